@@ -21,7 +21,6 @@ from ventbench.board.frames import load_tracks
 from ventbench.entries.runs import DRAWS, Runs
 from ventbench.entries.scoring import score
 from ventbench.pages.plots import write_stress_chart
-from ventbench.task.stressors import CATEGORIES
 
 ENTRIES = ("pid_robust", "residual_mlp_all", "ppo", "dqn", "adaptive_pid")
 DOCS = Path(__file__).parents[1] / "docs"
@@ -48,13 +47,6 @@ def table(scores: list[dict[str, Any]]) -> str:
         row("worst condition, cmH2O", lambda e: f"{e['worst_error']:.1f}"),
         row("stressors held out of tuning, cmH2O", lambda e: f"{e['held_out_score']:.2f}"),
     ]
-    for category in (*CATEGORIES, "pairs"):
-
-        def shown(entry: dict[str, Any], category: str = category) -> str:
-            own = entry["categories"][category]
-            return f"{own['error_cmH2O']:.2f}, {own['survived']:.0%}"
-
-        lines.append(row(f"{category}: error, survived", shown))
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""Tables of the site that are made from the code: a page has a mark where one goes."""
+"""What the site has from the code: tables and the reference; a page has a mark where one goes."""
 
 from __future__ import annotations
 
@@ -82,8 +82,21 @@ def stressors() -> str:
     return "\n".join([*lines, "", f"Pairs, both mild: {pairs}."])
 
 
+def reference() -> str:
+    """Every name of the front door, as mkdocstrings is told of it."""
+    import ventbench
+
+    named = {"entries.runs.Runs": ("entries.runs", "Runs")}  # what a score is made of
+    named |= {name: place for name, place in ventbench._SOURCES.items() if name != "LUNGS"}
+    return "\n\n".join(
+        f"::: ventbench.{module}.{attribute}\n    options:\n      heading: ventbench.{name}\n"
+        f"      toc_label: {name}"
+        for name, (module, attribute) in sorted(named.items(), key=lambda item: item[0].lower())
+    )
+
+
 _TABLES: dict[str, Callable[[], str]] = {
-    table.__name__: table for table in (commands, mechanisms, stressors)
+    table.__name__: table for table in (commands, mechanisms, reference, stressors)
 }
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators, names
 from ventbench.plants.stacking import PlantsFor, open_loop_breaths
@@ -23,7 +23,6 @@ from ventbench.task.metrics.open_loop import mae
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = NDArray[np.float64]
 
 #: A breath is looked at more closely if its error exceeds this, cmH2O ...
 SUSPECT = 1.0
@@ -228,7 +227,7 @@ def open_loop(
         )
     apart = np.isin(breaths.breath_id, [misfit.breath_id for misfit in doubtful])
 
-    def figures(index: NDArray[np.int64]) -> dict[str, Any]:
+    def figures(index: Ints) -> dict[str, Any]:
         return {
             **summary("", error[index]),
             **summary("held_out_", crossed[index][held_out[index]]),

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.recordings import Breaths, load
@@ -18,8 +19,6 @@ from ventbench.task.lungs import lung as parse_lung
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -257,7 +256,7 @@ def _numbers(path: Path, column: str, text: list[str]) -> Floats:
     return values
 
 
-def _first(path: Path, column: str, bad: NDArray[np.bool_], values: Floats, why: str) -> None:
+def _first(path: Path, column: str, bad: Bools, values: Floats, why: str) -> None:
     if np.any(bad):
         row = int(np.argmax(bad))
         raise InputError(f"{path} line {row + 2}, column {column}: {values[row]:g} {why}")

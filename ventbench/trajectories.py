@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.task import protocol, waveform
 from ventbench.task.metrics.score import run_error
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from ventbench.plants.catalog import Given
     from ventbench.task.interfaces import Controller, Plant
 
-Floats = NDArray[np.float64]
 
 _SERIES = ("target", "pressure", "u_in", "u_out")
 

@@ -10,14 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import ventbench.board
 from ventbench.base.errors import InputError
 from ventbench.board import frames, store
 from ventbench.task.lungs import LUNG_IDS
 
 
 def test_a_row_an_entry(full: Path, site: Path) -> None:
-    board = ventbench.board.load_board(full)
+    board = frames.load_board(full)
     rows = list(csv.DictReader(io.StringIO((site / "leaderboard.csv").read_text())))
     assert list(board["name"]) == [row["name"] for row in rows]
     names = [name for column in frames.COLUMNS for name in column.names]

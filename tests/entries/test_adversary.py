@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries.adversary import EDGE, RIG, _Bench, adversary
+from ventbench.entries.cells import PlantError, ProtocolRun
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import as_submission
 from ventbench.entries.runner import InProcessRunner
-from ventbench.entries.stepping import PlantError, ProtocolRun
 from ventbench.physics.parameters import VALVE_GAIN
 from ventbench.plants.population import NAMES, to_vector
 from ventbench.plants.rigs import load_rigs
@@ -33,7 +33,9 @@ def test_a_held_valve_is_unsafe_at_the_supply_that_algebra_says(
     make, tmp_path, monkeypatch
 ) -> None:
     """A held flow Q gives PEEP + Q (R + t / C); the gate needs four samples, from t = 0.9 s on."""
-    monkeypatch.setattr("ventbench.task.mildest.ROUNDS", 2)  # one coordinate has no combinations
+    monkeypatch.setattr(
+        "ventbench.entries.adversary.ROUNDS", 2
+    )  # one coordinate has no combinations
     flow = (LIMIT - 5.0) / (R / 1e3 + 30 * 0.03 / C)
     u_in = flow / stressor("supply_high").strong ** SEVERITY / VALVE_GAIN
     entry = make(act=f"return {u_in!r}")

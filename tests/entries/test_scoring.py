@@ -13,7 +13,7 @@ from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
-from ventbench.entries import runner, stepping
+from ventbench.entries import cells
 from ventbench.entries.errors import Failure, SubmissionError
 from ventbench.entries.folder import open_submission
 from ventbench.entries.runner import InProcessRunner
@@ -178,7 +178,7 @@ def test_without_draws(plants):
 
 
 def test_compiles_once(plants):
-    compiled: list[Any] = [stepping._inspire, stepping._observe]
+    compiled: list[Any] = [cells._inspire, cells._observe]
     for function in compiled:
         function.clear_cache()
     run_protocol(
@@ -554,47 +554,15 @@ def test_what_cannot_be_scored(given, said):
         score(given, simulator="physics")
 
 
-def test_progress_counts_the_rounds_of_all_sessions():
-    class Session:
-        closed = 0
-
-        def __init__(self):
-            self.failures = {0: "something"}
-
-        def ask(self, cells, observations):
-            self.asked = cells, observations[:, 0]
-
-        def answers(self):
-            return self.asked
-
-        def processor_time(self):
-            return 0.0
-
-        def close(self):
-            Session.closed += 1
-
-    class Plain:
-        def __init__(self):
-            self.sandbox = {"layer": "none"}
-
-        def start(self, submission, tasks):
-            return Session()
-
+def test_progress_counts_the_rounds_of_all_runs():
     seen = []
-    plain: Any = Plain()
-    nothing: Any = None
-    counting = runner.CountingRunner(plain, lambda *far: seen.append(far), sessions=2)
-    assert counting.sandbox == {"layer": "none"}
-    rows = np.arange(6.0).reshape(3, 2)
-    for _ in range(2):
-        session = counting.start(nothing, [nothing] * 3)
-        for _ in range(2):
-            np.testing.assert_array_equal(session.act(rows), rows[:, 0])
-        assert session.failures == {0: "something"}
-        session.close()
-    assert Session.closed == 2
+    stressors = ["supply_high"]
+    score(
+        lambda observation: 5.0, simulator="physics", stress=1, stressors=stressors,
+        progress=lambda *far: seen.append(far),
+    )  # fmt: skip
     total = 2 * protocol.BREATHS * protocol.INSPIRATION_STEPS
-    assert seen == [(1, total), (2, total), (3, total), (4, total)]
+    assert seen == [(done, total) for done in range(1, total + 1)]
 
 
 @pytest.mark.slow

@@ -160,7 +160,7 @@ def test_too_few_and_too_many_cells(rows, write_csv):
 
 def test_an_open_quote(rows, write_csv):
     rows[4][U_IN] = '"12'
-    assert refused(write_csv(rows)).line == 6
+    assert refused(write_csv(rows)).problems[0].line == 6
 
 
 def test_time_that_does_not_increase(rows, write_csv):
@@ -288,7 +288,8 @@ def test_many_problems_are_counted_and_the_first_twenty_shown(rows, write_csv):
     assert [p.line for p in error.problems][:4] == [2, 3, 7, 8]
     assert len(error.problems) == 20
     assert str(error).splitlines()[-1] == "... and 97 more problems (117 in all)."
-    assert (error.line, error.column, error.value) == (2, "R", "900")
+    first = error.problems[0]
+    assert (first.line, first.column, first.value) == (2, "R", "900")
     for row in many[5:]:
         row[U_IN] = "ten"
     error = refused(write_csv(many))

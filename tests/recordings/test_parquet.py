@@ -32,7 +32,7 @@ def test_a_bad_value_names_its_row(table, tmp_path):
         load(path)
     text = f"{path} row 10, column u_in: 104.2 is outside 0..100 %. Fix the row or pass --clip."
     assert str(caught.value) == text
-    assert caught.value.value == "104.2"
+    assert caught.value.problems[0].value == "104.2"
 
 
 def test_progress_ends_at_the_whole_file(make, tmp_path):

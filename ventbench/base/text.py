@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ventbench.base.errors import require
 
 if TYPE_CHECKING:
     import jinja2
+
+#: Longest text and most rows of what a file says about itself, on a page.
+MAX_CHARACTERS, MAX_ROWS = 300, 100
 
 
 def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
@@ -64,6 +67,30 @@ def deceptive(text: str) -> str:
 def escape_markdown(text: str) -> str:
     """Make text plain in Markdown: no link, image, table or heading can come from it."""
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))
+
+
+def flatten(value: Any) -> list[tuple[str, str]]:
+    """JSON values as pairs of name and text for a table, cut and not escaped."""
+    return list(_pairs(value, ""))[:MAX_ROWS]
+
+
+def _pairs(value: Any, prefix: str) -> Iterator[tuple[str, str]]:
+    parts = value if isinstance(value, list | tuple) else [value]
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _pairs(part, f"{prefix} {key}".strip())
+    elif any(isinstance(part, Mapping | list | tuple) for part in parts):
+        for index, part in enumerate(parts):
+            yield from _pairs(part, f"{prefix} {index + 1}".strip())
+    elif text := ", ".join(_short(part) for part in parts if part is not None):
+        cut = text if len(text) <= MAX_CHARACTERS else text[: MAX_CHARACTERS - 1] + "…"
+        yield prefix, cut
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def page_templates(

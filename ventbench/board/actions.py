@@ -14,13 +14,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import canonical
 from ventbench.task import protocol
-
-Floats = NDArray[np.float64]
 
 #: How the bytes are laid out; written into the record.
 ENCODING = "zlib, byte planes of little-endian float64"

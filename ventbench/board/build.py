@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ventbench.base import files
+from ventbench.base.text import flatten
 from ventbench.board import canonical, comparison, drawings, frames, pages, ranking, store
 from ventbench.board.frames import Line
 from ventbench.board.gate import Evidence
@@ -111,15 +112,7 @@ def _index(
     root: str,
     own: Round | None = None,
 ) -> str:
-    """Return the page of the board, or that of a round.
-
-    Args:
-        environment: of the templates.
-        leaderboard: all records.
-        tracks: that are shown.
-        root: relative address of the page of the board.
-        own: the round whose page it is.
-    """
+    """Return the page of the board, or that of a round; ``root`` leads to the page of the board."""
     lines = frames.lines(tracks)
     shown = own or next((track.round for track in tracks if track.round), None)
     header = lines[0].row.record.header if lines else None
@@ -130,7 +123,7 @@ def _index(
         tracks=[_track(track) for track in tracks],
         columns=SHOWN,
         aside=[_aside(line) for line in lines if line.status not in ("ranked", "practice")],
-        simulators=pages.flatten(header.simulators) if header else [],
+        simulators=flatten(header.simulators) if header else [],
         draws=header.draws if header else None,
         stress=[pages.stress_shown(row) for row in stressed],
         chart=pages.stress_chart(stressed),
@@ -330,7 +323,7 @@ def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
         ("Versions", header.versions),
         ("Timing", header.timing),
     )
-    flat = [(title, pages.flatten(values)) for title, values in groups]
+    flat = [(title, flatten(values)) for title, values in groups]
     return [(title, rows) for title, rows in flat if rows]
 
 

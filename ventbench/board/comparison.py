@@ -27,11 +27,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from ventbench.base.arrays import Bools, Floats, Ints
 
 #: Probability that any pair of entries is called wrongly.
 ERROR = 0.05
@@ -68,7 +66,7 @@ class Ranks:
         worst: worst rank, shape ``(N,)``.
     """
 
-    better: NDArray[np.bool_]
+    better: Bools
     rank: Ints
     best: Ints
     worst: Ints
@@ -150,7 +148,7 @@ def _clusters(values: Floats, rig: Ints) -> Floats:
     return centred @ member / values.shape[1]
 
 
-def holm(p: Floats) -> NDArray[np.bool_]:
+def holm(p: Floats) -> Bools:
     """Which hypotheses of all ordered pairs are rejected, shape ``(N, N)``."""
     rejected = np.zeros(p.shape, bool)
     pairs = np.flatnonzero(~np.eye(len(p), dtype=bool))

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base import VERSION, files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import actions, canonical, record, schema
 from ventbench.board.record import HardwareRecord
@@ -334,7 +334,7 @@ def trace(replayed: Replayed) -> dict[str, Any]:
     }
 
 
-def _plain(values: NDArray[np.float64]) -> Any:
+def _plain(values: Floats) -> Any:
     """Nested lists, null for NaN."""
     if values.ndim:
         return [_plain(row) for row in values]

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from ventbench.base.arrays import Floats
 from ventbench.base.text import number
 from ventbench.board import comparison, pages
 from ventbench.board.ranking import Row
-from ventbench.board.record import Floats, Record
+from ventbench.board.record import Record
 from ventbench.task import protocol
 
 #: Size of the small plot of an interval; the entry's dot never touches its edge.

@@ -30,22 +30,8 @@ if TYPE_CHECKING:
 #: Shown where there is nothing to show.
 NONE = "–"
 
-#: Longest text and most rows of what a record says about itself, on a page.
-MAX_CHARACTERS, MAX_ROWS = 300, 100
-
 #: Shares of survived runs below which a field of the stress chart gets the next darker shade.
 SHARES = (1.0, 0.95, 0.85, 0.7, 0.5, 0.3)
-
-#: Titles of the stressors' categories, in the words of a clinician.
-CATEGORY_TITLES = {
-    "valve": "Valve and supply",
-    "circuit": "Circuit",
-    "sensor": "Sensor",
-    "lung": "Airway and lung",
-    "patient": "Patient",
-    "setting": "Other lungs",
-    "pairs": "Two at once, both mild",
-}
 
 
 def environment() -> jinja2.Environment:
@@ -133,35 +119,6 @@ def step_time(timing: Mapping[str, Any]) -> float:
     value = timing.get("act_median_us")
     good = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if good else math.nan  # type: ignore[arg-type]
-
-
-def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """What a record says about itself, as pairs of text; not escaped."""
-    rows: list[tuple[str, str]] = []
-    _flatten(value, prefix, rows)
-    return rows[:MAX_ROWS]
-
-
-def _flatten(value: Any, prefix: str, rows: list[tuple[str, str]]) -> None:
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            _flatten(part, f"{prefix} {key}".strip(), rows)
-        return
-    parts = value if isinstance(value, list | tuple) else [value]
-    if any(isinstance(part, Mapping | list | tuple) for part in parts):
-        for index, part in enumerate(parts):
-            _flatten(part, f"{prefix} {index + 1}".strip(), rows)
-        return
-    text = ", ".join(_short(part) for part in parts if part is not None)
-    if text:
-        cut = text if len(text) <= MAX_CHARACTERS else text[: MAX_CHARACTERS - 1] + "…"
-        rows.append((prefix, cut))
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def hardware_of(made: Sequence[HardwareRow], name: str) -> HardwareRow | None:
@@ -265,10 +222,10 @@ def stress_chart(made: Sequence[StressRow]) -> list[dict[str, Any]]:
             )
             for name in names
         ]
-        groups.append({"title": CATEGORY_TITLES[category], "rows": lines})
+        groups.append({"title": CATEGORIES[category].capitalize(), "rows": lines})
     pairs = [c for c in index if len(c.stressors) > 1]
     lines = [_line(_pair(c), [(c, "mild"), (None, "")], made, index) for c in pairs]
-    groups.append({"title": CATEGORY_TITLES["pairs"], "rows": lines})
+    groups.append({"title": "Two at once, both mild", "rows": lines})
     return [group for group in groups if group["rows"]]
 
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.board import comparison, gate
 from ventbench.board.canonical import RECORDS
 from ventbench.board.comparison import CMH2O, POINTS, Ranks
@@ -30,8 +30,6 @@ from ventbench.entries.runs import Runs
 from ventbench.task import protocol
 from ventbench.task.draws import DEVELOPMENT
 from ventbench.task.metrics import bootstrap
-
-Floats = NDArray[np.float64]
 
 #: The PID that each track's entries are compared with.
 BASELINES = {"performance": "pid_best", "robustness": "pid_robust"}
@@ -343,9 +341,7 @@ def ranks_of(entries: Sequence[Entry], values: Sequence[Floats]) -> Ranks:
     return _ranks(entries, values, rigs.session[:, rigs.ranked], POINTS)
 
 
-def _ranks(
-    entries: Sequence[Entry], values: Sequence[Floats], rig: NDArray[np.int64], matters: float
-) -> Ranks:
+def _ranks(entries: Sequence[Entry], values: Sequence[Floats], rig: Ints, matters: float) -> Ranks:
     names = [entry.record.name for entry in entries]
     source = [names.index(x.source) if x.source in names else None for x in entries]
     return comparison.ranks(np.stack(values), rig, source, matters=matters)
@@ -422,12 +418,7 @@ def _interval(values: Floats, means: Floats) -> Interval:
 
 
 def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:
-    """Entries that were run under the newest table of stressors, best first.
-
-    Args:
-        rows: entries of a track; those of other tables of stressors are left out.
-        evidence: what stands behind the records.
-    """
+    """Entries that ran under the newest table of stressors, best first; others are left out."""
     ran = [(row, own) for row in rows if (own := row.record.stress) is not None]
     newest = max((own.stressors for _, own in ran), default=0)
     current = [(row, own.tables) for row, own in ran if own.stressors == newest]

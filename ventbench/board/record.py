@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
 from ventbench.entries.runs import Runs
@@ -25,8 +25,6 @@ from ventbench.task import draws, protocol
 from ventbench.task.metrics.score import normalised, passes_safety_gate
 from ventbench.task.stressors import VERSION as STRESSORS_VERSION
 from ventbench.task.stressors import condition_of
-
-Floats = NDArray[np.float64]
 
 #: What the key ``track`` says of every such record.
 TRACK = "hardware"
@@ -62,14 +60,14 @@ class RecordHeadroom:
         pid: error of the lung's best PID, cmH2O, of that shape.
     """
 
-    session: NDArray[np.int64]
-    member: NDArray[np.int64]
+    session: Ints
+    member: Ints
     error: Floats
     attainable: Floats
     pid: Floats
 
     @property
-    def ranked(self) -> NDArray[np.bool_]:
+    def ranked(self) -> Bools:
         """Whether each draw is on rigs that nobody trained on, shape ``(K,)``."""
         return draws.ranked(self.session)
 
@@ -125,7 +123,7 @@ class Record(schema.Submitted):
     pressure: Floats
     u_in: Floats
     peak: Floats
-    steps_above: NDArray[np.int64]
+    steps_above: Ints
     headroom: RecordHeadroom
     stress: RecordStress | None = None
 
@@ -460,11 +458,6 @@ def timestamp(now: datetime | None = None) -> str:
 def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecord:
     """Check what ties the keys of a hardware record together.
 
-    Args:
-        content: types and ranges are right.
-        sha256: of its bytes.
-        label: names the file in messages.
-
     Raises:
         InputError: naming the first key that is wrong.
     """
@@ -532,10 +525,7 @@ def _measured_problems(content: HardwareContent) -> list[str]:
     """What a hardware record says of its pressures and they do not, by key.
 
     Highest pressure, safety, the pressure before the first command acts, and that no two breaths of
-    a lung are equal to the last digit.
-
-    Args:
-        content: types, ranges and shapes are right.
+    a lung are equal to the last digit. Types, ranges and shapes must be right.
     """
     problems: list[str] = []
     seen: set[bytes] = set()

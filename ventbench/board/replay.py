@@ -15,14 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ventbench.base import precision
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.board.record import Record
 from ventbench.board.rounds import Round
 from ventbench.board.schema import ScoreHeader
-from ventbench.entries.stepping import as_float64
+from ventbench.entries.cells import as_float64
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
 from ventbench.task import environment as env
@@ -37,8 +38,6 @@ from ventbench.task.metrics.score import (
     run_error,
     safety_limit,
 )
-
-Floats = NDArray[np.float64]
 
 #: The breath whose nominal inspirations are kept for the page.
 TRACE_BREATH = max(protocol.SCORED_BREATHS)
@@ -104,18 +103,18 @@ class Replayed:
 
     nominal: Floats
     drawn: Floats
-    safe: NDArray[np.bool_]
+    safe: Bools
     peak: Floats
-    steps_above: NDArray[np.int64]
-    below: NDArray[np.int64]
-    above: NDArray[np.int64]
+    steps_above: Ints
+    below: Ints
+    above: Ints
     spread: Floats
     pressure: Floats
     u_in: Floats
     first: Floats
     controllable: Floats
-    session: NDArray[np.int64]
-    member: NDArray[np.int64]
+    session: Ints
+    member: Ints
 
 
 @jax.jit

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base import files
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.board import canonical, create, store
@@ -28,8 +28,6 @@ from ventbench.entries.runs import Runs
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import stressors
-
-Floats = NDArray[np.float64]
 
 #: What a second run can show.
 REPRODUCED, DIFFERENT, NOT_RERUN = "reproduced", "different", "not re-run"
@@ -221,12 +219,7 @@ def _check_same(submission: Submission, score: Record) -> None:
 
 
 def stress_difference(recorded: RecordStress, again: Runs) -> str:
-    """Describe how runs of the stress track differ from the recorded ones; empty if they do not.
-
-    Args:
-        recorded: figures and hash of the commands.
-        again: the second run.
-    """
+    """Describe how runs of the stress track differ from the recorded ones; empty if they do not."""
     if recorded.stressors != stressors.VERSION:
         return f"stress: its stressors are version {recorded.stressors}, not {stressors.VERSION}"
     tables = recorded.tables
@@ -256,7 +249,7 @@ def _closeness(recorded: Floats, again: Floats) -> str:
     return f"commands within {np.abs(recorded - again).max():.1e} %"
 
 
-def _bits_apart(recorded: Floats, again: Floats) -> NDArray[np.bool_]:
+def _bits_apart(recorded: Floats, again: Floats) -> Bools:
     bits = (np.ascontiguousarray(x, np.float64).view(np.uint64) for x in (recorded, again))
     return np.not_equal(*bits)
 

@@ -13,10 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import actions, attestation, canonical, record, rounds, schema
 from ventbench.board.canonical import RECORDS
@@ -361,7 +359,7 @@ def commands_path(record: Record, folder: Path) -> Path:
     return folder / f"{record.header.actions.sha256}{actions.SUFFIX}"
 
 
-def load_commands(record: Record, folder: Path) -> NDArray[np.float64]:
+def load_commands(record: Record, folder: Path) -> Floats:
     """Read the commands of a record.
 
     Args:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import attestation, canonical, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
@@ -38,8 +38,6 @@ from ventbench.plants.rigs import rigs_of
 from ventbench.task import protocol
 from ventbench.task.draws import Draws
 from ventbench.task.metrics.score import normalised
-
-Floats = NDArray[np.float64]
 
 #: Most that errors of bounds may differ from what their commands give, cmH2O.
 BOUNDS_TOLERANCE = 1e-9
@@ -113,10 +111,7 @@ def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Rep
 def _strange_files(folder: Path, entries: Sequence[AnyRecord], *, whole: bool) -> list[str]:
     """Files that belong to no record of the leaderboard: none of them may be published.
 
-    Args:
-        folder: of the leaderboard.
-        entries: that could be read.
-        whole: whether these are all; else nobody knows which commands the others name.
+    If the entries are not the whole, nobody knows which commands the others name.
     """
     plain, odd = canonical.walk(folder)
     problems = [f"{folder / name} is neither a plain file nor a folder; remove it" for name in odd]
@@ -169,9 +164,7 @@ def _check_replay(
 def _check_ranks(leaderboard: Store, by_draw: Mapping[str, Floats]) -> list[str]:
     """Ranks that recorded errors give and replayed ones do not: nobody gains by a rounding error.
 
-    Args:
-        leaderboard: all that could be read.
-        by_draw: replayed values that rank; a record without them keeps its own.
+    A record without replayed values, ``(L, k)`` by its hash, keeps its own.
     """
     problems = []
     for track in ranking.board(leaderboard):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from ventbench.entries.folder import Submission
     from ventbench.entries.result import Score
-    from ventbench.entries.runner import Progress
+    from ventbench.entries.scoring import Progress
 
 Track = Literal["performance", "robustness", "all"]
 
@@ -400,7 +400,7 @@ def transfer(
 
     from ventbench.entries import scoring as transfers
     from ventbench.entries.folder import open_submission
-    from ventbench.entries.runner import CountingRunner, runner_of
+    from ventbench.entries.runner import runner_of
     from ventbench.plants.rigs import load_rigs
 
     opened = [open_submission(name) for name in names]
@@ -409,8 +409,8 @@ def transfer(
         chosen = track or entry.manifest.tracks[0]
         with bars() as shown:
             runner = runner_of(entry, sandbox=not in_process)
-            counting = CountingRunner(runner, counted(shown, f"running {entry.label}"))
-            runs = transfers.transfer(entry, rigs, track=chosen, runner=counting)
+            told = counted(shown, f"running {entry.label}")
+            runs = transfers.transfer(entry, rigs, track=chosen, runner=runner, progress=told)
         groups = transfers.by_group(runs, rigs)
         results.append({"name": entry.manifest.name, "track": chosen, "groups": groups})
     emit({"entries": results}, json)

@@ -4,9 +4,8 @@
 - :mod:`~ventbench.entries.manifest`: ``submission.toml``;
 - :mod:`~ventbench.entries.runner`: who runs the controllers (in this process, or a sandbox);
   one controller in one run is a :class:`ventbench.sandbox.child.cell.Cell` in both;
-- :mod:`~ventbench.entries.stepping`: the loop between plants and runner;
 - :mod:`~ventbench.entries.cells`: what is scored, against the bounds of
-  :mod:`~ventbench.entries.reference`;
+  :mod:`~ventbench.entries.reference`, and the loop between plants and runner;
 - :mod:`~ventbench.entries.scoring`: the score, :mod:`~ventbench.entries.runs` the figures of its
   runs, and :mod:`~ventbench.entries.result` its form;
 - :mod:`~ventbench.entries.scaffold`: a new submission that scores at once;

@@ -1,35 +1,41 @@
-"""What is scored: cells, the plants that they run on, and the bounds of the score.
+"""What is scored: cells, their plants, the bounds of the score, and how a submission runs on them.
 
 A cell is a lung on one of its rigs, a PIP, deviations of ventilator and sensor, and a condition.
-All conditions share their cells, so that each stressed run has an unstressed twin.
+All conditions share their cells, so that each stressed run has an unstressed twin. Between plants
+and controllers only numbers cross, and no cell waits for another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from jax import Array
 
+from ventbench.base import precision
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.entries.errors import Failure
+from ventbench.entries.folder import Submission
 from ventbench.entries.reference import Reference, reference_of
+from ventbench.entries.runner import Runner, pack
 from ventbench.entries.runs import pip_columns
 from ventbench.plants.corrected import Stressed, stressed_plants
 from ventbench.plants.rigs import Rigs
 from ventbench.task import draws as draw_tables
-from ventbench.task import protocol
+from ventbench.task import environment as env
+from ventbench.task import protocol, rollouts
 from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario
-from ventbench.task.interfaces import Plant
+from ventbench.task.interfaces import Plant, PlantT, Task
 from ventbench.task.lungs import Lung
+from ventbench.task.rollouts import Script
 from ventbench.task.stressors import Condition, conditions, stressor
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,3 +190,277 @@ def chosen_conditions(stressors: Sequence[str]) -> tuple[Condition, ...]:
     """
     names = {stressor(name).name for name in stressors}
     return tuple(c for c in conditions() if not names or set(c.stressors) <= names)
+
+
+@dataclass(frozen=True)
+class ProtocolRun:
+    """Inspirations of all cells; arrays of shape ``(..., BREATHS, INSPIRATION_STEPS)``.
+
+    ``(...)`` is the batch shape of the cells, lungs first, or conditions and then lungs.
+
+    Attributes:
+        pressure: airway pressure at each step, which is scored, cmH2O.
+        requested: what the controllers asked for, %; 0 once a cell has failed.
+        u_in: what was applied, %.
+        volume: gas in the lung, mL; None where the plants have no such signal.
+        failures: what failed, by index of the cell.
+        act_seconds: time on the clock that an answer took on average, s, each time that some came.
+    """
+
+    pressure: Floats
+    requested: Floats
+    u_in: Floats
+    volume: Floats | None
+    failures: Mapping[tuple[int, ...], Failure]
+    act_seconds: Floats
+
+
+def as_float64(plants: PlantT, count: int) -> PlantT:
+    """Return stacked plants with 64-bit leaves.
+
+    Args:
+        plants: one plant whose leaves have the lungs on their leading axis.
+        count: number of lungs.
+
+    Raises:
+        ValueError: if a leaf has another leading axis.
+    """
+
+    def convert(leaf: Any) -> Array:
+        leaf = jnp.asarray(leaf)
+        if leaf.shape[:1] != (count,):
+            raise ValueError(
+                f"a plant's parameter of shape {leaf.shape} is not stacked over {count} lungs"
+            )
+        return leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(convert, plants)
+
+
+def _strong(tree: Any) -> Any:
+    """Drop weak types, which would make the second step compile anew."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), tree)
+
+
+@jax.jit
+def _begin(plants: Plant, scenario: Scenario, breath: Array) -> tuple[Plant, env.LoopState]:
+    def begin(plant: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
+        varied = env.vary(plant, scenario, breath)
+        return varied, env.start_breath(varied, scenario)
+
+    return _strong(jax.vmap(begin)(plants, scenario))
+
+
+_observe = jax.jit(env.observe)
+
+
+@jax.jit
+def _inspire(
+    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array, which: Array
+) -> tuple[env.LoopState, Array]:
+    """Apply commands to some cells; the others wait."""
+    after, applied = _strong(jax.vmap(env.inspire)(plants, scenario, loop, u_in))
+    return _where(which, after, loop), applied
+
+
+@jax.jit
+def _where(which: Array, one: Any, other: Any) -> Any:
+    """Take one state in some cells and the other in the rest, ``which`` of the batch shape."""
+
+    def choose(x: Array, y: Array) -> Array:
+        shape = which.shape + (1,) * (x.ndim - which.ndim)
+        return jnp.where(which.reshape(shape), x, y)
+
+    return jax.tree.map(choose, one, other)
+
+
+def _of_cells(values: Array, batch: tuple[int, ...]) -> Floats:
+    return np.broadcast_to(np.asarray(values), batch).ravel()
+
+
+class PlantError(FloatingPointError):
+    """A plant answered with NaN or infinity.
+
+    Attributes:
+        index: of the plant on the leading axis.
+    """
+
+    def __init__(self, index: int) -> None:
+        super().__init__(f"simulator {index} answered with NaN or infinity")
+        self.index = index
+
+
+def step_through(
+    plants: Plant,
+    scenario: Scenario,
+    runner: Runner,
+    submission: Submission,
+    tasks: Sequence[Task],
+    *,
+    changing: bool = False,
+    count: Callable[[], object] = lambda: None,
+) -> ProtocolRun:
+    """Run a submission on every lung and cell. Call it within ``precision.float64()``.
+
+    Args:
+        plants: from :func:`as_float64`, L lungs; leaves may have the cells' batch shape too,
+            ``(L, ..., )`` with axes of length 1 where cells share a plant.
+        scenario: cells of each lung, batch shape ``(L, ...)``.
+        runner: runs the controllers.
+        submission: whose they are.
+        tasks: what is told of each lung, length L.
+        changing: the plants are others in each breath: leaves ``(L, BREATHS, ...)``.
+        count: called after each round: once every cell has one more command.
+
+    Raises:
+        SubmissionError: if the submission cannot be run at all.
+        PlantError: if a plant answers with NaN or infinity.
+    """
+    batch = np.shape(scenario.pip)
+    cells, steps = int(np.prod(batch)), protocol.INSPIRATION_STEPS
+    total = protocol.BREATHS * steps
+    pressure, requested, applied, volume = (np.zeros((cells, total)) for _ in range(4))
+    each = [task for task in tasks for _ in range(cells // len(tasks))]
+    breaths = range(protocol.BREATHS)
+    parts = [jax.tree.map(lambda x, k=k: x[:, k], plants) if changing else plants for k in breaths]
+    begun = [_begin(part, scenario, k) for k, part in enumerate(parts)]
+    loop, seconds = begun[0][1], []
+    has_volume = loop.signals.volume is not None
+    # Cells go on by themselves: what one takes, no other one waits for.
+    given, ready = np.zeros(cells, np.int64), np.arange(cells)
+    with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
+        session = runner.start(submission, each)
+    try:
+        while (given < total).any():
+            at = np.minimum(given, total - 1).reshape(batch)
+            rows = pack(_observe(scenario, loop, at // steps, at % steps))
+            pressure[ready, given[ready]] = _of_cells(loop.signals.scored, batch)[ready]
+            if has_volume:
+                volume[ready, given[ready]] = _of_cells(loop.signals.volume, batch)[ready]
+            start = time.perf_counter()
+            with precision.float32():
+                session.ask(ready, rows[ready])
+                ready, commands = session.answers()
+            seconds.append((time.perf_counter() - start) / max(1, len(ready)))
+            requested[ready, given[ready]] = commands
+            u_in, moved = np.zeros(cells), np.zeros(cells, bool)
+            u_in[ready], moved[ready] = commands, True
+            for k, (varied, _) in enumerate(begun):
+                own = moved & (given // steps == k)
+                if own.any():
+                    loop, now = _inspire(
+                        varied, scenario, loop, u_in.reshape(batch), own.reshape(batch)
+                    )
+                    applied[own, given[own]] = _of_cells(now, batch)[own]
+            rounds = given.min()
+            given[ready] += 1
+            for _ in range(given.min() - rounds):
+                count()
+            for k, (_, rest) in enumerate(begun):
+                fresh = moved & (given % steps == 0) & (given // steps == k)
+                if fresh.any():
+                    loop = _where(fresh.reshape(batch), rest, loop)
+            ready = ready[given[ready] < total]
+        failures = dict(session.failures)
+    finally:
+        session.close()
+    broken = np.flatnonzero(~np.isfinite(pressure).reshape(len(tasks), -1).all(axis=1))
+    if broken.size:
+        raise PlantError(int(broken[0]))
+    by_cell = {tuple(int(i) for i in np.unravel_index(k, batch)): v for k, v in failures.items()}
+    shape = (*batch, protocol.BREATHS, steps)
+    pressure, requested, applied, volume = (
+        x.reshape(shape) for x in (pressure, requested, applied, volume)
+    )
+    kept = volume if has_volume else None
+    return ProtocolRun(pressure, requested, applied, kept, by_cell, np.array(seconds))
+
+
+def run_cells(
+    cells: Cells,
+    runner: Runner,
+    submission: Submission,
+    tasks: Sequence[Task],
+    count: Callable[[], object] = lambda: None,
+) -> ProtocolRun:
+    """Run a submission on cells, batch shape ``(S, L, n, P)``. Call it within ``float64()``.
+
+    Without stressors all cells run together; else the draws run one after the other, all
+    conditions and lungs of one together.
+
+    Args:
+        cells: S conditions, L lungs, n draws, P PIPs.
+        runner: runs the controllers.
+        submission: whose they are.
+        tasks: what is told of each lung, length L.
+        count: see :func:`step_through`.
+
+    Raises:
+        SubmissionError: if the submission cannot be run at all.
+        PlantError: if a plant answers with NaN or infinity.
+    """
+    lungs, conditions = len(cells.lungs), len(cells.conditions)
+    if conditions == 1:
+        plants = as_float64(cells.plants, lungs)
+        run = step_through(plants, cells.scenario, runner, submission, tasks, count=count)
+        return _reshaped(run, lambda x: x[None], lambda at: (0, *at))
+    runs = []
+    for draw in range(len(cells.draw)):
+        plants, scenario = cells.stressed(draw)
+        each = list(tasks) * conditions
+        try:
+            run = step_through(
+                plants, scenario, runner, submission, each, changing=True, count=count
+            )
+        except PlantError as error:
+            name = cells.conditions[error.index // lungs].id
+            raise FloatingPointError(
+                f"the plant under {name} answered with NaN or infinity"
+            ) from error
+        runs.append(
+            _reshaped(
+                run,
+                lambda x: x.reshape(conditions, lungs, 1, *x.shape[1:]),
+                lambda at, draw=draw: (*divmod(at[0], lungs), draw, 0),
+            )
+        )
+
+    def joined(name: str) -> Floats:
+        return np.stack([getattr(run, name) for run in runs], axis=2)
+
+    failures = {at: failure for run in runs for at, failure in run.failures.items()}
+    seconds = np.concatenate([run.act_seconds for run in runs])
+    pressure, requested, u_in, volume = map(joined, ("pressure", "requested", "u_in", "volume"))
+    return ProtocolRun(pressure, requested, u_in, volume, failures, seconds)
+
+
+def _reshaped(
+    run: ProtocolRun,
+    shape: Callable[[Floats], Floats],
+    index: Callable[[tuple[int, ...]], tuple[int, ...]],
+) -> ProtocolRun:
+    volume = None if run.volume is None else shape(run.volume)
+    failures = {index(at): failure for at, failure in run.failures.items()}
+    pressure, requested, u_in = map(shape, (run.pressure, run.requested, run.u_in))
+    return ProtocolRun(pressure, requested, u_in, volume, failures, run.act_seconds)
+
+
+def replay(
+    plants: Plant, scenario: Scenario, requested: Floats
+) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
+    """Apply recorded commands again, with the expirations. Call it within ``float64()``.
+
+    Args:
+        plants: from :func:`as_float64`, L lungs.
+        scenario: cells, as in :func:`step_through`.
+        requested: as in :class:`ProtocolRun`.
+
+    Returns:
+        Arrays of shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
+    """
+
+    def run(plant: Plant, scenario: Scenario, commands: Array) -> Any:
+        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True)
+
+    commands = jnp.asarray(requested.reshape(*requested.shape[:-2], -1))
+    return jax.vmap(run)(plants, scenario, commands)

@@ -14,8 +14,8 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.entries.contract_runs import (
     STEPS,
     Answers,
@@ -42,8 +42,6 @@ from ventbench.entries.review import inspect_folder
 from ventbench.entries.runner import ControllerSession, Runner
 from ventbench.task import draws, protocol
 from ventbench.task.lungs import LUNGS
-
-Floats = NDArray[np.float64]
 
 #: Calls of ``act`` in a whole score, on how many processor cores, and the longest that they may
 #: take, s: half of what the sandbox allows, as the scorer's machine may be slower and busy.
@@ -179,12 +177,7 @@ def _report(name: str, findings: list[Finding], **others: object) -> CheckReport
 
 
 def _import_finding(problem: str, label: str) -> Finding:
-    """Finding of a submission that cannot be imported.
-
-    Args:
-        problem: as ``cell.controller_class`` words it.
-        label: the submission, with which the problem begins.
-    """
+    """Finding of a submission that cannot be imported, whose label the problem begins with."""
     advice = "it must be possible to import it with what the sandbox has"
     return _placed("run", problem.removeprefix(f"{label}: "), advice)
 
@@ -223,11 +216,7 @@ def _placed(group: Group, text: str, advice: str) -> Finding:
 
 
 def _clipping_notes(commands: Sequence[Floats]) -> Iterator[Finding]:
-    """A note on commands beyond the valve.
-
-    Args:
-        commands: answers of the plain runs, %.
-    """
+    """A note on commands beyond the valve, by the answers of the plain runs, %."""
     values = np.concatenate(commands)
     outside = np.sum((values < 0.0) | (values > protocol.U_MAX))
     if outside:
@@ -279,11 +268,7 @@ def _differ(first: Floats, other: Floats) -> str:
 
 
 def time_findings(act_seconds: Floats) -> Iterator[Finding]:
-    """Findings on how long ``act`` takes.
-
-    Args:
-        act_seconds: processor time of each call, s.
-    """
+    """Findings on how long ``act`` takes, by the processor time of each call, s."""
     mean = float(act_seconds.mean())
     total = mean * ACTS / CORES
     score = f"the {ACTS} calls of a score {total:.0f} s on {CORES} cores"

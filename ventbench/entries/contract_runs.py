@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import CONTROLLER, Submission
 from ventbench.entries.runner import ControllerSession, Runner
@@ -195,8 +195,6 @@ def driven(submission: Submission) -> Iterator[Submission]:
             file.write(code.encode())
         yield dataclasses.replace(submission, folder=folder)
 
-
-Floats = NDArray[np.float64]
 
 #: Rounds whose time does not count: first calls load and compile.
 _WARM_UP = 3

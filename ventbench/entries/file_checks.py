@@ -253,11 +253,7 @@ WEIGHTS_ADVICE = {
 
 
 def weights_problems(path: Path) -> list[str]:
-    """Say what is wrong with a file of arrays, each for a sentence that starts with its name.
-
-    Args:
-        path: a ``.npz``, ``.npy`` or ``.safetensors`` file.
-    """
+    """Say what is wrong with a file of arrays, each for a sentence that starts with its name."""
     try:
         if path.suffix.lower() == ".safetensors":
             return _safetensors(path)

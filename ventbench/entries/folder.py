@@ -223,10 +223,6 @@ def content_hash(folder: Path, paths: list[Path]) -> str:
 
     Of the text that ``sha256sum`` prints for the files, sorted by relative path:
     ``HASH  PATH`` a line.
-
-    Args:
-        folder: the submission's folder.
-        paths: its files.
     """
     return combined_hash({p.relative_to(folder).as_posix(): files.sha256(p) for p in paths})
 

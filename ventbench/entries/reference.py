@@ -21,9 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import InProcess, results
 from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
@@ -57,7 +58,6 @@ PID_GAINS = (
     (1.96, 23.0, 0.14),
 )
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 # Steps that the second start of a further breath opens the valve fully for.
@@ -295,13 +295,7 @@ def _part(own: Plant, cell: Scenario, gains: Floats, starts: tuple[int, ...]) ->
 
 
 def _inspirations(plants: Plant, cells: Scenario, breath: int) -> tuple[Plant, Scenario]:
-    """One scored inspiration of each cell, on one axis, with its plant.
-
-    Args:
-        plants: leaves ``(L, n, 1, ...)``.
-        cells: batch shape ``(L, n, P)``.
-        breath: which of the scored ones.
-    """
+    """One scored inspiration of each cell ``(L, n, P)``, on one axis, with its plant."""
     shape = np.shape(cells.pip)
     size, at = int(np.prod(shape)), protocol.SCORED_BREATHS[breath]
     each = jax.tree.map(

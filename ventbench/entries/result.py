@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base import VERSION, files
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.entries.cells import Protocol
 from ventbench.entries.folder import Submission
 from ventbench.entries.runs import CellFailure, Runs, number
@@ -30,7 +31,6 @@ from ventbench.trajectories import Trajectories
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = NDArray[np.float64]
 
 #: Failures and stressed conditions that a printed score names; the JSON has all.
 _FAILURES_SHOWN, _CONDITIONS_SHOWN = 3, 10
@@ -67,8 +67,8 @@ class Score:
     stressed: Runs | None
     controllable: Floats
     figures: Mapping[str, Floats]
-    below: NDArray[np.int64]
-    above: NDArray[np.int64]
+    below: Ints
+    above: Ints
     trajectories: Trajectories
     sandbox: Mapping[str, Any] | None
     timing: Mapping[str, float]
@@ -98,7 +98,7 @@ class Score:
         return np.moveaxis(self._by_draw(self.runs.error)[:, 1:], 1, 0)
 
     @property
-    def safe(self) -> NDArray[np.bool_]:
+    def safe(self) -> Bools:
         """Whether all runs of a lung passed the safety gate, shape ``(L,)``."""
         return self.runs.safe[0].all(axis=-1)
 
@@ -145,7 +145,7 @@ class Score:
         return None if reference is None else reference.normalised(self.controllable)
 
     @property
-    def ranked(self) -> NDArray[np.bool_]:
+    def ranked(self) -> Bools:
         """Whether each draw is on rigs that nobody trained on, shape ``(K,)``."""
         return np.zeros(0, bool) if self.rig_draws is None else self.rig_draws.ranked
 
@@ -327,7 +327,7 @@ class Score:
         *,
         first: int = 0,
         published: bool = False,
-        some: NDArray[np.bool_] | slice = slice(None),
+        some: Bools | slice = slice(None),
     ) -> dict[str, Any] | None:
         """Mean over some draws, ``(k, lungs)``, of all lungs or of those from ``first`` on."""
         if not len(values):
@@ -371,7 +371,7 @@ class Score:
         }
 
     def _over_rigs(
-        self, values: Floats, first: int, some: NDArray[np.bool_] | slice
+        self, values: Floats, first: int, some: Bools | slice
     ) -> tuple[float, tuple[float, float]]:
         """Mean over draws with its interval, which resamples draws, rigs and members."""
         assert self.rig_draws is not None

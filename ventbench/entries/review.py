@@ -40,9 +40,6 @@ def check_sources(folder: Path) -> list[Finding]:
     """Look at ``controller.py`` and all of the folder's modules that it imports.
 
     Other sources, such as the training's, need only be Python.
-
-    Args:
-        folder: the submission's folder.
     """
     findings, trees = [], {}
     for path in sources(folder):
@@ -97,11 +94,7 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def _check_class(tree: ast.Module) -> list[Finding]:
-    """Look for the class and its methods.
-
-    Args:
-        tree: the parsed ``controller.py``.
-    """
+    """Look for the class and its methods in the parsed ``controller.py``."""
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     if CLASS in classes:
         return list(_class(classes[CLASS]))
@@ -211,11 +204,7 @@ _LATE = "import it at the top of the file; later the folder is not searched any 
 
 
 def _check_imports(trees: Mapping[str, ast.Module]) -> list[Finding]:
-    """Follow the imports from ``controller.py`` on.
-
-    Args:
-        trees: all parsed sources, by path below the folder; the controller's among them.
-    """
+    """Follow the imports from ``controller.py`` on, in all parsed sources by path in the folder."""
     own = {name.partition("/")[0].removesuffix(".py") for name in trees}
     waiting, seen, findings = [CONTROLLER], set(), []
     while waiting:
@@ -386,12 +375,7 @@ _CHECKS = ("manifest", "files", "sources", "review")
 
 
 def findings_as_json(folder: str, check: str) -> list[dict[str, Any]]:
-    """Make one kind of check on a folder, for a process that answers in JSON.
-
-    Args:
-        folder: the submission's.
-        check: ``"manifest"``, ``"files"``, ``"sources"`` or ``"review"``.
-    """
+    """Make one of :data:`_CHECKS` on a folder, for a process that answers in JSON."""
     path = Path(folder)
     if check == "manifest":
         findings = check_manifest(path)[0]
@@ -404,11 +388,7 @@ def findings_as_json(folder: str, check: str) -> list[dict[str, Any]]:
 
 
 def all_findings_as_json(folder: str) -> list[dict[str, Any]]:
-    """Make every check on a folder, for a process that answers in JSON.
-
-    Args:
-        folder: the submission's.
-    """
+    """Make every check on a folder, for a process that answers in JSON."""
     return [finding for check in _CHECKS for finding in findings_as_json(folder, check)]
 
 

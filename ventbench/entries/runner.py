@@ -8,23 +8,17 @@ time. Only numbers cross: a :class:`Task` for each cell at the start, then at ev
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import Submission
 from ventbench.sandbox.child.cell import Cell, Failed, controller_class
 from ventbench.sandbox.pipes import Asked
-from ventbench.task import protocol
 from ventbench.task.interfaces import Observation, Task
-
-Floats, Integers = NDArray[np.float64], NDArray[np.int64]
-
-#: Called with rounds of commands that are done, and all of them.
-Progress = Callable[[int, int], None]
 
 
 class ControllerSession(Protocol):
@@ -35,7 +29,7 @@ class ControllerSession(Protocol):
         """What went wrong up to now, by index of the cell; a failed cell stays failed."""
         ...
 
-    def ask(self, cells: Integers, observations: Floats) -> None:
+    def ask(self, cells: Ints, observations: Floats) -> None:
         """Give some controllers their next observation; each is asked by itself.
 
         Of each controller once for each step of each inspiration, in order, after its answer.
@@ -46,7 +40,7 @@ class ControllerSession(Protocol):
         """
         ...
 
-    def answers(self) -> tuple[Integers, Floats]:
+    def answers(self) -> tuple[Ints, Floats]:
         """Take the commands that have come, and wait for one if there is none.
 
         Returns:
@@ -132,7 +126,7 @@ class InProcessSession(Asked):
             except Failed as failed:
                 self.failures[index] = failed.failure
 
-    def ask(self, cells: Integers, observations: Floats) -> None:
+    def ask(self, cells: Ints, observations: Floats) -> None:
         """Ask some controllers for their next command; see :class:`ControllerSession`."""
         for index, row in zip(cells.tolist(), observations.tolist(), strict=True):
             self._answers[index] = 0.0
@@ -143,7 +137,7 @@ class InProcessSession(Asked):
                     self.failures[index] = failed.failure
                     del self._cells[index]
 
-    def answers(self) -> tuple[Integers, Floats]:
+    def answers(self) -> tuple[Ints, Floats]:
         """Take the commands; see :class:`ControllerSession`."""
         given, self._answers = self._answers, {}
         return np.array(list(given), np.int64), np.array(list(given.values()))
@@ -187,49 +181,3 @@ def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
     from ventbench.sandbox.runner import SandboxRunner
 
     return SandboxRunner()
-
-
-class CountingRunner:
-    """Runs controllers as another runner does, and tells after each round how far it is.
-
-    Args:
-        runner: does the work.
-        progress: called with rounds done and all rounds.
-        sessions: how many sessions the whole score starts, each of one run of all breaths.
-    """
-
-    def __init__(self, runner: Runner, progress: Progress, sessions: int = 1):
-        self._runner, self._progress, self._done = runner, progress, 0
-        self._total = sessions * protocol.BREATHS * protocol.INSPIRATION_STEPS
-
-    @property
-    def sandbox(self) -> Mapping[str, Any] | None:
-        """Layers for the record, or None."""
-        return self._runner.sandbox
-
-    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
-        """Make and reset one fresh controller for each cell; see :class:`Runner`."""
-        return _CountingSession(self._runner.start(submission, tasks), self._count, len(tasks))
-
-    def _count(self) -> None:
-        self._done += 1
-        self._progress(self._done, self._total)
-
-
-class _CountingSession(Asked):
-    def __init__(self, session: ControllerSession, count: Callable[[], None], cells: int):
-        self._session, self._count, self._cells, self._left = session, count, cells, cells
-        self.ask = session.ask
-        self.close, self.processor_time = session.close, session.processor_time
-
-    @property
-    def failures(self) -> Mapping[int, Failure]:
-        return self._session.failures
-
-    def answers(self) -> tuple[Integers, Floats]:
-        cells, commands = self._session.answers()
-        self._left -= len(cells)
-        while self._left <= 0:
-            self._left += self._cells
-            self._count()
-        return cells, commands

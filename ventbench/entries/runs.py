@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.entries.errors import Failure
 from ventbench.task import protocol
@@ -34,7 +34,6 @@ from ventbench.task.stressors import (
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = NDArray[np.float64]
 
 #: Number of draws of an official score under stress: each lung has each PIP once.
 DRAWS = 6
@@ -104,15 +103,15 @@ class Runs:
     conditions: tuple[Condition, ...]
     lungs: tuple[str, ...]
     pips: Floats
-    rig: NDArray[np.int64]
-    member: NDArray[np.int64]
+    rig: Ints
+    member: Ints
     error: Floats
-    safe: NDArray[np.bool_]
-    survived: NDArray[np.bool_]
+    safe: Bools
+    survived: Bools
     alarm_s: Floats
     peak: Floats
     volume: Floats
-    draw: NDArray[np.int64]
+    draw: Ints
     plateau_error: Floats | None = None
     requested: Floats | None = None
     failures: Sequence[CellFailure] = ()
@@ -329,7 +328,7 @@ class Runs:
         }
 
 
-def pip_columns(lungs: int, n: int) -> NDArray[np.int64]:
+def pip_columns(lungs: int, n: int) -> Ints:
     """Place of the PIP of each lung and draw among the protocol's, ``(lungs, n)``.
 
     In each draw the lungs have different PIPs, and over six draws each lung has each PIP once.

@@ -6,8 +6,9 @@ Scored is the airway pressure; controllers see readings of the sensor.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -15,20 +16,14 @@ import numpy as np
 
 from ventbench.base import precision
 from ventbench.base.errors import InputError
-from ventbench.entries.cells import Cells, protocol_of
+from ventbench.entries.cells import Cells, ProtocolRun, as_float64, protocol_of, replay, run_cells
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.manifest import TRACKS
 from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
-from ventbench.entries.runner import (
-    CountingRunner,
-    Progress,
-    Runner,
-    runner_of,
-)
+from ventbench.entries.runner import Runner, runner_of
 from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure, Runs, number
-from ventbench.entries.stepping import ProtocolRun, as_float64, replay, run_cells
 from ventbench.plants.catalog import Given
 from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.task import draws, protocol
@@ -40,6 +35,9 @@ from ventbench.task.metrics.score import controllable_error, passes_safety_gate,
 from ventbench.task.metrics.step_response import steady_error
 from ventbench.task.stressors import Condition
 from ventbench.trajectories import end_to_end
+
+#: Called with rounds of commands that are done, and all of them.
+Progress = Callable[[int, int], None]
 
 
 def score(
@@ -92,9 +90,6 @@ def score(
         False
     """
     entry = as_submission(submission)
-    runner: Runner = runner_of(entry, sandbox=sandbox)
-    if progress is not None:
-        runner = CountingRunner(runner, progress, sessions=1 + stress)
     result = run_protocol(
         entry,
         load_rigs(simulator),
@@ -102,7 +97,8 @@ def score(
         draws=draws,
         stress=stress,
         stressors=stressors,
-        runner=runner,
+        runner=runner_of(entry, sandbox=sandbox),
+        progress=progress,
     )
     if len(result.failures) == result.requested[..., 0, 0].size and entry.sha256 is None:
         raise SubmissionError(result.failures[0].message)  # a class or function that never works
@@ -121,6 +117,7 @@ def run_protocol(
     stress: int = 0,
     stressors: Sequence[str] = (),
     runner: Runner | None = None,
+    progress: Progress | None = None,
 ) -> Score:
     """Run a submission through the protocol, on any rigs and by any runner.
 
@@ -136,6 +133,7 @@ def run_protocol(
         stressors: names of the stressors; all conditions if empty.
         runner: runs the controllers; if not given, the sandbox, and a class or function in this
             process.
+        progress: called after each round of commands with rounds done and all rounds.
 
     Raises:
         SubmissionError: if the submission cannot be run at all, or does not enter the track.
@@ -156,11 +154,12 @@ def run_protocol(
         rigs, draws=draws, drawn=drawn, pips=pips, stress=stress, stressors=stressors,
         reference=reference,
     )  # fmt: skip
+    count = _counted(progress, 1 + stress)
     with precision.float64():
-        run = run_cells(what.cells, runner, submission, tasks)
+        run = run_cells(what.cells, runner, submission, tasks, count)
         under_stress = None
         if what.stressed is not None:
-            stressed = run_cells(what.stressed, runner, submission, tasks)
+            stressed = run_cells(what.stressed, runner, submission, tasks, count)
             under_stress = runs_of(stressed, what.stressed, submission, tasks)
         # The expirations are run for the picture only; no score depends on them.
         own = as_float64(what.cells.plants, len(names))
@@ -205,6 +204,12 @@ def run_protocol(
             "act_max_us": 1e6 * float(np.max(run.act_seconds)),
         },
     )
+
+
+def _counted(progress: Progress | None, sessions: int) -> Callable[[], object]:
+    """What counts the rounds of some runs of all breaths, and tells how far they are."""
+    rounds, total = itertools.count(1), sessions * protocol.BREATHS * protocol.INSPIRATION_STEPS
+    return lambda: progress and progress(next(rounds), total)
 
 
 def enter(
@@ -306,7 +311,12 @@ GROUPS = ("reference rig", "other members", "other rigs", "held-out rigs")
 
 
 def transfer(
-    submission: Submission, rigs: Rigs, *, track: str | None = None, runner: Runner | None = None
+    submission: Submission,
+    rigs: Rigs,
+    *,
+    track: str | None = None,
+    runner: Runner | None = None,
+    progress: Progress | None = None,
 ) -> Runs:
     """Run an entry on all plants of all scored rigs, without noise.
 
@@ -316,6 +326,7 @@ def transfer(
         track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
         runner: runs the controllers; if not given, the sandbox, and a class or function in this
             process.
+        progress: as of :func:`score`.
 
     Returns:
         Figures of all PIPs on all plants; where a lung has fewer than another, its reference runs
@@ -341,7 +352,7 @@ def transfer(
         plants = draws.plants_of(rigs.plants, rig, member)
         scenario, every = nominal_scenario(pips), np.zeros(most, np.int64)
         cells = Cells(rigs.lungs, (Condition(),), plants, scenario, pips, every, rig, member)
-        run = run_cells(cells, runner, submission, tasks)
+        run = run_cells(cells, runner, submission, tasks, _counted(progress, 1))
     return dataclasses.replace(runs_of(run, cells, submission, tasks), requested=None)
 
 

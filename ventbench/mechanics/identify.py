@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.mechanics.labels import (
     Estimate,
@@ -66,13 +66,7 @@ _FLOWS = (20.0, 4000.0)
 
 
 def problem_with(breaths: Breaths, resistance: Estimate, compliance: Estimate) -> str | None:
-    """Why R and C of a lung are not to be trusted, as a sentence; None if they are plausible.
-
-    Args:
-        breaths: breaths of the lung, with flow or volume.
-        resistance: R, cmH2O/(L/s).
-        compliance: C, mL/cmH2O.
-    """
+    """Why R and C of a lung are not to be trusted, as a sentence; None if they are plausible."""
     low, high = compliance.ci95
     possible = COMPLIANCES[0] <= compliance.value <= COMPLIANCES[1]
     possible &= RESISTANCES[0] <= resistance.value <= RESISTANCES[1]
@@ -133,8 +127,6 @@ def _symptom(breaths: Breaths) -> str:
             return f"the peak flow is {peak:.3g} mL/s; its unit may be another one"
     return f"pressure and {what} do not move together as those of one lung do"
 
-
-Floats = NDArray[np.float64]
 
 #: Units of R and C.
 _UNITS = ("cmH2O/(L/s)", "mL/cmH2O")

@@ -18,11 +18,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.mechanics.segments import Segment
-
-Floats = NDArray[np.float64]
 
 #: Autocorrelations between neighbouring smoothed samples.
 _AUTOCORRELATIONS = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94)
@@ -170,7 +168,7 @@ class CrossProducts:
     products: Floats
     freedom: Floats
     constant: Floats
-    breaths: NDArray[np.int64]
+    breaths: Ints
 
     def __len__(self) -> int:
         """Number of breaths b."""
@@ -264,7 +262,7 @@ def cross_products(
     return CrossProducts(products, freedom, constant, np.array(indices, np.int64))
 
 
-def fit(table: CrossProducts, which: NDArray[np.bool_], columns: Sequence[int]) -> RegressionFit:
+def fit(table: CrossProducts, which: Bools, columns: Sequence[int]) -> RegressionFit:
     """Fit columns to some of the breaths by restricted maximum likelihood.
 
     Args:
@@ -350,7 +348,7 @@ def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> flo
     return float(abs(x) * np.sqrt(max(square, 0.0) / table.freedom.sum()))
 
 
-def _whiten(values: Floats, begins: NDArray[np.bool_]) -> Floats:
+def _whiten(values: Floats, begins: Bools) -> Floats:
     """Whiten signals ``(n, c)`` for each autocorrelation, ``(r, n, c)``."""
     rho = np.array(_AUTOCORRELATIONS)[:, None, None]
     white = np.repeat(values[None], len(rho), axis=0)

@@ -13,10 +13,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
-
-Floats = NDArray[np.float64]
 
 #: Pressure at the compared samples; time, volume, flow, its slope, and dose.
 _Signals: TypeAlias = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
@@ -58,8 +57,8 @@ class Segment:
 
     breath: int
     first: bool
-    rows: NDArray[np.int64]
-    begins: NDArray[np.bool_]
+    rows: Ints
+    begins: Bools
     pressure: Floats
     time: Floats
     volume: Floats
@@ -117,7 +116,7 @@ def clipped_share(breaths: Breaths) -> float:
 
 def _smoothed(
     time: Floats, pressure: Floats, flow: Floats | None, volume: Floats | None
-) -> tuple[NDArray[np.int64], NDArray[np.bool_], *_Signals] | None:
+) -> tuple[Ints, Bools, *_Signals] | None:
     """Fields of a segment from ``rows`` on; None if the segment would be too short."""
     if len(time) < 3:
         return None
@@ -154,9 +153,7 @@ def _volume(time: Floats, flow: Floats | None, volume: Floats | None) -> Floats:
     return integrate(time, flow)
 
 
-def _compared(
-    fine: NDArray[np.intp], known: NDArray[np.bool_], half: int, step: int
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _compared(fine: NDArray[np.intp], known: Bools, half: int, step: int) -> tuple[Ints, Bools]:
     """Centres of windows of known samples, half a window apart, and which of them follow a gap.
 
     Args:
@@ -174,7 +171,7 @@ def _compared(
     whole = complete[fine]
     # A run ends where a window is incomplete, and where the next centre is further away.
     ends = np.flatnonzero(np.diff(fine) > step) + 1
-    rows: list[NDArray[np.int64]] = []
+    rows: list[Ints] = []
     for part in np.split(np.arange(len(fine)), ends):
         offset = int(part[0]) if len(part) else 0
         for start, stop in _runs(whole[part]):
@@ -185,7 +182,7 @@ def _compared(
     return np.concatenate(rows), begins
 
 
-def _runs(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(known: Bools) -> list[tuple[int, int]]:
     """Starts and ends of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -196,7 +193,7 @@ def _unclipped(values: Floats) -> Floats:
     return np.where(_clipped(values), np.nan, values)
 
 
-def _clipped(values: Floats) -> NDArray[np.bool_]:
+def _clipped(values: Floats) -> Bools:
     """Samples in runs at the highest or the lowest of all readings, bool ``(n, T)``."""
     out = np.zeros(values.shape, bool)
     if not np.isfinite(values).any():

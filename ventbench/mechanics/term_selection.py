@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.mechanics.labels import Estimate
 from ventbench.mechanics.regression import (
     BASE,
@@ -26,8 +26,6 @@ from ventbench.mechanics.regression import (
 )
 from ventbench.mechanics.segments import Segment
 from ventbench.system_id.fit import t_quantile
-
-Floats = NDArray[np.float64]
 
 #: Log-likelihood ratio on held-out breaths that a term needs: one false term in a hundred.
 LEAST_NATS = 4.6
@@ -162,7 +160,7 @@ def _plausible(table: CrossProducts, fitted: RegressionFit) -> bool:
 
 def _best_column(
     table: CrossProducts,
-    which: NDArray[np.bool_],
+    which: Bools,
     columns: tuple[int, ...],
     name: str,
 ) -> int:
@@ -184,7 +182,7 @@ def _allowed(name: str, fitted: RegressionFit) -> bool:
     return name not in POSITIVE or fitted.coefficients[-1] > 0.0
 
 
-def splits(count: int) -> list[NDArray[np.bool_]]:
+def splits(count: int) -> list[Bools]:
     """Training breaths, bool ``(count,)``: alternate ones and halves, and their complements."""
     index = np.arange(count)
     first = [index % 2 == 0, index < count // 2]
@@ -404,18 +402,18 @@ def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> DelayEstima
     return DelayEstimate(family.name, Estimate(value, family.unit, ends), nats, effect, ())
 
 
-def _value(table: CrossProducts, which: NDArray[np.bool_]) -> float:
+def _value(table: CrossProducts, which: Bools) -> float:
     fitted = fit(table, which, range(table.products.shape[-1] - 1))
     return float(log_likelihood(table, fitted)[which].sum()) + fitted.log_prior
 
 
-def _residual_variance(table: CrossProducts, which: NDArray[np.bool_]) -> float:
+def _residual_variance(table: CrossProducts, which: Bools) -> float:
     """Variance of the residual, autocorrelation included, cmH2O2."""
     fitted = fit(table, which, range(table.products.shape[-1] - 1))
     return fitted.sigma**2 / (1.0 - fitted.autocorrelation**2)
 
 
-def _peak(family: _DelayFamily, tables: Sequence[CrossProducts], which: NDArray[np.bool_]) -> float:
+def _peak(family: _DelayFamily, tables: Sequence[CrossProducts], which: Bools) -> float:
     """Strength of the largest likelihood, by a parabola through the best of the grid."""
     values = np.array([_value(table, which) for table in tables])
     k = int(np.argmax(values))

@@ -1,4 +1,4 @@
-"""Geometry of the small multiples, the same for the HTML report and the PNG; polylines as SVG.
+"""Geometry of the small multiples of the HTML report, and polylines as SVG.
 
 A panel is one lung and PIP: pressure above, u_in below, on one time axis: the last scored breath
 from its start to just after the target's fall. Lengths are in units of the panel.
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.pages.scores import Floats
+from ventbench.base.arrays import Floats
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
 
@@ -79,6 +79,9 @@ SHOWN = round((protocol.FALL_END + 0.3) / protocol.DT)
 #: The breath that is shown, counted from 0.
 BREATH = max(protocol.SCORED_BREATHS)
 
+#: Its steps in a run.
+WINDOW = slice(BREATH * protocol.BREATH_STEPS, BREATH * protocol.BREATH_STEPS + SHOWN + 1)
+
 
 @dataclass(frozen=True)
 class RunPanel:
@@ -120,15 +123,10 @@ def inspiration(line: Floats) -> Floats:
     return line[: protocol.INSPIRATION_STEPS]
 
 
-def _window() -> slice:
-    start = BREATH * protocol.BREATH_STEPS
-    return slice(start, start + SHOWN + 1)
-
-
 def _column(runs: Sequence[Trajectories], j: int) -> list[RunPanel]:
-    pip, window = runs[0].pips[j], _window()
-    x = time_x(np.arange(SHOWN + 1, dtype=np.float64) * protocol.DT)
-    low, high = _limits([run.pressure[:, j, window] for run in runs], runs[0].target[:, j, window])
+    pip, window = runs[0].pips[j], WINDOW
+    x = time_x(shown_times())
+    low, high = pressure_limits(runs, j)
 
     def y(pressure: Floats | float) -> Floats:
         return TOP + (high - np.asarray(pressure)) / (high - low) * PRESSURE_HEIGHT
@@ -158,11 +156,18 @@ def _column(runs: Sequence[Trajectories], j: int) -> list[RunPanel]:
     return column
 
 
-def _limits(pressures: Sequence[Floats], target: Floats) -> tuple[float, float]:
-    """Pressure axis: holds all runs, up to half the target's height beyond it."""
+def shown_times() -> Floats:
+    """Times of the samples that are shown, s since the start of the breath, ``(SHOWN + 1,)``."""
+    return np.arange(SHOWN + 1, dtype=np.float64) * protocol.DT
+
+
+def pressure_limits(runs: Sequence[Trajectories], j: int) -> tuple[float, float]:
+    """Pressure axis of a PIP: holds all runs, up to half the target's height beyond it."""
+    target = runs[0].target[:, j, WINDOW]
     bottom, top = float(target.min()), float(target.max())
     height = max(top - bottom, 1.0)
-    values = np.concatenate([pressure[np.isfinite(pressure)] for pressure in pressures])
+    values = np.concatenate([run.pressure[:, j, WINDOW].ravel() for run in runs])
+    values = values[np.isfinite(values)]
     high = min(float(values.max(initial=top)), top + 0.5 * height)
     low = max(float(values.min(initial=bottom)), bottom - 0.5 * height)
     return low - 0.08 * height, high + 0.08 * height

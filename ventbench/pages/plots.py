@@ -1,26 +1,26 @@
 """Charts by matplotlib: stressor by severity, and the error of a PID over its gains.
 
-In the chart of stressors the colour of a field is the share of runs that held the set pressure
-safely; beside it stands what the stressor adds to the error.
+In the chart of stressors the colour of a field is the share of runs that held the set pressure.
 """
 
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench import palette
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, require
+from ventbench.base.text import number
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, stressor
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from ventbench.train.pid_grid import PIDGrid
 
 #: Values of D that are shown beside the best one, %/cmH2O.
@@ -45,29 +45,20 @@ def gain_map_png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> by
         InputError: if matplotlib is missing.
     """
     require("matplotlib")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     error = grid.error.mean(axis=-1, dtype=np.float64)
     rows = list(zip(grid.lungs, error, strict=True)) if each else []
     if single and len(grid.lungs) > 1:
         rows.append(("mean of all", error.mean(axis=0)))
     columns = len(SLICES) + 1
-    figure = Figure(figsize=(2.5 * columns + 0.8, 2.5 * len(rows) + 0.7), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure((2.5 * columns + 0.8, 2.5 * len(rows) + 0.7))
     figure.suptitle("Mean |pressure - target|, cmH2O; cross: the least of the map")
     axes = figure.subplots(len(rows), columns, squeeze=False)
     for line, (name, values) in zip(axes, rows, strict=True):
         _row(figure, line, name, grid.gains, values)
-    output = io.BytesIO()
-    # Without the version of matplotlib, equal grids give equal bytes.
-    figure.savefig(output, format="png", dpi=DPI, metadata={"Software": None})
-    return output.getvalue()
+    return _png(figure)
 
 
-def _row(
-    figure: Any, axes: Any, name: str, gains: NDArray[np.float64], error: NDArray[np.float64]
-) -> None:
+def _row(figure: Any, axes: Any, name: str, gains: Floats, error: Floats) -> None:
     best = int(np.argmin(error))
     shown = [d for d in SLICES if np.any(gains[:, 2] == d)]
     slices = [("best: ", float(gains[best, 2])), *(("", d) for d in shown)]
@@ -84,8 +75,8 @@ def _row(
 
 def _map(
     axis: Any,
-    gains: NDArray[np.float64],
-    error: NDArray[np.float64],
+    gains: Floats,
+    error: Floats,
     d: float,
     limits: tuple[float, float],
 ) -> Any:
@@ -112,30 +103,11 @@ def _map(
     return image
 
 
-#: Dots per inch of the picture.
-DPI = 130
-
-#: Sizes in inches: a row, a column of a severity, text on the left, room above and below.
-ROW, COLUMN, LEFT, HEAD, FOOT = 0.235, 1.12, 4.1, 1.25, 0.85
-
-#: Gap between two entries in columns, and between two categories in rows.
-ENTRY_GAP, CATEGORY_GAP = 0.18, 0.45
-
-INK, QUIET = "#16191d", "#5b636d"
+#: Inches of a column and a row of the chart, and of what stands around them.
+COLUMN, ROW, AROUND = 1.12, 0.235, (4.6, 1.9)
 
 #: From no run that held (dark) to all (white): one hue, so that it reads in grey as well.
 COLORS = ("#8c1d18", "#c8452f", "#ec8a5e", "#f7cfae", "#ffffff")
-
-_CATEGORY_TITLES = {
-    "none": "without stressor",
-    "valve": "valve and supply",
-    "circuit": "circuit",
-    "sensor": "sensor",
-    "lung": "airway and lung",
-    "patient": "patient",
-    "setting": "other lungs",
-    "pairs": "pairs",
-}
 
 
 def write_stress_chart(path: Path | str, scores: Sequence[Mapping[str, Any]]) -> Path:
@@ -143,7 +115,7 @@ def write_stress_chart(path: Path | str, scores: Sequence[Mapping[str, Any]]) ->
 
     Args:
         path: target, ``.png`` by custom.
-        scores: what ``ventbench score --track stress --json`` wrote for each entry.
+        scores: the key ``stress`` of what ``ventbench score --json`` wrote for each entry.
 
     Returns:
         The path; equal input gives equal bytes.
@@ -163,130 +135,99 @@ def stress_chart_png(scores: Sequence[Mapping[str, Any]]) -> bytes:
     if not scores:
         raise InputError("no stress score to draw")
     require("matplotlib")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from matplotlib.colors import LinearSegmentedColormap
+
+    order = [*CATEGORIES, "pairs"]
+    category = {
+        tuple(row["stressors"]): row["category"]
+        for row in scores[0]["conditions"]
+        if row["stressors"]
+    }
+    rows = sorted(category, key=lambda names: order.index(category[names]))
+    by_id = [{row["condition"]: row for row in score["conditions"]} for score in scores]
+    cells = [
+        [of.get(f"{'+'.join(names)}:{severity}") for of in by_id for severity in SEVERITIES]
+        for names in rows
+    ]
+    share = [[np.nan if cell is None else cell["survived"] for cell in row] for row in cells]
+    columns = len(share[0])
+    size = (AROUND[0] + COLUMN * columns, AROUND[1] + ROW * len(rows))
+    figure = _figure(size)
+    axes = figure.subplots()
+    shade = LinearSegmentedColormap.from_list("held", COLORS)
+    axes.imshow(share, cmap=shade, vmin=0.0, vmax=1.0, aspect="auto")
+    axes.set_yticks(range(len(rows)), [_title(names) for names in rows], fontsize=8.5)
+    axes.set_xticks(range(columns), SEVERITIES * len(scores), fontsize=8.5)
+    axes.tick_params(length=0.0, top=True, labeltop=True, bottom=False, labelbottom=False)
+    axes.spines[:].set_visible(False)
+    for y, row in enumerate(cells):
+        kind = category[rows[y]]
+        if y == 0 or kind != category[rows[y - 1]]:
+            axes.axhline(y - 0.5, color=palette.LINE)
+            axes.text(columns - 0.4, y, CATEGORIES.get(kind, kind), color=palette.QUIET, **_SMALL)
+        for x, cell in enumerate(row):
+            if cell is not None:
+                ink = "white" if cell["survived"] < 0.35 else palette.INK
+                axes.text(x, y, _cell(cell), color=ink, ha="center", **_SMALL)
+    for k, score in enumerate(scores):
+        axes.axvline(2 * k - 0.5, color=palette.LINE)
+        value = "failed" if score["score"] is None else f"{score['score']:.2f} cmH2O"
+        about = f"{value}, {100 * score['survived']:.0f} % held\n"
+        about += f"{_number(by_id[k]['none']['error_cmH2O'])} cmH2O without stressor"
+        text = f"{score['name']}\n{about}"
+        axes.text(2 * k + 0.5, -1.6, text, ha="center", va="bottom", fontsize=8.5, parse_math=False)
+    figure.supxlabel(
+        "Colour and %: runs that held the set pressure within 2 cmH2O + 4 % in the third breath "
+        "and stayed safe. Then what the stressor adds to the mean error, cmH2O; "
+        "▲ n: runs with unsafe pressure.",
+        fontsize=8.5, color=palette.QUIET,
+    )  # fmt: skip
+    return few_colours(_png(figure))
+
+
+def few_colours(picture: bytes) -> bytes:
+    """A PNG in 256 colours: a third of the size, and not to be told."""
     from PIL import Image
 
-    rows = _rows(scores[0])
-    height = max(y for _, _, y in rows) + 1.0
-    across = len(scores) * (len(SEVERITIES) + ENTRY_GAP)
-    size = (LEFT + COLUMN * across + 0.2, HEAD + ROW * height + FOOT)
-    figure = Figure(figsize=size, dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    box = (LEFT / size[0], FOOT / size[1], COLUMN * across / size[0], ROW * height / size[1])
-    axes = figure.add_axes(box, xlim=(0.0, across), ylim=(height, 0.0))
-    axes.set_axis_off()
-    names = ", ".join(str(score["name"]) for score in scores)
-    figure.text(
-        0.15 / size[0], 1.0 - 0.3 / size[1], f"Stress track: {names}", fontsize=13, color=INK,
-        weight="bold", parse_math=False, va="center",
-    )  # fmt: skip
-    _labels(axes, rows)
-    for index, score in enumerate(scores):
-        _entry(axes, score, rows, index * (len(SEVERITIES) + ENTRY_GAP))
-    figure.text(
-        0.15 / size[0], 0.42 / size[1],
-        "Colour and %: runs that held the set pressure within 2 cmH2O + 4 % in the third breath "
-        "and stayed safe.\nSmall: what the stressor adds to the mean error, cmH2O. "
-        "▲ n: runs with unsafe pressure.",
-        fontsize=8.5, color=QUIET, va="center", linespacing=1.5,
-    )  # fmt: skip
-    output = io.BytesIO()
-    # Without the version of matplotlib, equal scores give equal bytes.
-    figure.savefig(output, format="png", dpi=DPI, metadata={"Software": None})
-    # 256 colours: a third of the size, and not to be told.
-    picture = Image.open(output).convert("RGB")
-    small = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    image = Image.open(io.BytesIO(picture)).convert("RGB")
+    small = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     output = io.BytesIO()
     small.save(output, format="PNG", optimize=True)
     return output.getvalue()
 
 
-def _rows(score: Mapping[str, Any]) -> list[tuple[tuple[str, ...], str, float]]:
-    """Stressors of a score with their category and their place, in the order of categories."""
-    known = {tuple(row["stressors"]): row["category"] for row in score["conditions"]}
-    rows, y = [], 0.0
-    for category in ("none", *CATEGORIES, "pairs"):
-        members = [names for names, own in known.items() if own == category]
-        y += CATEGORY_GAP if rows and members else 0.0
-        for names in members:
-            rows.append((names, category, y))
-            y += 1.0
-    return rows
+_SMALL: dict[str, Any] = {"fontsize": 8.5, "va": "center"}
 
 
-def _labels(axes: Axes, rows: list[tuple[tuple[str, ...], str, float]]) -> None:
-    seen = set()
-    for names, category, y in rows:
-        if category not in seen:
-            seen.add(category)
-            place = -LEFT / COLUMN + 0.12
-            axes.text(
-                place, y + 0.5, _CATEGORY_TITLES[category], fontsize=8.5, color=QUIET, va="center",
-                clip_on=False,
-            )  # fmt: skip
-        if len(names) > 1:
-            text = " + ".join(name.replace("_", " ") for name in names)
-        else:
-            text = stressor(names[0]).title if names else ""
-        axes.text(-0.08, y + 0.5, text, fontsize=8.5, color=INK, va="center", ha="right")
+def _title(names: tuple[str, ...]) -> str:
+    if len(names) == 1:
+        return stressor(names[0]).title
+    return " + ".join(name.replace("_", " ") for name in names)
 
 
-def _entry(
-    axes: Axes,
-    score: Mapping[str, Any],
-    rows: list[tuple[tuple[str, ...], str, float]],
-    left: float,
-) -> None:
-    from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.patches import Rectangle
-
-    shade = LinearSegmentedColormap.from_list("held", COLORS)
-    by_id = {row["condition"]: row for row in score["conditions"]}
-    middle = left + len(SEVERITIES) / 2
-    value = "failed" if score["score"] is None else f"{score['score']:.2f} cmH2O"
-    held = f"{100 * score['survived']:.0f} % held"
-    axes.text(
-        middle, -2.05, str(score["name"]), fontsize=9.5, weight="bold", color=INK, ha="center",
-        parse_math=False,
-    )  # fmt: skip
-    axes.text(middle, -1.15, f"{value}, {held}", fontsize=8.5, color=QUIET, ha="center")
-    for column, severity in enumerate(SEVERITIES):
-        axes.text(left + column + 0.5, -0.3, severity, fontsize=8.5, color=INK, ha="center")
-    for names, category, y in rows:
-        if category == "none":
-            cells = [(by_id["none"], left, 2.0)]
-        else:
-            ids = [f"{'+'.join(names)}:{severity}" for severity in SEVERITIES]
-            cells = [(by_id[key], left + k, 1.0) for k, key in enumerate(ids) if key in by_id]
-        for row, x, width in cells:
-            share = row["survived"]
-            axes.add_patch(
-                Rectangle(
-                    (x + 0.02, y + 0.05), width - 0.04, 0.9,
-                    facecolor=shade(round(20.0 * share) / 20.0),  # few colours: a small file
-                    edgecolor="#d9dde2", linewidth=0.6,
-                )
-            )  # fmt: skip
-            ink = "white" if share < 0.35 else INK
-            axes.text(
-                x + (0.42 if width == 1 else 0.8), y + 0.52, f"{100 * share:.0f} %",
-                fontsize=8.5, color=ink, va="center", ha="right",
-            )  # fmt: skip
-            text = _shown(row["error_cmH2O"] if category == "none" else row["rise_cmH2O"])
-            if category != "none" and text[0].isdigit() and text != "0.0":
-                text = f"+{text}"
-            axes.text(
-                x + (0.72 if width == 1 else 1.2), y + 0.52, text, fontsize=7.5,
-                color=ink, va="center", ha="right",
-            )  # fmt: skip
-            if row["unsafe_runs"]:
-                axes.text(
-                    x + width - 0.06, y + 0.52, f"▲{row['unsafe_runs']}", fontsize=7.5, color=ink,
-                    va="center", ha="right",
-                )  # fmt: skip
+def _cell(row: Mapping[str, Any]) -> str:
+    unsafe = f" ▲{row['unsafe_runs']}" if row["unsafe_runs"] else ""
+    return f"{100 * row['survived']:.0f} %  {_number(row['rise_cmH2O'], sign=True)}{unsafe}"
 
 
-def _shown(value: float | None) -> str:
+def _number(value: float | None, sign: bool = False) -> str:
     """A number with one decimal; what rounds to zero has no sign."""
-    return "failed" if value is None else f"{round(value, 1) + 0.0:.1f}"
+    text = number(math.nan if value is None else value, 1, sign)
+    return "0.0" if text == "+0.0" else text
+
+
+def _figure(size: tuple[float, float]) -> Any:
+    """A figure that has no global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _png(figure: Any) -> bytes:
+    output = io.BytesIO()
+    # Without the version of matplotlib, equal figures give equal bytes.
+    figure.savefig(output, format="png", dpi=DPI, metadata={"Software": None})
+    return output.getvalue()

@@ -14,9 +14,10 @@ import numpy as np
 import ventbench
 from ventbench import palette
 from ventbench.base import errors, files
+from ventbench.base.arrays import Floats
 from ventbench.base.text import number, page_templates
 from ventbench.pages import graphics, scores
-from ventbench.pages.scores import Floats, check, labels, shared_tracks
+from ventbench.pages.scores import check, labels, shared_tracks
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.task.metrics import bootstrap

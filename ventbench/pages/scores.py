@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
-from ventbench.base.text import number
+from ventbench.base.text import flatten, number
 from ventbench.task import protocol
 from ventbench.task.metrics import bootstrap
 from ventbench.task.metrics.score import run_error
 from ventbench.trajectories import Trajectories
-
-Floats = NDArray[np.float64]
 
 #: Steps of a run.
 STEPS = protocol.BREATHS * protocol.BREATH_STEPS
@@ -96,7 +94,7 @@ def shared_tracks(runs: Sequence[Trajectories]) -> str:
     return f"{' and '.join(tracks)} {'track' if len(tracks) == 1 else 'tracks'}"
 
 
-def scored() -> NDArray[np.bool_]:
+def scored() -> Bools:
     """Scored steps of a run: inspirations of the scored breaths, shape ``(T,)``."""
     breath, phase = np.divmod(np.arange(STEPS), protocol.BREATH_STEPS)
     return np.isin(breath, protocol.SCORED_BREATHS) & (phase < protocol.INSPIRATION_STEPS)
@@ -116,11 +114,8 @@ def errors(run: Trajectories) -> Floats:
 
 #: Keys of a score that are shown elsewhere or say nothing about where the score comes from.
 NOT_PROVENANCE = frozenset(
-    ("score", "lungs", "secondary", "secondary_missing", "failures", "timing", "cells", "values")
+    ("score", "ci95", "lungs", "secondary", "secondary_missing", "failures", "timing", "values")
 )
-
-#: Rows of provenance shown for one score, and characters of one of them.
-MAX_ROWS, MAX_CHARACTERS = 60, 200
 
 
 @dataclass(frozen=True)
@@ -200,21 +195,13 @@ def failures(score: Mapping[str, Any]) -> list[str]:
 
 def provenance(score: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Provenance of a score, as flat pairs of text; not escaped."""
-    rows: list[tuple[str, str]] = []
-    _flatten("", {k: v for k, v in score.items() if k not in NOT_PROVENANCE}, rows)
-    return rows[:MAX_ROWS]
+    return flatten(_about(score))
 
 
-def _flatten(prefix: str, value: Any, rows: list[tuple[str, str]]) -> None:
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            if key not in NOT_PROVENANCE and (prefix, key) != ("draws", "ci95"):
-                _flatten(f"{prefix} {key}".strip(), part, rows)
-    elif value not in (None, "", [], ()):
-        parts = value if isinstance(value, list | tuple) else [value]
-        text = ", ".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in parts)
-        cut = text[: MAX_CHARACTERS - 1] + "…" if len(text) > MAX_CHARACTERS else text
-        rows.append((prefix, cut))
+def _about(value: Any) -> Any:
+    if not isinstance(value, Mapping):
+        return value
+    return {key: _about(part) for key, part in value.items() if key not in NOT_PROVENANCE}
 
 
 def _read(run: Trajectories, score: Mapping[str, Any]) -> tuple[float, list[float], Floats]:

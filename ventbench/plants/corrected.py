@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.physics.catalogue import parameter, paths
 from ventbench.physics.model import Physics
 from ventbench.plants.hybrid import RELIEF, RELIEF_CONDUCTANCE
@@ -90,9 +90,6 @@ def corrected_signals(simulator: Signals, more: Signals, less: Signals) -> Signa
         sum_of(simulator.flow, "flow"),
         sum_of(simulator.volume, "volume"),
     )
-
-
-Floats = NDArray[np.float64]
 
 
 @flax.struct.dataclass

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base import files
+from ventbench.base.arrays import Bools, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.files import data_path
 from ventbench.plants.hybrid import Hybrid
@@ -65,7 +66,7 @@ class Seen:
     prints: Fingerprints
     fold: NDArray[np.int8]
 
-    def folds(self, breaths: Breaths) -> NDArray[np.int64]:
+    def folds(self, breaths: Breaths) -> Ints:
         """Look breaths up: a fold, :data:`BY_ALL` or :data:`BY_NONE`, shape ``(n,)``.
 
         What is perhaps a copy counts as one.
@@ -108,7 +109,7 @@ class Frozen:
         return tuple(self.manifest["lungs"])
 
     @property
-    def _references(self) -> NDArray[np.int64]:
+    def _references(self) -> Ints:
         return np.array([about["session"] for about in self.manifest["lungs"].values()])
 
     @property
@@ -188,20 +189,20 @@ class Frozen:
         """Plants of the member that has not seen each breath; of member 0 if all have seen it."""
         return self._of(breaths, np.maximum(self.seen.folds(breaths), 0))
 
-    def held_out(self, breaths: Breaths) -> NDArray[np.bool_]:
+    def held_out(self, breaths: Breaths) -> Bools:
         """Whether some member has not seen the breath, so that it can be judged by it, ``(n,)``."""
         return self.seen.folds(breaths) != BY_ALL
 
-    def unseen(self, breaths: Breaths) -> NDArray[np.bool_]:
+    def unseen(self, breaths: Breaths) -> Bools:
         """Whether the official simulators, member 0, have not seen the breath, ``(n,)``."""
         return self.seen.folds(breaths) == BY_NONE
 
-    def perhaps_copies(self, breaths: Breaths) -> NDArray[np.bool_]:
+    def perhaps_copies(self, breaths: Breaths) -> Bools:
         """Whether the breath may be one of the training, but blank pressures do not tell, (n,)."""
         found = match(breaths, self.seen.prints)
         return (found.known >= 0) & ~found.certain
 
-    def _of(self, breaths: Breaths, member: NDArray[np.int64]) -> Hybrid:
+    def _of(self, breaths: Breaths, member: Ints) -> Hybrid:
         at = self.sessions.assign(breaths)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), self.members)
 
@@ -220,7 +221,7 @@ class Frozen:
         }
 
 
-def seen(breaths: Breaths, fold: NDArray[np.int64]) -> Seen:
+def seen(breaths: Breaths, fold: Ints) -> Seen:
     """Make the list; a breath of which there are copies in several folds was seen by all."""
     copy, _ = repetitions(breaths)
     folds = fold.astype(np.int8)

@@ -15,14 +15,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.plants.hybrid import ELASTIC_KNOTS, PLAYS, VALVE_KNOTS, Hybrid
 from ventbench.task.draws import uniforms
-
-Floats = NDArray[np.float64]
 
 #: Command at which the flow of a valve is its size, %.
 SIZE_AT = 20.0

@@ -21,12 +21,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.task.interfaces import Plant
-
-Floats = NDArray[np.float64]
 
 #: What a simulator may ask for, in the order of arguments that have other names.
 _ARGUMENTS = ("u_in", "u_out", "dt", "R", "C", "initial_pressure", "time", "flow")

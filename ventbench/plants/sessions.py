@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
@@ -44,11 +44,11 @@ class SampleTiming:
         regular: whether the interval is one at which the rigs run.
     """
 
-    interval_ms: NDArray[np.float64]
-    spiky: NDArray[np.bool_]
-    inspiratory: NDArray[np.int64]
-    known: NDArray[np.bool_]
-    regular: NDArray[np.bool_]
+    interval_ms: Floats
+    spiky: Bools
+    inspiratory: Ints
+    known: Bools
+    regular: Bools
 
 
 def sample_timing(breaths: Breaths) -> SampleTiming:
@@ -95,7 +95,7 @@ class Sessions:
         """Number of sessions."""
         return len(self.table)
 
-    def assign(self, breaths: Breaths) -> NDArray[np.int64]:
+    def assign(self, breaths: Breaths) -> Ints:
         """Find the session of each breath: the nearest clock among those of its lung.
 
         A combination that was never seen thus falls to the one most like it.
@@ -121,7 +121,7 @@ class Sessions:
         return out
 
     @staticmethod
-    def _distance(seen: SampleTiming, index: NDArray[np.int64], to: Session) -> NDArray[np.float64]:
+    def _distance(seen: SampleTiming, index: Ints, to: Session) -> Floats:
         samples = np.abs(seen.inspiratory[index] - to.inspiratory)
         spike = (seen.spiky[index] != to.spiky) & seen.known[index]
         return (
@@ -131,7 +131,7 @@ class Sessions:
             + spike * _SPIKE_UNITS
         )
 
-    def rigs(self) -> NDArray[np.int64]:
+    def rigs(self) -> Ints:
         """Kind of rig of each session."""
         return np.array([session.rig for session in self.table])
 
@@ -171,7 +171,7 @@ def find(breaths: Breaths) -> Sessions:
     return Sessions(tuple(rows))
 
 
-def _groups(seen: SampleTiming, index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _groups(seen: SampleTiming, index: Ints) -> list[Ints]:
     groups = []
     for spiky in (False, True):
         some = index[seen.spiky[index] == spiky]

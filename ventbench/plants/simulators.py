@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base import precision
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.plants.python_simulator import PythonSimulator
@@ -21,8 +21,6 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import Lung, lung
 from ventbench.task.rollouts import open_loop
-
-Floats = NDArray[np.float64]
 
 #: Commands of a table of simulated pressures may differ from the recorded ones by rounding, %.
 _SAME_COMMAND = 0.05
@@ -142,19 +140,19 @@ class Simulators:
             inner = stacked.plants if isinstance(stacked, VmappedPlant) else stacked
             return take(inner, 0)
 
-    def held_out(self, breaths: Breaths) -> NDArray[np.bool_]:
+    def held_out(self, breaths: Breaths) -> Bools:
         """Whether :meth:`cross_fitted` gives a plant that has not seen the breath, ``(n,)``."""
         if self._training is None:
             return np.ones(len(breaths), bool)
         return self._training.held_out(breaths)
 
-    def unseen(self, breaths: Breaths) -> NDArray[np.bool_]:
+    def unseen(self, breaths: Breaths) -> Bools:
         """Whether :meth:`for_breaths` gives a plant that has not seen the breath, ``(n,)``."""
         if self._training is None:
             return np.ones(len(breaths), bool)
         return self._training.unseen(breaths)
 
-    def perhaps_copies(self, breaths: Breaths) -> NDArray[np.bool_]:
+    def perhaps_copies(self, breaths: Breaths) -> Bools:
         """Whether the breath is perhaps one of the training, which blank pressures hide, (n,)."""
         if self._training is None:
             return np.zeros(len(breaths), bool)

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 from ventbench.base import precision
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
@@ -163,7 +163,7 @@ class VmappedPlant:
 
 def open_loop_breaths(
     plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] | None = None
-) -> NDArray[np.float64]:
+) -> Floats:
     """Pressures that plants answer to the commands of recorded breaths with, in batches.
 
     Each breath starts at its first recorded pressure.

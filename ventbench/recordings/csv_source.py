@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import csv
 import gzip
-import hashlib
 import os
 import re
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import IO
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
 
+from ventbench.base.files import sha256
 from ventbench.recordings.problems import SHOWN, Place, RecordingError, RecordingProblem, fail
-from ventbench.recordings.rows import Chunk, chunk_of_batch
+from ventbench.recordings.rows import Chunk, Source, chunks_of
 from ventbench.recordings.schema import COLUMNS, Kind, check_header
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 BLOCK = 8 << 20
 """Bytes of text read at a time (the parser holds a few of them)."""
@@ -22,29 +26,14 @@ BLANKS = ["", "NaN", "nan", "NA", "N/A", "null"]
 
 
 @dataclass
-class CsvSource:
-    """A CSV file that is read once, in order.
+class CsvSource(Source):
+    """A CSV file, plain or gzipped.
 
     Attributes:
-        file: the path as the caller wrote it.
-        kind: `csv` or `csv.gz`.
-        names: column names of the header.
-        warnings: about columns that are ignored.
-        sha256: SHA-256 of the file on disk; None until all chunks are read.
         block: bytes of text that are read at a time.
-        size: bytes of the file.
-        done: bytes that have been read.
     """
 
-    file: str
-    kind: Kind
-    names: tuple[str, ...] = ()
-    warnings: tuple[RecordingProblem, ...] = ()
-    sha256: str | None = None
-    place: str = field(default="line", init=False)
     block: int = BLOCK
-    size: int = field(default=0, init=False)
-    done: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         """Read and check the header.
@@ -57,36 +46,31 @@ class CsvSource:
         self.size = os.path.getsize(self.file)
 
     def chunks(self) -> Iterator[Chunk]:
-        """Yield the rows in order.
-
-        Raises:
-            RecordingError: the text cannot be read as numbers.
-        """
+        """Yield the rows in order; see :class:`Source`."""
         import pyarrow as pa
 
-        reader = HashingReader(self.file)
         try:
-            yield from self._parse(reader)
-            self.sha256 = reader.finish()
+            with open(self.file, "rb") as stream:
+                for chunk in chunks_of(self._batches(stream)):
+                    # The parser closes its input at the end of the text.
+                    self.done = self.size if stream.closed else stream.tell()
+                    yield chunk
         except pa.ArrowInvalid as error:
-            if next(data_lines(self.file, self.kind), None) is None:  # a header alone
-                self.sha256 = reader.finish()
-                return
-            problems, total = text_problems(self.file, self.kind, self.names)
-            if not problems:
-                raise fail(self.file, str(error).strip().rstrip("."), "Fix the file.") from None
-            raise RecordingError(problems, total) from None
+            if next(data_lines(self.file, self.kind), None) is not None:  # not a header alone
+                problems, total = text_problems(self.file, self.kind, self.names)
+                if not problems:
+                    raise fail(self.file, str(error).strip().rstrip("."), "Fix the file.") from None
+                raise RecordingError(problems, total) from None
         except (OSError, EOFError) as error:
             advice = "Copy or download the file again."
             raise fail(self.file, f"the file cannot be read ({error})", advice) from None
-        finally:
-            reader.release()
+        self.sha256 = sha256(Path(self.file))
 
-    def _parse(self, reader: HashingReader) -> Iterator[Chunk]:
+    def _batches(self, file: IO[bytes]) -> Iterator[pa.RecordBatch]:
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
-        stream = pa.PythonFile(reader, "r")
+        stream = pa.PythonFile(file, "r")
         if self.kind == "csv.gz":
             stream = pa.CompressedInputStream(stream, "gzip")
         whole = {name: column.whole for name, column in COLUMNS.items() if name in self.names}
@@ -99,15 +83,7 @@ class CsvSource:
         options = arrow_csv.ReadOptions(
             block_size=self.block, skip_rows=1, column_names=list(self.names)
         )
-        batches = arrow_csv.open_csv(stream, read_options=options, convert_options=convert)
-        row0, last_id = 0, None
-        for batch in batches:
-            if batch.num_rows:
-                chunk = chunk_of_batch(batch, row0, last_id)
-                self.done = reader.count
-                yield chunk
-                row0 += len(chunk)
-                last_id = int(chunk.columns["breath_id"][-1])
+        yield from arrow_csv.open_csv(stream, read_options=options, convert_options=convert)
 
 
 def _header(file: str, kind: Kind) -> tuple[str, ...]:
@@ -176,11 +152,6 @@ def text_problems(
     file: str, kind: Kind, names: Sequence[str]
 ) -> tuple[list[RecordingProblem], int]:
     """List the cells that are not numbers and the rows that have too few or too many cells.
-
-    Args:
-        file: path.
-        kind: `csv` or `csv.gz`.
-        names: column names of the header.
 
     Returns:
         The first `SHOWN` problems, and the count of all.
@@ -254,50 +225,3 @@ def open_bytes(path: str | os.PathLike[str], kind: Kind) -> IO[bytes]:
     if kind == "csv.gz":
         return gzip.open(path, "rb")  # type: ignore[return-value]
     return open(path, "rb")
-
-
-class HashingReader:
-    """A binary file that hashes the bytes that are read from it: those that are parsed."""
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Open the file at `path`."""
-        self._stream = open(path, "rb")  # noqa: SIM115 (closed by close)
-        self._hash = hashlib.sha256()
-        self.count = 0  # bytes that have been read
-
-    @property
-    def closed(self) -> bool:
-        """Whether the file is closed."""
-        return self._stream.closed
-
-    def read(self, size: int = -1) -> bytes:
-        """Read and hash up to `size` bytes."""
-        data = self._stream.read(size)
-        self._hash.update(data)
-        self.count += len(data)
-        return data
-
-    def readable(self) -> bool:
-        """True."""
-        return True
-
-    def writable(self) -> bool:
-        """False."""
-        return False
-
-    def seekable(self) -> bool:
-        """False: bytes are read once, in order."""
-        return False
-
-    def finish(self) -> str:
-        """Hash the rest of the file, if any, and return the SHA-256 in hex."""
-        while self.read(1 << 20):
-            pass
-        return self._hash.hexdigest()
-
-    def close(self) -> None:
-        """Do nothing: the parser closes its input early, before `finish`."""
-
-    def release(self) -> None:
-        """Close the file."""
-        self._stream.close()

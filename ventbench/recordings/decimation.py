@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 
 #: Median sampling interval, s, below which a recording is decimated. The dynamics that pressure can
@@ -56,9 +57,9 @@ class Decimation:
     """
 
     breaths: Breaths
-    index: NDArray[np.int64]
+    index: Ints
 
-    def of(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def of(self, values: Floats) -> Floats:
         """Values at the kept samples, ``(n, T)``, of values at all samples."""
         return np.take_along_axis(values, self.index, axis=1)
 
@@ -118,7 +119,7 @@ def decimate(breaths: Breaths) -> Decimation:
     return Decimation(fewer, index)
 
 
-def _kept(breaths: Breaths, i: int, length: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _kept(breaths: Breaths, i: int, length: int) -> tuple[Ints, Ints]:
     """Samples of a breath that are kept, in order, and those of them that are readings.
 
     The first and the last sample are kept.
@@ -142,7 +143,7 @@ def _kept(breaths: Breaths, i: int, length: int) -> tuple[NDArray[np.int64], NDA
     return np.unique(np.concatenate([nodes, before])), nodes[spaced]
 
 
-def _changes(u_in: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+def _changes(u_in: Floats, tolerance: float) -> Ints:
     """First samples of runs in which the command stays within a band of twice the tolerance."""
     starts, low, high = [0], u_in[0], u_in[0]
     for k, value in enumerate(u_in.tolist()):
@@ -153,9 +154,7 @@ def _changes(u_in: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
     return np.array(starts)
 
 
-def _means(
-    u_in: NDArray[np.float64], dt: NDArray[np.float64], nodes: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _means(u_in: Floats, dt: Floats, nodes: Ints) -> Floats:
     """Mean command from each kept sample to the next, ``(k,)``; the last stands as it is."""
     volume = np.concatenate([[0.0], np.cumsum(u_in * dt)])
     passed = np.concatenate([[0.0], np.cumsum(dt)])
@@ -163,7 +162,7 @@ def _means(
     return np.append(means, u_in[nodes[-1]])
 
 
-def _spaced(time: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _spaced(time: Floats) -> Bools:
     """Whether a sample comes long enough after the last reading that is kept, ``(k,)``."""
     kept, last = np.zeros(len(time), bool), -np.inf
     for k, now in enumerate(time.tolist()):
@@ -178,9 +177,7 @@ def _wide(values: NDArray, width: int, fill: float) -> NDArray:
     return np.concatenate([values, more], axis=1)
 
 
-def _widened(
-    time: NDArray[np.float64], dt: NDArray[np.float64], width: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _widened(time: Floats, dt: Floats, width: int) -> tuple[Floats, Floats]:
     """Times and intervals that go on at the last interval, up to a width."""
     beyond = np.arange(1, width - time.shape[1] + 1)
     time = np.concatenate([time, time[:, -1:] + dt[:, -1:] * beyond], axis=1)

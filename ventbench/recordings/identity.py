@@ -21,9 +21,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.recordings.breaths import Breaths
 
-Floats = NDArray[np.float64]
 Keys = NDArray[np.uint64]
 
 #: Inspiratory samples that count; what follows may be missing from a copy.
@@ -51,9 +51,9 @@ class Fingerprints:
 
     commands: Keys
     pressures: Keys
-    measured: NDArray[np.bool_]
+    measured: Bools
 
-    def select(self, which: NDArray[np.int64]) -> Fingerprints:
+    def select(self, which: Ints) -> Fingerprints:
         """Return those of some of the breaths."""
         return Fingerprints(*(getattr(self, field.name)[which] for field in fields(self)))
 
@@ -68,8 +68,8 @@ class Matches:
             breath is perhaps a copy, ``(n,)``.
     """
 
-    known: NDArray[np.int64]
-    certain: NDArray[np.bool_]
+    known: Ints
+    certain: Bools
 
 
 def fingerprints(breaths: Breaths) -> Fingerprints:
@@ -121,7 +121,7 @@ def match(breaths: Breaths, known: Fingerprints) -> Matches:
     return Matches(found, certain)
 
 
-def repetitions(breaths: Breaths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def repetitions(breaths: Breaths) -> tuple[Ints, Ints]:
     """Find breaths that are there more than once.
 
     Returns:
@@ -156,7 +156,7 @@ def _values(breaths: Breaths) -> list[Floats]:
     return out
 
 
-def _measured(pressure: Floats) -> NDArray[np.bool_]:
+def _measured(pressure: Floats) -> Bools:
     return np.count_nonzero(np.isnan(pressure), axis=1) == 0
 
 

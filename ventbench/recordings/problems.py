@@ -84,31 +84,6 @@ class RecordingError(InputError):
             lines.append(f"... and {self.total - len(lines)} more problems ({self.total} in all).")
         return "\n".join(lines)
 
-    @property
-    def file(self) -> str:
-        """File of the first problem."""
-        return self.problems[0].file
-
-    @property
-    def line(self) -> int | None:
-        """Line (CSV) or row (Parquet) of the first problem."""
-        return self.problems[0].line
-
-    @property
-    def column(self) -> str | None:
-        """Column of the first problem."""
-        return self.problems[0].column
-
-    @property
-    def value(self) -> str | None:
-        """Value of the first problem."""
-        return self.problems[0].value
-
-    @property
-    def advice(self) -> str:
-        """Advice for the first problem."""
-        return self.problems[0].advice
-
 
 def fail(file: str, what: str, advice: str, line: int | None = None) -> RecordingError:
     """Make a RecordingError about a whole file or a line."""

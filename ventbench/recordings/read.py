@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 from ventbench.recordings.problems import ProblemLog, RecordingError, RecordingProblem, fail
@@ -36,7 +36,7 @@ COLUMNS = ("simulated", "simulated_pressure", "pressure_simulated", "pressure")
 _TIMES = ("time_step", "time")
 
 
-def read_simulated(path: str | os.PathLike[str], breaths: Breaths) -> NDArray[np.float64]:
+def read_simulated(path: str | os.PathLike[str], breaths: Breaths) -> Floats:
     """Read simulated pressures of recorded breaths.
 
     The table has ``breath_id`` and a column of :data:`COLUMNS` (``simulated`` if recorded pressures
@@ -90,9 +90,9 @@ def read_simulated(path: str | os.PathLike[str], breaths: Breaths) -> NDArray[np
 
 
 def _at_times(
-    values: NDArray[np.float64], at: NDArray[np.float64], wanted: NDArray[np.float64], file: str,
+    values: Floats, at: Floats, wanted: Floats, file: str,
     number: int,
-) -> NDArray[np.float64]:  # fmt: skip
+) -> Floats:  # fmt: skip
     if len(at) < 2 or not np.all(np.diff(at) > 0):
         raise InputError(f"{file}: the times of breath {number} do not increase")
     if at[-1] < wanted[-1] - (at[-1] - at[-2]) - 1e-9:
@@ -120,7 +120,7 @@ def _table(path: Path) -> dict[str, np.ndarray]:
     return {name: table.column(name).to_numpy() for name in dict.fromkeys(table.column_names)}
 
 
-def _numbers(values: np.ndarray, file: str, name: str) -> NDArray[np.float64]:
+def _numbers(values: np.ndarray, file: str, name: str) -> Floats:
     try:
         return np.asarray(values, float)
     except (TypeError, ValueError) as error:

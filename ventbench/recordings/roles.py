@@ -11,12 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
-
-Floats = NDArray[np.float64]
 
 SLOW = 0.5
 """Median sampling interval, s, above which times are not in seconds."""
@@ -96,7 +94,7 @@ class Saturation:
 
 
 def breath_figures(
-    time: Floats, samples: Mapping[str, np.ndarray], starts: NDArray[np.int64]
+    time: Floats, samples: Mapping[str, np.ndarray], starts: Ints
 ) -> dict[str, Floats]:
     """Reduce breaths to the numbers that :func:`findings` and :func:`saturations` judge.
 
@@ -115,7 +113,7 @@ def breath_figures(
     pressure, u_in = samples["pressure"], np.nan_to_num(samples["u_in"])
     inside = samples["u_out"] == 0
 
-    def mean(values: Floats, where: NDArray[np.bool_]) -> Floats:
+    def mean(values: Floats, where: Bools) -> Floats:
         where = where & np.isfinite(values)
         count = np.add.reduceat(where.astype(float), starts)
         return _ratio(np.add.reduceat(np.where(where, values, 0.0), starts), count)
@@ -140,9 +138,7 @@ def breath_figures(
     return out
 
 
-def _ends(
-    values: Floats, starts: NDArray[np.int64], breath: NDArray[np.int64]
-) -> dict[str, Floats]:
+def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
     """Largest value of each breath, how often, the next one, how often, and the step to the top."""
     with np.errstate(invalid="ignore"):
         top = np.fmax.reduceat(values, starts)
@@ -163,8 +159,8 @@ def _ends(
 
 
 def _regression(
-    time: Floats, pressure: Floats, flow: Floats, starts: NDArray[np.int64],
-    breath: NDArray[np.int64],
+    time: Floats, pressure: Floats, flow: Floats, starts: Ints,
+    breath: Ints,
 ) -> dict[str, Floats]:  # fmt: skip
     """Correlation of pressure and flow, and the cross products of p = R Q + V / C + p0."""
     known = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
@@ -191,11 +187,7 @@ def _ratio(a: Floats, b: Floats) -> Floats:
 
 
 def saturations(figures: Mapping[str, Floats]) -> tuple[Saturation, ...]:
-    """Levels at which sensors end: reached again and again, exactly, and left by small steps.
-
-    Args:
-        figures: of all breaths, from :func:`breath_figures`.
-    """
+    """Levels at which sensors end: reached again and again, exactly, and left by small steps."""
     found = []
     for name in ("pressure", "flow"):
         if not np.isfinite(figures.get(f"{name}_high", np.zeros(0))).any():
@@ -310,7 +302,7 @@ def _commands(figures: Mapping[str, Floats]) -> list[Finding]:
 
 
 def _phases(
-    figures: Mapping[str, Floats], low: Floats, spans: Floats, moves: NDArray[np.bool_]
+    figures: Mapping[str, Floats], low: Floats, spans: Floats, moves: Bools
 ) -> list[Finding]:
     share = float(np.nanmedian(figures["inspiration"]))
     height = _ratio(figures["end"] - low, spans)[moves]

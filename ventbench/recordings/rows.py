@@ -1,14 +1,18 @@
-"""Rows of a file as flat arrays: chunks as they are read, regrouped into whole breaths."""
+"""Rows of a file as flat arrays: chunks as they are read, regrouped into whole breaths, checked.
+
+Checks of values, breaths and times only add to a `ProblemLog`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ventbench.recordings.schema import COLUMNS
+from ventbench.recordings.problems import ProblemLog, RecordingProblem
+from ventbench.recordings.schema import COLUMNS, Column, Kind
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -115,20 +119,54 @@ def _join(chunks: list[Chunk]) -> Chunk:
     return Chunk(chunks[0].row0, columns, blank)
 
 
-def chunk_of_batch(batch: pa.RecordBatch, row0: int, last_id: int | None) -> Chunk:
-    """Convert an Arrow batch.
+@dataclass
+class Source:
+    """A file, or a table in memory, that is read once, in order.
 
-    Args:
-        batch: known columns only, in any numeric type.
-        row0: number of its first row in the file.
-        last_id: breath_id of the row before, used where the first ones are blank; None at the
-            start, where the first id that is not blank is used.
+    Attributes:
+        file: the path as the caller wrote it.
+        kind: format.
+        names: column names.
+        warnings: about columns that are ignored.
+        sha256: SHA-256 of the file on disk; None until all chunks are read.
+        place: what messages count in: ``line`` or ``row``.
+        size: bytes, or rows of Parquet.
+        done: how much of that has been read.
+    """
 
-    Returns:
-        The rows as int64 (id, breath_id) and float64 arrays.
+    file: str
+    kind: Kind
+    names: tuple[str, ...] = field(default=(), init=False)
+    warnings: tuple[RecordingProblem, ...] = field(default=(), init=False)
+    sha256: str | None = field(default=None, init=False)
+    place: str = field(default="line", init=False)
+    size: int = field(default=0, init=False)
+    done: int = field(default=0, init=False)
 
-    Raises:
-        pyarrow.ArrowInvalid: a whole number does not fit 64 bits.
+    def chunks(self) -> Iterator[Chunk]:
+        """Yield the rows in order.
+
+        Raises:
+            RecordingError: the file is damaged, or not of numbers.
+        """
+        raise NotImplementedError
+
+
+def chunks_of(batches: Iterable[pa.RecordBatch]) -> Iterator[Chunk]:
+    """Convert the Arrow batches of a file, in order; empty ones are left out."""
+    row0, last_id = 0, None
+    for batch in batches:
+        if batch.num_rows:
+            chunk = _chunk_of_batch(batch, row0, last_id)
+            yield chunk
+            row0 += len(chunk)
+            last_id = int(chunk.columns["breath_id"][-1])
+
+
+def _chunk_of_batch(batch: pa.RecordBatch, row0: int, last_id: int | None) -> Chunk:
+    """Convert a batch of known columns in any numeric type.
+
+    A blank breath_id at its start is ``last_id``, that of the row before, or the first one known.
     """
     columns = {}
     blank_id = np.zeros(batch.num_rows, dtype=bool)
@@ -154,3 +192,224 @@ def _numpy(array: pa.Array, whole: bool) -> tuple[np.ndarray, np.ndarray | None]
         array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
         array = array.cast(pa.float64())
     return array.to_numpy(zero_copy_only=False), None
+
+
+#: Rows from which a value that is repeated is reported once.
+_OFTEN = 10
+
+
+def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str, np.ndarray]:
+    """Check each cell: blank, infinite, out of range.
+
+    Args:
+        rows: whole breaths.
+        log: receives the problems.
+        clip: clip u_in to 0..100 % with a warning; otherwise it is a problem.
+
+    Returns:
+        The columns, with u_in clipped on request.
+    """
+    columns = dict(rows.columns)
+    _add_blank(rows, log, "breath_id", rows.blank_id)
+    for name, values in rows.columns.items():
+        column = COLUMNS[name]
+        if column.whole:
+            continue
+        if not column.blank:
+            _add_blank(rows, log, name, np.isnan(values))
+        infinite = np.isinf(values)
+        if infinite.any():
+            at = np.flatnonzero(infinite)
+            what = "{value} is infinite"
+            log.add(rows.row0 + at, name, what, "Fix the row.", values=values[at])
+        outside = _outside(values, column) & ~infinite
+        if not outside.any():
+            continue
+        at = np.flatnonzero(outside)
+        level, advice = "problem", column.advice
+        what = f"{{value}} is outside {column.span}"
+        if name == "u_in" and clip:
+            level, advice, what = "warning", "It was clipped.", what
+            columns[name] = np.where(infinite, values, np.clip(values, column.low, column.high))
+        elif name == "u_out":
+            what = "{value} is neither 0 nor 1"
+        elif column.positive:
+            what = f"{{value}} is not in {column.span}"
+        if name in ("R", "C"):  # the label of a whole recording: one mistake, not one a row
+            _add_once(rows.row0 + at, name, what, advice, values[at], log)
+        else:
+            log.add(rows.row0 + at, name, what, advice, values=values[at], level=level)
+    return columns
+
+
+def _add_once(
+    at: np.ndarray, name: str, what: str, advice: str, values: np.ndarray, log: ProblemLog
+) -> None:
+    """Report a value that many rows repeat once, whatever blocks the file is read in."""
+    kinds, first, counts = np.unique(values, return_index=True, return_counts=True)
+    often = counts >= _OFTEN
+    single = ~np.isin(values, kinds[often])
+    log.add(at[single], name, what, advice, values=values[single])
+    for row, value in zip(first[often], kinds[often], strict=True):
+        log.add_once(int(at[row]), name, f"{what}, here and in more rows", advice, value)
+
+
+def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: np.ndarray) -> None:
+    if blank.any():
+        what = f"the cell is blank, but {name} is needed in every row"
+        at = rows.row0 + np.flatnonzero(blank)
+        values = np.full(len(at), np.nan)
+        log.add(at, name, what, "Fill it in or remove the breath.", values=values)
+
+
+def _outside(values: np.ndarray, column: Column) -> np.ndarray:
+    if column.name == "u_out":
+        return (values != 0.0) & (values != 1.0) & ~np.isnan(values)
+    low = values <= column.low if column.positive else values < column.low
+    return low | (values > column.high)
+
+
+def check_ids(rows: Rows, log: ProblemLog, seen: dict[int, int]) -> None:
+    """Check that the rows of each breath follow one another.
+
+    Args:
+        rows: whole breaths.
+        log: receives the problems.
+        seen: first row of each breath so far, by breath_id; new breaths are added.
+    """
+    again, first = [], []
+    starts = rows.row0 + rows.starts
+    ids = rows.columns["breath_id"][rows.starts]
+    for breath, row in zip(ids.tolist(), starts.tolist(), strict=True):
+        earlier = seen.setdefault(breath, row)
+        if earlier != row:
+            again.append(row)
+            first.append(earlier)
+    log.add(
+        np.array(again, dtype=np.int64),
+        "breath_id",
+        "breath {value} comes again, it is already at {other}",
+        "Keep the rows of a breath together, and give each breath an id of its own.",
+        values=np.array([rows.columns["breath_id"][row - rows.row0] for row in again]),
+        others=np.array(first, dtype=np.int64),
+    )
+
+
+def check_lung(rows: Rows, log: ProblemLog) -> None:
+    """Check that R and C stay the same within each breath."""
+    breath = np.repeat(np.arange(len(rows.starts)), rows.lengths)
+    for name in ("R", "C"):
+        values = rows.columns[name]
+        first = values[rows.starts][breath]
+        with np.errstate(invalid="ignore"):
+            at = np.flatnonzero((values != first) & ~np.isnan(values) & ~np.isnan(first))
+        if len(at) == 0:
+            continue
+        at = at[np.unique(breath[at], return_index=True)[1]]
+        log.add(
+            rows.row0 + at,
+            name,
+            f"{name} changes to {{value}} within the breath, which starts at {{other}}",
+            "A breath has one lung: give the second part its own breath_id, or fix the row.",
+            values=values[at],
+            others=rows.row0 + rows.starts[breath[at]],
+        )
+
+
+def check_single(rows: Rows, log: ProblemLog) -> None:
+    """Check that each breath has at least two samples."""
+    at = rows.starts[rows.lengths == 1]
+    log.add(
+        rows.row0 + at,
+        "breath_id",
+        "breath {value} has one sample, at least two are needed",
+        "Remove it, or keep the rows of a breath together.",
+        values=rows.columns["breath_id"][at],
+    )
+
+
+def check_row_ids(rows: Rows, log: ProblemLog, last: int | None) -> int:
+    """Warn where the column id, which is not used otherwise, does not increase.
+
+    Args:
+        rows: whole breaths.
+        log: receives the warnings.
+        last: id of the row before, or None at the start.
+
+    Returns:
+        The last id.
+    """
+    ids = rows.columns["id"]
+    before = np.concatenate([ids[:1] - 1 if last is None else [last], ids[:-1]])
+    at = np.flatnonzero(ids <= before)
+    what = "id {value} is not greater than the one before"
+    advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
+    log.add(rows.row0 + at, "id", what, advice, values=ids[at], level="warning")
+    return int(ids[-1])
+
+
+_SORT = "Sort the rows of the breath by time_step, and remove rows that are there twice."
+
+
+def check_times(rows: Rows, log: ProblemLog) -> None:
+    """Check that the known times increase within each breath.
+
+    Repeated rows are reported as such. In breaths without times, a row is a repeat if it equals the
+    row before in every column, including `id`.
+
+    Args:
+        rows: whole breaths.
+        log: receives the problems.
+    """
+    time = rows.columns["time_step"]
+    breath = np.repeat(np.arange(len(rows.starts)), rows.lengths)
+    known = np.flatnonzero(np.isfinite(time))
+    previous, here = known[:-1], known[1:]
+    late = (time[here] <= time[previous]) & (breath[here] == breath[previous])
+    if late.any():
+        _add_order(rows, log, previous[late], here[late])
+    blank = np.isnan(time)
+    at = np.flatnonzero(blank[1:] & blank[:-1] & (breath[1:] == breath[:-1])) + 1
+    at = at[_same(rows, at - 1, at, rows.columns)] if len(at) else at
+    _add_repeat(rows, log, at - 1, at, "id", rows.columns["id"])
+
+
+def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarray) -> None:
+    time = rows.columns["time_step"]
+    equal = time[previous] == time[here]
+    names = [name for name in rows.columns if name != "id"]
+    repeat = equal & _same(rows, previous, here, names)
+    _add_repeat(rows, log, previous[repeat], here[repeat], "time_step", time)
+    for chosen, what in (
+        (equal & ~repeat, "two rows of the breath have the time {value} s, the other is {other}"),
+        (~equal, "time goes back to {value} s from {other}"),
+    ):
+        at, before = here[chosen], previous[chosen]
+        log.add(rows.row0 + at, "time_step", what, _SORT, values=time[at],
+                     others=rows.row0 + before)  # fmt: skip
+
+
+def _add_repeat(
+    rows: Rows,
+    log: ProblemLog,
+    previous: np.ndarray,
+    here: np.ndarray,
+    column: str,
+    values: np.ndarray,
+) -> None:
+    log.add(
+        rows.row0 + here,
+        column,
+        "the row repeats {other}",
+        "Remove one of the two.",
+        values=values[here],
+        others=rows.row0 + previous,
+    )
+
+
+def _same(rows: Rows, first: np.ndarray, other: np.ndarray, names: object) -> np.ndarray:
+    same = np.ones(len(first), dtype=bool)
+    for name in names:  # type: ignore[attr-defined]
+        a, b = rows.columns[name][first], rows.columns[name][other]
+        same &= (a == b) | ((a != a) & (b != b))
+    return same

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,17 +15,21 @@ import numpy as np
 
 from ventbench.base.errors import InputTypeError, require
 from ventbench.base.files import sha256
-from ventbench.recordings.checks import (
+from ventbench.recordings.csv_source import CsvSource, locate_rows
+from ventbench.recordings.problems import Place, ProblemLog, RecordingError, RecordingProblem, fail
+from ventbench.recordings.rows import (
+    Chunk,
+    Rows,
+    Source,
     check_ids,
     check_lung,
     check_row_ids,
     check_single,
     check_times,
     check_values,
+    chunks_of,
+    whole_breaths,
 )
-from ventbench.recordings.csv_source import CsvSource, locate_rows
-from ventbench.recordings.problems import Place, ProblemLog, RecordingError, RecordingProblem, fail
-from ventbench.recordings.rows import Chunk, Rows, chunk_of_batch, whole_breaths
 from ventbench.recordings.schema import COLUMNS, Kind, check_header
 from ventbench.recordings.times import KnownTimes, known_times, leading_zeros
 
@@ -42,31 +46,17 @@ BATCH = 1 << 17
 
 
 @dataclass
-class ParquetSource:
-    """A Parquet file, or a table in memory, that is read once, in order.
+class ParquetSource(Source):
+    """A Parquet file, a spreadsheet, or a table in memory.
 
     Attributes:
-        file: the path as the caller wrote it.
-        kind: `parquet`, `xlsx`, or `table` in memory.
         table: the table in memory; None for Parquet.
-        names: column names.
-        warnings: about columns that are ignored.
-        sha256: SHA-256 of the file; None until all chunks are read.
         batch: rows that are read at a time.
-        size: rows of the file.
-        done: rows that have been read.
     """
 
-    file: str
     kind: Kind = "parquet"
     table: pa.Table | None = None
-    names: tuple[str, ...] = ()
-    warnings: tuple[RecordingProblem, ...] = ()
-    sha256: str | None = None
-    place: str = field(default="row", init=False)
     batch: int = BATCH
-    size: int = field(default=0, init=False)
-    done: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         """Read and check names and types.
@@ -77,6 +67,7 @@ class ParquetSource:
         import pyarrow as pa
         from pyarrow import parquet
 
+        self.place = "row"
         try:
             schema = parquet.read_schema(self.file) if self.table is None else self.table.schema
         except (pa.ArrowException, OSError) as error:
@@ -93,22 +84,14 @@ class ParquetSource:
             raise RecordingError(problems)
 
     def chunks(self) -> Iterator[Chunk]:
-        """Yield the rows in order.
-
-        Raises:
-            RecordingError: the file is damaged.
-        """
+        """Yield the rows in order; see :class:`Source`."""
         import pyarrow as pa
 
-        row0, last_id = 0, None
+        known = [name for name in COLUMNS if name in self.names]
         try:
-            for batch in self._batches([name for name in COLUMNS if name in self.names]):
-                if batch.num_rows:
-                    chunk = chunk_of_batch(batch, row0, last_id)
-                    self.done = row0 + len(chunk)
-                    yield chunk
-                    row0 += len(chunk)
-                    last_id = int(chunk.columns["breath_id"][-1])
+            for chunk in chunks_of(self._batches(known)):
+                self.done = chunk.row0 + len(chunk)
+                yield chunk
             self.sha256 = None if self.kind == "table" else sha256(Path(self.file))
         except (pa.ArrowException, OSError) as error:
             raise _damaged(self.file, error) from None
@@ -141,9 +124,6 @@ def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[RecordingPr
 def _damaged(file: str, error: Exception) -> RecordingError:
     text = str(error).strip().splitlines()[0].rstrip(".")
     return fail(file, f"the Parquet file cannot be read ({text})", "Write or copy it again.")
-
-
-Source = CsvSource | ParquetSource
 
 
 def open_source(path: str | os.PathLike[str] | pd.DataFrame) -> Source:

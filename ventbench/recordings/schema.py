@@ -50,54 +50,29 @@ class Column:
         return f"{self.low:g}..{self.high:g} {self.unit}".rstrip()
 
 
+def _label(name: str, unit: str, what: str) -> Column:
+    advice = f"Write the {what} of the test lung in {unit}."
+    return Column(name, unit, 0.0, 500.0, positive=True, advice=advice)
+
+
+def _measured(name: str, unit: str, low: float, high: float) -> Column:
+    advice = f"Write the {name} in {unit}, or leave the cell blank."
+    return Column(name, unit, low, high, blank=True, advice=advice)
+
+
 COLUMNS: dict[str, Column] = {
     column.name: column
     for column in (
         Column("id", "", blank=True, whole=True),
         Column("breath_id", "", whole=True),
-        Column(
-            "R",
-            "cmH2O/(L/s)",
-            0.0,
-            500.0,
-            positive=True,
-            advice="Write the resistance of the test lung in cmH2O/(L/s).",
-        ),
-        Column(
-            "C",
-            "mL/cmH2O",
-            0.0,
-            500.0,
-            positive=True,
-            advice="Write the compliance of the test lung in mL/cmH2O.",
-        ),
+        _label("R", "cmH2O/(L/s)", "resistance"),
+        _label("C", "mL/cmH2O", "compliance"),
         Column("time_step", "s", blank=True),
         Column("u_in", "%", 0.0, 100.0, advice="Fix the row or pass --clip."),
         Column("u_out", "", 0.0, 1.0, advice="Write 1 while the expiratory valve is open, else 0."),
-        Column(
-            "pressure",
-            "cmH2O",
-            -20.0,
-            120.0,
-            blank=True,
-            advice="Write the pressure in cmH2O, or leave the cell blank.",
-        ),
-        Column(
-            "flow",
-            "mL/s",
-            -10_000.0,
-            10_000.0,
-            blank=True,
-            advice="Write the flow in mL/s, or leave the cell blank.",
-        ),
-        Column(
-            "volume",
-            "mL",
-            -20_000.0,
-            20_000.0,
-            blank=True,
-            advice="Write the volume in mL, or leave the cell blank.",
-        ),
+        _measured("pressure", "cmH2O", -20.0, 120.0),
+        _measured("flow", "mL/s", -10_000.0, 10_000.0),
+        _measured("volume", "mL", -20_000.0, 20_000.0),
     )
 }
 

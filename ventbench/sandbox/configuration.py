@@ -56,13 +56,7 @@ _THREADED = ("jax", "flax")
 
 
 def modules_needed(folder: Path) -> tuple[tuple[str, ...], bool]:
-    """Modules to load before cells start, so that they share them.
-
-    Args:
-        folder: the submission's folder; its sources are read in a limited process.
-
-    Returns:
-        The modules, and whether they need threads.
+    """Modules to load before cells start, so that they share them, and whether they need threads.
 
     Raises:
         SubmissionError: if the sources cannot be read within the limits.

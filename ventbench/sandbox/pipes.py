@@ -10,8 +10,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence, Set
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.sandbox.child import wire
 from ventbench.sandbox.child.wire import Reply, WireError
 
@@ -22,8 +22,6 @@ _UNASKED = "bytes came after the reply"
 #: the same for few cells as for many. Slow cells keep nobody waiting for longer.
 GATHERED_S = 0.05
 
-Floats, Integers = NDArray[np.float64], NDArray[np.int64]
-
 #: What became of a cell: its reply, a breach of the wire's rules, or None: its pipe has ended.
 Outcome = Reply | WireError | None
 
@@ -31,11 +29,11 @@ Outcome = Reply | WireError | None
 class Asked:
     """Controllers that are asked each by itself; none waits for another."""
 
-    def ask(self, cells: Integers, observations: Floats) -> None:
+    def ask(self, cells: Ints, observations: Floats) -> None:
         """Give some controllers an observation each; see ``ControllerSession``."""
         raise NotImplementedError
 
-    def answers(self) -> tuple[Integers, Floats]:
+    def answers(self) -> tuple[Ints, Floats]:
         """Take what has been answered; see ``ControllerSession``."""
         raise NotImplementedError
 

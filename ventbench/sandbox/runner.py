@@ -60,10 +60,7 @@ def layers() -> tuple[str, ...]:
 
 
 def check_floor(shown: Sequence[str]) -> None:
-    """Refuse to go on where cells are confined too little for any foreign code.
-
-    Args:
-        shown: layers that are in force.
+    """Refuse to go on where the layers in force confine too little for any foreign code.
 
     Raises:
         SandboxError: naming the missing layers first.

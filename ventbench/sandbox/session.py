@@ -18,11 +18,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.sandbox.child import libc, lockdown, wire
 from ventbench.sandbox.child.failures import Failure, SubmissionError, printable
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
-from ventbench.sandbox.pipes import Asked, Clock, Floats, Integers, Outcome, Pipes
+from ventbench.sandbox.pipes import Asked, Clock, Outcome, Pipes
 from ventbench.sandbox.zygote import ZygoteClient, signal_name
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
@@ -125,7 +126,7 @@ class SandboxSession(Asked):
                 raise SubmissionError(failure.what)
         self._give_up(late)
 
-    def ask(self, cells: Integers, observations: Floats) -> None:
+    def ask(self, cells: Ints, observations: Floats) -> None:
         """Ask some controllers for their next commands, as of ``ControllerSession``."""
         for cell, outcome in self._pipes.early(self._asked).items():
             self._judge(cell, outcome)
@@ -138,7 +139,7 @@ class SandboxSession(Asked):
         self._void |= set(cells.tolist()) - frames.keys()
         self._pipes.send(frames)
 
-    def answers(self) -> tuple[Integers, Floats]:
+    def answers(self) -> tuple[Ints, Floats]:
         """Take the commands that are there, as of ``ControllerSession``."""
         commands = dict.fromkeys(self._void, 0.0)
         if self._asked and not self._void:
@@ -344,12 +345,7 @@ def ended(status: int | None) -> Verdict:
 
 
 def not_answered(outcome: Outcome, limit: str) -> Verdict:
-    """Verdict on a cell that was out of time.
-
-    Args:
-        outcome: what it said when it was asked where it is.
-        limit: how long was waited.
-    """
+    """Verdict on a cell that was out of time, by what it said when it was asked where it is."""
     _, _, detail, printed = _fields(outcome.text if isinstance(outcome, Reply) else b"")
     what = f"the controller did not answer within {limit}"
     return Verdict("timeout", what, _with_prints(detail, printed))

@@ -1,34 +1,19 @@
 """System identification: data, noise, predictions, least squares, fits and their intervals."""
 
-from ventbench.system_id.data import Data, make_data
-from ventbench.system_id.fit import Fit, fit, refit_breath_parameters
-from ventbench.system_id.noise import Noise, robust_noise
-from ventbench.system_id.predictor import START, Predictor
-from ventbench.system_id.problem import (
-    Problem,
-    Unknowns,
-    free_paths,
-    make_unknowns,
-    parameter_values,
-)
-from ventbench.system_id.profile_likelihood import ConfidenceInterval, interval, profile_interval
-
-__all__ = [
-    "START",
-    "ConfidenceInterval",
-    "Data",
-    "Fit",
-    "Noise",
-    "Predictor",
-    "Problem",
-    "Unknowns",
-    "fit",
-    "free_paths",
-    "interval",
-    "make_data",
-    "make_unknowns",
-    "parameter_values",
-    "profile_interval",
-    "refit_breath_parameters",
-    "robust_noise",
-]
+from ventbench.system_id.data import Data as Data
+from ventbench.system_id.data import make_data as make_data
+from ventbench.system_id.fit import ConfidenceInterval as ConfidenceInterval
+from ventbench.system_id.fit import Fit as Fit
+from ventbench.system_id.fit import fit as fit
+from ventbench.system_id.fit import interval as interval
+from ventbench.system_id.fit import profile_interval as profile_interval
+from ventbench.system_id.fit import refit_breath_parameters as refit_breath_parameters
+from ventbench.system_id.noise import Noise as Noise
+from ventbench.system_id.noise import robust_noise as robust_noise
+from ventbench.system_id.predictor import START as START
+from ventbench.system_id.predictor import Predictor as Predictor
+from ventbench.system_id.problem import Problem as Problem
+from ventbench.system_id.problem import Unknowns as Unknowns
+from ventbench.system_id.problem import free_paths as free_paths
+from ventbench.system_id.problem import make_unknowns as make_unknowns
+from ventbench.system_id.problem import parameter_values as parameter_values

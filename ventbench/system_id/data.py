@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class Data:
         return len(self.u_in)
 
     @property
-    def lung(self) -> NDArray[np.int64]:
+    def lung(self) -> Ints:
         """Index of each breath's lung label, from 0, ``(n,)``."""
         pairs = np.stack([self.R, self.C], axis=1)
         return np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.system_id.data import Floats
+from ventbench.base.arrays import Floats
 
 #: Cost at a point; cost, gradient and Gauss-Newton Hessian at a point.
 Cost = Callable[[Floats], float]

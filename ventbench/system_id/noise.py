@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.system_id.data import Floats
+from ventbench.base.arrays import Floats
 
 #: Highest autocorrelation of noise: above it, the model is taken to fit badly.
 MOST_AR = 0.95

@@ -17,13 +17,14 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.executor import parallel_map
 from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.physics.dead_time import resolution_of
 from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.model import Physics
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 
 Ints = NDArray[np.int_]
 

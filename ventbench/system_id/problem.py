@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.physics.catalogue import mechanism, parameter, paths, strength_path
 from ventbench.physics.parameters import REFITTED, Parameter
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START, Predictor, needs_small_steps
@@ -56,8 +57,8 @@ class Unknowns:
     """
 
     paths: tuple[str, ...]
-    index: NDArray[np.int64]
-    path_of: NDArray[np.int64]
+    index: Ints
+    path_of: Ints
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -65,12 +66,12 @@ class Unknowns:
         return tuple(parameter_of(path) for path in self.paths)
 
     @property
-    def shared(self) -> NDArray[np.bool_]:
+    def shared(self) -> Bools:
         """Whether each unknown is shared by breaths, ``(U,)``."""
         own = np.array([parameter.scope == "breath" for parameter in self.parameters])
         return ~own[self.path_of]
 
-    def of(self, path: str) -> NDArray[np.int64]:
+    def of(self, path: str) -> Ints:
         """Unknowns of a parameter, in the order of their groups."""
         return np.flatnonzero(self.path_of == self.paths.index(path))
 

@@ -37,6 +37,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench.base import precision
+from ventbench.base.arrays import Floats
 from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
 from ventbench.task.draws import DEVELOPMENT_SEED, uniforms
@@ -64,7 +65,6 @@ ACCEPTED, GOOD = 0.1, 0.7
 #: Cells whose derivatives are computed together: bounds memory.
 BATCH = 64
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 

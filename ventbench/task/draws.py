@@ -27,9 +27,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 from ventbench.base import precision
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.environment import Scenario, nominal_scenario
@@ -76,28 +76,9 @@ OF_RIGS = ("r_scale", "c_scale", "delay")
 #: probability from 0 to 1: quantiles of the measured breaths of the scored rigs, which the manifest
 #: of the simulators holds too. Between neighbouring breaths no correlation was found.
 GAIN_QUANTILES = (
-    -0.41,
-    -0.294,
-    -0.152,
-    -0.093,
-    -0.081,
-    -0.046,
-    -0.033,
-    -0.02,
-    -0.011,
-    -0.001,
-    0.0,
-    0.001,
-    0.011,
-    0.021,
-    0.033,
-    0.039,
-    0.051,
-    0.081,
-    0.093,
-    0.122,
-    0.247,
-)
+    -0.41, -0.294, -0.152, -0.093, -0.081, -0.046, -0.033, -0.02, -0.011, -0.001, 0.0,
+    0.001, 0.011, 0.021, 0.033, 0.039, 0.051, 0.081, 0.093, 0.122, 0.247,
+)  # fmt: skip
 
 #: What kind of rig a draw is on.
 TRAINING, HELD_OUT, DRAWN = 0, 1, 2
@@ -115,8 +96,6 @@ _COMMITMENT = b"ventbench season 1\n"
 # It is part of the labels of the streams and of what records say of draws.
 _FORMAT = 2
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 PlantT = TypeVar("PlantT")
 
 
@@ -140,7 +119,7 @@ class Draws:
     cells: Scenario
     rig: Ints
     member: Ints
-    ranked: NDArray[np.bool_]
+    ranked: Bools
     drawn: Plant | None = None
 
     @property
@@ -258,7 +237,7 @@ def build(
     )
 
 
-def ranked(rig: Ints) -> NDArray[np.bool_]:
+def ranked(rig: Ints) -> Bools:
     """Whether each draw is ranked, shape ``(n,)``.
 
     In a round those are ranked that are on rigs that nobody trained on; in practice all are shown.
@@ -365,7 +344,7 @@ def plants_of(plants: PlantT, rig: Ints, member: Ints, drawn: PlantT | None = No
     return jax.tree.map(lambda leaf: leaf[:, :, None], chosen)
 
 
-def uniforms(seed: bytes, label: str, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
+def uniforms(seed: bytes, label: str, shape: int | tuple[int, ...]) -> Floats:
     r"""Uniform numbers that follow from a seed and a label, the same on every machine.
 
     Block ``k = 0, 1, ...`` of the stream is HMAC-SHA256, with the seed as its key, of

@@ -12,8 +12,9 @@ import flax.struct
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.task import protocol, waveform
 from ventbench.task.interfaces import Observation, Plant, Signals
@@ -73,7 +74,7 @@ def nominal_scenario(pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Scenari
     return Scenario(*(jnp.asarray(array) for array in arrays))
 
 
-def _table(values: NDArray[np.float64], scenario: Scenario) -> Array:
+def _table(values: Floats, scenario: Scenario) -> Array:
     # With its type spelled out: JAX keeps the constant that it makes of a numpy array, and would
     # bring a 64-bit one from an earlier trace into a 32-bit trace.
     return jnp.asarray(values, jnp.result_type(scenario.pip))

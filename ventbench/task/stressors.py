@@ -23,9 +23,16 @@ VERSION = 1
 Severity = Literal["mild", "strong"]
 SEVERITIES: tuple[Severity, ...] = ("mild", "strong")
 
-#: Where a stressor sits, in the order of tables and charts.
+#: Where a stressor sits, in the order of tables and charts, and that in words.
 Category = Literal["valve", "circuit", "sensor", "lung", "patient", "setting"]
-CATEGORIES: tuple[Category, ...] = ("valve", "circuit", "sensor", "lung", "patient", "setting")
+CATEGORIES: dict[Category, str] = {
+    "valve": "valve and supply",
+    "circuit": "circuit",
+    "sensor": "sensor",
+    "lung": "airway and lung",
+    "patient": "patient",
+    "setting": "other lungs",
+}
 
 #: How a strength acts on what the reference physics has: it is added to it, it multiplies it, or it
 #: is a label, in whose proportion to the lung's own label R or C changes.

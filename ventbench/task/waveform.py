@@ -6,8 +6,9 @@ Both follow from the integer step of the breath, never from accumulated time.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Floats
 from ventbench.task import protocol
 
 #: Bias flow that holds PEEP late in expiration, %, and its rate of rise, 1/s (paper, section 4.3;
@@ -16,7 +17,7 @@ EXPIRATORY_BIAS = 5.0
 EXPIRATORY_RATE = 5.0
 
 
-def shape(step: ArrayLike) -> NDArray[np.float64]:
+def shape(step: ArrayLike) -> Floats:
     """Height of the target above PEEP as a share of PIP - PEEP.
 
     Args:
@@ -31,7 +32,7 @@ def shape(step: ArrayLike) -> NDArray[np.float64]:
     return np.where(t < protocol.FALL_START - 1e-9, 1.0, np.clip(fall, 0.0, 1.0))
 
 
-def target(step: ArrayLike, pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> NDArray[np.float64]:
+def target(step: ArrayLike, pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Floats:
     """Target airway pressure, cmH2O.
 
     Args:
@@ -43,9 +44,7 @@ def target(step: ArrayLike, pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> 
     return peep + (pip - peep) * shape(step)
 
 
-def targets_ahead(
-    step: int, pip: ArrayLike, peep: ArrayLike = protocol.PEEP
-) -> NDArray[np.float64]:
+def targets_ahead(step: int, pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Floats:
     """Return the next :data:`~ventbench.task.protocol.TARGETS_AHEAD` targets after ``step``, cmH2O.
 
     Returns:
@@ -55,7 +54,7 @@ def targets_ahead(
     return target(steps, np.asarray(pip, float)[..., None], np.asarray(peep, float)[..., None])
 
 
-def expiratory_command(step: ArrayLike) -> NDArray[np.float64]:
+def expiratory_command(step: ArrayLike) -> Floats:
     """Fixed command of the inspiratory valve during expiration, %.
 
     The expiratory valve is open throughout.

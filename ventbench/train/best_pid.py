@@ -14,15 +14,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.plants.rigs import Rigs
 from ventbench.task import draws as draw_tables
 from ventbench.task.draws import Draws
 from ventbench.train.pid_grid import drawn_errors
-
-Floats = NDArray[np.float64]
 
 #: Where searches may begin, %/cmH2O: P and I, and D.
 P_I, D = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0), (0.1, 1.0, 10.0, 100.0)
@@ -57,7 +55,7 @@ class BestPIDs:
     search_errors: Floats
 
     @property
-    def agree(self) -> NDArray[np.bool_]:
+    def agree(self) -> Bools:
         """Whether at least two searches of a lung ended at one error, shape ``(L,)``."""
         ordered = np.sort(self.search_errors, axis=1)
         return ordered[:, 1] - ordered[:, 0] < AGREEMENT

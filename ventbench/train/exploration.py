@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.recordings import Breaths, make_breaths
@@ -24,7 +24,6 @@ from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.task.metrics.score import safety_limit
 
-Floats = NDArray[np.float64]
 Range = tuple[float, float]
 
 
@@ -71,7 +70,7 @@ class Disturbance:
         end: end of the disturbance, s.
     """
 
-    boundary: NDArray[np.bool_]
+    boundary: Bools
     u: Floats
     begin: Floats
     end: Floats
@@ -99,9 +98,6 @@ def draw_disturbances(
     return Disturbance(
         boundary, u, np.where(boundary, 0.0, ends[:, 0]), np.where(boundary, fall, ends[:, 1])
     )
-
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

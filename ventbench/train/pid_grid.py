@@ -27,6 +27,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import InProcess, executor, in_order, results
 from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
@@ -58,7 +59,6 @@ TOGETHER = 20
 TUNING = "tuning"
 TUNING_SEED = hashlib.sha256(b"ventbench, draws for tuning").digest()
 
-Floats = NDArray[np.float64]
 
 #: Files of a search in its folder.
 TABLE, RESULT, PARTS = "grid.parquet", "best.json", "parts"
@@ -69,7 +69,7 @@ Progress = Callable[[int, int], None]
 _GAINS = ["P", "I", "D"]
 
 
-def paper_gains() -> NDArray[np.float64]:
+def paper_gains() -> Floats:
     """All combinations of :data:`VALUES`, P slowest, D fastest, shape ``(8000, 3)``."""
     return np.array(list(itertools.product(VALUES, VALUES, VALUES)))
 
@@ -93,7 +93,7 @@ def _errors(plant: Plant, gains: Array, cells: Scenario) -> Array:
 
 def errors(
     plants: Plant,
-    gains: NDArray[np.float64],
+    gains: Floats,
     pips: tuple[float, ...] = protocol.PIPS,
     batch: int = BATCH,
 ) -> NDArray[np.float32]:
@@ -137,7 +137,7 @@ class PIDGrid:
 
     lungs: tuple[str, ...]
     pips: tuple[float, ...]
-    gains: NDArray[np.float64]
+    gains: Floats
     error: NDArray[np.float32]
 
     def __repr__(self) -> str:
@@ -177,11 +177,11 @@ def search(
     *,
     settings: Mapping[str, Any],
     folder: Path | None = None,
-    gains: NDArray[np.float64] | None = None,
+    gains: Floats | None = None,
     pool: Executor | None = None,
     part: int = BATCH,
     progress: Progress | None = None,
-    errors_of: Callable[[Plant, NDArray[np.float64]], NDArray[np.float32]] | None = None,
+    errors_of: Callable[[Plant, Floats], NDArray[np.float32]] | None = None,
 ) -> PIDGrid:
     """Run the grid of gains on plants without noise.
 
@@ -232,7 +232,7 @@ def search(
     return PIDGrid(tuple(plants), protocol.PIPS, grid, error)
 
 
-def _part_errors(plant: Plant, gains: NDArray[np.float64]) -> NDArray[np.float32]:
+def _part_errors(plant: Plant, gains: Floats) -> NDArray[np.float32]:
     stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], plant)
     return errors(stacked, gains)[0]
 

@@ -15,9 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.entries import reference
 from ventbench.plants import frozen
@@ -26,8 +26,6 @@ from ventbench.task import protocol
 from ventbench.task.interfaces import Controller, Plant
 from ventbench.task.lungs import LUNG_IDS, LUNGS, Lung, lung, scored_lung
 from ventbench.task.metrics.score import LEAST_HEADROOM
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,9 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.base.resume import Checkpoint, fingerprint
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, save_weights, untrained
@@ -205,14 +206,57 @@ FitProgress = Callable[[int, int, float], None]
 CHUNK = 50
 
 
-def _optimiser(config: ResidualConfig) -> optax.GradientTransformation:
-    warm = max(config.updates // 50, 1)
-    schedule = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, warm, max(config.updates, warm + 1)
-    )
+def optimiser(
+    updates: int, learning_rate: float, weight_decay: float
+) -> optax.GradientTransformation:
+    """AdamW with clipped gradients; the rate warms up and then falls along a cosine."""
+    warm = max(updates // 50, 1)
+    schedule = optax.warmup_cosine_decay_schedule(0.0, learning_rate, warm, max(updates, warm + 1))
     return optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay)
+        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=weight_decay)
     )
+
+
+def chunk(
+    update: Callable[[Any, Array], tuple[Any, Array]], carry: Any, first: Array, updates: int
+) -> tuple[Any, Array]:
+    """:data:`CHUNK` updates from number ``first`` on, none beyond the last; state and mean loss."""
+
+    def inside(carry: Any, number: Array) -> tuple[Any, Array]:
+        new, loss = update(carry, number)
+        return jax.tree.map(lambda a, b: jnp.where(number >= updates, a, b), carry, new), loss
+
+    numbers = first + jnp.arange(CHUNK)
+    carry, losses = jax.lax.scan(inside, carry, numbers)
+    counted = numbers < updates
+    return carry, jnp.sum(losses * counted) / jnp.maximum(jnp.sum(counted), 1)
+
+
+def run_chunks(
+    advance: Callable[[Any, Array], tuple[Any, Array]],
+    carry: Any,
+    updates: int,
+    stored: Checkpoint,
+    progress: FitProgress | None,
+) -> Any:
+    """Make all updates, a :func:`chunk` at a time, from the stored state on; the last state.
+
+    Raises:
+        FloatingPointError: if the loss is not finite; the checkpoint stays at the last good one.
+    """
+    carry, first = stored.restore(carry)
+    while first < updates:
+        new, loss = advance(carry, jnp.asarray(first))
+        loss = float(loss)
+        if not np.isfinite(loss):
+            raise FloatingPointError(
+                f"training diverged between updates {first} and {first + CHUNK}"
+            )
+        carry, first = new, min(first + CHUNK, updates)
+        stored.save(carry, first)
+        if progress is not None:
+            progress(first, updates, loss)
+    return carry
 
 
 def _cells(number: Array, lungs: int, pips: int, config: ResidualConfig) -> tuple[Array, Array]:
@@ -235,7 +279,7 @@ def _advance(
     config: ResidualConfig,
 ) -> tuple[tuple[Any, Any], Array]:
     """``CHUNK`` updates, fewer at the end; returns layers, the optimiser's state and mean loss."""
-    optimiser = _optimiser(config)
+    adam = optimiser(config.updates, config.learning_rate, config.weight_decay)
     members, lungs = jax.tree.leaves(plants)[0].shape[:2]
     pips = jnp.asarray(protocol.PIPS, jnp.float32)
 
@@ -259,14 +303,10 @@ def _advance(
             )
 
         mean, gradient = jax.value_and_grad(value)(layers)
-        updates, state = optimiser.update(gradient, state, layers)
-        new = (optax.apply_updates(layers, updates), state)
-        last = number >= config.updates
-        return jax.tree.map(lambda a, b: jnp.where(last, a, b), carry, new), mean
+        updates, state = adam.update(gradient, state, layers)
+        return (optax.apply_updates(layers, updates), state), mean
 
-    carry, losses = jax.lax.scan(update, carry, first + jnp.arange(CHUNK))
-    inside = first + jnp.arange(CHUNK) < config.updates
-    return carry, jnp.sum(losses * inside) / jnp.maximum(jnp.sum(inside), 1)
+    return chunk(update, carry, first, config.updates)
 
 
 def fit(
@@ -325,25 +365,18 @@ def fit(
     if start is not None:
         layers = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start.layers)
         controller = controller.replace(layers=layers)  # type: ignore[attr-defined]
-    carry: Any = (controller.layers, _optimiser(config).init(controller.layers))
+    adam = optimiser(config.updates, config.learning_rate, config.weight_decay)
+    carry: Any = (controller.layers, adam.init(controller.layers))
     settings = {
         "config": dataclasses.asdict(config), "gains": list(gains), "seed": seed,
         "simulators": fingerprint(plants), "weights": fingerprint(weights),
         "start": None if start is None else fingerprint(start.layers),
     }  # fmt: skip
     stored = Checkpoint(checkpoint, settings)
-    carry, first = stored.restore(carry)
-    while first < config.updates:
-        new, loss = _advance(carry, like, plants, key, jnp.asarray(first), weights, config)
-        loss = float(loss)
-        if not np.isfinite(loss):
-            raise FloatingPointError(
-                f"training diverged between updates {first} and {first + CHUNK}"
-            )
-        carry, first = new, min(first + CHUNK, config.updates)
-        stored.save(carry, first)
-        if progress is not None:
-            progress(first, config.updates, loss)
+    carry = run_chunks(
+        lambda carry, first: _advance(carry, like, plants, key, first, weights, config),
+        carry, config.updates, stored, progress,
+    )  # fmt: skip
     if not keep:
         stored.delete()
     return controller.replace(layers=carry[0])  # type: ignore[attr-defined]
@@ -362,7 +395,7 @@ def train_residual(
     *,
     config: ResidualConfig | None = None,
     seed: int = 0,
-    gains: NDArray[np.float64] | None = None,
+    gains: Floats | None = None,
     simulator: Given = "frozen",
     progress: Progress | None = None,
 ) -> TrainedControllers:

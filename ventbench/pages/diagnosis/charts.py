@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Floats
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
 from ventbench.diagnosis.residual_analysis import Profile, profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages import graphics
-from ventbench.pages.scores import Floats
 from ventbench.physics.characteristics import Characteristic
 
 #: Room for the labels: left, right, top, bottom, picture units.
@@ -24,6 +24,12 @@ STAGES = (
     ("refit", "R and C refitted", "refit"),
     ("after", "corrected", "after"),
 )
+
+
+def stages(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Those of :data:`STAGES` that a diagnosis has; not all where nothing is missing."""
+    return [x for x in STAGES if x[0] != "after" or diagnosis.verdict != "nothing_missing"]
+
 
 #: Breaths that are shown of either kind.
 WORST = 3

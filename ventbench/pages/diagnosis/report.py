@@ -69,7 +69,7 @@ def html(diagnosis: Diagnosis) -> str:
         groups=groups(diagnosis),
         corrected=diagnosis.verdict != "nothing_missing",
         held_out=len(diagnosis.open_loop.held_out_breaths),
-        stages=_stages(diagnosis),
+        stages=charts.stages(diagnosis),
         panels=charts.panels(diagnosis),
         places=[_place(diagnosis, place) for place in diagnosis.location[:PLACES]],
         remaining=[_place(diagnosis, place) for place in diagnosis.remaining[:PLACES]],
@@ -150,14 +150,10 @@ def groups(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     distance = diagnosis.open_loop
     everything = {"before": distance.before, "refit": distance.refit, "after": distance.after}
     rows = [("all", everything), *distance.groups.items()]
-    keys = [key for key, _, _ in _stages(diagnosis)]
+    keys = [key for key, _, _ in charts.stages(diagnosis)]
     return [
         {"name": name, "cells": [_cell(values.get(key)) for key in keys]} for name, values in rows
     ]
-
-
-def _stages(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    return [x for x in charts.STAGES if x[0] != "after" or diagnosis.verdict != "nothing_missing"]
 
 
 def _cell(distance: OpenLoopError | None) -> dict[str, str]:
@@ -336,11 +332,7 @@ def description(listed: list[Entry]) -> str:
 
 
 def typeset(equation: str) -> Markup:
-    """A line of mathematics as HTML: letters in italics, indices below, powers above.
-
-    Args:
-        equation: plain text in the notation of the catalogue.
-    """
+    """A line of mathematics as HTML: letters in italics, indices below, powers above."""
 
     def markup(match: re.Match[str]) -> str:
         power, unit, quantity, index, sign = match.group(

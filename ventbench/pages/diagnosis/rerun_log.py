@@ -11,12 +11,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ventbench import palette
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.text import escape_markdown
 from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.pages.diagnosis.charts import STAGES, rmse
-from ventbench.pages.scores import Floats
+from ventbench.pages.diagnosis.charts import rmse, stages
 
 APPLICATION = "ventbench"
 
@@ -121,7 +121,7 @@ def log_lung(
         )
 
     send("pressure/recorded", breaths.pressure, "recorded", COLORS["recorded"], 3.0)
-    for key, text, _ in _stages(diagnosis):
+    for key, text, _ in stages(diagnosis):
         simulated = getattr(traces, key)[index]
         send(f"pressure/{key}", simulated, text, COLORS[key], 1.5)
         send(f"error/{key}", breaths.pressure - simulated, text, COLORS[key], 1.5)
@@ -134,7 +134,7 @@ def log_lung(
 def log_by_breath(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
     """Root mean square errors of every breath, in the order of the recording."""
     number = np.arange(1, len(diagnosis.traces.breaths) + 1)
-    for key, _, _ in _stages(diagnosis):
+    for key, _, _ in stages(diagnosis):
         values = np.nan_to_num(rmse(diagnosis.traces, getattr(diagnosis.traces, key)))
         bars = rr.BarChart(values, color=palette.rgb(COLORS[key]), abscissa=number)
         stream.log(f"/by_breath/{key}", bars, static=True)
@@ -144,7 +144,7 @@ def log_maps(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
     """Errors of all breaths as pictures on one scale of colours, the first breath on top."""
     traces = diagnosis.traces
     errors = {
-        key: traces.breaths.pressure - getattr(traces, key) for key, _, _ in _stages(diagnosis)
+        key: traces.breaths.pressure - getattr(traces, key) for key, _, _ in stages(diagnosis)
     }
     errors.pop("before")
     refit = np.abs(errors["refit"][np.isfinite(errors["refit"])])
@@ -161,10 +161,6 @@ def diverging(share: Floats) -> np.ndarray:
     end = np.where(known > 0, red, blue)
     color = 255.0 + np.abs(known) * (end - 255.0)
     return np.where(np.isfinite(share)[..., None], color, 128.0).round().astype(np.uint8)
-
-
-def _stages(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    return [x for x in STAGES if x[0] != "after" or diagnosis.verdict != "nothing_missing"]
 
 
 def blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 
 #: What a column may stand for.
@@ -98,8 +99,6 @@ def recognise(names: tuple[str, ...]) -> Layout | None:
     return None
 
 
-Floats = NDArray[np.float64]
-
 #: Shortest breath, s, and longest.
 _SHORTEST, _LONGEST = 0.5, 30.0
 
@@ -112,8 +111,8 @@ _GAP = 5.0
 
 def find_breaths(
     file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats],
-    keys: list[NDArray[np.int64]], groups: list[NDArray[np.int64]], layout: Layout | None,
-) -> tuple[list[NDArray[np.int64]], str]:  # fmt: skip
+    keys: list[Ints], groups: list[Ints], layout: Layout | None,
+) -> tuple[list[Ints], str]:  # fmt: skip
     """Split a continuous recording where inspirations begin.
 
     Args:
@@ -184,7 +183,7 @@ def find_breaths(
 
 
 def expiratory_valve(
-    values: Mapping[str, Floats], other: Mapping[str, Floats], pieces: list[NDArray[np.int64]]
+    values: Mapping[str, Floats], other: Mapping[str, Floats], pieces: list[Ints]
 ) -> tuple[NDArray[np.int8], str]:
     """Return u_out of each row, ``(N,)``, and a sentence that says where it is from.
 
@@ -221,7 +220,7 @@ def expiratory_valve(
 
 def _onsets(
     file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats]
-) -> tuple[NDArray[np.int64], str]:
+) -> tuple[Ints, str]:
     """Rows at which inspirations begin, and what shows them."""
     if "u_out" in other:
         shut = other["u_out"] < 0.5
@@ -248,7 +247,7 @@ def _onsets(
     return _crossings(rise, 0.3 * span, _ONSET * span), "where pressure rises"
 
 
-def _crossings(signal: Floats, high: float, low: float) -> NDArray[np.int64]:
+def _crossings(signal: Floats, high: float, low: float) -> Ints:
     """Rows before which a signal was low for the last time before it becomes high."""
     onsets, last, armed = [], 0, False
     for k, value in enumerate(signal.tolist()):
@@ -260,7 +259,7 @@ def _crossings(signal: Floats, high: float, low: float) -> NDArray[np.int64]:
     return np.array(onsets, np.int64)
 
 
-def _after_pause(on: NDArray[np.bool_], time: Floats) -> NDArray[np.int64]:
+def _after_pause(on: Bools, time: Floats) -> Ints:
     """Rows at which a valve opens after it was shut for a while."""
     onsets, shut_since = [], None
     for k in range(len(on)):
@@ -273,7 +272,7 @@ def _after_pause(on: NDArray[np.bool_], time: Floats) -> NDArray[np.int64]:
     return np.array(onsets, np.int64)
 
 
-def _is_high(signal: Floats) -> NDArray[np.bool_]:
+def _is_high(signal: Floats) -> Bools:
     """Whether a signal of two levels is at the upper one."""
     return signal > 0.5 * (np.nanmin(signal) + np.nanmax(signal))
 

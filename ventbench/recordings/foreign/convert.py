@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 from ventbench.recordings.foreign.breath_onsets import (
@@ -33,8 +34,6 @@ from ventbench.recordings.foreign.units import Conversion, conversion, in_file_u
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung
-
-Floats = NDArray[np.float64]
 
 #: Roles with units.
 _MEASURED = ("time", "pressure", "flow", "volume", "u_in")
@@ -347,13 +346,13 @@ def _numbers(table: Table, name: str) -> Floats:
     return np.asarray(values, float)
 
 
-def _labels(values: NDArray[Any]) -> NDArray[np.int64]:
+def _labels(values: NDArray[Any]) -> Ints:
     """Number of each distinct value."""
     return np.unique(values, return_inverse=True)[1].reshape(-1)
 
 
 def _time(
-    table: Table, time: Floats | None, rate: float | None, keys: list[NDArray[np.int64]]
+    table: Table, time: Floats | None, rate: float | None, keys: list[Ints]
 ) -> tuple[Floats, str]:
     """Time of each row, s; NaN where the file leaves it blank."""
     if rate is not None:
@@ -448,8 +447,8 @@ def _check_signs(
 
 def _sound(
     table: Table, by_role: Mapping[str, str], samples: Mapping[str, NDArray[Any]], time: Floats,
-    pieces: list[NDArray[np.int64]], skip: bool,
-) -> tuple[list[NDArray[np.int64]], list[str]]:  # fmt: skip
+    pieces: list[Ints], skip: bool,
+) -> tuple[list[Ints], list[str]]:  # fmt: skip
     """Breaths that the schema can hold; refuse the others, or leave them out and name them."""
     rows, bad, problems = np.concatenate(pieces), dict[int, str](), list[str]()
     owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
@@ -509,7 +508,7 @@ def _suspicious(
 
 
 def _breaths(
-    source: str, pieces: list[NDArray[np.int64]], time: Floats,
+    source: str, pieces: list[Ints], time: Floats,
     samples: Mapping[str, NDArray[Any]], R: Floats, C: Floats, notes: list[str],
 ) -> Breaths:  # fmt: skip
     rows, lengths = np.concatenate(pieces), np.array([len(piece) for piece in pieces])

@@ -18,6 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError, require
 from ventbench.recordings.foreign.units import is_unit, spelled, unit_of
 
@@ -71,7 +72,7 @@ class Table:
     file: str
     columns: dict[str, NDArray[Any]]
     units: dict[str, str] = field(default_factory=dict)
-    lines: NDArray[np.int64] | None = None
+    lines: Ints | None = None
     rate: float | None = None
     notes: tuple[str, ...] = ()
 
@@ -318,7 +319,7 @@ def _columns(
     return columns, odd_cells, any_odd, filled
 
 
-def _values(cells: Any, mark: str) -> tuple[NDArray[np.float64], int]:
+def _values(cells: Any, mark: str) -> tuple[Floats, int]:
     """Numbers of a column, NaN for other cells; and how many have thousands apart."""
     import pandas as pd
 
@@ -338,7 +339,7 @@ def _values(cells: Any, mark: str) -> tuple[NDArray[np.float64], int]:
     return values, int(apart.sum())
 
 
-def _clock(cells: Any) -> NDArray[np.float64] | None:
+def _clock(cells: Any) -> Floats | None:
     """Seconds of times of day, on over midnight; None if hardly any cell is one."""
     parts = cells.str.extract(rf"^{_CLOCK.pattern}$")
     hours, minutes = (parts[k].astype(float).to_numpy(float, na_value=np.nan) for k in (0, 1))

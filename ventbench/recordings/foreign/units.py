@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 
 #: Pascal in a centimetre of water (conventional, at 4 degrees Celsius) and of other units.
@@ -67,11 +67,11 @@ class Conversion:
     to: str
     factor: Fraction
 
-    def apply(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, values: Floats) -> Floats:
         """Convert; one rounding to the nearest number at most for each of two integers."""
         return _times(values, self.factor)
 
-    def invert(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def invert(self, values: Floats) -> Floats:
         """Convert back to the unit of the file."""
         return _times(values, 1 / self.factor)
 
@@ -144,7 +144,7 @@ def stem(name: str) -> str:
     return re.sub(r"[^\w]|_", "", name.rpartition(".")[2] or name).lower()
 
 
-def _times(values: NDArray[np.float64], factor: Fraction) -> NDArray[np.float64]:
+def _times(values: Floats, factor: Fraction) -> Floats:
     return np.asarray(values, float) * factor.numerator / factor.denominator
 
 

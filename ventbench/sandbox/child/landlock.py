@@ -47,11 +47,7 @@ def abi() -> int:
 
 
 def taken_away(version: int) -> tuple[int, int, int]:
-    """File rights, network rights and scopes that an ABI can take away: all are taken.
-
-    Args:
-        version: Landlock ABI, from 1.
-    """
+    """File rights, network rights and scopes that an ABI, from 1, can take away: all are taken."""
     files = (1 << _FILE_RIGHTS[min(version, 5)]) - 1
     network = _NET_BIND_AND_CONNECT if version >= 4 else 0
     scopes = _SCOPE_ABSTRACT_SOCKET_AND_SIGNAL if version >= 6 else 0

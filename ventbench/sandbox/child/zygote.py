@@ -184,11 +184,6 @@ def _serve(
 ) -> list[tuple[serve.Setup, Lockdown, serve.Start]]:
     """Prepare, say so, serve.
 
-    Args:
-        descriptor: the socket to the scorer.
-        forks: starts the cells.
-        layers: those that are in force already.
-
     Returns:
         Nothing at the end; in each cell, once, the arguments of :func:`serve.run`.
     """

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from ventbench.base.arrays import Floats
 
 #: Resamples and seed of every interval that ventbench reports.
 RESAMPLES = 2000

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Floats
 from ventbench.task import protocol
 from ventbench.task.metrics import step_response
-
-Floats = NDArray[np.float64]
 
 #: The PVP's high-pressure alarm: this share above PIP.
 ALARM_SHARE = 0.15
@@ -37,7 +36,7 @@ class InspirationSignals(NamedTuple):
     dt: Floats
 
 
-def mean_command(u_in: ArrayLike) -> NDArray[np.float64]:
+def mean_command(u_in: ArrayLike) -> Floats:
     """Mean of the applied command over an inspiration, %.
 
     Args:
@@ -49,7 +48,7 @@ def mean_command(u_in: ArrayLike) -> NDArray[np.float64]:
     return np.mean(np.asarray(u_in, float), axis=-1)
 
 
-def mean_change(u_in: ArrayLike) -> NDArray[np.float64]:
+def mean_change(u_in: ArrayLike) -> Floats:
     """Wear of the valve: mean over steps of ``|u_t - u_(t-1)|``, % a step.
 
     The valve is closed before the first command, so that ``u_(-1) = 0``.
@@ -63,7 +62,7 @@ def mean_change(u_in: ArrayLike) -> NDArray[np.float64]:
     return np.mean(np.abs(np.diff(np.asarray(u_in, float), axis=-1, prepend=0.0)), axis=-1)
 
 
-def clipped_share(requested: ArrayLike) -> NDArray[np.float64]:
+def clipped_share(requested: ArrayLike) -> Floats:
     """Share of commands outside the valve's range of 0 to 100 %, which were clipped, 0..1.
 
     Args:
@@ -77,7 +76,7 @@ def clipped_share(requested: ArrayLike) -> NDArray[np.float64]:
     return np.where(np.any(np.isnan(requested), axis=-1), np.nan, np.mean(outside, axis=-1))
 
 
-def time_above_alarm(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
+def time_above_alarm(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> Floats:
     """Time above PIP + 15 %, s: number of samples above ``1.15 pip`` times ``dt``.
 
     Args:

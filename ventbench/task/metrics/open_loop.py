@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from ventbench.base.arrays import Floats, Ints
 
 
 def _differences(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None) -> Floats:
@@ -30,9 +30,7 @@ def _sum(differences: Floats) -> Floats:
     return np.where(empty, np.nan, np.nansum(differences, axis=-1))
 
 
-def distance(
-    measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None
-) -> NDArray[np.float64]:
+def distance(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None) -> Floats:
     """Open-loop distance of each breath, the paper's equation for one sequence of controls.
 
     ``sum over t = 1..T of |f1(x_t1, u_t) - f2(x_t2, u_t)|``: both systems start from the same
@@ -55,9 +53,7 @@ def distance(
     return _sum(_differences(measured, simulated, mask))
 
 
-def mae(
-    measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None
-) -> NDArray[np.float64]:
+def mae(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None) -> Floats:
     """Mean absolute error per step of each breath: :func:`distance` over the counted steps.
 
     Args:
@@ -73,9 +69,7 @@ def mae(
     return _sum(differences) / np.where(steps, steps, 1)
 
 
-def by_horizon(
-    measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None
-) -> NDArray[np.float64]:
+def by_horizon(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None) -> Floats:
     """Mean absolute error at each step after the start, over breaths (the paper's figure).
 
     Args:
@@ -119,7 +113,7 @@ class Extrapolation:
     recorded: int
 
 
-def command_counts(u_in: ArrayLike) -> NDArray[np.int64]:
+def command_counts(u_in: ArrayLike) -> Ints:
     """Count commands, %, of any shape in the ranges of :data:`EDGES`; shape ``(10,)``."""
     return np.histogram(np.asarray(u_in, float), bins=EDGES)[0].astype(np.int64)
 

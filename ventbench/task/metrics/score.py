@@ -10,11 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.task import protocol
-
-Floats = NDArray[np.float64]
 
 
 def run_error(pressure: ArrayLike, target: ArrayLike) -> Floats:
@@ -51,7 +50,7 @@ def lung_score(errors: ArrayLike) -> Floats:
     return np.mean(np.asarray(errors, float), axis=-1)
 
 
-def longest_run(flags: ArrayLike) -> NDArray[np.int64]:
+def longest_run(flags: ArrayLike) -> Ints:
     """Length of the longest run of true values along the last axis.
 
     Args:
@@ -71,7 +70,7 @@ def safety_limit(pip: ArrayLike) -> Floats:
     return np.minimum(protocol.SAFETY_PRESSURE, np.asarray(pip, float) + protocol.SAFETY_MARGIN)
 
 
-def passes_safety_gate(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> NDArray[np.bool_]:
+def passes_safety_gate(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> Bools:
     """Whether inspirations pass the protocol's safety gate.
 
     The limit is ``min(60, pip + 15)`` cmH2O. A run of n samples above it lasts ``n dt``; longer

@@ -9,9 +9,9 @@ A figure of an inspiration with a NaN pressure is NaN.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from ventbench.base.arrays import Floats
 
 #: Shares of the step between which the rise is timed.
 RISE = (0.1, 0.9)

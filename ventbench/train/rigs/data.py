@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Ints
 from ventbench.base.errors import InputError
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings import Breaths, RecordingError, join, load
@@ -40,7 +41,7 @@ class RigRecordings:
 
     breaths: Breaths
     measured: int
-    fold: NDArray[np.int64]
+    fold: Ints
     labels: tuple[Lung, ...]
     sources: dict[str, dict[str, Any]]
     skipped: tuple[str, ...]
@@ -107,7 +108,7 @@ def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings
     return RigRecordings(breaths, count, fold, labels, sources, tuple(skipped))
 
 
-def assign_folds(breaths: Breaths, *, count: int = 5, seed: int = 0) -> NDArray[np.int64]:
+def assign_folds(breaths: Breaths, *, count: int = 5, seed: int = 0) -> Ints:
     """Assign the breaths of each lung to the folds of a cross-validation, in turn.
 
     The breaths of a lung are ordered by the SHA-256 of ``{seed}:{breath_id}:{lung}``, so that the

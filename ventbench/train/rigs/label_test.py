@@ -27,8 +27,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.sessions import Sessions
 from ventbench.task.lungs import Lung
@@ -111,7 +111,7 @@ class LabelTest:
         """Ends of the laws that the label's resistor may have."""
         return (1.0,) if self.laminar_share == 1.0 else (self.laminar_share, 0.0)
 
-    def _gains(self, R: float) -> NDArray[np.float64]:
+    def _gains(self, R: float) -> Floats:
         return np.array([label_gain(max(R, 1e-3), self.lung.R, share) for share in self._shares])
 
     @property
@@ -221,7 +221,7 @@ class LabelTest:
         return row
 
 
-def resistance_and_compliance(plant: Hybrid) -> NDArray[np.float64]:
+def resistance_and_compliance(plant: Hybrid) -> Floats:
     """R at :data:`REFERENCE_FLOW` and C over :data:`CHORD` of plants, shape ``(2, ...)``."""
     resistance = np.asarray(plant.R) + REFERENCE_FLOW * np.asarray(plant.K2)
     elastance = np.asarray(plant.E, float)
@@ -234,7 +234,7 @@ def resistance_and_compliance(plant: Hybrid) -> NDArray[np.float64]:
     return np.stack([resistance, volume / (CHORD[1] - CHORD[0])])
 
 
-def interval(value: float, resampled: NDArray[np.float64]) -> tuple[float, float]:
+def interval(value: float, resampled: Floats) -> tuple[float, float]:
     """Return the 95 % interval of a positive quantity from its values in resampled fits."""
     wide = 1.96 * float(np.std(np.log(resampled), ddof=1)) if len(resampled) > 1 else 0.0
     return float(value * np.exp(-wide)), float(value * np.exp(wide))
@@ -292,7 +292,7 @@ def label_tests(
     errors: Mapping[int, Sequence[float]],
     sessions: Sessions,
     labels: Sequence[Lung],
-    counts: tuple[NDArray[np.int64], NDArray[np.int64]],
+    counts: tuple[Ints, Ints],
     laminar_share: float,
 ) -> list[LabelTest]:
     """Put the tests of all sessions together.

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 import tomli_w
 from jax import Array
-from numpy.typing import NDArray
 
 from ventbench.base import files, precision
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.plants import frozen, population
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.population import LUNG, NAMES, RigPopulation, from_vector, to_vector
@@ -32,8 +32,6 @@ from ventbench.train.rigs import random_effects
 from ventbench.train.rigs.data import InspirationData, inspirations, load_rig_recordings
 from ventbench.train.rigs.fit import Noise, simulate
 from ventbench.train.rigs.random_effects import Population, Prior, Units
-
-Floats = NDArray[np.float64]
 
 #: Standard deviation of the logarithm of the valve's last slope that is added, as between members
 #: of the ensemble: hardly anything is recorded there.
@@ -81,18 +79,18 @@ class _Breaths:
     """What the breaths of the chosen sessions are, and their gains and starts so far."""
 
     data: InspirationData
-    at: NDArray[np.int64]
+    at: Ints
     weight: Floats
     noise: Noise
     gain: Floats
     start: Floats
 
     @property
-    def counted(self) -> NDArray[np.bool_]:
+    def counted(self) -> Bools:
         return np.asarray(self.data.share) > 0
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Bools:
         return np.asarray(self.data.start_known) > 0
 
     def at_start(self) -> Floats:
@@ -183,11 +181,7 @@ def _units(breaths: _Breaths, rigs: Floats, design: Floats) -> Units:
 def design_of(lungs: Sequence[str]) -> Floats:
     """Design of rigs: own means of a lung's numbers, common means of a ventilator's.
 
-    Args:
-        lungs: id of each rig's lung, J of them.
-
-    Returns:
-        Shape ``(J, p, q)``; the lungs are in the order in which they come.
+    Shape ``(J, p, q)`` for the lungs of J rigs, in the order in which they come.
     """
     names, mine = list(dict.fromkeys(lungs)), len(LUNG)
     shared = len(NAMES) - mine
@@ -375,7 +369,7 @@ def _write(fitted: FittedPopulation, known: frozen.Frozen) -> None:
     files.write_text(folder / frozen.ROLES, tomli_w.dumps(written))
 
 
-def _scatter(gain: Floats, group: NDArray[np.int64]) -> tuple[Floats, float, float]:
+def _scatter(gain: Floats, group: Ints) -> tuple[Floats, float, float]:
     """Deviations from the median of each group, scaled to the standard deviation within groups.
 
     Returns:

@@ -22,11 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tomli_w
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from ventbench import open_loop_report
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.resume import Format, WorkFolder
 from ventbench.plants import frozen, sessions
@@ -123,14 +123,14 @@ class _Problem:
     table: Sessions
     inspirations: InspirationData
     whole: WholeBreaths
-    weight: NDArray[np.float64]
+    weight: Floats
     centre: Centre
     scales: Scales
     noise: Noise
     laminar_share: float
 
     @property
-    def session(self) -> NDArray[np.int64]:
+    def session(self) -> Ints:
         return np.asarray(self.inspirations.groups.session)
 
     @property
@@ -269,7 +269,7 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
     done = 0.0
 
     def run(
-        name: str, what: str, weight: NDArray[np.float64], *, expiration: bool = False,
+        name: str, what: str, weight: Floats, *, expiration: bool = False,
         start: Fitted | None = None,
     ) -> Fitted:  # fmt: skip
         nonlocal done
@@ -430,7 +430,7 @@ def _assess(
     }, members
 
 
-def _seen_by(data: RigRecordings) -> NDArray[np.int64]:
+def _seen_by(data: RigRecordings) -> Ints:
     """Member that has not seen each breath; the members of the folds follow the scored one."""
     rest = len(data.breaths) - data.measured
     return np.append(data.fold + 1, np.full(rest, BY_ALL))
@@ -491,7 +491,7 @@ def _recorded_commands(problem: _Problem, rigs: Sequence[int]) -> list[int]:
     return command_counts(np.asarray(problem.inspirations.u_in)[counted]).tolist()
 
 
-def _figures(prefix: str, error: NDArray[np.float64]) -> dict[str, Any]:
+def _figures(prefix: str, error: Floats) -> dict[str, Any]:
     """Summary to 1e-6 cmH2O, empty where there is no breath, as TOML knows no null."""
     summary = open_loop_report.summary(prefix, error)
     if not summary[f"{prefix}breaths"]:

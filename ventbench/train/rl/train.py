@@ -20,6 +20,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.resume import Checkpoint, fingerprint
 from ventbench.controllers import rl_policy
@@ -102,10 +103,10 @@ class TrainedPolicies:
 
     policies: Any
     validation: NDArray[np.float32]
-    episodes: NDArray[np.int64]
+    episodes: Ints
     curves: NDArray[np.float32]
     validation_curves: NDArray[np.float32]
-    seconds: NDArray[np.float64]
+    seconds: Floats
     compile_seconds: float
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import math
 import os
 import re
 import select
@@ -277,8 +279,69 @@ class RerunView:
             "/late_ms", indexes=[times], columns=rr.Scalars.columns(scalars=late)
         )
         self._stream.set_time("bench_time", duration=float(breath.time[0] + start))
-        text = f"{run.kind} {run.entry} {run.lung} PIP {run.pip:g} #{run.repeat}"
-        self._stream.log("/runs", rr.TextLog(text))
+        self._stream.log("/runs", rr.TextLog(_told(run)))
+
+
+class McapView:
+    """Writes each breath to an MCAP file, as Foxglove and its kin read it; JSON, a message a step.
+
+    The topic ``/breath`` has the samples (units as in the log, null where there is none), ``/run``
+    what ran; times are those of the bench, from 0.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        InputError: if mcap is not installed, or the file cannot be written.
+    """
+
+    _SAMPLES = ("pressure", "flow", "target", "requested", "u_in", "u_out", "late", "busy")
+
+    def __init__(self, path: Path) -> None:
+        from ventbench.base import errors
+
+        errors.require("mcap", extra="mcap", what="MCAP files")
+        from mcap.writer import Writer
+
+        try:
+            self._file = open(path, "wb")  # noqa: SIM115 - it stays open as long as the session
+        except OSError as error:
+            raise errors.InputError(f"--mcap {path}: {error.strerror}; name another file") from None
+        self._writer = Writer(self._file)
+        self._writer.start(library="ventbench")
+        number, text = {"type": ["number", "null"]}, {"type": "string"}
+        self._run = self._channel("run", {"text": text})
+        self._breath = self._channel("breath", dict.fromkeys(self._SAMPLES, number))
+        self._elapsed = 0.0
+
+    def _channel(self, name: str, properties: dict[str, Any]) -> int:
+        schema = json.dumps({"type": "object", "properties": properties}).encode()
+        known = self._writer.register_schema(f"ventbench.{name}", "jsonschema", schema)
+        return self._writer.register_channel(f"/{name}", "json", known)
+
+    def _add(self, channel: int, time: float, values: dict[str, Any]) -> None:
+        at = round(1e9 * time)
+        self._writer.add_message(channel, at, json.dumps(values).encode(), at)
+
+    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        """Write a breath, after those before it."""
+        start = self._elapsed - breath.time[0]
+        self._elapsed += breath.time[-1] - breath.time[0] + protocol.DT
+        self._add(self._run, start + breath.time[0], {"text": _told(run)})
+        columns = {name: getattr(breath, name) for name in self._SAMPLES}
+        for step, time in enumerate(breath.time):
+            row = {name: column[step] for name, column in columns.items() if column}
+            row = {name: value if math.isfinite(value) else None for name, value in row.items()}
+            self._add(self._breath, start + time, row)
+
+    def close(self) -> None:
+        """Write the index, and close the file."""
+        self._writer.finish()
+        self._file.close()
+
+
+def _told(run: PlannedRun) -> str:
+    return f"{run.kind} {run.entry} {run.lung} PIP {run.pip:g} #{run.repeat}"
 
 
 class Views:
@@ -286,6 +349,11 @@ class Views:
 
     def __init__(self, *views: Any) -> None:
         self._views = views
+
+    def close(self) -> None:
+        """Close those that are files."""
+        for view in self._views:
+            getattr(view, "close", lambda: None)()
 
     def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
         """Show a breath in each."""

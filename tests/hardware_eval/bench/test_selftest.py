@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,25 @@ def test_a_good_bench_goes(bench: Bench) -> None:
     # The emulated lung reports its flow, so that R and C are those of the label.
     assert pytest.approx(5.0, rel=0.15) == sheet.R
     assert pytest.approx(20.0, rel=0.05) == sheet.C
+
+
+def test_parts_are_left_out_one_by_one_and_the_sheet_says_so(
+    bench: Bench, device: LoopbackDevice
+) -> None:
+    begun = len(device.actuations)
+    sheet = selftest(bench, LUNG, skip=("lung", "sweep", "sensor"))
+    assert sheet.go, str(sheet)
+    assert sheet.skipped == ("sensor", "sweep", "lung")
+    assert {x.name for x in sheet.findings} == {
+        "leak", "interruptions", "safety", "on_time", "latest_step", "round_trip"
+    }  # fmt: skip
+    assert sheet.as_dict()["skipped"] == ["sensor", "sweep", "lung"]
+    assert "left out: lung" in str(sheet)
+    moved = device.actuations[begun - 1 :]
+    assert {x.u_out for x in moved if x.u_in > 0.0} == {0}  # the filling alone
+    assert sum(a.u_out > b.u_out for a, b in pairwise(moved)) == 1
+    with pytest.raises(InputError, match="no part 'valve'; choose of sensor, leak, sweep, lung"):
+        selftest(bench, LUNG, skip=("valve",))
 
 
 def test_what_a_slow_line_spoils_is_repeated(bench: Bench, device: LoopbackDevice) -> None:

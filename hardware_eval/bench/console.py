@@ -20,7 +20,7 @@ import numpy as np
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, View
 from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.emulation.faults import parse
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
 
 if TYPE_CHECKING:
@@ -250,9 +250,7 @@ class RerunView:
     """
 
     def __init__(self, target: str) -> None:
-        from ventbench.base import errors
-
-        errors.require("rerun")
+        require("rerun")
         import rerun as rr
 
         self._rr: Any = rr
@@ -283,61 +281,48 @@ class RerunView:
 
 
 class McapView:
-    """Writes each breath to an MCAP file, as Foxglove and its kin read it; JSON, a message a step.
+    """Writes each breath to an MCAP file, for Foxglove and its kin: JSON, one message a step.
 
-    The topic ``/breath`` has the samples (units as in the log, null where there is none), ``/run``
-    what ran; times are those of the bench, from 0.
+    The topic ``/breath`` has the samples in the log's units, null where there is none, and what
+    runs; times are those of the bench, from 0.
 
     Args:
         path: of the file.
 
     Raises:
-        InputError: if mcap is not installed, or the file cannot be written.
+        InputError: if mcap is not installed.
+        OSError: if the file cannot be written.
     """
 
-    _SAMPLES = ("pressure", "flow", "target", "requested", "u_in", "u_out", "late", "busy")
+    _SAMPLES = ("pressure", "flow", "target", "requested", "u_in", "u_out", "late")
 
     def __init__(self, path: Path) -> None:
-        from ventbench.base import errors
-
-        errors.require("mcap", extra="mcap", what="MCAP files")
+        require("mcap", extra="mcap", what="MCAP files")
         from mcap.writer import Writer
 
-        try:
-            self._file = open(path, "wb")  # noqa: SIM115 - it stays open as long as the session
-        except OSError as error:
-            raise errors.InputError(f"--mcap {path}: {error.strerror}; name another file") from None
-        self._writer = Writer(self._file)
-        self._writer.start(library="ventbench")
-        number, text = {"type": ["number", "null"]}, {"type": "string"}
-        self._run = self._channel("run", {"text": text})
-        self._breath = self._channel("breath", dict.fromkeys(self._SAMPLES, number))
-        self._elapsed = 0.0
-
-    def _channel(self, name: str, properties: dict[str, Any]) -> int:
+        number = {"type": ["number", "null"]}
+        properties = {"run": {"type": "string"}, **dict.fromkeys(self._SAMPLES, number)}
         schema = json.dumps({"type": "object", "properties": properties}).encode()
-        known = self._writer.register_schema(f"ventbench.{name}", "jsonschema", schema)
-        return self._writer.register_channel(f"/{name}", "json", known)
-
-    def _add(self, channel: int, time: float, values: dict[str, Any]) -> None:
-        at = round(1e9 * time)
-        self._writer.add_message(channel, at, json.dumps(values).encode(), at)
+        self._writer = Writer(str(path))
+        self._writer.start(library="ventbench")
+        known = self._writer.register_schema("ventbench.breath", "jsonschema", schema)
+        self._channel = self._writer.register_channel("/breath", "json", known)
+        self._elapsed = 0.0
 
     def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
         """Write a breath, after those before it."""
         start = self._elapsed - breath.time[0]
         self._elapsed += breath.time[-1] - breath.time[0] + protocol.DT
-        self._add(self._run, start + breath.time[0], {"text": _told(run)})
-        columns = {name: getattr(breath, name) for name in self._SAMPLES}
-        for step, time in enumerate(breath.time):
-            row = {name: column[step] for name, column in columns.items() if column}
-            row = {name: value if math.isfinite(value) else None for name, value in row.items()}
-            self._add(self._breath, start + time, row)
+        columns = [getattr(breath, name) for name in self._SAMPLES]
+        for time, *row in zip(breath.time, *columns, strict=True):
+            numbers = [value if math.isfinite(value) else None for value in row]
+            values = {"run": _told(run), **dict(zip(self._SAMPLES, numbers, strict=True))}
+            at = round(1e9 * (start + time))
+            self._writer.add_message(self._channel, at, json.dumps(values).encode(), at)
 
     def close(self) -> None:
         """Write the index, and close the file."""
         self._writer.finish()
-        self._file.close()
 
 
 def _told(run: PlannedRun) -> str:

@@ -359,7 +359,7 @@ def judge(
     label = math.nan if holds is None else float(holds)
     findings.append(Finding("identity", label, holds is not False, told))
     findings += _lung(lung, errors, R, C, gain, alone)
-    findings.append(_span(found, known))
+    findings.append(span_finding(found, known))
     return Sheet(lung, tuple(findings), errors, R, C, skipped)
 
 
@@ -526,7 +526,7 @@ def measured_lung(
     return KnownLung(lung, (logs[0], logs[1]), (relative[0], relative[1])), R, C, gain
 
 
-def _span(found: KnownLung, known: KnownLung | None) -> Finding:
+def span_finding(found: KnownLung, known: KnownLung | None) -> Finding:
     """Compare a lung with itself: the span of the pressure scales R and 1/C alike."""
     if known is None or known.lung != found.lung:
         return Finding("sensor_span", math.nan, True, "unknown: this lung was not calibrated")

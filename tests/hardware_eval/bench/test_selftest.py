@@ -13,11 +13,13 @@ import pytest
 from hardware_eval.bench import selftest as selftest_module
 from hardware_eval.bench.collect import collect
 from hardware_eval.bench.loop import Bench, SilentOperator
-from hardware_eval.bench.selftest import LIMITS, Driven, selftest
+from hardware_eval.bench.selftest import LIMITS, Driven, measured_lung, selftest, span_finding
 from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault
 from ventbench.base.errors import InputError
+
+from .test_identity import probed
 
 LUNG = "R5C20"
 
@@ -125,6 +127,26 @@ def test_the_leak_is_judged_by_its_error(fall: float, go: bool) -> None:
         held = Driven(time, pressure, time, time, time, time, time, (), False, 0)
         right += selftest_module._closed(held, 0.3)[0].ok is go
     assert right >= 198
+
+
+@pytest.mark.parametrize("off", [0.95, 1.05])
+def test_a_span_that_is_off_shows_on_a_calibrated_lung(off: float) -> None:
+    """Lungs by analysis: the label holds, and only the lung's own calibration tells."""
+    found = []
+    for gain, seed in ((1.0, 0), (1.0, 1), (off, 2)):
+        probes = [
+            replace(probe, pressure=gain * probe.pressure)
+            for probe in probed(20.0, 20.0, False, 0.2, seed)
+        ]
+        found.append(measured_lung(probes, "R20C20", 0.2)[0])
+    then, again, changed = found
+    assert span_finding(again, then).ok
+    finding = span_finding(changed, then)
+    assert not finding.ok
+    assert finding.value == pytest.approx(off, abs=0.015)
+    assert "calibrate sensor and flow" in finding.text
+    assert span_finding(changed, replace(then, lung="R5C10")).ok  # another lung tells nothing
+    assert span_finding(changed, None).ok
 
 
 FAULTS = {

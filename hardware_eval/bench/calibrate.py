@@ -294,7 +294,8 @@ def measure(
     xs, ys, errors = (tuple(round(float(x), 6) for x in column) for column in columns)
     date = (now or datetime.datetime.now(datetime.UTC)).isoformat(timespec="seconds")
     above = (0,) * len(xs) if kind in ("zero", "peep", "leak", "lung") else _above(xs)
-    return Part(kind, date, xs, ys, errors, above, by_hand, lung)
+    label = lung if kind == "lung" else ""
+    return Part(kind, date, xs, ys, errors, above, by_hand, label)
 
 
 def _watched(done: Driven, kind: str) -> Driven:

@@ -28,7 +28,7 @@ from scipy import stats
 
 from hardware_eval.bench import safety, selftest
 from hardware_eval.bench.drive import Driven
-from hardware_eval.bench.selftest import KnownLung
+from hardware_eval.bench.identity import KnownLung, measured_lung
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Effect
 from proofs.challenge.stranger.rig import Rig
 from ventbench.task import protocol
@@ -193,7 +193,7 @@ def session(
 def calibrated(done: dict[str, list[Driven]], label: str) -> KnownLung:
     """The lung by its calibration."""
     noise = float(np.std(np.diff(done["sensor"][0].pressure))) / np.sqrt(2.0)
-    return selftest.measured_lung(done["lung"], label, noise)[0]
+    return measured_lung(done["lung"], label, noise)[0]
 
 
 def of_label(

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hardware_eval.bench.drive import Commands, Driven, drive
+from hardware_eval.bench.identity import KnownLung, measured_lung
 from hardware_eval.bench.loop import Bench
-from hardware_eval.bench.selftest import KnownLung, closed_lung, measured_lung, programs
+from hardware_eval.bench.selftest import closed_lung, programs
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Reading
 from ventbench.base import files

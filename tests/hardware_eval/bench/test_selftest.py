@@ -12,8 +12,9 @@ import pytest
 
 from hardware_eval.bench import selftest as selftest_module
 from hardware_eval.bench.collect import collect
+from hardware_eval.bench.identity import measured_lung
 from hardware_eval.bench.loop import Bench, SilentOperator
-from hardware_eval.bench.selftest import LIMITS, Driven, measured_lung, selftest, span_finding
+from hardware_eval.bench.selftest import LIMITS, Driven, selftest, span_finding
 from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault

@@ -65,6 +65,9 @@ lock: setup ## write requirements.lock anew from pyproject.toml
 	$(PY) -m uv pip compile pyproject.toml --all-extras --universal --python-version 3.11 \
 		--fork-strategy fewest --generate-hashes --quiet --custom-compile-command "make lock" \
 		--output-file requirements.lock $(LOCK_ARGS)
+	$(PY) -m uv pip compile --group device --universal --python-version 3.11 --fork-strategy fewest \
+		--generate-hashes --quiet --custom-compile-command "make lock" \
+		--output-file hardware_eval/device/requirements.txt $(LOCK_ARGS)
 
 bench: setup ## every benchmark
 	@set -e; for file in $(wildcard benchmarks/[a-z]*.py); do \

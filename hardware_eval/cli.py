@@ -15,7 +15,16 @@ from typing import Annotated
 
 import typer
 
-from hardware_eval.commands import Calibrated, Port, Yes, calibration_of, keys, numbers, register
+from hardware_eval.commands import (
+    Calibrated,
+    Port,
+    Yes,
+    calibration_of,
+    keys,
+    known_by,
+    numbers,
+    register,
+)
 from ventbench import __version__
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
@@ -43,6 +52,15 @@ Control = Annotated[
     Path | None,
     typer.Option(
         metavar="SOCKET", help="Control socket of an emulator, which then disturbs the tube itself."
+    ),
+]
+Skip = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--skip",
+        metavar="PART",
+        help="Leave out a part of the self-test: sensor, leak, sweep or lung; repeatable. The "
+        "record says so, and without sensor or lung has no rank.",
     ),
 ]
 
@@ -109,11 +127,15 @@ def run(
     largest_rise: Annotated[
         float, typer.Option(help="Largest rise of the command in one step, %.")
     ] = 100.0,
+    fallback: Annotated[
+        bool, typer.Option(help="A safe controller takes over when an entry is late or unsafe.")
+    ] = True,
     in_process: options.InProcess = False,
     dry_run: Annotated[
         bool, typer.Option(help="Run the plan on the frozen simulators first.")
     ] = True,
     selftest: Annotated[bool, typer.Option(help="Test the bench once each lung is set.")] = True,
+    skip: Skip = None,
     rest: Annotated[float, typer.Option(min=0.5, help="Time at rest before each run, s.")] = 4.0,
     rerun: Annotated[
         str | None,
@@ -131,9 +153,11 @@ def run(
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
     from hardware_eval.bench.console import Blind, ConsoleOperator, RerunView, TerminalView, Views
+    from hardware_eval.bench.fallback import DEFAULT as FALLBACK
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.plan import make_plan
     from hardware_eval.bench.safety import SafetySettings
+    from hardware_eval.bench.selftest import Sheet, chosen_parts
     from hardware_eval.bench.selftest import selftest as run_selftest
     from hardware_eval.results import evaluate as ev
     from ventbench.base import files
@@ -151,13 +175,15 @@ def run(
     settings = SafetySettings(largest_u_in=largest_u_in, largest_rise=largest_rise)
     views = Views(TerminalView(), *([RerunView(rerun)] if rerun else []))
 
-    def before_lung(bench: Bench, mounted: str) -> str:
+    left_out = chosen_parts(skip or ())
+
+    def before_lung(bench: Bench, mounted: str) -> Sheet | None:
         if not selftest:
-            return ""
-        sheet = run_selftest(bench, mounted, valve=calibrated.valve if calibrated else None)
+            return None
+        sheet = run_selftest(bench, mounted, **known_by(calibrated), skip=left_out)
         files.write_json(out / f"selftest-{mounted}.json", sheet.as_dict())
         print(sheet, flush=True)
-        return "" if sheet.go else "the self-test says no-go: " + "; ".join(sheet.problems())
+        return sheet
 
     line = ev.connect(port)
     calibrated = calibration_of(line, calibration)
@@ -170,6 +196,7 @@ def run(
                 view=masked if blind else views, sandbox=not in_process,
                 dry=dry_run, before_lung=before_lung, settings=settings, operator_name=operator,
                 notes=notes, rest=rest, calibration=calibrated,
+                fallback=FALLBACK if fallback else None,
             )  # fmt: skip
     finally:
         line.client.close()
@@ -233,6 +260,7 @@ def selftest(
         str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
     ],
     plant: options.PlantName = "frozen",
+    skip: Skip = None,
     calibration: Calibrated = None,
     json: JsonFile = None,
 ) -> None:
@@ -255,7 +283,7 @@ def selftest(
         with keys(person):
             sheet = run_selftest(
                 Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant,
-                valve=calibrated.valve if calibrated else None,
+                **known_by(calibrated), skip=skip or (),
             )  # fmt: skip
     finally:
         line.client.close()
@@ -455,6 +483,9 @@ def replay(
     rerun: Annotated[
         str | None, typer.Option(metavar="FILE|live", help="Show the breaths in rerun.")
     ] = None,
+    mcap: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the breaths to an MCAP file.")
+    ] = None,
     json: JsonFile = None,
 ) -> None:
     """Show a session again, and compute its errors and timing from the raw log.
@@ -463,7 +494,7 @@ def replay(
     """
     from hardware_eval.results.compare import replay as run_replay
 
-    report = run_replay(log, record=record, rerun=rerun)
+    report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
     emit(report.as_dict(), json)
     print(report, file=sys.stderr if str(json) == "-" else sys.stdout)
     if report.problems:

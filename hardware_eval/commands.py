@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -71,7 +71,7 @@ def trial(
 
 
 def calibrate(
-    part: Annotated[str, typer.Argument(help="zero, span, valve, peep, flow or leak.")],
+    part: Annotated[str, typer.Argument(help="zero, span, valve, peep, flow, leak or lung.")],
     port: Port,
     lung: Annotated[
         str, typer.Option(help="Label of the mounted lung.", autocompletion=known_lungs)
@@ -87,6 +87,9 @@ def calibrate(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="The device's calibration; parts are added to it.")
     ] = Path("calibration.json"),
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also draw all parts, as a PNG.")
+    ] = None,
     yes: Yes = False,
     json: JsonFile = None,
 ) -> None:
@@ -101,6 +104,7 @@ def calibrate(
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.safety import DEFAULT
     from hardware_eval.results import evaluate as ev
+    from ventbench.base import files
     from ventbench.task.lungs import scored_lung
 
     values = numbers("--reference", reference)
@@ -119,6 +123,8 @@ def calibrate(
         line.client.close()
     saved = calibration.Calibration(device, {**kept, part: made}).save(out)
     emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
+    if plot is not None:
+        files.write_atomically(plot, lambda file: file.write(saved.plot_png()))
     to = sys.stderr if str(json) == "-" else sys.stdout
     print(made, file=to)
     if part == "leak":
@@ -135,6 +141,13 @@ def calibration_of(line: Line, path: Path | None) -> Calibration | None:
     from hardware_eval.bench import calibrate as calibration
 
     return None if path is None else calibration.load(path, calibration.device_of(line.client))
+
+
+def known_by(calibration: Calibration | None) -> dict[str, Any]:
+    """What a calibration tells a self-test."""
+    if calibration is None:
+        return {}
+    return {"valve": calibration.valve, "known": calibration.known_lung}
 
 
 def numbers(option: str, text: str | None) -> list[float]:

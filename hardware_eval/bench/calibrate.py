@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import io
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -22,12 +23,13 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hardware_eval.bench.drive import Commands, Driven, drive
+from hardware_eval.bench.identity import KnownLung, measured_lung
 from hardware_eval.bench.loop import Bench
-from hardware_eval.bench.selftest import closed_lung
+from hardware_eval.bench.selftest import closed_lung, programs
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Reading
 from ventbench.base import files
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 
@@ -41,7 +43,7 @@ STALE = 30.0
 #: What can be calibrated, and the units of reference and reading.
 PARTS = {
     "zero": ("cmH2O", "cmH2O"), "span": ("cmH2O", "cmH2O"), "peep": ("cmH2O", "cmH2O"),
-    "valve": ("%", "mL/s"), "flow": ("mL/s", "mL/s"), "leak": ("s", "cmH2O"),
+    "valve": ("%", "mL/s"), "flow": ("mL/s", "mL/s"), "leak": ("s", "cmH2O"), "lung": ("", ""),
 }  # fmt: skip
 
 #: Openings of the valve, %, upwards; downwards they are the same.
@@ -141,6 +143,7 @@ class Part:
         date: when, UTC, ISO 8601.
         reference, reading, error, above: the series, see :func:`fit`; units in :data:`PARTS`.
         by_hand: whether a person read the values.
+        lung: label of the mounted lung; the series of ``lung`` is the logarithms of R and 1/C.
     """
 
     kind: str
@@ -150,6 +153,7 @@ class Part:
     error: tuple[float, ...]
     above: tuple[int, ...]
     by_hand: bool
+    lung: str = ""
 
     @property
     def fit(self) -> Fit:
@@ -158,6 +162,12 @@ class Part:
                                                    self.above)))  # fmt: skip
 
     def __str__(self) -> str:
+        if self.kind == "lung":
+            R, elastance = (
+                Estimate(math.exp(x), math.exp(x - 1.96 * e), math.exp(x + 1.96 * e))
+                for x, e in zip(self.reading, self.error, strict=True)
+            )
+            return f"lung: {self.lung} has R {R} cmH2O/(L/s), 1/C {elastance} cmH2O/L"
         own, (x, y) = self.fit, PARTS[self.kind]
         parts = [f"{self.kind}: {own.intercept} {y} at 0 {x}"]
         if math.isfinite(own.slope.value):
@@ -260,6 +270,20 @@ def measure(
                 _held_open(bench, lung, opening, bool(above))
                 flow = ask(f"the meter's steady flow at {opening:g} %, mL/s: ")
                 points.append((opening, flow, max(0.02 * abs(flow), 1.0)))  # as meters state it
+    elif kind == "lung":
+        confirmed(f"set the lung to {lung} and connect it. Is it set?")
+        done = {
+            part: [
+                _watched(drive(bench, lung, make(), steps, pip=pip), kind)
+                for make, steps, pip in programs()[part]
+            ]
+            for part in ("sensor", "lung")
+        }
+        noise = max(float(np.std(np.diff(done["sensor"][0].pressure))) / math.sqrt(2.0), 1e-3)
+        own = measured_lung(done["lung"], lung, noise)[0]
+        points = [(float(k), own.logarithms[k], own.errors[k]) for k in range(2)]
+        if not np.isfinite(points).all():
+            raise InputError("lung: neither R nor C can be measured here; see the self-test")
     else:
         confirmed(f"set the lung to {lung} and connect it. Is it set?")
         commands, fill, steps = closed_lung()
@@ -270,8 +294,9 @@ def measure(
     columns = zip(*points, strict=True)
     xs, ys, errors = (tuple(round(float(x), 6) for x in column) for column in columns)
     date = (now or datetime.datetime.now(datetime.UTC)).isoformat(timespec="seconds")
-    above = (0,) * len(xs) if kind in ("zero", "peep", "leak") else _above(xs)
-    return Part(kind, date, xs, ys, errors, above, by_hand)
+    above = (0,) * len(xs) if kind in ("zero", "peep", "leak", "lung") else _above(xs)
+    label = lung if kind == "lung" else ""
+    return Part(kind, date, xs, ys, errors, above, by_hand, label)
 
 
 def _watched(done: Driven, kind: str) -> Driven:
@@ -349,6 +374,48 @@ class Calibration:
         low, high = (flow - 2.0 * error) / opening, (flow + 2.0 * error) / opening
         return float(np.mean(flow / opening)), float(low.min()), float(high.max())
 
+    @property
+    def known_lung(self) -> KnownLung | None:
+        """The lung that was calibrated; None if none was."""
+        if (part := self.parts.get("lung")) is None:
+            return None
+        (R, elastance), (R_error, elastance_error) = part.reading, part.error
+        return KnownLung(part.lung, (R, elastance), (R_error, elastance_error))
+
+    def plot_png(self) -> bytes:
+        """Draw each series about its line: circles from below, triangles from above.
+
+        Raises:
+            InputError: if matplotlib is missing.
+        """
+        require("matplotlib")
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        shown = [part for part in self.parts.values() if part.kind != "lung"]
+        figure = Figure(figsize=(4.0 * max(len(shown), 1), 3.4), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle(f"device {self.device['device_id']}, SHA-256 {self.sha256[:12]}")
+        for place, part in enumerate(shown, 1):
+            axes, (x_unit, y_unit), line = figure.add_subplot(1, len(shown), place), *(
+                PARTS[part.kind], part.fit,
+            )  # fmt: skip
+            x, y, error, above = map(np.array, (part.reference, part.reading, part.error,
+                                                part.above))  # fmt: skip
+            slope = 0.0 if math.isnan(line.slope.value) else line.slope.value
+            departure = y - line.intercept.value - slope * x
+            if np.ptp(x) == 0.0:
+                x = np.arange(1.0, len(x) + 1)
+            for marker, these in (("o", above == 0), ("v", above == 1)):
+                axes.errorbar(x[these], departure[these], 1.96 * error[these], None, marker)
+            axes.axhline(0.0, color="0.6")
+            axes.set_title(f"{part.kind}, {part.date[:10]}")
+            axes.set_xlabel("mean" if slope == 0.0 else f"reference, {x_unit}")
+            axes.set_ylabel(f"reading - line, {y_unit}")
+        with io.BytesIO() as file:
+            figure.savefig(file, format="png", dpi=110)
+            return file.getvalue()
+
     def about(self) -> dict[str, Any]:
         """What a record says of it."""
         return {"sha256": self.sha256, "dates": {k: x.date for k, x in self.parts.items()}}
@@ -384,7 +451,7 @@ def load(
         parts = {
             kind: Part(
                 kind, x["date"], tuple(x["reference"]), tuple(x["reading"]), tuple(x["error"]),
-                tuple(x["above"]), x["by_hand"],
+                tuple(x["above"]), x["by_hand"], x.get("lung", ""),
             )
             for kind, x in content["parts"].items()
         }  # fmt: skip

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import math
 import os
 import re
 import select
@@ -18,7 +20,7 @@ import numpy as np
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, View
 from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.emulation.faults import parse
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
 
 if TYPE_CHECKING:
@@ -248,9 +250,7 @@ class RerunView:
     """
 
     def __init__(self, target: str) -> None:
-        from ventbench.base import errors
-
-        errors.require("rerun")
+        require("rerun")
         import rerun as rr
 
         self._rr: Any = rr
@@ -277,8 +277,56 @@ class RerunView:
             "/late_ms", indexes=[times], columns=rr.Scalars.columns(scalars=late)
         )
         self._stream.set_time("bench_time", duration=float(breath.time[0] + start))
-        text = f"{run.kind} {run.entry} {run.lung} PIP {run.pip:g} #{run.repeat}"
-        self._stream.log("/runs", rr.TextLog(text))
+        self._stream.log("/runs", rr.TextLog(_told(run)))
+
+
+class McapView:
+    """Writes each breath to an MCAP file, for Foxglove and its kin: JSON, one message a step.
+
+    The topic ``/breath`` has the samples in the log's units, null where there is none, and what
+    runs; times are those of the bench, from 0.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        InputError: if mcap is not installed.
+        OSError: if the file cannot be written.
+    """
+
+    _SAMPLES = ("pressure", "flow", "target", "requested", "u_in", "u_out", "late")
+
+    def __init__(self, path: Path) -> None:
+        require("mcap", extra="mcap", what="MCAP files")
+        from mcap.writer import Writer
+
+        number = {"type": ["number", "null"]}
+        properties = {"run": {"type": "string"}, **dict.fromkeys(self._SAMPLES, number)}
+        schema = json.dumps({"type": "object", "properties": properties}).encode()
+        self._writer = Writer(str(path))
+        self._writer.start(library="ventbench")
+        known = self._writer.register_schema("ventbench.breath", "jsonschema", schema)
+        self._channel = self._writer.register_channel("/breath", "json", known)
+        self._elapsed = 0.0
+
+    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        """Write a breath, after those before it."""
+        start = self._elapsed - breath.time[0]
+        self._elapsed += breath.time[-1] - breath.time[0] + protocol.DT
+        columns = [getattr(breath, name) for name in self._SAMPLES]
+        for time, *row in zip(breath.time, *columns, strict=True):
+            numbers = [value if math.isfinite(value) else None for value in row]
+            values = {"run": _told(run), **dict(zip(self._SAMPLES, numbers, strict=True))}
+            at = round(1e9 * (start + time))
+            self._writer.add_message(self._channel, at, json.dumps(values).encode(), at)
+
+    def close(self) -> None:
+        """Write the index, and close the file."""
+        self._writer.finish()
+
+
+def _told(run: PlannedRun) -> str:
+    return f"{run.kind} {run.entry} {run.lung} PIP {run.pip:g} #{run.repeat}"
 
 
 class Views:
@@ -286,6 +334,11 @@ class Views:
 
     def __init__(self, *views: Any) -> None:
         self._views = views
+
+    def close(self) -> None:
+        """Close those that are files."""
+        for view in self._views:
+            getattr(view, "close", lambda: None)()
 
     def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
         """Show a breath in each."""

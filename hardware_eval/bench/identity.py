@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.bench.drive import Driven
+from hardware_eval.bench.safety import VALVE_GAIN
 from ventbench.base.errors import InputError
 from ventbench.mechanics import identify
 from ventbench.mechanics.labels import (
@@ -90,3 +91,57 @@ def identified(
     if not holds:
         told += f": may be {' or '.join(settings)}" if settings else ": no lung that is known"
     return holds, holds and settings == [lung], told
+
+
+@dataclass(frozen=True)
+class KnownLung:
+    """A lung by the probes of the self-test, to be compared with itself.
+
+    Attributes:
+        lung: its label.
+        logarithms: of R, cmH2O/(L/s), and 1/C, cmH2O/L.
+        errors: their standard errors, by the noise of the sensor.
+    """
+
+    lung: str
+    logarithms: tuple[float, float]
+    errors: tuple[float, float]
+
+
+def measured_lung(
+    probes: Sequence[Driven], lung: str, noise: float
+) -> tuple[KnownLung, float, float, float]:
+    """R, C and the valve's flow over nominal, from ``p = p0 + R Q + V / C`` by least squares.
+
+    Where no flow is measured the nominal valve's is taken, two steps delayed as in the recordings,
+    and the valve's flow is what makes C the label's.
+
+    Args:
+        probes: of the part ``lung``.
+        lung: the label.
+        noise: standard deviation of the sensor's, cmH2O.
+    """
+    steps = protocol.INSPIRATION_STEPS
+    rows, pressures, given, nominal = [], [], 0.0, 0.0
+    measured = all(np.isfinite(probe.flow[:steps]).all() for probe in probes)
+    for index, probe in enumerate(probes):
+        valve = 1e-3 * VALVE_GAIN * probe.u_in[:steps]  # L/s, from each sample to the next
+        flow = 1e-3 * probe.flow[:steps] if measured else np.append([0.0, 0.0], valve[:-2])
+        between = 0.5 * (flow[1:] + flow[:-1]) if measured else valve[:-1]
+        volume = np.append(0.0, np.cumsum(between * protocol.DT))
+        given, nominal = given + float(volume[-1]), nominal + float(valve.sum() * protocol.DT)
+        own = np.zeros((steps, len(probes)))
+        own[:, index] = 1.0
+        rows.append(np.column_stack([flow, volume, own]))
+        pressures.append(probe.pressure[:steps])
+    design = np.concatenate(rows)
+    solution, *_ = np.linalg.lstsq(design, np.concatenate(pressures), rcond=None)
+    R, elastance = float(solution[0]), float(solution[1])
+    C = 1000.0 / elastance if elastance > 0.0 else math.inf
+    gain = given / max(nominal, 1e-9) if measured else parse_lung(lung).C / C
+    errors = noise * np.sqrt(np.diag(np.linalg.pinv(design.T @ design))[:2])
+    logs, relative = [math.nan] * 2, [math.nan] * 2
+    for k, value in enumerate((R, elastance)):
+        if value > 0.0:
+            logs[k], relative[k] = math.log(value), float(errors[k]) / value
+    return KnownLung(lung, (logs[0], logs[1]), (relative[0], relative[1])), R, C, gain

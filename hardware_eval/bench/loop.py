@@ -3,7 +3,8 @@
 The loop runs at the protocol's 30 ms by absolute deadlines, so that a late step does not shift
 those after it. Each step takes a fresh reading, looks at it (:mod:`hardware_eval.bench.safety`),
 asks the controller, and sends the command. A controller that has not answered in time does not hold
-the loop up: the last safe command is repeated, and counted. However a run ends, its last act is to
+the loop up: the fallback takes over (:mod:`hardware_eval.bench.fallback`), or without one the last
+safe command is repeated, and it is counted. However a run ends, its last act is to
 vent the lung; where it can act no more (``kill -9``, a cable pulled, a machine asleep) the device's
 watchdog does.
 """
@@ -21,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval import realtime
-from hardware_eval.bench import safety
+from hardware_eval.bench import fallback, safety
 from hardware_eval.bench.controllers import ControllerFailedError, LiveController
+from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.plan import PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.realtime import Clock
@@ -38,7 +40,8 @@ Floats = NDArray[np.float64]
 #: the command's way to the device, and for this loop.
 ANSWER_BY = 0.022
 
-#: Share of a run's answers that may come later than that; an entry that is late more often fails.
+#: Share of a run's answers that may come later than that, or that the fallback may refuse; an entry
+#: of more fails.
 LATE_SHARE = 0.01
 
 #: A late answer counts only if it had this time at least, s: else the host was late, not the entry.
@@ -157,6 +160,8 @@ class RunResult:
         held_up: whether host or line, too slow for the loop, ended it.
         asked: steps whose controller was asked.
         longest_answer: longest time that an answer took, s.
+        outside: answers that the fallback refused.
+        fallback, longest_fallback: steps that it commanded, in all and in a row.
     """
 
     status: str
@@ -169,6 +174,9 @@ class RunResult:
     held_up: bool = False
     asked: int = 0
     longest_answer: float = 0.0
+    outside: int = 0
+    fallback: int = 0
+    longest_fallback: int = 0
 
     @property
     def error(self) -> float:
@@ -202,6 +210,7 @@ class Bench:
         operator: the person.
         view: shows breaths; None for none.
         rest: time at rest before each run, s.
+        fallback: bounds of the controller that takes over; None for none.
     """
 
     client: Client
@@ -210,6 +219,7 @@ class Bench:
     operator: Operator
     view: View | None = None
     rest: float = REST_S
+    fallback: FallbackSettings | None = None
 
 
 def run_once(
@@ -253,6 +263,7 @@ class _Loop:
         self._bench, self._run, self._controller = bench, run, controller
         self._on_breath = on_breath
         self._safety = safety.init(parse_lung(run.lung))
+        self._fallback = fallback.init(parse_lung(run.lung))
         self._breaths: list[BreathLog] = []
         self._asked = self._late_answers = self._limited = self._unanswered = 0
         self._command = (0.0, 1)
@@ -289,12 +300,14 @@ class _Loop:
 
         A score needs every pressure of its inspirations, and a controller that answered in time.
         """
-        if self._late_answers > LATE_SHARE * self._asked:
+        outside = self._fallback.outside
+        if self._late_answers + outside > LATE_SHARE * self._asked:
+            left = f", {outside} were outside the envelope" if outside else ""
             return self._ended(
                 "failed",
                 f"{self._late_answers} of {self._asked} answers took longer than "
                 f"{1e3 * ANSWER_BY:.0f} ms, the longest "
-                f"{1e3 * self._controller.longest_answer:.0f} ms; {100 * LATE_SHARE:g} % may",
+                f"{1e3 * self._controller.longest_answer:.0f} ms{left}; {100 * LATE_SHARE:g} % may",
             )
         if self._run.kind not in ("scored", "control"):
             return self._ended("complete", "")
@@ -378,7 +391,7 @@ class _Loop:
         """Choose a command and send it."""
         bench, run, log = self._bench, self._run, self._breaths[-1]
         inspiring = step < protocol.INSPIRATION_STEPS
-        requested, budget = math.nan, 0.0
+        requested, budget, cut = math.nan, 0.0, False
         if inspiring:
             previous = _BIAS if step == 0 else self._command[0]
             if step == 0:
@@ -395,12 +408,22 @@ class _Loop:
                     bench.client.vent()
                     return self._ended("failed", str(error))
                 requested = math.nan if answer is None else answer
-            if math.isnan(requested):
-                self._late_answers += budget >= _FAIR
+            self._late_answers += math.isnan(requested) and budget >= _FAIR
+            if not math.isnan(requested):
+                u_in, cut = safety.limit_command(bench.settings, previous, requested)
+            elif bench.fallback is None:
                 u_in = self._command[0] if self._command[1] == 0 else 0.0
             else:
-                u_in, cut = safety.limit_command(bench.settings, previous, requested)
-                self._limited += cut
+                u_in = None
+            if bench.fallback is not None:
+                pressure = math.nan if reading is None else reading.pressure
+                self._fallback, u_in = fallback.step(
+                    bench.fallback, self._fallback, step, pressure, run.pip, u_in, previous
+                )
+                u_in, also = safety.limit_command(bench.settings, previous, u_in)
+                cut |= also
+            assert u_in is not None
+            self._limited += cut
             command = (u_in, 0)
         else:
             command = (float(waveform.expiratory_command(step)), 1)
@@ -437,6 +460,7 @@ class _Loop:
         return RunResult(
             status, reason, self._safety.trips, tuple(self._breaths), self._late_answers,
             self._limited, vented_after, held_up, self._asked, self._controller.longest_answer,
+            self._fallback.outside, self._fallback.taken, self._fallback.longest,
         )  # fmt: skip
 
 

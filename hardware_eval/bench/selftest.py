@@ -8,7 +8,7 @@ that stand in :data:`LIMITS` with their reasons; the sheet says go or no-go.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.bench.drive import Commands, Driven, drive
-from hardware_eval.bench.identity import identified
+from hardware_eval.bench.identity import KnownLung, identified, measured_lung
 from hardware_eval.bench.loop import ON_TIME_S, Bench
 from hardware_eval.bench.safety import VALVE_GAIN
+from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS
 from ventbench.task.lungs import lung as parse_lung
@@ -81,6 +82,12 @@ LIMITS: dict[str, Limit] = {
         "R and C by pressure and flow, measured or of a calibrated valve, with 95 % intervals: the "
         "label holds within the tolerance of test lungs. Simulators have no say in it.",
     ),
+    "sensor_span": Limit(
+        0.99, 1.01, "of calibrated",
+        "R and 1/C of the calibrated lung against those of its calibration: both are off as the "
+        "pressure's span is, or the flow's. A lung repeats within 1 %; counts beyond 2.6 standard "
+        "errors of the noise at rest.",
+    ),
     "on_time": Limit(
         0.98, 1.0, "of steps", "Share of steps that begin within 2 ms of their deadline.",
     ),
@@ -133,6 +140,7 @@ class Sheet:
         errors: open-loop error of each lung's frozen simulator on the probes, cmH2O.
         R, C: least-squares estimates, cmH2O/(L/s) and mL/cmH2O; by the nominal valve where no flow
             is measured, and then no better than that.
+        skipped: parts that were left out, of :data:`PARTS`; nothing is known of them.
     """
 
     lung: str
@@ -140,6 +148,7 @@ class Sheet:
     errors: dict[str, float] = field(default_factory=dict)
     R: float = math.nan
     C: float = math.nan
+    skipped: tuple[str, ...] = ()
 
     @property
     def go(self) -> bool:
@@ -160,6 +169,7 @@ class Sheet:
         return {
             "lung": self.lung,
             "go": self.go,
+            "skipped": list(self.skipped),
             "nearest": self.nearest,
             "R": _number(self.R),
             "C": _number(self.C),
@@ -179,6 +189,7 @@ class Sheet:
         for x in self.findings:
             limit = f"{x.limit.low:g} to {x.limit.high:g} {x.limit.unit}"
             lines.append(f"  {'ok   ' if x.ok else 'NO-GO'} {x.name:13s} {x.text} ({limit})")
+        lines += [f"  left out: {part}" for part in self.skipped]
         return "\n".join(lines)
 
 
@@ -218,9 +229,46 @@ _ATTEMPTS = 10
 _MISSED = 0.05
 
 
+#: Parts that can be left out one by one. The sensor is read in any case: the others need its noise.
+PARTS = ("sensor", "leak", "sweep", "lung")
+
+#: What drives the valves for a while: its commands, steps, and highest pressure that is meant,
+#: cmH2O.
+Program = tuple[Callable[[], Commands], int, float]
+
+
+def chosen_parts(skip: Collection[str]) -> tuple[str, ...]:
+    """Parts to leave out, in the order of :data:`PARTS`.
+
+    Raises:
+        InputError: if there is no such part.
+    """
+    if unknown := sorted(set(skip) - set(PARTS)):
+        raise InputError(f"the self-test has no part {unknown[0]!r}; choose of {', '.join(PARTS)}")
+    return tuple(part for part in PARTS if part in skip)
+
+
+def programs() -> dict[str, list[Program]]:
+    """What each part does, the lung vented and at rest before each."""
+    puffed = _LEAD + _PUFF + _STILL
+    return {
+        "sensor": [(lambda: lambda step, pressure: (0.0, 1), 34, 10.0)],
+        "leak": [(_fill_and_hold, _FILL + _WATCH, 30.0)],
+        "sweep": [(partial(_puff, u), puffed, 30.0) for u in (0.0, *_SWEEP)],
+        "lung": [(partial(_probe, *probe), protocol.BREATH_STEPS, probe[0]) for probe in _PROBES],
+    }
+
+
+def rest_before(lung: str) -> float:
+    """Rest before each program, s: until the labelled lung has emptied."""
+    label = parse_lung(lung)
+    return float(np.clip(_TIME_CONSTANTS * 1e-3 * label.C * (label.R + _OUTLET), *_REST))
+
+
 def selftest(
     bench: Bench, lung: str, *, simulator: Any = "frozen",
-    valve: tuple[float, float, float] | None = None,
+    valve: tuple[float, float, float] | None = None, known: KnownLung | None = None,
+    skip: Collection[str] = (),
 ) -> Sheet:  # fmt: skip
     """Test a bench with a mounted lung.
 
@@ -232,51 +280,38 @@ def selftest(
         simulator: the simulators that know the lungs; see :func:`ventbench.load_simulators`.
         valve: calibrated flow of the valve and its range, mL/s per %; used where the device
             measures no flow.
+        known: the lung of a calibration.
+        skip: parts to leave out, of :data:`PARTS`.
 
     Raises:
+        InputError: if there is no such part.
         EmergencyStop: if the operator pressed the key.
         LinkError: if the device is lost.
     """
-    label = parse_lung(lung)
-    empties = _TIME_CONSTANTS * 1e-3 * label.C * (label.R + _OUTLET)
-    bench = replace(bench, rest=float(np.clip(empties, *_REST)))
-    driven: list[Driven] = []
+    left_out = chosen_parts(skip)
+    bench = replace(bench, rest=rest_before(lung))
+    driven: dict[str, list[Driven]] = {}
+    everything: list[Driven] = []
     repeated = 0
-
-    def run(make: Callable[[], Commands], steps: int, pip: float) -> Driven:
-        nonlocal repeated
-        for attempt in range(_ATTEMPTS):
-            done = drive(bench, lung, make(), steps, pip=pip)
-            late = bool(np.any(done.late > LIMITS["latest_step"].high))
-            many = done.missed > _MISSED * steps
-            if not (done.held_up or late or many) or attempt == _ATTEMPTS - 1:
+    for part, each in programs().items():
+        if part in left_out and part != "sensor":
+            continue
+        driven[part] = []
+        for make, steps, pip in each:
+            if any(x.trips for x in everything):
                 break
-            repeated += 1
-        driven.append(done)
-        return done
-
-    findings, noise = _at_rest(run(lambda: lambda step, pressure: (0.0, 1), 34, 10.0))
-    if not any(x.trips for x in driven):
-        findings += _closed(run(_fill_and_hold, _FILL + _WATCH, 30.0), noise)
-    if not any(x.trips for x in driven):
-        steps = _LEAD + _PUFF + _STILL
-        puffs = [run(partial(_puff, u), steps, 30.0) for u in (0.0, *_SWEEP)]
-        findings += _sweep(puffs, noise, label.C)
-    probes: list[Driven] = []
-    for pip, P, I in _PROBES:  # noqa: E741 - the field's names
-        if any(x.trips for x in driven):
-            break
-        probes.append(run(partial(_probe, pip, P, I), protocol.BREATH_STEPS, pip))
-    errors: dict[str, float] = {}
-    R = C = math.nan
-    if probes and not any(x.trips for x in driven):
-        errors = _errors(probes, simulator)
-        R, C, gain = _mechanics(probes, lung)
-        holds, alone, told = identified(probes, lung, valve)
-        known = math.nan if holds is None else float(holds)
-        findings.append(Finding("identity", known, holds is not False, told))
-        findings += _lung(lung, errors, R, C, gain, alone)
-    busy = any(x.held_up for x in driven)
+            for attempt in range(_ATTEMPTS):
+                done = drive(bench, lung, make(), steps, pip=pip)
+                late = bool(np.any(done.late > LIMITS["latest_step"].high))
+                many = done.missed > _MISSED * steps
+                if not (done.held_up or late or many) or attempt == _ATTEMPTS - 1:
+                    break
+                repeated += 1
+            everything.append(done)
+            driven[part].append(done)
+    sheet = judge(lung, driven, simulator=simulator, valve=valve, known=known, skipped=left_out)
+    findings = list(sheet.findings)
+    busy = any(x.held_up for x in everything)
     findings.append(
         Finding(
             "interruptions", float(repeated), not busy,
@@ -286,12 +321,46 @@ def selftest(
         if repeated
         else _finding("interruptions", 0.0, "neither host nor line was held up")
     )  # fmt: skip
-    trips = [text for x in driven if not x.held_up for text in x.trips]
+    trips = [text for x in everything if not x.held_up for text in x.trips]
     findings.append(
         Finding("safety", float(len(trips)), not trips, "; ".join(trips) or "nothing tripped")
     )
-    findings += _clock(driven, bench)
-    return Sheet(lung, tuple(findings), errors, R, C)
+    findings += _clock(everything, bench)
+    return replace(sheet, findings=tuple(findings))
+
+
+def judge(
+    lung: str, driven: Mapping[str, Sequence[Driven]], *, simulator: Any = "frozen",
+    valve: tuple[float, float, float] | None = None, known: KnownLung | None = None,
+    skipped: tuple[str, ...] = (),
+) -> Sheet:  # fmt: skip
+    """Judge what the programs of the parts brought; of the clock and the checks says nothing.
+
+    Args:
+        lung: the label.
+        driven: of each part, in the order of its programs; shorter where a check ended it.
+        simulator: see :func:`selftest`; None to ask none.
+        valve: see there.
+        known: see there.
+        skipped: parts that were left out.
+    """
+    findings, noise = _at_rest(driven["sensor"][0])
+    findings = [] if "sensor" in skipped else findings
+    if driven.get("leak"):
+        findings += _closed(driven["leak"][0], noise)
+    if driven.get("sweep"):
+        findings += _sweep(driven["sweep"], noise, parse_lung(lung).C)
+    probes = list(driven.get("lung", ()))
+    if not probes or any(probe.trips for probe in probes):
+        return Sheet(lung, tuple(findings), skipped=skipped)
+    errors = {} if simulator is None else _errors(probes, simulator)
+    found, R, C, gain = measured_lung(probes, lung, noise)
+    holds, alone, told = identified(probes, lung, valve)
+    label = math.nan if holds is None else float(holds)
+    findings.append(Finding("identity", label, holds is not False, told))
+    findings += _lung(lung, errors, R, C, gain, alone)
+    findings.append(span_finding(found, known))
+    return Sheet(lung, tuple(findings), errors, R, C, skipped)
 
 
 def _finding(name: str, value: float, text: str) -> Finding:
@@ -351,9 +420,10 @@ def _puff(u_in: float) -> Commands:
     return commands
 
 
-def _sweep(puffs: list[Driven], noise: float, C: float) -> list[Finding]:
+def _sweep(puffs: Sequence[Driven], noise: float, C: float) -> list[Finding]:
     """Compare the rises of the puffs, of no opening and of :data:`_SWEEP`, with the noise."""
-    if not all(puff.pressure.size == _LEAD + _PUFF + _STILL for puff in puffs):
+    whole = [puff.pressure.size == _LEAD + _PUFF + _STILL for puff in puffs]
+    if whole != [True] * (1 + len(_SWEEP)):
         return [Finding("valve_sweep", math.nan, False, "the sweep was stopped")]
     rises = [
         float(puff.pressure[-_SETTLED:].mean() - puff.pressure[1:_LEAD].mean()) for puff in puffs
@@ -402,42 +472,34 @@ def _errors(probes: list[Driven], simulator: Any) -> dict[str, float]:
     return errors
 
 
-def _mechanics(probes: list[Driven], lung: str) -> tuple[float, float, float]:
-    """R, C and the valve's flow over nominal, from ``p = p0 + R Q + V / C`` by least squares.
-
-    Where no flow is measured the nominal valve's is taken, two steps delayed as in the recordings,
-    and the valve's flow is what makes C the label's.
-    """
-    steps = protocol.INSPIRATION_STEPS
-    rows, pressures, given, nominal = [], [], 0.0, 0.0
-    measured = all(np.isfinite(probe.flow[:steps]).all() for probe in probes)
-    for index, probe in enumerate(probes):
-        valve = 1e-3 * VALVE_GAIN * probe.u_in[:steps]  # L/s, from each sample to the next
-        flow = 1e-3 * probe.flow[:steps] if measured else np.append([0.0, 0.0], valve[:-2])
-        between = 0.5 * (flow[1:] + flow[:-1]) if measured else valve[:-1]
-        volume = np.append(0.0, np.cumsum(between * protocol.DT))
-        given, nominal = given + float(volume[-1]), nominal + float(valve.sum() * protocol.DT)
-        own = np.zeros((steps, len(probes)))
-        own[:, index] = 1.0
-        rows.append(np.column_stack([flow, volume, own]))
-        pressures.append(probe.pressure[:steps])
-    solution, *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(pressures), rcond=None)
-    R, elastance = float(solution[0]), float(solution[1])
-    C = 1000.0 / elastance if elastance > 0.0 else math.inf
-    return R, C, given / max(nominal, 1e-9) if measured else parse_lung(lung).C / C
+def span_finding(found: KnownLung, known: KnownLung | None) -> Finding:
+    """Compare a lung with itself: the span of the pressure scales R and 1/C alike."""
+    if known is None or known.lung != found.lung:
+        return Finding("sensor_span", math.nan, True, "unknown: this lung was not calibrated")
+    apart = np.subtract(found.logarithms, known.logarithms)
+    weights = 1.0 / (np.square(found.errors) + np.square(known.errors))
+    use = np.isfinite(apart) & np.isfinite(weights)
+    if not use.any():
+        return Finding("sensor_span", math.nan, False, "neither R nor C could be measured")
+    change = float(np.average(apart[use], weights=weights[use]))
+    error = float(np.sum(weights[use])) ** -0.5
+    beyond = abs(change) - _SIGMAS * error > math.log(LIMITS["sensor_span"].high)
+    told = f"R and 1/C are {math.exp(change):.3f} (SE {error:.3f}) of those calibrated"
+    told += ": calibrate sensor and flow, or is it another lung?" if beyond else ""
+    return Finding("sensor_span", math.exp(change), not beyond, told)
 
 
 def _lung(
     lung: str, errors: dict[str, float], R: float, C: float, gain: float, alone: bool
 ) -> list[Finding]:
-    nearest = min(errors, key=lambda name: errors[name])
-    ratio = errors[lung] / max(errors[nearest], 1e-9)
-    # Of two simulators that are both within the noise of a sensor neither is wrong.
-    ratio = 1.0 if errors[lung] < 0.3 else ratio
-    told = f"{errors[lung]:.2f} cmH2O as {lung}"
-    if nearest != lung:
-        told += f", {errors[nearest]:.2f} as {nearest}: is the lung set to {nearest}?"
-    label = parse_lung(lung)
+    label, ratio, told = parse_lung(lung), math.nan, f"no simulator of {lung} was asked"
+    if lung in errors:
+        nearest = min(errors, key=lambda name: errors[name])
+        # Of two simulators that are both within the noise of a sensor neither is wrong.
+        ratio = 1.0 if errors[lung] < 0.3 else errors[lung] / max(errors[nearest], 1e-9)
+        told = f"{errors[lung]:.2f} cmH2O as {lung}"
+        if nearest != lung:
+            told += f", {errors[nearest]:.2f} as {nearest}: is the lung set to {nearest}?"
     decided = Finding("lung", ratio, True, told + "; R and C are the label's")
     return [
         decided if alone else _finding("lung", ratio, told),

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from hardware_eval.bench.controllers import ControllerFailedError, MakeController, control_pid
@@ -23,6 +23,7 @@ from hardware_eval.bench.loop import (
 from hardware_eval.bench.plan import CONTROL, Plan, PlannedRun, progress
 from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.safety import SafetySettings
+from hardware_eval.bench.selftest import PARTS, Sheet
 from hardware_eval.realtime import take_priority
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.parser import LinkError
@@ -56,7 +57,7 @@ def run_plan(
     log: RawLog,
     *,
     about: Mapping[str, Any],
-    before_lung: Callable[[str], str] = lambda lung: "",
+    before_lung: Callable[[str], Sheet | None] = lambda lung: None,
     prepare_run: Callable[[PlannedRun], None] = lambda run: None,
 ) -> SessionEnd:
     """Run what is left of a plan.
@@ -67,7 +68,7 @@ def run_plan(
         make_controller: makes the controller of a run; called while the lung rests.
         log: of the plan; what it holds already is not run again.
         about: what the session's line in the log says besides the plan: device, operator, notes.
-        before_lung: called once a lung is confirmed; returns why not to go on, or nothing.
+        before_lung: tests a lung once it is confirmed; None where nobody does.
         prepare_run: called before each run; an emulator mounts the lung here.
 
     Returns:
@@ -82,7 +83,7 @@ def run_plan(
     attempts = dict(state.attempts)
     if not any(line["type"] == "plan" for line in logged):
         log.append({"type": "plan", "plan": plan.as_dict()})
-    log.append({"type": "session", **about, "safety": bench.settings.as_dict()})
+    log.append({"type": "session", **about, "safety": _safety(bench)})
     remaining = state.remaining(plan)
     end = SessionEnd(not remaining, "", 0)
     try:
@@ -101,6 +102,12 @@ def run_plan(
     return end
 
 
+def _safety(bench: Bench) -> dict[str, Any]:
+    """Checks, limits and fallback, as records have them."""
+    own = None if bench.fallback is None else asdict(bench.fallback)
+    return {**bench.settings.as_dict(), "fallback": own}
+
+
 def _runs(
     bench: Bench,
     plan: Plan,
@@ -108,7 +115,7 @@ def _runs(
     attempts: dict[int, int],
     make_controller: MakeController,
     log: RawLog,
-    before_lung: Callable[[str], str],
+    before_lung: Callable[[str], Sheet | None],
     prepare_run: Callable[[PlannedRun], None],
 ) -> SessionEnd:
     mounted, spoilt, held_up, made = "", 0, 0, 0
@@ -170,12 +177,17 @@ def _runs(
     return SessionEnd(True, "", made)
 
 
-def _mount(bench: Bench, lung: str, log: RawLog, before_lung: Callable[[str], str]) -> str:
-    """Have a lung set and checked; returns why not to go on, or nothing."""
+def _mount(bench: Bench, lung: str, log: RawLog, before_lung: Callable[[str], Sheet | None]) -> str:
+    """Have a lung set and tested; returns why not to go on, or nothing."""
     if not bench.operator.confirm(f"set the lung to {lung} and connect it. Is it set?"):
         return f"the operator did not confirm lung {lung}"
     log.append({"type": "event", "what": "lung", "lung": lung})
-    return before_lung(lung)
+    sheet = before_lung(lung)
+    told = {"lung": lung, "skipped": list(PARTS)} if sheet is None else sheet.as_dict()
+    log.append({"type": "selftest", **told})
+    if sheet is None or sheet.go:
+        return ""
+    return "the self-test says no-go: " + "; ".join(sheet.problems())
 
 
 def _one(
@@ -223,6 +235,9 @@ def _one(
             "late_answers": result.late_answers,
             "longest_answer": round(result.longest_answer, 6),
             "limited": result.limited,
+            "outside": result.outside,
+            "fallback": result.fallback,
+            "longest_fallback": result.longest_fallback,
             "trips": [vars(trip) for trip in result.trips],
         }
     )

@@ -73,18 +73,23 @@ class Replay:
         rows.append(
             f"{timing.steps} steps, {100 * timing.on_time:.2f} % within 2 ms, latest "
             f"{1e3 * timing.worst:.1f} ms, {timing.lost} lost, {timing.late_answers} late answers "
-            f"({100 * timing.late_share:.2f} %), longest {1e3 * timing.longest_answer:.1f} ms"
+            f"({100 * timing.late_share:.2f} %), longest {1e3 * timing.longest_answer:.1f} ms, "
+            f"{timing.outside} outside the envelope; fallback {100 * timing.fallback_share:.2f} % "
+            f"of steps, at most {timing.longest_fallback} in a row"
         )
         return "\n".join([*rows, *self.problems])
 
 
-def replay(log: Path, *, record: Path | None = None, rerun: str | None = None) -> Replay:
+def replay(
+    log: Path, *, record: Path | None = None, rerun: str | None = None, mcap: Path | None = None
+) -> Replay:
     """Read a log again.
 
     Args:
         log: the file, or the folder that holds it.
         record: a hardware record to check against it.
         rerun: ``"live"`` or the path of an ``.rrd`` file to show the breaths in.
+        mcap: MCAP file to write them to.
 
     Raises:
         InputError: if there is no such log, or the record is none.
@@ -116,18 +121,20 @@ def replay(log: Path, *, record: Path | None = None, rerun: str | None = None) -
                 variances = [np.var(x, ddof=1) for x in own if len(x) > 1]
                 spread = float(np.sqrt(np.mean(variances))) if variances else float("nan")
                 spreads.setdefault(entry, {})[lung] = spread
-    if rerun is not None:
-        _show(everything, rerun, len(plan.runs))
+    _show(everything, rerun, mcap, len(plan.runs))
     problems = () if record is None else tuple(_differences(record, log, cells))
     done = len(progress(plan, logged).done)
     timing = jitter(log)
     return Replay(len(plan.runs), done, len(everything), errors, spreads, timing, problems)
 
 
-def _show(everything: list[Any], target: str, total: int) -> None:
-    from hardware_eval.bench.console import RerunView
+def _show(everything: list[Any], rerun: str | None, mcap: Path | None, total: int) -> None:
+    from hardware_eval.bench.console import McapView, RerunView, Views
 
-    view = RerunView(target)
+    shown = [*([RerunView(rerun)] if rerun else []), *([McapView(mcap)] if mcap else [])]
+    if not shown:
+        return
+    view = Views(*shown)
     for breath in everything:
         run = PlannedRun(
             breath.run, breath.kind, breath.entry, breath.lung, breath.pip, breath.repeat
@@ -139,6 +146,7 @@ def _show(everything: list[Any], target: str, total: int) -> None:
         }
         log = BreathLog(**columns, u_out=breath.u_out.tolist(), target=aims.tolist())
         view.breath(run, log, breath.run, total)
+    view.close()
 
 
 def _differences(

@@ -20,10 +20,12 @@ from hardware_eval.bench.controllers import (
     LiveController,
     SubmissionController,
 )
+from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import REST_S, Bench, Operator, View
 from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.bench.raw_log import RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
+from hardware_eval.bench.selftest import Sheet
 from hardware_eval.realtime import Clock, RealClock
 from hardware_eval.results import record as records
 from hardware_eval.wire.client import Client
@@ -249,13 +251,14 @@ def evaluate(
     view: View | None = None,
     sandbox: bool = True,
     dry: bool = True,
-    before_lung: Callable[[Bench, str], str] = lambda bench, lung: "",
+    before_lung: Callable[[Bench, str], Sheet | None] = lambda bench, lung: None,
     settings: SafetySettings = DEFAULT,
     operator_name: str = "",
     notes: str = "",
     rest: float = REST_S,
     prepare_run: Callable[[PlannedRun], None] = lambda run: None,
     calibration: Calibration | None = None,
+    fallback: FallbackSettings | None = None,
 ) -> Evaluation:
     """Run a plan, or what is left of it, and make the records once it is done.
 
@@ -268,13 +271,14 @@ def evaluate(
         view: shows breaths.
         sandbox: run entries as in scoring; without it, in this process.
         dry: run the plan on the frozen simulators first, unless the log has begun.
-        before_lung: checks a lung once it is set; returns why not to go on, or nothing.
+        before_lung: tests a lung once it is set; None where nobody does.
         settings: safety.
         operator_name: for the record.
         notes: for the record.
         rest: time at rest before each run, s.
         prepare_run: see :func:`hardware_eval.bench.session.run_plan`.
         calibration: of the device, for the record.
+        fallback: takes over from entries that are late or leave their envelope; not in the dry run.
 
     Raises:
         InputError: if the log is of another plan, or the dry run finds the plan unsafe.
@@ -304,7 +308,7 @@ def evaluate(
         "sandbox": None if runner.sandbox is None else dict(runner.sandbox),
         "simulated": simulated,
     }
-    bench = Bench(line.client, line.clock, settings, operator, view, rest)
+    bench = Bench(line.client, line.clock, settings, operator, view, rest, fallback)
     make = controllers(submissions, plan.track, runner, real_time=line.real)
     with RawLog(log_path) as log, _ends_by_exception(), _quick_switches():
         end = session.run_plan(

@@ -43,6 +43,9 @@ class Jitter:
         late_answers: steps whose controller did not answer in time.
         late_share: their share of the steps whose controller was asked.
         longest_answer: longest time that an answer took, s.
+        outside: answers that the fallback refused.
+        fallback_share: share of the steps that the fallback commanded.
+        longest_fallback: steps in a row that it commanded, at most.
         busy_median, busy_worst: time from a step's beginning to its command's answer, s.
     """
 
@@ -53,6 +56,9 @@ class Jitter:
     late_answers: int
     late_share: float
     longest_answer: float
+    outside: int
+    fallback_share: float
+    longest_fallback: int
     busy_median: float
     busy_worst: float
 
@@ -81,22 +87,23 @@ def jitter(log: Path, entry: str | None = None) -> Jitter:
     Raises:
         InputError: if it holds no step.
     """
-    late, busy, answers, asked, longest = [], [], 0, 0, 0.0
+    late, busy, longest = [], [], {"longest_answer": 0.0, "longest_fallback": 0}
+    sums = {"late_answers": 0, "asked": 0, "outside": 0, "fallback": 0}
     for line in lines(log):
         if line["type"] == "breath":
             late += line["late"]
             busy += line["busy"]
         if line["type"] == "run" and line["entry"] == (entry or line["entry"]):
-            answers += line.get("late_answers", 0)
-            asked += line.get("asked", 0)
-            longest = max(longest, line.get("longest_answer", 0.0))
+            sums = {name: value + line.get(name, 0) for name, value in sums.items()}
+            longest = {name: max(value, line.get(name, 0)) for name, value in longest.items()}
     if not late:
         raise InputError(f"{log} holds no breath")
-    delays = np.array(late, float)
+    delays, asked = np.array(late, float), max(sums["asked"], 1)
     return Jitter(
         len(delays), float(np.mean(delays <= ON_TIME_S)), int(np.sum(delays > protocol.DT)),
-        float(delays.max()), answers, answers / max(asked, 1), longest, float(np.median(busy)),
-        float(np.max(busy)),
+        float(delays.max()), sums["late_answers"], sums["late_answers"] / asked,
+        longest["longest_answer"], sums["outside"], sums["fallback"] / asked,
+        int(longest["longest_fallback"]), float(np.median(busy)), float(np.max(busy)),
     )  # fmt: skip
 
 
@@ -158,6 +165,7 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
         "plan": plan.as_dict(),
         "control": _control(log),
         "safety": about["safety"],
+        "selftest": _skipped(logged, lungs),
         "timing": dataclasses.asdict(jitter(log, name)),
         "sandbox": about["sandbox"],
         "provenance": {},
@@ -242,6 +250,21 @@ def _tables(
         "stops": stops,
         "safe": safe,
         "peak_pressure_cmH2O": peaks,
+    }
+
+
+def _skipped(logged: list[dict[str, Any]], lungs: list[str]) -> dict[str, list[str]]:
+    """Parts of the self-test that were left out on each lung, at any of its mountings."""
+    return {
+        lung: sorted(
+            {
+                part
+                for line in logged
+                if line["type"] == "selftest" and line["lung"] == lung and line.get("go", True)
+                for part in line["skipped"]
+            }
+        )
+        for lung in lungs
     }
 
 

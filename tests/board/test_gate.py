@@ -54,6 +54,7 @@ def hardware(template: dict[str, Any], runs: list[Any], **changed: Any) -> bytes
                   "u_in_tenths_percent": [[(0 * np.array(runs)).tolist()]]},
         "recording": {"sha256": RAW, "bytes": 1, "breaths": 6},
         "plan": {}, "control": {}, "safety": {}, "timing": {}, "provenance": {},
+        "selftest": {LUNG: ["leak"]},
     }  # fmt: skip
     return canonical.canonical(own | changed)
 
@@ -107,6 +108,15 @@ def test_unsafe_hardware_that_says_so_has_no_rank(template) -> None:
     made = measured(hardware(template, runs, safe=[False]))
     vouched = Evidence(frozenset([made.sha256]))
     assert gate.measured(made, vouched) == ("did not pass the safety gate on R5C20",)
+
+
+@pytest.mark.parametrize("parts", [{LUNG: ["lung", "sweep"]}, {}])
+def test_a_lung_that_was_not_identified_has_no_rank(template, parts: dict[str, list[str]]) -> None:
+    made = measured(hardware(template, pressures(), selftest=parts))
+    vouched = Evidence(frozenset([made.sha256]))
+    unknown = f"no self-test of which lung was mounted on {LUNG}"
+    zero = () if parts else (f"no self-test of the sensor's zero on {LUNG}",)
+    assert gate.measured(made, vouched) == (*zero, unknown)
 
 
 def added(folder: Path, content: bytes) -> HardwareRecord:

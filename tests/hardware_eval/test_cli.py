@@ -11,10 +11,12 @@ from typing import Any
 
 import pytest
 import typer.main
+from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from hardware_eval import cli
 from hardware_eval.bench.controllers import ControllerFailedError, SubmissionController
+from hardware_eval.bench.raw_log import breaths
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
@@ -54,7 +56,16 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
     made = record.load(Path(told["records"]["pid_best"]))
     assert isinstance(made, HardwareRecord)
     assert Path(told["recording"]).is_file()
-    again = invoke("replay", str(out), "--record", told["records"]["pid_best"])
+    assert made.header.selftest == {"R5C20": ["leak", "lung", "sensor", "sweep"]}
+    assert made.header.safety["fallback"]["hand_back"] == 3
+    assert made.header.timing["fallback_share"] == 0.0
+    file = tmp_path / "session.mcap"
+    again = invoke("replay", str(out), "--record", told["records"]["pid_best"], "--mcap", str(file))
+    with open(file, "rb") as opened:  # read by the package's own reader
+        messages = [json.loads(x.data) for _, _, x in make_reader(opened).iter_messages()]
+    logged = [breath for breath in breaths(out / "raw.jsonl") if len(breath.time)]
+    assert len(messages) == sum(len(breath.time) for breath in logged)
+    assert messages[5]["pressure"] == logged[0].pressure[5]
     assert again.exit_code == 0, again.output
     assert "2 of 2 runs are done" in again.output
     # The drawn seed is the plan's, so that the same command finds it done.

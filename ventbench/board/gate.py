@@ -28,6 +28,9 @@ PRACTICE = "practice: its draws are published, and entries can be made for them"
 UNATTESTED = "not official: no key of this leaderboard has signed the record"
 NO_BENCH_LOG = "no bench log of the maintainers names the record"
 
+#: Parts of the bench's self-test without which nobody knows what was measured, or on what.
+NEEDED_PARTS = {"sensor": "the sensor's zero", "lung": "which lung was mounted"}
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -96,6 +99,10 @@ def measured(record: HardwareRecord, evidence: Evidence) -> tuple[str, ...]:
         why.append("software stood in for the ventilator and its lung")
     if record.sha256 not in evidence.vouched:
         why.append(NO_BENCH_LOG)
+    for part, unknown in NEEDED_PARTS.items():
+        lungs = [x for x in record.header.lungs if part in record.header.selftest.get(x, [part])]
+        if lungs:
+            why.append(f"no self-test of {unknown} on {', '.join(lungs)}")
     if record.header.stops:
         why.append(f"{len(record.header.stops)} runs were stopped")
     return (*why, *_unsafe(record.header.lungs, record.header.safe))

@@ -241,7 +241,10 @@ class Recording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HardwareContent(schema.SubmittedContent, frozen=True, tag_field="kind", tag="hardware"):
-    """The content of a hardware record; L lungs, P PIPs, K repetitions."""
+    """The content of a hardware record; L lungs, P PIPs, K repetitions.
+
+    ``selftest`` has the parts of the self-test that were left out on each lung.
+    """
 
     track: Literal["hardware"]
     simulated_track: schema.Track
@@ -260,6 +263,7 @@ class HardwareContent(schema.SubmittedContent, frozen=True, tag_field="kind", ta
     plan: schema.FreeForm
     control: schema.FreeForm
     safety: schema.FreeForm
+    selftest: dict[schema.LungId, list[schema.Text]] = msgspec.field(default_factory=dict)
 
 
 @dataclass(frozen=True)

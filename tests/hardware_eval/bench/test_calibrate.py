@@ -16,6 +16,7 @@ from hardware_eval.bench import calibrate
 from hardware_eval.bench.calibrate import Calibration, device_of, fit, load, measure
 from hardware_eval.bench.loop import Bench, SilentOperator
 from hardware_eval.bench.safety import DEFAULT
+from hardware_eval.bench.selftest import selftest
 from hardware_eval.emulation.faults import FaultKind, LungFault
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.results.evaluate import Line
@@ -107,6 +108,7 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     assert parts["peep"].fit.intercept.value == pytest.approx(0.0, abs=0.05)
     parts["leak"] = measure(bench, "leak", lung=LUNG, now=DAY)
     assert calibrate.lost_flow(parts["leak"], LUNG).low < 5.0
+    parts["lung"] = measure(bench, "lung", lung=LUNG, now=DAY)
     hal: Any = device.service.hal
     hal.faults = (LungFault(FaultKind.LEAK, device.clock.now(), strength=0.01),)
     leaking = calibrate.lost_flow(measure(bench, "leak", lung=LUNG, now=DAY), LUNG)
@@ -116,6 +118,15 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     saved = Calibration(own, parts).save(path)
     kept = load(path, own, now=DAY + datetime.timedelta(days=29))
     assert kept == saved
+    known = kept.known_lung
+    assert known is not None
+    assert known.lung == LUNG
+    assert np.exp(known.logarithms) == pytest.approx([5.0, 1000.0 / 20.0], rel=0.15)
+    sheet = selftest(bench, LUNG, simulator=None, known=known, skip=("leak", "sweep"))
+    (span,) = [x for x in sheet.findings if x.name == "sensor_span"]
+    assert span.ok
+    assert span.value == pytest.approx(1.0, abs=0.005)
+    assert saved.plot_png().startswith(b"\x89PNG")
     assert kept.valve == pytest.approx((slope.value,) * 3, rel=0.01)
     bent = replace(parts["valve"], reading=(228.0, 500.0, 228.0))  # not linear: 22.8 to 16.7
     mean, low, high = Calibration(own, {"valve": bent}).valve or (0.0,) * 3

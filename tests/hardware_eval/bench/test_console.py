@@ -114,9 +114,8 @@ def test_keys_of_the_self_test_do_not_raise_the_pressure(
     person = ConsoleOperator(reaction=0.0)
     plan = make_plan(["a"], ["R5C20"], pips=(10.0,), repeats=1, control_every=0)
 
-    def selftest(lung: str) -> str:
+    def selftest(lung: str) -> None:
         keyboard.press("yy")
-        return ""
 
     with person.keys(), RawLog(tmp_path / "raw.jsonl") as log:
         keyboard.press_later("y", 0.02)

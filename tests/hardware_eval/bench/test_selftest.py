@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,15 @@ import pytest
 
 from hardware_eval.bench import selftest as selftest_module
 from hardware_eval.bench.collect import collect
+from hardware_eval.bench.identity import measured_lung
 from hardware_eval.bench.loop import Bench, SilentOperator
-from hardware_eval.bench.selftest import LIMITS, Driven, selftest
+from hardware_eval.bench.selftest import LIMITS, Driven, selftest, span_finding
 from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault
 from ventbench.base.errors import InputError
+
+from .test_identity import probed
 
 LUNG = "R5C20"
 
@@ -29,6 +33,25 @@ def test_a_good_bench_goes(bench: Bench) -> None:
     # The emulated lung reports its flow, so that R and C are those of the label.
     assert pytest.approx(5.0, rel=0.15) == sheet.R
     assert pytest.approx(20.0, rel=0.05) == sheet.C
+
+
+def test_parts_are_left_out_one_by_one_and_the_sheet_says_so(
+    bench: Bench, device: LoopbackDevice
+) -> None:
+    begun = len(device.actuations)
+    sheet = selftest(bench, LUNG, skip=("lung", "sweep", "sensor"))
+    assert sheet.go, str(sheet)
+    assert sheet.skipped == ("sensor", "sweep", "lung")
+    assert {x.name for x in sheet.findings} == {
+        "leak", "interruptions", "safety", "on_time", "latest_step", "round_trip"
+    }  # fmt: skip
+    assert sheet.as_dict()["skipped"] == ["sensor", "sweep", "lung"]
+    assert "left out: lung" in str(sheet)
+    moved = device.actuations[begun - 1 :]
+    assert {x.u_out for x in moved if x.u_in > 0.0} == {0}  # the filling alone
+    assert sum(a.u_out > b.u_out for a, b in pairwise(moved)) == 1
+    with pytest.raises(InputError, match="no part 'valve'; choose of sensor, leak, sweep, lung"):
+        selftest(bench, LUNG, skip=("valve",))
 
 
 def test_what_a_slow_line_spoils_is_repeated(bench: Bench, device: LoopbackDevice) -> None:
@@ -105,6 +128,26 @@ def test_the_leak_is_judged_by_its_error(fall: float, go: bool) -> None:
         held = Driven(time, pressure, time, time, time, time, time, (), False, 0)
         right += selftest_module._closed(held, 0.3)[0].ok is go
     assert right >= 198
+
+
+@pytest.mark.parametrize("off", [0.95, 1.05])
+def test_a_span_that_is_off_shows_on_a_calibrated_lung(off: float) -> None:
+    """Lungs by analysis: the label holds, and only the lung's own calibration tells."""
+    found = []
+    for gain, seed in ((1.0, 0), (1.0, 1), (off, 2)):
+        probes = [
+            replace(probe, pressure=gain * probe.pressure)
+            for probe in probed(20.0, 20.0, False, 0.2, seed)
+        ]
+        found.append(measured_lung(probes, "R20C20", 0.2)[0])
+    then, again, changed = found
+    assert span_finding(again, then).ok
+    finding = span_finding(changed, then)
+    assert not finding.ok
+    assert finding.value == pytest.approx(off, abs=0.015)
+    assert "calibrate sensor and flow" in finding.text
+    assert span_finding(changed, replace(then, lung="R5C10")).ok  # another lung tells nothing
+    assert span_finding(changed, None).ok
 
 
 FAULTS = {

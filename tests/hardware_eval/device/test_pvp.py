@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import math
 import os
+import re
+import select
 import socket
+import subprocess
 import sys
 import threading
 import time
+import tomllib
+import tty
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +25,7 @@ from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.link import Link
-from hardware_eval.wire.messages import Mode
+from hardware_eval.wire.messages import PROTOCOL_VERSION, Hello, Mode, Packet, encode
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 
@@ -292,3 +297,59 @@ def test_a_serial_line_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
 def test_a_taken_address_is_told() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InputError, match="listen"):
         board.tcp_line("127.0.0.1", taken.getsockname()[1])
+
+
+#: The ventilator's two packages, as files that a process of its own imports.
+STAND_INS = {
+    "pigpio.py": (
+        "OUTPUT = 1\nclass pi:\n connected = True\n"
+        " def __getattr__(self, name): return lambda *values: None\n"
+    ),
+    "smbus2.py": (
+        "class SMBus:\n def __init__(self, number): pass\n"
+        " def write_i2c_block_data(self, *values): pass\n"
+        " def read_i2c_block_data(self, *values): return [0x45, 0xD0]\n"  # 1117 counts: 1.2 cmH2O
+        " def close(self): pass\n"
+    ),
+}
+
+
+def test_the_program_runs_on_the_packages_of_its_own_list_alone(
+    configuration: Path, tmp_path: Path
+) -> None:
+    """Neither JAX nor anything else that only the benchmark needs can be imported."""
+    root = Path(board.__file__).parents[2]
+    project = tomllib.loads((root / "pyproject.toml").read_text())
+    names = {"cobs", "numpy", "pigpio", "pyserial", "smbus2"}
+    assert {re.split("[>=]", x)[0] for x in project["dependency-groups"]["device"]} == names
+    listed = (root / "hardware_eval/device/requirements.txt").read_text()
+    assert set(re.findall(r"^([\w-]+)==", listed, re.M)) == names
+    blocked = {re.split("[>=]", x)[0].replace("-", "_") for x in project["project"]["dependencies"]}
+    blocked = (blocked | {"jaxlib", "distributed", "rerun"}) - names
+    for name, text in STAND_INS.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "sitecustomize.py").write_text(
+        f"import sys\nsys.modules.update(dict.fromkeys({sorted(blocked)}))\n"
+    )
+    master, slave = os.openpty()
+    tty.setraw(master)
+    words = ["--config", str(configuration), "--pressure-limit", "50", "--port", os.ttyname(slave)]
+    program = subprocess.Popen(
+        [sys.executable, "-m", "hardware_eval.device", *words], cwd=root,
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{root}"}, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        hello = encode(Packet(7, 1, Hello(PROTOCOL_VERSION, None)))
+        answer, end = b"", time.monotonic() + 60.0
+        while b"bench 3" not in answer and time.monotonic() < end and program.poll() is None:
+            os.write(master, hello)
+            if select.select([master], [], [], 0.5)[0]:
+                answer += os.read(master, 1000)
+        program.terminate()
+        _, said = program.communicate(timeout=60)
+        assert b"bench 3" in answer, said.decode()
+    finally:
+        program.kill()
+        program.wait()
+        for descriptor in (master, slave):
+            os.close(descriptor)

@@ -66,6 +66,9 @@ def test_the_record_holds_score_device_and_recording(done: ev.Evaluation, path: 
     assert np.isfinite(made.errors).all()
     assert len(header.control[LUNG]["errors"]) == 3  # before the first, the fourth, at the end
     assert header.timing["lost"] == 0
+    assert (header.timing["outside"], header.timing["fallback_share"]) == (0, 0.0)
+    assert header.safety["fallback"] is None
+    assert header.selftest == {LUNG: ["leak", "lung", "sensor", "sweep"]}
     assert set(header.safety) >= {"over_pressure", "stuck_sensor", "largest_u_in"}
     assert header.safety["over_pressure"]["reason"]
 
@@ -118,7 +121,9 @@ def test_the_board_shows_it_beside_the_simulated_score(path: Path, tmp_path: Pat
     assert isinstance(added, HardwareRecord)
     (hardware,) = frames.load_tracks(folder, track="performance")[0].hardware
     assert hardware.reasons == (
-        "software stood in for the ventilator and its lung", gate.NO_BENCH_LOG
+        "software stood in for the ventilator and its lung", gate.NO_BENCH_LOG,
+        "no self-test of the sensor's zero on R5C20",
+        "no self-test of which lung was mounted on R5C20",
     )  # fmt: skip
     assert hardware.rank is None
     done = build.build(folder, out)

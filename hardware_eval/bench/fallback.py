@@ -1,0 +1,246 @@
+"""A fallback that takes over when an entry is late or about to leave its envelope, and hands back.
+
+Simplex: the entry commands as long as the safe controller could still rescue the lung after its
+command. Whether it could is a one-sided reachability over every rig within bounds: R, C and the
+valve's gain off by so much, a resistor that is linear or parabolic, a valve one to three steps
+late. The pressure ``j`` steps after a reading ``p`` is at most ::
+
+    p + e + D(g u[j]) - D(g u[0]) + g dt / C (u[1] + ... + u[j])
+
+with the noise ``e``, the commands ``u`` whose flow is seen then, and the resistor's drop ``D``. It
+is monotonic in 1/C and in R, and its largest value over R and g lies at their ends, whichever way
+the flow changes; a slow valve in front of a linear resistor mixes dead times, and stays below the
+largest of their bounds. Every reading of the last steps gives such a bound, as does the volume that
+can be left of the breath before; the least of them holds. After the entry's command the safe
+controller closes the valve. The command is inside the envelope if then no pressure is above the
+device's limit and none above the protocol's for longer than its safety gate allows.
+
+In the first steps of a breath no reading tells the drop of its flow. There, the pressure that
+remains when the flow has ended decides; the rest is left to the checks of host and device.
+
+The fallback is the paper's PI of the labelled lung, cut to the largest command that is inside.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_eval.bench.plan import CONTROL_GAINS
+from hardware_eval.bench.safety import VALVE_GAIN
+from ventbench.mechanics.labels import APPARATUS, TOLERANCE_R
+from ventbench.task import protocol
+from ventbench.task.lungs import Lung
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FallbackSettings:
+    """Bounds and habits of the fallback; written into every record.
+
+    Attributes:
+        R, C, gain: factors by which a rig may differ from its label and from the nominal valve;
+            a test lung keeps within about half of that.
+        apparatus: resistance of tubes and filters, cmH2O/(L/s).
+        outlet: largest resistance of the expiratory valve, cmH2O/(L/s).
+        lags: steps from a command to the reading that shows its flow, least and most.
+        noise: most by which a reading is too low, cmH2O.
+        readings: newest readings that bound the future.
+        highest: pressure that may never be reached, cmH2O.
+        above: steps in a row that the pressure may be above ``PIP + SAFETY_MARGIN``.
+        hand_back: answers in a row, in time and inside, after which the entry commands again.
+    """
+
+    R: float = TOLERANCE_R
+    C: float = 1.15
+    gain: float = 1.15
+    apparatus: float = APPARATUS
+    outlet: float = 10.0
+    lags: tuple[int, int] = (1, 3)
+    noise: float = 1.0
+    readings: int = 4
+    highest: float = protocol.SAFETY_PRESSURE
+    above: int = 2
+    hand_back: int = 3
+
+
+DEFAULT = FallbackSettings()
+
+
+@dataclass(frozen=True)
+class FallbackState:
+    """State between two steps.
+
+    Attributes:
+        lung: label of the mounted lung.
+        commands: of this inspiration, oldest first, behind those that were on their way when it
+            began, %.
+        pressures: readings of this inspiration, cmH2O; NaN where there was none.
+        residual: most that the lung can have held when it began, as a pressure, cmH2O.
+        integral: the PI's average of the error, cmH2O.
+        active: whether the fallback commands.
+        good: answers in a row that were in time and inside.
+        taken: steps that the fallback has commanded.
+        outside: answers that were not inside.
+        episode, longest: steps in a row that it commands, now and at most.
+    """
+
+    lung: Lung
+    commands: tuple[float, ...] = ()
+    pressures: tuple[float, ...] = ()
+    residual: float = protocol.PEEP
+    integral: float = 0.0
+    active: bool = False
+    good: int = 0
+    taken: int = 0
+    outside: int = 0
+    episode: int = 0
+    longest: int = 0
+
+
+def init(lung: Lung) -> FallbackState:
+    """State before the first breath, the lung at rest."""
+    return FallbackState(lung)
+
+
+def step(
+    settings: FallbackSettings,
+    state: FallbackState,
+    time_step: int,
+    pressure: float,
+    pip: float,
+    answer: float | None,
+    before: float,
+) -> tuple[FallbackState, float]:
+    """Choose between the entry's command and the fallback's, at a step of an inspiration.
+
+    Args:
+        settings: bounds.
+        state: from :func:`init` or the step before.
+        time_step: step of the breath, from 0.
+        pressure: reading, cmH2O; NaN if there is none.
+        pip: target, cmH2O.
+        answer: the entry's command, %; None if it is late.
+        before: command in force before this step, %.
+
+    Returns:
+        The next state, and the command, %.
+    """
+    if time_step == 0:
+        state = _begun(settings, state, pressure, before)
+    state = replace(state, pressures=(*state.pressures, pressure))
+    known = math.isfinite(pressure)
+    error = pip - pressure if known else 0.0
+    share = protocol.DT / (protocol.DT + 0.5)
+    integral = state.integral + share * (error - state.integral) if known else state.integral
+    outside = answer is not None and not is_inside(settings, state, pip, answer)
+    good = 0 if answer is None or outside else state.good + 1
+    active = not good or (state.active and good <= settings.hand_back)
+    if active or answer is None:
+        P, I = CONTROL_GAINS[state.lung.id]  # noqa: E741 - the field's names
+        wanted = min(max(P * error + I * integral, 0.0), protocol.U_MAX) if known else before
+        command = largest_inside(settings, state, pip, wanted)
+    else:
+        command = answer
+    episode = state.episode + 1 if active else 0
+    return replace(
+        state, commands=(*state.commands, command), integral=integral, active=active, good=good,
+        taken=state.taken + active, outside=state.outside + outside, episode=episode,
+        longest=max(state.longest, episode),
+    ), command  # fmt: skip
+
+
+def _begun(
+    settings: FallbackSettings, state: FallbackState, pressure: float, before: float
+) -> FallbackState:
+    """The state at the first step of an inspiration; ``before`` is the bias flow's command."""
+    residual, late = protocol.PEEP, settings.lags[1]
+    if seen := [x for x in state.pressures if math.isfinite(x)]:
+        R, C, gain = _most(settings, state.lung)
+        filled = seen[-1] + settings.noise + gain * protocol.DT / C * sum(state.commands[-late:])
+        emptied = (protocol.BREATH_STEPS - protocol.INSPIRATION_STEPS) * protocol.DT
+        slowest = 1e-3 * state.lung.C * settings.C * (R + settings.outlet)
+        residual += max(filled - protocol.PEEP, 0.0) * math.exp(-emptied / slowest)
+    if math.isfinite(pressure):
+        residual = max(residual, pressure)
+    return replace(
+        state, commands=(before,) * late, pressures=(), integral=0.0,
+        residual=residual + settings.noise,
+    )  # fmt: skip
+
+
+def _most(settings: FallbackSettings, lung: Lung) -> tuple[float, float, float]:
+    """Most of R, cmH2O/(L/s), least of C, mL/cmH2O, most of the gain, mL/s per %."""
+    R = lung.R * settings.R + settings.apparatus
+    return R, lung.C / settings.C, VALVE_GAIN * settings.gain
+
+
+def reachable(settings: FallbackSettings, state: FallbackState, answer: float) -> Floats:
+    """Highest pressures if the valve takes an answer for a step and is then closed.
+
+    Args:
+        settings: bounds.
+        state: with the reading of this step.
+        answer: command, %.
+
+    Returns:
+        Bound of each next step until all flow has ended, cmH2O, shape ``(lags[1] + 1,)``.
+    """
+    R_most, C, gain_most = _most(settings, state.lung)
+    first, last = settings.lags
+    newest = len(state.pressures) - 1  # this step
+    sent = np.array([*state.commands, answer, *[0.0] * (last + 1)])
+    # Of each reading from the inspiration's first on: commands whose flow it may show, by lag.
+    shown = np.stack([sent[last - lag : len(sent) - lag] for lag in range(first, last + 1)])
+    ahead = newest + np.arange(1, last + 2)
+    R = np.array([state.lung.R / settings.R, R_most])[:, None, None, None]
+    gain = VALVE_GAIN * np.array([1.0 / settings.gain, settings.gain])
+    flows = 1e-3 * gain[:, None, None] * shown  # L/s
+    drops = R * np.stack([flows, flows**2])[:, None]  # linear and parabolic, (2, R, gain, lag, k)
+    drops = drops.reshape(-1, *shown.shape)
+    stored = np.cumsum(shown, axis=1) * gain_most * protocol.DT / C
+    # Since the inspiration began, with what may be left of the breath before.
+    least = state.residual + (drops + stored)[..., ahead].max(axis=(0, 1))
+    for k in range(max(last, newest + 1 - settings.readings), newest + 1):
+        if math.isfinite(state.pressures[k]):
+            change = (drops + stored)[..., ahead] - (drops + stored)[..., k : k + 1]
+            bound = state.pressures[k] + settings.noise + change.max(axis=(0, 1))
+            least = np.minimum(least, bound)
+    return least
+
+
+def is_inside(settings: FallbackSettings, state: FallbackState, pip: float, answer: float) -> bool:
+    """Whether no rig within the bounds comes to harm by a command, if the valve closes after it."""
+    limit = min(protocol.SAFETY_PRESSURE, pip + protocol.SAFETY_MARGIN)
+    highest = reachable(settings, state, answer)
+    if highest[-1] > limit:
+        return False
+    if len(state.pressures) <= settings.lags[1]:  # no reading tells the resistor's drop yet
+        return True
+    above = 0
+    for pressure in reversed(state.pressures):
+        if not pressure > limit:
+            break
+        above += 1
+    for pressure in highest.tolist():
+        above = above + 1 if pressure > limit else 0
+        if pressure > settings.highest or above > settings.above:
+            return False
+    return True
+
+
+def largest_inside(
+    settings: FallbackSettings, state: FallbackState, pip: float, wanted: float
+) -> float:
+    """The largest command up to ``wanted`` that is inside, %; 0 if none is."""
+    if is_inside(settings, state, pip, wanted):
+        return wanted
+    low, high = 0.0, wanted
+    for _ in range(10):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if is_inside(settings, state, pip, middle) else (low, middle)
+    return low

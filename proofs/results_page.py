@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from proofs import code_version
-from proofs.challenge.figures import Figure, full_answer, in_words
+from proofs.challenge.figures import Figure, full_answer
 from ventbench.base import files
 from ventbench.base.errors import InputError
 
@@ -83,8 +83,8 @@ def _wrong_answers(result: Judged) -> list[str]:
         "",
         f"Answers that are not right ({len(wrong)} of {len(result.cases)}):",
         "",
-        "| kind | lung | truth | answer | believed | error, inspiration, expiration |",
-        "|---|---|---|---|---|---|",
+        "| kind | truth | answer | believed |",
+        "|---|---|---|---|",
     ]
     for case in wrong:
         truth = " + ".join(
@@ -92,8 +92,7 @@ def _wrong_answers(result: Judged) -> list[str]:
             for effect, strength in zip(case.truth, case.strengths, strict=True)
         )
         lines.append(
-            f"| {case.kind} | {case.lung} | {truth or 'nothing'} | {full_answer(case)} | "
-            f"{case.confidence:.0%} | {case.inspiration:.2f}, {case.expiration:.2f} |"
+            f"| {case.kind} | {truth or 'nothing'} | {full_answer(case)} | {case.confidence:.0%} |"
         )
     return lines
 
@@ -112,9 +111,9 @@ def _commands(
                 f"python -m proofs challenge make --generator {source} {seeds[-1]} "
                 f"--cases {draw.total} --out {where}"
             )
-            answer += [
-                f"python -m proofs challenge answer {where} --diagnoser {who}" for who in diagnosers
-            ]
+            one = f"python -m proofs challenge answer {where} --diagnoser"
+            each = f"for who in {' '.join(diagnosers)}; do {one} $who; done"
+            answer.append(each if len(diagnosers) > 1 else f"{one} {diagnosers[0]}")
             drawn.append(f"| `{source}` | `{draw.seed}` | `{draw.commitment}` |")
     who = f"--diagnoser {diagnosers[0]} " if last == "reveal" else ""
     end = f"python -m proofs challenge {last} {' '.join(folders)} {who}{' '.join(seeds)}"
@@ -165,8 +164,12 @@ def board_section(result: Board) -> str:
 
 
 def _cell(figure: Figure) -> str:
-    value, span = in_words(figure)
-    return f"{value} ({span})" if span else value
+    """Value and interval of a figure."""
+    if figure.value is None:
+        return "–"
+    form = "{:.0%}" if figure.is_share else "{:.3g}"
+    span = "" if figure.ci95 is None else f" ({'..'.join(map(form.format, figure.ci95))})"
+    return form.format(figure.value) + span
 
 
 def proof_section(proof: Proof) -> str:

@@ -44,15 +44,6 @@ class Figure:
     is_share: bool = False
 
 
-def in_words(figure: Figure, between: str = " to ") -> tuple[str, str]:
-    """Value and interval of a figure in words; empty where there is none."""
-    if figure.value is None:
-        return "–", ""
-    form = "{:.0%}" if figure.is_share else "{:.3g}"
-    span = "" if figure.ci95 is None else between.join(form.format(end) for end in figure.ci95)
-    return form.format(figure.value), span
-
-
 def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % score interval (Wilson) of a share."""
     z = 1.959964

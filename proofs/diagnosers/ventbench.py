@@ -1,7 +1,7 @@
 """ventbench's own diagnosis as a diagnoser, by its public interface.
 
 A verdict becomes probabilities: names by how far each is preferred over its alternatives, places by
-their weights, and what the diagnosis cannot know by shares that were set on opened cases.
+their weights, and what the diagnosis cannot know by shares that were fitted on opened cases.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _CHANGES = {"gain": ("gain_step", "gain_drift"), "zero": ("zero_step", "sensor_d
 
 @dataclass(frozen=True)
 class Calibration:
-    """Shares that the verdicts deserve.
+    """Shares that the verdicts deserve, 0..1.
 
     Attributes:
         nothing: of the verdict *nothing missing*; else an effect was overlooked.
@@ -42,6 +42,8 @@ class Calibration:
         alone: of what is left where a verdict fails, that there is nothing beside the names.
         foreign: of an effect without a name, that it is one of those names of the vocabulary for
             which the diagnosis has no hypothesis, all alike; else it is at any place.
+        doubt: power of the unexplained error, in multiples of the noise from 1 on, by which the
+            odds of a verdict fall that leaves nothing open.
     """
 
     nothing: float
@@ -49,10 +51,13 @@ class Calibration:
     placed: float
     alone: float
     foreign: float
+    doubt: float
 
 
 #: Fitted on opened cases by ``benchmarks/adapter_calibration.py``.
-CALIBRATION = Calibration(0.93, 0.95, 0.9, 0.1, 0.5)
+CALIBRATION = Calibration(
+    nothing=0.87, named=0.87, placed=0.21, alone=0.24, foreign=0.95, doubt=3.6
+)
 
 #: Most hypotheses of alternatives, and least probability of one.
 _MOST, _LEAST = 60, 1e-4
@@ -131,7 +136,7 @@ def hypotheses(
             for terms, probability in stated:
                 unnamed(terms, told * weight * probability, at, [place])
     elif main or found["verdict"] == "nothing_missing":
-        told = shares.named if main else shares.nothing
+        told = _doubted(shares.named if main else shares.nothing, found["open_loop"], shares.doubt)
         for terms, probability in stated:
             add(terms, told * probability)
     else:
@@ -145,6 +150,13 @@ def hypotheses(
     kept = {terms: p for terms, p in weights.items() if p > _LEAST}
     total = sum(kept.values())
     return [{"terms": sorted(terms), "probability": p / total} for terms, p in kept.items()]
+
+
+def _doubted(share: float, errors: Mapping[str, Any], doubt: float) -> float:
+    """A share after a look at what stays unexplained."""
+    beyond = (errors["unexplained"] or 0.0) / (errors["noise_floor"] or np.inf)
+    odds = share / (1.0 - share) * max(beyond, 1.0) ** -doubt
+    return odds / (1.0 + odds)
 
 
 def _session(found: Mapping[str, Any]) -> frozenset[str]:

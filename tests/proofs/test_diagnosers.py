@@ -63,12 +63,13 @@ def test_sparse_regression_finds_the_terms_that_act() -> None:
     assert not thresholded_least_squares(x, y, 2.0).any()
 
 
-SHARES = Calibration(nothing=0.9, named=0.8, placed=0.7, alone=0.25, foreign=0.6)
+SHARES = Calibration(nothing=0.9, named=0.8, placed=0.7, alone=0.25, foreign=0.6, doubt=2.0)
 
 
 def shares_of(verdict: str, *mechanisms: dict, **found) -> dict[frozenset[str], float]:
     given = {"verdict": verdict, "mechanisms": mechanisms, "slot": None, "changes": [],
-             "saturated": None} | found  # fmt: skip
+             "saturated": None, "open_loop": {"unexplained": 0.1, "noise_floor": 0.2},
+             } | found  # fmt: skip
     told = hypotheses(given, PUBLISHED, SHARES)
     assert sum(each["probability"] for each in told) == pytest.approx(1.0)
     assert all(TERMS.issuperset(each["terms"]) for each in told)
@@ -95,6 +96,13 @@ def test_a_verdict_has_its_share_and_what_it_may_have_missed_the_rest() -> None:
     assert terms() not in told
     changed = shares_of("named", changes=[{"of": "gain", "drifts": False}], saturated={})
     assert changed[terms("gain_step", "saturation")] == pytest.approx(0.8)
+
+
+def test_what_stays_unexplained_speaks_against_a_verdict_that_leaves_nothing_open() -> None:
+    for verdict, names, share in (("named", [named("leak")], 0.8), ("nothing_missing", [], 0.9)):
+        large = {"open_loop": {"unexplained": 0.6, "noise_floor": 0.2}}
+        told = shares_of(verdict, *names, **large)[terms(*(each["name"] for each in names))]
+        assert told / (1.0 - told) == pytest.approx(share / (1.0 - share) / 9.0)
 
 
 def test_a_place_without_a_name_may_be_a_name_without_a_hypothesis() -> None:

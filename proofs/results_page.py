@@ -72,29 +72,22 @@ def challenge_section(result: Judged) -> str:
 
 
 def _wrong_answers(result: Judged) -> list[str]:
-    """Every answer that is not right, by kind of the question."""
-    wrong = sorted(
-        (case for case in result.cases.values() if not case.right),
-        key=lambda case: (case.kind, case.effects, case.name),
-    )
+    """Answers that are not right, and what was the truth."""
+    wrong = [case for case in result.cases.values() if not case.right]
     if not wrong:
         return []
-    lines = [
-        "",
-        f"Answers that are not right ({len(wrong)} of {len(result.cases)}):",
-        "",
-        "| kind | truth | answer | believed |",
-        "|---|---|---|---|",
-    ]
-    for case in wrong:
+    truths: dict[str, list[str]] = {}
+    for case in sorted(wrong, key=lambda case: (case.effects, case.strengths)):
         truth = " + ".join(
-            f"{effect.name} ({strength}{'' if effect.seen else ', below the detection limit'})"
+            f"{strength} {effect.name}{'' if effect.seen else ' (below the detection limit)'}"
             for effect, strength in zip(case.truth, case.strengths, strict=True)
         )
-        lines.append(
-            f"| {case.kind} | {truth or 'nothing'} | {full_answer(case)} | {case.confidence:.0%} |"
-        )
-    return lines
+        truths.setdefault(full_answer(case), []).append(truth or "nothing")
+    return [
+        "", f"Answers that are not right ({len(wrong)} of {len(result.cases)}):", "",
+        "| answer | truth |", "|---|---|",
+        *(f"| {answer} | {'; '.join(given)} |" for answer, given in sorted(truths.items())),
+    ]  # fmt: skip
 
 
 def _commands(

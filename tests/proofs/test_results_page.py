@@ -60,8 +60,8 @@ def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
     assert "Diagnoser `refit`, code 1a2b3c, answered 1 of 40, 1 of 8:\n" in text
     assert "| `stranger` | `words` | `abc123` |\n| `stranger` | `-more` | `def456` |" in text
     assert "Answers that are not right (1 of 2):" in text
-    answered = "unknown:lung + valve_lag | 90% |"
-    assert f"| single | leak (strong, below the detection limit) | {answered}" in text
+    told = "unknown:lung + valve_lag | strong leak (below the detection limit)"
+    assert f"| {told} |" in text
     assert "| strong: more | 90% (70%..97%) | 20 | >= 98%, missed |" in text
     assert "seconds a case, median 5.25; another score 0.51 (0.4..0.625)." in text
     assert "false |" not in text  # there was no case

@@ -252,6 +252,10 @@ def test_a_stranger_reads_and_writes_nothing_else(tmp_path, monkeypatch):
         outcome = run(find(str(mine)), case, QUICK)
         assert "PermissionError" in outcome.problem
         assert "landlock" in outcome.layers
+    (mine / "data").symlink_to(kept)
+    with pytest.raises(InputError, match="data is a link"):
+        find(str(mine))
+    (mine / "data").unlink()
     (mine / "diagnoser.toml").write_text('name = "../up"\nfunction = "spy:diagnose"\n')
     with pytest.raises(InputError, match="a name has letters"):
         find(str(mine))

@@ -59,8 +59,8 @@ CALIBRATION = Calibration(
     nothing=0.87, named=0.87, placed=0.21, alone=0.24, foreign=0.95, doubt=3.6
 )
 
-#: Most hypotheses of alternatives, and least probability of one.
-_MOST, _LEAST = 60, 1e-4
+#: Most hypotheses of alternatives and of all, and least probability of one.
+_MOST, _ALL, _LEAST = 60, 400, 1e-4
 
 
 def diagnose(folder: Path) -> dict[str, Any]:
@@ -147,7 +147,8 @@ def hypotheses(
     bases = {main, frozenset()}
     for base in bases:
         unnamed(base, (1.0 - told) * (1.0 - alone) / len(bases), foreign, places)
-    kept = {terms: p for terms, p in weights.items() if p > _LEAST}
+    likely = sorted(weights, key=weights.__getitem__, reverse=True)[:_ALL]
+    kept = {terms: weights[terms] for terms in likely if weights[terms] > _LEAST}
     total = sum(kept.values())
     return [{"terms": sorted(terms), "probability": p / total} for terms, p in kept.items()]
 

@@ -13,7 +13,7 @@ from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.make import make
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Limits, built_in, find
-from proofs.challenge.vocabulary import PUBLISHED, TERMS
+from proofs.challenge.vocabulary import PUBLISHED, TERMS, VOCABULARY
 from proofs.diagnosers import lisdd
 from proofs.diagnosers.common import Templates
 from proofs.diagnosers.gaussian_process import _Process
@@ -117,6 +117,13 @@ def test_a_place_without_a_name_may_be_a_name_without_a_hypothesis() -> None:
     beside = shares_of("named", named("leak"), slot={"name": "nowhere", "places": {}})
     assert beside[terms("leak")] == pytest.approx(0.3 * 0.25)
     assert beside[terms("leak", "unknown:airway")] > beside[terms("unknown:airway")]
+
+
+def test_an_answer_is_not_longer_than_may_be() -> None:
+    names = sorted(VOCABULARY)
+    many = [named(names[k], 0.3, *names[k + 1 : k + 4]) for k in (0, 4, 8)]
+    every = ("f(p)", "f(Q)", "f(V)", "measurement", "f(t) at the supply", "exhalation path")
+    assert 100 < len(shares_of("named", *many, slot={"places": dict.fromkeys(every, 1.0)})) <= 500
 
 
 def test_an_effect_without_name_and_place_is_a_set() -> None:

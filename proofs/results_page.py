@@ -121,7 +121,8 @@ _BOARD = {
     "calibration error (ECE)": "calibration error",
     "detected, where something is missing": "detected",
     "false alarms, where nothing is missing": "false alarms",
-    "right part of the rig": "right part",
+    "right name and size": "right name and size",
+    "a confident wrong name": "confident wrong name",
     "withheld inspirations, error, cmH2O": "inspirations, cmH2O",
     "processor seconds, mean": "seconds",
 }

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from proofs import code_version
-from proofs.challenge.figures import Figure, full_answer, in_words, scores
+from proofs.challenge.figures import Figure, full_answer
 from ventbench.base import files
 from ventbench.base.errors import InputError
 
 if TYPE_CHECKING:
-    from proofs.challenge.reveal import Board, Judged
+    from proofs.challenge.reveal import Board, Draw, Judged
     from proofs.real.rig import Proof
 
 
@@ -46,41 +46,14 @@ def write_section(path: Path, name: str, text: str) -> None:
     files.write_text(path, before[:start] + section + before[end + len(last) :])
 
 
-def challenge_section(result: Judged, seeds: Sequence[str]) -> str:
-    """Figures of a challenge as Markdown, with the commands and what was committed.
-
-    Args:
-        result: opened challenge, of one or more draws.
-        seeds: seed of each draw.
-    """
-    source = result.generator
-    folder, who = f"runs/{source}", result.diagnoser
+def challenge_section(result: Judged) -> str:
+    """Figures of a challenge, of one or more draws, as Markdown, with how they come to be."""
     versions = ", ".join(result.versions) or "unknown"
-    draws = [
-        (seed, f"{folder}{k}" if k > 1 else folder, draw)
-        for k, (seed, draw) in enumerate(zip(seeds, result.draws, strict=True), start=1)
-    ]
-    lines = ["```sh"]
-    for seed, where, draw in draws:
-        lines.append(
-            f"python -m proofs challenge make --generator {source} --seed={seed} "
-            f"--cases {draw.total} --out {where}"
-        )
-        lines.append(f"python -m proofs challenge answer {where} --diagnoser {who}")
-    folders = " ".join(where for _, where, _ in draws)
-    given = " ".join(f"--seed={seed}" for seed, _, _ in draws)
-    lines += [
-        f"python -m proofs challenge reveal {folders} --diagnoser {who} {given}",
-        "```",
+    answered = ", ".join(f"{draw.answered} of {draw.total}" for draw in result.draws)
+    lines = [
+        *_commands({result.generator: result.draws}, [result.diagnoser], "reveal"),
         "",
-        f"Generator `{source}`, diagnoser `{who}`, code {versions}:",
-        "",
-        "| seed | commitment | answered |",
-        "|---|---|---|",
-        *(
-            f"| `{seed}` | `{draw.commitment}` | {draw.answered} of {draw.total} |"
-            for seed, _, draw in draws
-        ),
+        f"Diagnoser `{result.diagnoser}`, code {versions}, answered {answered}:",
         "",
         "| figure | measured | cases | goal |",
         "|---|---|---|---|",
@@ -99,41 +72,80 @@ def challenge_section(result: Judged, seeds: Sequence[str]) -> str:
 
 
 def _wrong_answers(result: Judged) -> list[str]:
-    """Every answer that is not right, by kind of the question."""
-    wrong = sorted(
-        (case for case in result.cases.values() if not case.right),
-        key=lambda case: (case.kind, case.effects, case.name),
-    )
+    """Answers that are not right, and what was the truth."""
+    wrong = [case for case in result.cases.values() if not case.right]
     if not wrong:
         return []
-    lines = [
-        "",
-        f"Answers that are not right ({len(wrong)} of {len(result.cases)}):",
-        "",
-        "| kind | lung | truth | answer | believed | error, inspiration, expiration |",
-        "|---|---|---|---|---|---|",
-    ]
-    for case in wrong:
+    truths: dict[str, list[str]] = {}
+    for case in sorted(wrong, key=lambda case: (case.effects, case.strengths)):
         truth = " + ".join(
-            f"{effect.name} ({strength}{'' if effect.seen else ', below the detection limit'})"
+            f"{strength} {effect.name}{'' if effect.seen else ' (below the detection limit)'}"
             for effect, strength in zip(case.truth, case.strengths, strict=True)
         )
-        lines.append(
-            f"| {case.kind} | {case.lung} | {truth or 'nothing'} | {full_answer(case)} | "
-            f"{case.confidence:.0%} | {case.inspiration:.2f}, {case.expiration:.2f} |"
-        )
-    return lines
+        truths.setdefault(full_answer(case), []).append(truth or "nothing")
+    return [
+        "", f"Answers that are not right ({len(wrong)} of {len(result.cases)}):", "",
+        "| answer | truth |", "|---|---|",
+        *(f"| {answer} | {'; '.join(given)} |" for answer, given in sorted(truths.items())),
+    ]  # fmt: skip
+
+
+def _commands(
+    tables: Mapping[str, Sequence[Draw]], diagnosers: Sequence[str], last: str
+) -> list[str]:
+    """Commands that make, answer and judge draws, and what was committed."""
+    make, answer, folders, seeds, drawn = [], [], [], [], []
+    for source, draws in tables.items():
+        for k, draw in enumerate(draws, start=1):
+            where = f"runs/{source}{k if k > 1 else ''}"
+            folders.append(where)
+            seeds.append(f"--seed={draw.seed}")
+            make.append(
+                f"python -m proofs challenge make --generator {source} {seeds[-1]} "
+                f"--cases {draw.total} --out {where}"
+            )
+            one = f"python -m proofs challenge answer {where} --diagnoser"
+            each = f"for who in {' '.join(diagnosers)}; do {one} $who; done"
+            answer.append(each if len(diagnosers) > 1 else f"{one} {diagnosers[0]}")
+            drawn.append(f"| `{source}` | `{draw.seed}` | `{draw.commitment}` |")
+    who = f"--diagnoser {diagnosers[0]} " if last == "reveal" else ""
+    end = f"python -m proofs challenge {last} {' '.join(folders)} {who}{' '.join(seeds)}"
+    head = ["| world | seed | commitment |", "|---|---|---|"]
+    return ["```sh", *make, *answer, end, "```", "", *head, *drawn]
+
+
+#: Figures of the board, and their heads.
+_BOARD = {
+    "log score, nats": "log score, nats",
+    "isolation accuracy": "isolation accuracy",
+    "calibration error (ECE)": "calibration error",
+    "detected, where something is missing": "detected",
+    "false alarms, where nothing is missing": "false alarms",
+    "right name and size": "right name and size",
+    "a confident wrong name": "confident wrong name",
+    "withheld inspirations, error, cmH2O": "inspirations, cmH2O",
+    "processor seconds, mean": "seconds",
+}
 
 
 def board_section(result: Board) -> str:
     """Figures of all diagnosers side by side, and paired differences with their 95 % intervals."""
-    lines = []
+    every = [row for rows in result.tables.values() for row in rows]
+    names = list(dict.fromkeys(row.diagnoser for row in every))
+    drawn = {generator: rows[0].draws for generator, rows in result.tables.items()}
+    lines = _commands(drawn, names, "board")
     for generator, rows in result.tables.items():
-        names = " | ".join(f"{row.diagnoser} ({len(row.cases)})" for row in rows)
-        lines += [f"Generator `{generator}`:", "", f"| figure | {names} |"]
-        lines.append("|---" * (len(rows) + 1) + "|")
-        for figures in zip(*(scores(list(row.cases.values())) for row in rows), strict=True):
-            lines.append(f"| {figures[0].what} | {' | '.join(map(_cell, figures))} |")
+        lines += [
+            "",
+            f"World `{generator}`:",
+            "",
+            f"| diagnoser | cases | {' | '.join(_BOARD.values())} |",
+        ]
+        lines.append("|---" * (len(_BOARD) + 2) + "|")
+        for row in rows:
+            figures = {figure.what: figure for figure in row.figures}
+            cells = " | ".join(_cell(figures[what]) for what in _BOARD)
+            lines.append(f"| {row.diagnoser} | {len(row.cases)} | {cells} |")
         compared = {row.diagnoser: d for row in rows if (d := result.differences(row))}
         if compared:
             what = next(iter(compared.values()))
@@ -142,14 +154,16 @@ def board_section(result: Board) -> str:
             lines.append("|---" * (len(what) + 1) + "|")
         for name, differences in compared.items():
             lines.append(f"| {name} | {' | '.join(map(_cell, differences.values()))} |")
-        drawn = dict.fromkeys(draw.commitment for row in rows for draw in row.draws)
-        lines += ["", f"Commitments: {', '.join(drawn)}.", ""]
     return "\n".join(lines)
 
 
 def _cell(figure: Figure) -> str:
-    value, span = in_words(figure)
-    return f"{value} ({span})" if span else value
+    """Value and interval of a figure."""
+    if figure.value is None:
+        return "–"
+    form = "{:.0%}" if figure.is_share else "{:.3g}"
+    span = "" if figure.ci95 is None else f" ({'..'.join(map(form.format, figure.ci95))})"
+    return form.format(figure.value) + span
 
 
 def proof_section(proof: Proof) -> str:

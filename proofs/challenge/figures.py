@@ -44,15 +44,6 @@ class Figure:
     is_share: bool = False
 
 
-def in_words(figure: Figure, between: str = " to ") -> tuple[str, str]:
-    """Value and interval of a figure in words; empty where there is none."""
-    if figure.value is None:
-        return "–", ""
-    form = "{:.0%}" if figure.is_share else "{:.3g}"
-    span = "" if figure.ci95 is None else between.join(form.format(end) for end in figure.ci95)
-    return form.format(figure.value), span
-
-
 def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % score interval (Wilson) of a share."""
     z = 1.959964
@@ -142,7 +133,7 @@ def calibration_error(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def scores(cases: Sequence[JudgedCase]) -> list[Figure]:
     """What every diagnoser is measured by, over all cases."""
     present = [c for c in cases if c.something]
-    none = [c for c in cases if not c.effects]
+    alarms = [alarm for alarm in map(false_alarm, cases) if alarm is not None]
     seen = [c for c in present if c.visible]
     parts = [c.overlap for c in cases if c.overlap is not None]
     believed = [(c.confidence, float(c.isolation > 0.0)) for c in cases]
@@ -153,8 +144,7 @@ def scores(cases: Sequence[JudgedCase]) -> list[Figure]:
         mean("isolation accuracy", [c.isolation for c in cases]),
         mean("calibration error (ECE)", believed, most=0.05, of=calibration_error),  # type: ignore[arg-type]
         share("detected, where something is missing", (c.missing > 0.5 for c in present)),
-        share("false alarms, where nothing is missing",
-              (c.missing > 0.5 or bool(c.problem) for c in none), most=0.0),
+        share("false alarms, where nothing is missing", alarms, most=0.0),
         share("right part of the rig", (c.right_place for c in seen), least=0.90),
         share("right name and size", (c.right and _size_is_right(c) for c in seen), least=0.80),
         mean("harm of wrong names", [c.harm for c in cases]),
@@ -244,24 +234,29 @@ def second_round(before: dict[str, JudgedCase], after: dict[str, JudgedCase]) ->
     return share("confusable cases resolved by more breaths", cases, least=0.80)
 
 
-#: What diagnosers are compared by, case by case; less is better.
-PAIRED: Mapping[str, Callable[[JudgedCase], float]] = {
+def false_alarm(case: JudgedCase) -> bool | None:
+    """Whether something is said to be missing, or nothing at all; None if something is."""
+    return None if case.effects else case.missing > 0.5 or bool(case.problem)
+
+
+#: What diagnosers are compared by, case by case; less is better, and None does not count.
+PAIRED: Mapping[str, Callable[[JudgedCase], float | None]] = {
     "log score": lambda case: case.log_score,
-    "Brier": lambda case: case.brier,
     "isolation error": lambda case: 1.0 - case.isolation,
-    "harm": lambda case: case.harm,
+    "false alarms": false_alarm,
     "inspiration, cmH2O": lambda case: case.inspiration,
-    "expiration, cmH2O": lambda case: case.expiration,
+    "seconds": lambda case: case.seconds,
 }
 
 
 def paired(ours: Mapping[Any, JudgedCase], other: Mapping[Any, JudgedCase]) -> dict[str, Figure]:
     """Mean of the differences ``ours - other`` over common cases; negative: ours is better."""
     common = sorted(ours.keys() & other.keys())
-    return {
-        what: mean(what, [of(ours[name]) - of(other[name]) for name in common])
-        for what, of in PAIRED.items()
-    }
+    found = {}
+    for what, of in PAIRED.items():
+        pairs = ((of(ours[name]), of(other[name])) for name in common)
+        found[what] = mean(what, [a - b for a, b in pairs if a is not None and b is not None])
+    return found
 
 
 _NOTHING, _SEVERAL, _LOST = "nothing missing", "several names", "no answer"

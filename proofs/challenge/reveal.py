@@ -23,11 +23,13 @@ class Draw:
     """Cases that were made with one seed.
 
     Attributes:
+        seed: what it was made with.
         commitment: hash of the true answers, checked.
         total: number of its cases.
         answered: number of those that have an answer.
     """
 
+    seed: str
     commitment: str
     total: int
     answered: int
@@ -103,7 +105,7 @@ def reveal(folders: Sequence[ChallengeFolder], seeds: Sequence[str], diagnoser: 
         published = folder.commitment.read_text().split()[0]
         if published in {draw.commitment for draw in draws}:
             raise InputError(f"the draw with commitment {published} is given twice")
-        draws.append(Draw(published, len(folder.cases()), len(found)))
+        draws.append(Draw(secret, published, len(folder.cases()), len(found)))
         cases |= {(number, name): case for name, case in found.items()}
         unanswered += [name for name in expected if name not in found]
         versions |= {given["code"] for given in folder.answers(diagnoser).values()}

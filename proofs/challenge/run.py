@@ -156,6 +156,8 @@ def _of_folder(folder: Path) -> Diagnoser:
         manifest = msgspec.convert(tomllib.loads(path.read_text("utf-8")), Manifest)
     except (ValueError, msgspec.ValidationError) as error:
         raise InputError(f"{path}: {error}") from error
+    for link in (inside for inside in folder.rglob("*") if inside.is_symlink()):
+        raise InputError(f"{link} is a link, which would be copied from elsewhere; send the file")
     if manifest.function.count(":") != 1:
         raise InputError(f"{path}: function is {manifest.function!r}; give file:function")
     return _named(manifest.name, manifest.function, folder.resolve())

@@ -175,7 +175,7 @@ def reveal(
     from proofs.results_page import challenge_section
 
     result = work([ChallengeFolder(folder, round_) for folder in folders], seed, diagnoser)
-    _told(result, json, page, f"challenge {result.generator}", challenge_section(result, seed))
+    _told(result, json, page, f"challenge {result.generator}", challenge_section(result))
     if any(figure.met is False for figure in result.figures):
         raise typer.Exit(1)
 
@@ -203,6 +203,80 @@ def board(
     from proofs.results_page import board_section
 
     result = work([ChallengeFolder(folder) for folder in folders], seed, against)
+    _told(result, json, page, "board of diagnosers", board_section(result))
+
+
+@app.command()
+def freeze(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the round.")],
+    diagnoser: Annotated[
+        list[str],
+        typer.Option(help="Folder with diagnoser.toml, or one of the project's; repeated."),
+    ],
+    world: Annotated[
+        list[str],
+        typer.Option(metavar="NAME:CASES", help="Generator and its cases; may be repeated."),
+    ] = ["faults:60", "stranger:60"],  # noqa: B006
+    delay: Annotated[int, typer.Option(min=1, help="From the freeze to the beacon, s.")] = 600,
+    seconds: Annotated[float, typer.Option(min=1, help="Processor seconds a case.")] = 300.0,
+    rehearsal: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Chain of a referee in place of the public beacon."),
+    ] = None,
+) -> None:
+    """Freeze the diagnosers of a round; a public beacon decides later on their cases.
+
+    Example: `python -m proofs challenge freeze runs/r1 --diagnoser mine --diagnoser ventbench`
+    """
+    from proofs import rounds
+    from ventbench.board import beacon
+
+    worlds: dict[str, int] = {}
+    for given in world:
+        name, _, count = given.partition(":")
+        if not count.isdecimal() or not int(count):
+            raise typer.BadParameter(f"{given}: give NAME:CASES", param_hint="--world")
+        worlds[name] = int(count)
+    chain = beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal)
+    own = rounds.freeze(folder, diagnoser, worlds, delay_s=delay, seconds=seconds, chain=chain)
+    due = own.frozen.chain.time_of(own.number)
+    typer.echo(f"{len(own.frozen.diagnosers)} diagnosers frozen as {own.sha256}: publish that")
+    typer.echo(f"`challenge round {folder}` takes value {own.number} of the beacon, at {due:%F %T}")
+
+
+@app.command(name="round")
+def round_(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the round.")],
+    beacon: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Value of the beacon; default: ask a public relay."),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of cases at once.")] = 1,
+    json: JsonFile = None,
+    page: ResultsPage = None,
+) -> None:
+    """Draw a frozen round, let all answer, and compare them; the same command continues.
+
+    Example: `python -m proofs challenge round runs/r1`
+    """
+    from proofs import rounds
+    from proofs.results_page import board_section
+    from ventbench.board import beacon as beacons
+
+    own = rounds.load(folder)
+    if own.value is None:
+        chain = own.frozen.chain
+        content = beacon.read_bytes() if beacon else beacons.fetch(chain, own.number)
+        own = rounds.draw(own, content)
+    tasks: dict[str, Any] = {}
+    with bars() as shown:
+
+        def tell(what: str, done: int, count: int) -> None:
+            if what not in tasks:
+                tasks[what] = shown.add_task(what, total=count)
+            shown.update(tasks[what], completed=done, total=count)
+
+        result = rounds.play(own, jobs=jobs, tell=tell)
     _told(result, json, page, "board of diagnosers", board_section(result))
 
 

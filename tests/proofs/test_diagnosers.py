@@ -13,10 +13,12 @@ from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.make import make
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Limits, built_in, find
+from proofs.challenge.vocabulary import PUBLISHED, TERMS, VOCABULARY
 from proofs.diagnosers import lisdd
 from proofs.diagnosers.common import Templates
 from proofs.diagnosers.gaussian_process import _Process
 from proofs.diagnosers.sindy import thresholded_least_squares
+from proofs.diagnosers.ventbench import Calibration, hypotheses
 
 
 def test_the_project_enters_itself_and_its_rivals() -> None:
@@ -59,6 +61,75 @@ def test_sparse_regression_finds_the_terms_that_act() -> None:
     np.testing.assert_allclose(found[[1, 4]], [1.5, -0.7], atol=0.02)
     assert not thresholded_least_squares(x, y, np.inf).any()
     assert not thresholded_least_squares(x, y, 2.0).any()
+
+
+SHARES = Calibration(nothing=0.9, named=0.8, placed=0.7, alone=0.25, foreign=0.6, doubt=2.0)
+
+
+def shares_of(verdict: str, *mechanisms: dict, **found) -> dict[frozenset[str], float]:
+    given = {"verdict": verdict, "mechanisms": mechanisms, "slot": None, "changes": [],
+             "saturated": None, "open_loop": {"unexplained": 0.1, "noise_floor": 0.2},
+             } | found  # fmt: skip
+    told = hypotheses(given, PUBLISHED, SHARES)
+    assert sum(each["probability"] for each in told) == pytest.approx(1.0)
+    assert all(TERMS.issuperset(each["terms"]) for each in told)
+    return {frozenset(each["terms"]): each["probability"] for each in told}
+
+
+def named(name: str, confidence: float = 1.0, *alternatives: str) -> dict:
+    return {"name": name, "confidence": confidence, "alternatives": list(alternatives)}
+
+
+def terms(*names: str) -> frozenset[str]:
+    return frozenset(names)
+
+
+def test_a_verdict_has_its_share_and_what_it_may_have_missed_the_rest() -> None:
+    silent = shares_of("nothing_missing")
+    assert silent[terms()] == pytest.approx(0.9)
+    assert silent[terms("cough")] == silent[terms("lost_commands")] == pytest.approx(0.06 / 8)
+    assert silent[terms("unknown:lung")] == pytest.approx(0.04 / 9)
+    told = shares_of("named", named("leak", 0.75, "valve_dead_band"))
+    assert told[terms("leak")] == pytest.approx(0.8 * 0.75)
+    assert told[terms("valve_dead_band")] == pytest.approx(0.8 * 0.25)
+    assert told[terms("leak", "cough")] == told[terms("cough")] == pytest.approx(0.1 * 0.6 / 8)
+    assert terms() not in told
+    changed = shares_of("named", changes=[{"of": "gain", "drifts": False}], saturated={})
+    assert changed[terms("gain_step", "saturation")] == pytest.approx(0.8)
+
+
+def test_what_stays_unexplained_speaks_against_a_verdict_that_leaves_nothing_open() -> None:
+    for verdict, names, share in (("named", [named("leak")], 0.8), ("nothing_missing", [], 0.9)):
+        large = {"open_loop": {"unexplained": 0.6, "noise_floor": 0.2}}
+        told = shares_of(verdict, *names, **large)[terms(*(each["name"] for each in names))]
+        assert told / (1.0 - told) == pytest.approx(share / (1.0 - share) / 9.0)
+
+
+def test_a_place_without_a_name_may_be_a_name_without_a_hypothesis() -> None:
+    slot = {"name": "f(t) at the supply", "places": {"f(t) at the supply": 3.0, "f(Q)": 1.0}}
+    told = shares_of("unnamed", slot=slot)
+    rest = 0.3 * 0.75  # and a quarter of it: nothing is missing
+    assert told[terms()] == pytest.approx(0.3 * 0.25)
+    assert told[terms("supply_ripple")] == pytest.approx(0.7 * 0.75 * 0.6 + rest * 0.6 / 8)
+    assert told[terms("unknown:supply")] == pytest.approx(0.7 * 0.75 * 0.4 + rest * 0.4 / 9)
+    assert told[terms("secretions")] == pytest.approx(0.7 * 0.25 * 0.6 + rest * 0.6 / 8)
+    assert told[terms("cough")] == pytest.approx(rest * 0.6 / 8)
+    beside = shares_of("named", named("leak"), slot={"name": "nowhere", "places": {}})
+    assert beside[terms("leak")] == pytest.approx(0.3 * 0.25)
+    assert beside[terms("leak", "unknown:airway")] > beside[terms("unknown:airway")]
+
+
+def test_an_answer_is_not_longer_than_may_be() -> None:
+    names = sorted(VOCABULARY)
+    many = [named(names[k], 0.3, *names[k + 1 : k + 4]) for k in (0, 4, 8)]
+    every = ("f(p)", "f(Q)", "f(V)", "measurement", "f(t) at the supply", "exhalation path")
+    assert 100 < len(shares_of("named", *many, slot={"places": dict.fromkeys(every, 1.0)})) <= 500
+
+
+def test_an_effect_without_name_and_place_is_a_set() -> None:
+    told = shares_of("unnamed")
+    assert told[terms()] == pytest.approx(0.25)
+    assert told[terms("cough")] == told[terms("circuit_water")] == pytest.approx(0.75 * 0.6 / 8)
 
 
 @pytest.mark.slow

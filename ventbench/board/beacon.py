@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import hmac
 import json
 import math
 import sys
@@ -34,6 +35,8 @@ DOMAIN = b"BLS_SIG_BLS12381G1_XMD:SHA-256_SSWU_RO_NUL_"
 RELAY = "https://api.drand.sh"
 
 _MAX_BYTES, _TIMEOUT_S = 10_000, 20.0
+
+_PURPOSE = b"ventbench round 1\n"
 
 
 class Chain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,6 +72,11 @@ class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     round: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
     randomness: schema.Sha256
     signature: Annotated[str, schema.matching("[0-9a-f]{96}")]
+
+    def seed(self, frozen: str) -> bytes:
+        """Seed of what is drawn, by the SHA-256 of the file that says what was frozen before."""
+        key = bytes.fromhex(self.randomness)
+        return hmac.digest(key, _PURPOSE + bytes.fromhex(frozen), "sha256")
 
 
 def read(content: bytes, label: str) -> Value:

@@ -16,7 +16,6 @@ fixed by the time of the freeze. A round whose chain is not the pinned public on
 
 from __future__ import annotations
 
-import hmac
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -48,7 +47,6 @@ OPENED, PROTOCOL, FROZEN, BEACON, BOUNDS, RESULT = canonical.ROUND_FILES
 #: Time between freeze and beacon, s, and entries of an account, unless a round says otherwise.
 DELAY_S, LIMIT = 600, 3
 
-_PURPOSE = b"ventbench round 1\n"
 _MAX_BYTES = 5_000_000
 
 _Name = Annotated[str, schema.matching(canonical.ROUND_NAME)]
@@ -162,8 +160,7 @@ class Round:
         """
         if self.value is None:
             raise InputError(f"round {self.name} is {self.state}: it has no draws yet")
-        key = bytes.fromhex(self.value.randomness)
-        return hmac.digest(key, _PURPOSE + bytes.fromhex(self.frozen_sha256), "sha256")
+        return self.value.seed(self.frozen_sha256)
 
     @property
     def number(self) -> int:
@@ -249,16 +246,10 @@ def load_all(leaderboard: Path) -> tuple[Round, ...]:
 
 
 def open_round(
-    leaderboard: Path,
-    name: str,
-    closes: datetime,
-    project: Sequence[str],
-    *,
-    delay_s: int = DELAY_S,
-    limit: int = LIMIT,
-    chain: Chain = QUICKNET,
+    leaderboard: Path, name: str, closes: datetime, project: Sequence[str], *,
+    delay_s: int = DELAY_S, limit: int = LIMIT, chain: Chain = QUICKNET,
     now: datetime | None = None,
-) -> Round:
+) -> Round:  # fmt: skip
     """Open a round; arguments as of :class:`Opened`.
 
     Raises:

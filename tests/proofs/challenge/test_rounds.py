@@ -143,7 +143,8 @@ def test_commands(answered):
     assert done.exit_code in (0, 1)
     value = json.loads(done.stdout)
     published = (answered.path / "commitment.txt").read_text().strip()
-    assert value["draws"] == [{"commitment": published, "total": 2, "answered": 2}]
+    draw = {"seed": SECRET, "commitment": published, "total": 2, "answered": 2}
+    assert value["draws"] == [draw]
     assert len(value["cases"]) == 2
     helped = CliRunner().invoke(app, ["challenge", "--help"])
     assert all(name in helped.stdout for name in ("make", "answer", "record", "reveal", "board"))
@@ -251,6 +252,10 @@ def test_a_stranger_reads_and_writes_nothing_else(tmp_path, monkeypatch):
         outcome = run(find(str(mine)), case, QUICK)
         assert "PermissionError" in outcome.problem
         assert "landlock" in outcome.layers
+    (mine / "data").symlink_to(kept)
+    with pytest.raises(InputError, match="data is a link"):
+        find(str(mine))
+    (mine / "data").unlink()
     (mine / "diagnoser.toml").write_text('name = "../up"\nfunction = "spy:diagnose"\n')
     with pytest.raises(InputError, match="a name has letters"):
         find(str(mine))
@@ -297,8 +302,7 @@ def test_draws_and_diagnosers_are_scored_together(answered, tmp_path):
     arguments = [*folders, *seeds, "--seed", "other words", "--page", str(page)]
     done = CliRunner().invoke(app, ["challenge", "reveal", *arguments, "--diagnoser", "asks"])
     assert done.exit_code in (0, 1)
-    assert "| 2 of 2 |" in page.read_text()
-    assert "| 1 of 2 |" in page.read_text()
+    assert "answered 2 of 2, 1 of 2:" in page.read_text()
     missing = CliRunner().invoke(app, ["challenge", "reveal", *folders, *seeds])
     assert missing.exit_code == 2
     assert "2 folders and 1 seeds" in missing.output
@@ -306,9 +310,7 @@ def test_draws_and_diagnosers_are_scored_together(answered, tmp_path):
     done = CliRunner().invoke(app, ["challenge", "board", *arguments, "--against", "sees_nothing"])
     assert done.exit_code == 0
     text = page.read_text()
-    assert (
-        "| figure | asks (3) | sees_nothing (1) |" in text
-        or "| sees_nothing (1) | asks (3) |" in text
-    )
+    assert "\n| asks | 3 |" in text
+    assert "\n| sees_nothing | 1 |" in text
     assert "`sees_nothing` minus the other, case by case" in text
-    assert f"Commitments: {answered.commitment.read_text().strip()}, " in text
+    assert f"| `{SECRET}` | `{answered.commitment.read_text().strip()}` |" in text

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from proofs.paper import published
-from proofs.paper.report import (
-    Cell,
-    Chart,
-    Line,
-    Section,
-    Table,
-    Verdict,
-)
+from proofs.paper.report import Cell, Chart, Line, Section, Table, Verdict
 from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.controllers.pid import PID
@@ -326,7 +319,8 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
         "episodes_to_2_percent", "seconds", "compile_seconds",
     )  # fmt: skip
     rows = tuple(
-        (name, *(_plain_number(row[key]) for key in columns)) for name, row in methods.items()
+        (name, *(f"{x:,}" if isinstance(x, int) else x for x in map(row.get, columns)))
+        for name, row in methods.items()
     )
     gradient = methods["policy-gradient"]
     reached = [methods[name]["episodes_to_best_pid"] for name in ("policy-gradient", "ppo", "dqn")]
@@ -374,18 +368,17 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
 
 def stability(samples: Mapping[str, Any]) -> Section:
     """Spread of trainings over seeds (the paper's section 6)."""
-    methods = {row["method"]: row for row in samples["methods"]}
-    names = ("policy-gradient", "ppo", "dqn")
-    spread = [
-        100.0 * (methods[name]["high95"] - methods[name]["low95"]) / methods[name]["final"]
-        for name in names
-    ]
+    spread = {
+        row["method"]: 100.0 * (row["high95"] - row["low95"]) / row["final"]
+        for row in samples["methods"]
+    }
+    ours, *others = (spread[name] for name in ("policy-gradient", "ppo", "dqn"))
     return Section(
         "stability", "Stability of the training", "section 6",
         "The policy gradient trains stably, PPO and DQN do not.",
-        "agrees" if spread[0] < min(spread[1:]) else "differs",
+        "agrees" if ours < min(others) else "differs",
         f"The 95 % interval of the final score over {samples['seeds']} seeds is as wide as "
-        + ", ".join(f"{wide:.1f} % ({name})" for name, wide in zip(names, spread, strict=True))
+        + ", ".join(f"{wide:.1f} % ({name})" for name, wide in spread.items())
         + " of the score.",
         f"`{samples['about']['command']}`, stored",
     )  # fmt: skip
@@ -420,7 +413,3 @@ def _index(gains: Floats, wanted: Sequence[float]) -> int:
 
 def _gains(gains: Sequence[float] | Floats, count: int = 3) -> str:
     return ", ".join(f"{gain:g}" for gain in list(gains)[:count])
-
-
-def _plain_number(value: float | None) -> Cell:
-    return f"{value:,}" if isinstance(value, int) else value

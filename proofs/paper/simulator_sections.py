@@ -14,14 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proofs.paper import published
-from proofs.paper.report import (
-    Cell,
-    Chart,
-    Line,
-    Section,
-    Table,
-    Verdict,
-)
+from proofs.paper.report import Cell, Chart, Line, Section, Table, Verdict
 from ventbench.base import files, precision
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
@@ -285,10 +278,7 @@ def exploration(official: frozen.Frozen) -> Section:
             Table(
                 "Settings of all lungs, the paper's (appendix C.1)",
                 ("lung", *(field.replace("_", " ") for field in ranges.__dataclass_fields__)),
-                tuple(
-                    (name, *(str(value) for value in vars(own).values()))
-                    for name, own in RANGES.items()
-                ),
+                tuple((name, *map(str, vars(own).values())) for name, own in RANGES.items()),
             ),
         ),
     )  # fmt: skip

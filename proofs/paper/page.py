@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import ventbench
-from proofs.paper.report import Chart, HeatMap, Reproduction
+from proofs.paper.report import Chart, Reproduction
 from ventbench import palette
 from ventbench.base import files
 from ventbench.base.errors import require
@@ -18,15 +18,6 @@ from ventbench.pages import graphics
 #: Size of a chart and of its plot: left, top, right and bottom margins.
 WIDTH, HEIGHT = 640.0, 280.0
 LEFT, TOP, RIGHT, BOTTOM = 44.0, 18.0, 8.0, 34.0
-
-#: Side of a field of a heat map.
-FIELD = 11.0
-
-#: Errors above this multiple of the least one of a map look alike, as in ``ventbench tune``.
-SATURATION = 3.0
-
-#: From the least error (light) to SATURATION times it (dark): one hue, so that it reads in grey.
-LIGHT, DARK = "#f2f7fb", "#0b3a66"
 
 
 def write_reproduction(path: Path | str, reproduction: Reproduction) -> Path:
@@ -60,11 +51,7 @@ def html(reproduction: Reproduction) -> str:
         about=reproduction.about,
         summary=reproduction.summary(),
         sections=[
-            (
-                section,
-                [_chart(chart) for chart in section.charts],
-                [_map(chart) for chart in section.maps],
-            )
+            (section, [_chart(chart) for chart in section.charts])
             for section in reproduction.sections
         ],
         not_reproduced=reproduction.not_reproduced,
@@ -126,32 +113,3 @@ def _ticks(low: float, high: float) -> list[float]:
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= raw)
     return [round(k * step, 10) for k in range(math.ceil(low / step), int(high / step + 1e-9) + 1)]
-
-
-def _map(chart: HeatMap) -> dict[str, Any]:
-    """Fields of a heat map, the lowest row of values at the bottom."""
-    values = np.asarray(chart.values, float)
-    least = float(np.nanmin(values))
-    row, column = np.unravel_index(int(np.nanargmin(values)), values.shape)
-    start, end = palette.rgb(LIGHT), palette.rgb(DARK)
-    fields = []
-    for (i, j), value in np.ndenumerate(values):
-        if not math.isfinite(value):
-            continue
-        share = min(max((value / least - 1.0) / (SATURATION - 1.0), 0.0), 1.0)
-        share = round(share * 20.0) / 20.0
-        color = [round(a + share * (b - a)) for a, b in zip(start, end, strict=True)]
-        y = (len(chart.y) - 1 - i) * FIELD
-        fields.append((j * FIELD, y, "#{:02x}{:02x}{:02x}".format(*color)))
-    return {
-        "title": chart.title,
-        "alt": f"{chart.title}: least {least:.3f} at {chart.y_label} {chart.y[row]:g}, "
-        f"{chart.x_label} {chart.x[column]:g}",
-        "x_label": f"{chart.x_label}, {chart.x[0]:g} to {chart.x[-1]:g}",
-        "y_label": f"{chart.y_label}, {chart.y[0]:g} to {chart.y[-1]:g}",
-        "width": len(chart.x) * FIELD,
-        "height": len(chart.y) * FIELD,
-        "field": FIELD,
-        "fields": fields,
-        "best": (column * FIELD + FIELD / 2, (len(chart.y) - 1 - row) * FIELD + FIELD / 2),
-    }

@@ -26,6 +26,7 @@ from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.entries.scoring import score
 from ventbench.plants import frozen
+from ventbench.plants.rigs import rigs_of
 from ventbench.plants.stacking import take
 from ventbench.task.lungs import LUNG_IDS, lung
 from ventbench.train import pid_grid
@@ -140,14 +141,17 @@ def reproduce_paper(
         simulators.simulators(official, kept["horizon"]),
         simulators.by_horizon(kept["horizon"]),
         simulators.architectures(kept["networks"]),
+        simulators.boundary(kept["networks"]),
         simulators.exploration(official),
         controllers.best_gains(grid),
+        controllers.beyond_the_grid(rigs_of(official)),
         controllers.example(official, grid, scored["residual"][1]),
         controllers.performance(grid, errors["residual"]),
         controllers.robustness(grid, errors["residual"], errors["residual, all lungs"]),
         controllers.regularisation(kept["controllers"]),
         controllers.reinforcement(errors),
         controllers.sample_efficiency(kept["samples"]),
+        controllers.stability(kept["samples"]),
     )
     about = {
         "ventbench": ventbench.__version__,

@@ -58,4 +58,9 @@ NOT_REPRODUCED = (
         "720 trials of hyper-parameters for PPO and 180 for DQN",
         "their settings and results are not published; docs/reinforcement.md lists the trials here",
     ),
+    (
+        "sections 5 and 6",
+        "values of lambda; robustness to hyper-parameters",
+        "no values are given; `ventbench train residual --lambda X` regularises",
+    ),
 )

@@ -78,27 +78,6 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class HeatMap:
-    """Values over two discrete axes.
-
-    Attributes:
-        title: what is shown, with unit.
-        x_label: name of the columns.
-        y_label: name of the rows.
-        x: values of the columns.
-        y: values of the rows.
-        values: a row for each of ``y``.
-    """
-
-    title: str
-    x_label: str
-    y_label: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-    values: tuple[tuple[float, ...], ...]
-
-
-@dataclass(frozen=True)
 class Section:
     """One table, figure or claim of the paper beside ours.
 
@@ -112,7 +91,6 @@ class Section:
         source: how the figures here were made.
         tables: tables.
         charts: charts.
-        maps: heat maps.
     """
 
     id: str
@@ -124,7 +102,6 @@ class Section:
     source: str
     tables: tuple[Table, ...] = ()
     charts: tuple[Chart, ...] = ()
-    maps: tuple[HeatMap, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,10 @@ def test_a_search_finds_what_it_is_told_of(monkeypatch):
         return np.sum(away**2, axis=-1)[..., None]
 
     monkeypatch.setattr(best_pid, "drawn_errors", errors)
-    found = best_pid.best_pids(load_rigs(), draws=1)
+    found = best_pid.best_pids(load_rigs(), drawn=load_rigs().of_training.draws(1))
     assert found.agree.all()
     np.testing.assert_allclose(np.log(found.gains), np.tile(optimum, (6, 1)), atol=0.03)
+    result = best_pid.tune_beyond(["R5C10", "R20C50"], draws=1)
+    assert list(result["lungs"]) == ["R5C10", "R20C50"]
+    for entry in (*result["lungs"].values(), result["single"]):
+        np.testing.assert_allclose(np.log(entry["gains"]), optimum, atol=0.03)

@@ -74,11 +74,7 @@ def headroom(
         return
     parts = out.with_suffix(".parts")
     with bars() as progress:
-        task = progress.add_task("best PID of each lung", total=None)
-        pids = best_pids(
-            rigs, progress=lambda done, all_: progress.update(task, completed=done, total=all_)
-        )
-        task = progress.add_task("best attainable", total=None)
+        pids = best_pids(rigs, progress=counted(progress, "best PID of each lung"))
         with executor(workers, scheduler) as pool:
             computed = references.compute(
                 plants,
@@ -87,7 +83,7 @@ def headroom(
                 about,
                 folder=parts,
                 pool=pool,
-                progress=lambda done, all_: progress.update(task, completed=done, total=all_),
+                progress=counted(progress, "best attainable"),
             )
     sha256 = computed.save(out)
     shutil.rmtree(parts)  # they are in the file now
@@ -157,6 +153,10 @@ def pid(
             "without noise, as in the paper.",
         ),
     ] = 20,
+    beyond: Annotated[
+        bool,
+        typer.Option("--beyond", help="Search on draws without the grid: gains have no edge."),
+    ] = False,
     json: JsonFile = None,
 ) -> None:
     """Simulate the paper's 8,000 PIDs at six PIPs on the frozen simulators or others.
@@ -171,22 +171,27 @@ def pid(
     from rich.console import Console
 
     from ventbench.base.errors import InputError
+    from ventbench.base.files import write_json
+    from ventbench.train.best_pid import tune_beyond
     from ventbench.train.pid_grid import RESULT, TABLE, tune_pid
 
     if (lung is not None) + every + robust != 1:
         raise InputError("give exactly one of --lung LUNG, --all and --robust")
+    names = None if lung is None else (lung,)
     with bars() as shown:
-        grid, result = tune_pid(
-            None if lung is None else (lung,),
-            out,
-            draws=draws,
-            workers=workers,
-            scheduler=scheduler,
-            each=not robust,
-            simulator=plant,
-            progress=counted(shown, "trajectories"),
-        )
-    written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
+        if beyond:
+            result = tune_beyond(
+                names, draws=draws, each=not robust, single=lung is None, simulator=plant,
+                progress=counted(shown, "PIDs"),
+            )  # fmt: skip
+            write_json(out / RESULT, result)
+            written = [RESULT]
+        else:
+            grid, result = tune_pid(
+                names, out, draws=draws, workers=workers, scheduler=scheduler, each=not robust,
+                simulator=plant, progress=counted(shown, "trajectories"),
+            )  # fmt: skip
+            written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
     emit(result, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(result))

@@ -10,17 +10,21 @@ and no gain lies at the grid's edge.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
 from ventbench.base.arrays import Bools, Floats
-from ventbench.plants.rigs import Rigs
+from ventbench.plants.catalog import Given
+from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.task import draws as draw_tables
 from ventbench.task.draws import Draws
-from ventbench.train.pid_grid import drawn_errors
+from ventbench.train.pid_grid import TUNING, TUNING_SEED, drawn_errors
+from ventbench.train.plants import check_names, plants_to_train_on
 
 #: Where searches may begin, %/cmH2O: P and I, and D.
 P_I, D = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0), (0.1, 1.0, 10.0, 100.0)
@@ -40,11 +44,11 @@ AGREEMENT = 0.02
 
 @dataclass(frozen=True, eq=False)
 class BestPIDs:
-    """Best PIDs of L lungs; S searches of each.
+    """Best PIDs of L lungs, and of all together as one more where that was asked for; S searches.
 
     Attributes:
         gains: P, I, D, %/cmH2O, shape ``(L, 3)``.
-        error: mean over draws and PIPs without the first step, cmH2O, shape ``(L,)``.
+        error: weighted mean over draws and PIPs without the first step, cmH2O, shape ``(L,)``.
         search_gains: where each search ended, shape ``(L, S, 3)``.
         search_errors: their errors, shape ``(L, S)``.
     """
@@ -64,66 +68,107 @@ class BestPIDs:
 def best_pids(
     rigs: Rigs,
     *,
-    draws: int = draw_tables.COUNT,
-    searches: int = SEARCHES,
-    evaluations: int = EVALUATIONS,
+    drawn: Draws | None = None,
+    groups: Sequence[Sequence[int]] | None = None,
+    weights: Floats | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BestPIDs:
-    """Find the best PID of each lung on the rigs of the training and the development draws.
+    """Find the best PID of each lung on the rigs of the training.
 
     Args:
-        rigs: L lungs; what they hold out has no part.
-        draws: number of development draws.
-        searches: of each lung.
-        evaluations: of each search at most.
-        progress: called with the number of lungs done, and of all.
+        rigs: lungs; what they hold out has no part.
+        drawn: draws on the rigs of the training; the development draws if not given.
+        groups: lungs that share a PID; each has its own if not given.
+        weights: of the PIPs of each lung; equal if not given.
+        progress: called with the number of groups done, and of all.
     """
     rigs = rigs.of_training
-    drawn = rigs.draws(draws)
+    drawn = rigs.draws(draw_tables.COUNT) if drawn is None else drawn
+    groups = [[lung] for lung in range(len(rigs.lungs))] if groups is None else groups
+    weight = np.ones(np.shape(drawn.cells.pip)[::2]) if weights is None else weights
     report = progress or (lambda done, total: None)
-    ends, errors = [], []
-    for lung in range(len(rigs.lungs)):
-        report(lung, len(rigs.lungs))
-        own = [_search(rigs, drawn, lung, start, evaluations) for start in _starts(
-            rigs, drawn, lung, searches
-        )]  # fmt: skip
-        ends.append([gains for gains, _ in own])
-        errors.append([error for _, error in own])
-    report(len(rigs.lungs), len(rigs.lungs))
-    found, least = np.array(ends), np.array(errors)
-    best = np.argmin(least, axis=1)
-    lungs = np.arange(len(best))
-    return BestPIDs(found[lungs, best], least[lungs, best], found, least)
+
+    def errors(group: Sequence[int], drawn: Draws, gains: Floats, **options: int) -> Floats:
+        each = [drawn_errors(rigs, drawn, at, gains, **options) * weight[at] for at in group]
+        return np.mean(each, axis=(0, 2))
+
+    few, ends = drawn.first(min(4, drawn.count)), []
+    for done, group in enumerate(groups):
+        report(done, len(groups))
+        starts = _starts(partial(errors, group, few))
+        ends.append([_search(partial(errors, group, drawn, together=1), x) for x in starts])
+    report(len(groups), len(groups))
+    found = np.array([[gains for gains, _ in own] for own in ends])
+    error = np.array([[error for _, error in own] for own in ends])
+    at = (np.arange(len(groups)), np.argmin(error, axis=1))
+    return BestPIDs(found[at], error[at], found, error)
 
 
-def _starts(rigs: Rigs, drawn: Draws, lung: int, count: int) -> list[Floats]:
-    """Best points of the coarse grid, on the first draws, no two of them neighbours."""
+def tune_beyond(
+    lungs: Sequence[str] | None = None,
+    *,
+    draws: int = draw_tables.COUNT,
+    each: bool = True,
+    single: bool = True,
+    simulator: Given = "frozen",
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Tune PIDs as :func:`~ventbench.train.pid_grid.tune_pid` does, but without a grid's edge.
+
+    Args:
+        lungs: ids; all lungs of the simulators if not given.
+        draws: number of draws for tuning, at least 1.
+        each: find the best gains of each lung.
+        single: find the best gains for all of them together.
+        simulator: see :func:`ventbench.load_simulators`.
+        progress: called with the number of PIDs found, and of all.
+
+    Returns:
+        The content of ``best.json``; errors are weighted.
+
+    Raises:
+        InputError: if a lung or a simulator is unknown, or there are no draws.
+    """
+    trained_on = plants_to_train_on(simulator)
+    names = check_names(lungs, trained_on, all_lungs=False)
+    rigs = load_rigs(simulator).of_training
+    where = [trained_on.names.index(name) for name in names]
+    found = best_pids(
+        rigs,
+        drawn=rigs.draws(draws, seed=TUNING_SEED, name=TUNING),
+        groups=[[at] for at in where] * each + [where] * single,
+        weights=trained_on.weights,
+        progress=progress,
+    )
+    pairs = zip(found.gains.tolist(), found.error.tolist(), strict=True)
+    entries = [{"gains": gains, "error": error} for gains, error in pairs]
+    result: dict[str, Any] = {"draws": draws, "simulators": dict(trained_on.about)}
+    if each:
+        result["lungs"] = dict(zip(names, entries, strict=False))
+    return result | ({"single": entries[-1]} if single else {})
+
+
+def _starts(errors: Callable[[Floats], Floats]) -> list[Floats]:
+    """Best points of the coarse grid, no two of them neighbours."""
     grid = np.array(list(itertools.product(P_I, P_I, D)))
-    error = drawn_errors(rigs, drawn.first(min(4, drawn.count)), lung, grid).mean(axis=-1)
     chosen: list[Floats] = []
-    for gains in grid[np.argsort(error, kind="stable")]:
-        far = [np.count_nonzero(gains != other) > 1 for other in chosen]
-        if all(far):
+    for gains in grid[np.argsort(errors(grid), kind="stable")]:
+        if all(np.count_nonzero(gains != other) > 1 for other in chosen):
             chosen.append(gains)
-        if len(chosen) == count:
-            break
-    return chosen
+    return chosen[:SEARCHES]
 
 
-def _search(
-    rigs: Rigs, drawn: Draws, lung: int, start: Floats, evaluations: int
-) -> tuple[Floats, float]:
+def _search(errors: Callable[[Floats], Floats], start: Floats) -> tuple[Floats, float]:
     """Gains where a search ends, and their error."""
 
     def error(logarithms: Floats) -> float:
-        gains = np.exp(logarithms)[None]
-        return float(drawn_errors(rigs, drawn, lung, gains, together=1).mean())
+        return float(errors(np.exp(logarithms)[None])[0])
 
     first = np.log(start)
     simplex = np.vstack([first, first + np.log(FACTOR) * np.eye(3)])
     options = {
         "initial_simplex": simplex,
-        "maxfev": evaluations,
+        "maxfev": EVALUATIONS,
         "xatol": TOLERANCE,
         "fatol": ERROR_TOLERANCE,
     }

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from proofs.__main__ import app
 from proofs.paper import controller_sections, paper, published, simulator_sections
-from proofs.paper.report import Chart, HeatMap, Line, Reproduction, Section, Table
+from proofs.paper.report import Chart, Line, Reproduction, Section, Table
 from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.plants.learned import Architecture
@@ -75,6 +75,12 @@ def test_networks_are_set_beside_the_papers(stored):
     assert isinstance(usual, float)
     assert wide < usual
     assert rows["N_B 5"][1] is None
+    # Width 150 gains; of the other four larger shapes no interval is without zero.
+    assert section.verdict == "in part"
+    assert simulator_sections.boundary(stored["networks"]).verdict == "differs"
+    surely = copy.deepcopy(stored["networks"])
+    next(row for row in surely["variants"] if row["variant"] == "N_B 0")["low95"] = 0.01
+    assert simulator_sections.boundary(surely).verdict == "agrees"
 
 
 def test_the_grid_ranks_the_papers_gains():
@@ -105,6 +111,16 @@ def test_the_residual_network_is_judged_by_lung(residual, verdict):
     assert section.tables[0].rows[0][3] == pytest.approx(100.0 * (residual - 1.0), abs=1e-3)
 
 
+def test_no_claim_agrees_whose_interval_has_a_zero():
+    grid = grid_of(np.linspace(1.0, 2.0, len(GAINS)))
+    residual = np.repeat([[0.5], [0.9], [0.9], [0.95], [0.99], [0.99]], 6, axis=1)
+    section = controller_sections.performance(grid, residual)
+    assert section.verdict == "in part"
+    assert "better on 6 of 6" in section.finding
+    both = {"residual": residual, "PPO": np.full((6, 6), 0.88), "DQN": np.ones((6, 6))}
+    assert controller_sections.reinforcement(both).verdict == "in part"
+
+
 def test_one_network_for_all_must_win_by_more():
     grid = grid_of(np.linspace(1.0, 2.0, len(GAINS)))
     own, shared = np.full((6, 6), 0.9), np.full((6, 6), 0.8)
@@ -126,6 +142,7 @@ def test_studies_have_their_claims(stored):
     assert samples.verdict == "in part"
     assert "ppo" in {row[0] for row in samples.tables[0].rows}
     assert controller_sections.regularisation(stored["controllers"]).verdict == "differs"
+    assert controller_sections.stability(stored["samples"]).verdict == "differs"
     unfinished = copy.deepcopy(stored["samples"])
     unfinished["methods"][-1]["episodes_to_best_pid"] = None
     assert "Not all methods" in controller_sections.sample_efficiency(unfinished).finding
@@ -134,10 +151,9 @@ def test_studies_have_their_claims(stored):
 def small_page():
     table = Table("numbers", ("name", "value"), (("a", 1.23456), ("b", None)), 2)
     chart = Chart("lines", "s", "cmH2O", (Line("one", (1.0, 10.0), (2.0, math.nan)),), True)
-    field = HeatMap("map", "I", "P", (0.0, 1.0), (0.0, 1.0), ((3.0, 2.0), (math.nan, 1.0)))
     section = Section(
         "id", "A title", "table 9", "A <claim>.", "in part", "It is so.", "computed",
-        (table,), (chart,), (field,),
+        (table,), (chart,),
     )  # fmt: skip
     return Reproduction({"protocol": 2}, (section,), (("figure 1", "a drawing", "a drawing"),))
 
@@ -159,7 +175,7 @@ def test_the_html_page_is_whole_and_escapes():
 
     text = html(small_page())
     assert "A &lt;claim&gt;." in text
-    assert text.count("<rect") == 3
+    assert text.count("<svg") == 1
     assert "<script" not in text
     assert text == html(small_page())
 
@@ -189,7 +205,7 @@ def test_the_whole_page_agrees_with_scores_and_manifest(tmp_path, monkeypatch):
     official = frozen.load().lungs()
     for row in sections["simulators"]["tables"][0]["rows"]:
         assert row[2] == official[row[0]]["own_rig_mae"]
-    assert (tmp_path / "paper.html").read_text().count("<svg") >= 8
+    assert (tmp_path / "paper.html").read_text().count("<svg") == 3
     assert (tmp_path / "paper.md").read_text().startswith("# The paper, reproduced")
 
 

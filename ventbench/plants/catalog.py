@@ -227,8 +227,8 @@ def _by_text(text: str) -> Simulators:
             return _pressures_file(path)
         if name.endswith(".fmu"):
             raise InputError(
-                f"{path} holds machine code, which runs with all your rights: if you trust it, pass "
-                "--in-process; from Python, give ventbench.plants.fmu.Fmu(path)"
+                f"{path} holds machine code, which runs with all your rights: pass --in-process "
+                "if you trust it; from Python, give ventbench.plants.fmu.Fmu(path)"
             )
         return _plant_file(path)
     module, colon, attribute = text.partition(":")

@@ -11,13 +11,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer.main
 from _pytest.mark.structures import ParameterSet
+from scipy.io import savemat
+from typer.testing import CliRunner
 
 from ci import generated_tables
 from proofs import __main__ as proofs
+from ventbench.base.files import example
 from ventbench.cli import app
+from ventbench.cli.options import quiet_first
+from ventbench.recordings import load
 from ventbench.task.interfaces import Observation, Task
 
 ROOT = Path(__file__).parents[2]
@@ -31,6 +37,20 @@ PAGES = sorted(
 
 #: What makes a block take seconds to minutes on a machine that has compiled nothing yet.
 SLOW = re.compile(r"diagnose\(|train_|\bfit\(|ventbench\.score\(")
+
+
+#: Blocks of commands that run as they are written, by page and number from 1, in one folder a page;
+#: with those before them, and with the page's own controller or diagnoser.
+QUICK = {"docs/mechanics.md": (1,), "docs/missing_physics.md": (2,)}
+WHOLE = {"docs/diagnosers.md": (1,), "docs/mechanics.md": (2,)}
+
+#: Examples of ``--help`` that run as they are written.
+EXAMPLES = (
+    "ventbench lungs", "ventbench stressors", "ventbench doctor",
+    "ventbench simulate", "ventbench open-loop", "ventbench fmu", "ventbench coverage",
+    "ventbench data import",
+    "ventbench board show", "ventbench board records",
+)  # fmt: skip
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -93,6 +113,108 @@ def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def furnish(folder: Path) -> Path:
+    """Put what the pages speak of into a folder: recordings, tables, plans, a record."""
+    for name in ("data", "submissions", "leaderboard", "proofs", "ci"):
+        (folder / name).symlink_to(ROOT / name)
+    recorded = load(example("concealed"))
+    (folder / "recording.csv").write_bytes(example("concealed").read_bytes())
+    u_in, u_out = recorded.u_in[:4].ravel(), recorded.u_out[:4].ravel().astype(int)
+    at = 0.03 * np.arange(u_in.size)
+    table = np.stack([np.repeat(range(1, 5), recorded.u_in.shape[1]), at, u_in, u_out], axis=1)
+    head = "breath_id,time_step,u_in,u_out"
+    np.savetxt(folder / "plan.csv", table, "%.9g", ",", header=head, comments="")
+    np.savetxt(folder / "commands.csv", table[:80, 1:], "%.9g", ",", header=head[10:], comments="")
+    flow = load(example("flow"))
+    assert flow.flow is not None
+    pressure, flows = flow.pressure.ravel(), np.asarray(flow.flow).ravel()
+    at = 0.03 * np.arange(pressure.size)
+    rows = np.stack([at, pressure, 0.06 * flows], axis=1)
+    np.savetxt(folder / "lab.csv", rows, "%.9g", ",", header="time,Paw,Flow", comments="")
+    fine = np.interp(np.arange(0.0, at[-1], 0.005), at, pressure)
+    savemat(folder / "lab.mat", {"data": {"p": fine}, "other": {"p": fine}})
+    names = ("timestamp", "pressure", "flow_out", "control_in", "control_out", "oxygen")
+    zero, cycle = 0.0 * at, np.repeat(range(len(flow)), flow.pressure.shape[1])
+    logged = [1.6e9 + at, pressure, zero, flow.u_in.ravel(), flow.u_out.ravel(), zero, cycle]
+    head = ", ".join(f"'{name}'" for name in (*names, "cycle_number"))
+    rows = np.stack(logged, axis=1)
+    np.savetxt(folder / "waveforms.csv", rows, "%.14g", ",", header=head, comments="")
+    commands = next((ROOT / "leaderboard" / "records").glob("*.actions"))
+    (folder / commands.name).write_bytes(commands.read_bytes())
+    texts = (path.read_bytes() for path in sorted(commands.parent.glob("*.json")))
+    (folder / "RECORD.json").write_bytes(next(x for x in texts if commands.stem.encode() in x))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return furnish(tmp_path_factory.mktemp("reader"))
+
+
+def examples() -> dict[str, str]:
+    """Examples of ``--help`` by command."""
+    rows = [line.strip("| ").split(" | ") for line in generated_tables.commands().splitlines()[2:]]
+    return {row[0].strip("`"): row[2].strip("` ") for row in rows}
+
+
+QUICK_LINES = [
+    line
+    for page, numbers in QUICK.items()
+    for number in numbers
+    for line in blocks(ROOT / page, "sh")[number - 1].splitlines()
+]
+
+
+@pytest.mark.parametrize("line", [*QUICK_LINES, *map(examples().__getitem__, EXAMPLES)])
+def test_what_is_cheap_runs(line: str, furnished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(furnished)
+    program, *words = shlex.split(
+        line.replace("leaderboard/records/RECORD", "RECORD"), comments=True
+    )
+    done = CliRunner().invoke(PROGRAMS[program], quiet_first(words), catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WHOLE)
+def test_blocks_of_commands_run(page: str, tmp_path: Path, public_recordings: Path) -> None:
+    """As written, by a shell; packages are installed already, and ``&`` gets a moment to start."""
+    furnish(tmp_path)
+    (tmp_path / "recordings").symlink_to(public_recordings)
+    if page == "docs/diagnosers.md":
+        (tmp_path / "mine").mkdir()
+        for language, name in (("python", "diagnose.py"), ("toml", "diagnoser.toml")):
+            (tmp_path / "mine" / name).write_text(blocks(ROOT / page, language)[0], "utf-8")
+    lines = [blocks(ROOT / page, "sh")[number - 1] for number in WHOLE[page]]
+    script = re.sub(r"^pip install .*", "", "\n".join(lines), flags=re.M).replace(
+        "&\n", "& sleep 8\n"
+    )
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", f"trap 'kill $(jobs -p) 2>&- || true' EXIT\n{script}"],
+        cwd=tmp_path, env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+
+
+def test_forty_journeys_run_as_written() -> None:
+    """What a reader does, on pages and by ``--help``, scripts and notebooks included."""
+    count = {
+        "blocks of Python": sum(len(blocks(page, "python")) for page in PAGES),
+        "commands of pages": len(QUICK_LINES)
+        + sum(
+            len(blocks(ROOT / page, "sh")[number - 1].splitlines())
+            for page, numbers in WHOLE.items()
+            for number in numbers
+        ),
+        "examples of --help": len(EXAMPLES),
+        "scripts and notebooks": len([*ROOT.glob("examples/*.py"), *ROOT.glob("examples/*.ipynb")]),
+    }
+    print(f"{sum(count.values())} journeys: {count}")
+    assert sum(count.values()) >= 40
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_parse(page: Path) -> None:
     """Every command exists and takes the options that the page gives it."""
@@ -101,11 +223,11 @@ def test_commands_parse(page: Path) -> None:
 
 
 def test_the_sites_table_of_commands_has_all_and_their_examples_parse() -> None:
-    rows = [line.strip("| ").split(" | ") for line in generated_tables.commands().splitlines()[2:]]
-    named = {row[0].strip("`") for row in rows}
-    assert {"ventbench score", "ventbench board withdraw", f"{PROOFS} challenge reveal"} <= named
-    examples = [part.strip("` ") for row in rows for part in row[2].split("&&")]
-    ours = [line for line in examples if line.startswith(("ventbench ", f"{PROOFS} "))]
+    assert {"ventbench score", "ventbench board withdraw", f"{PROOFS} challenge reveal"} <= {
+        *examples()
+    }
+    parts = [part.strip() for example in examples().values() for part in example.split("&&")]
+    ours = [line for line in parts if line.startswith(("ventbench ", f"{PROOFS} "))]
     assert len(ours) > 30
     assert not {line: problem for line in ours if (problem := parse(line))}
 

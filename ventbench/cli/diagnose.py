@@ -13,17 +13,20 @@ from ventbench.cli.options import (
     JsonFile,
     Pad,
     PlantName,
+    TrustFmu,
     bars,
     claim_out,
     counted,
     emit,
     known_lungs,
     notes,
+    simulator_of,
 )
 from ventbench.cli.options import bars as progress_bars
 
 if TYPE_CHECKING:
     from ventbench.mechanics import Mechanics, SurveyedRun
+    from ventbench.plants.fmu import Fmu
 
 
 def mechanics(
@@ -216,6 +219,7 @@ def diagnose(
         ),
     ] = False,
     passive: Annotated[bool, typer.Option("--passive", hidden=True)] = False,
+    in_process: TrustFmu = False,
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
@@ -255,7 +259,7 @@ def diagnose(
         breaths = files.load(recordings, clip=clip, pad=pad, progress=reading)
     for note in breaths.notes:
         said.print(f"note: {note}", markup=False, highlight=False)
-    diagnosis = _diagnose(breaths, plant, simulated, lung, patient, drive)
+    diagnosis = _diagnose(breaths, simulator_of(plant, in_process), simulated, lung, patient, drive)
     written = diagnosis.save(out)
     emit(diagnosis.as_dict(), json)
     console = Console(stderr=str(json) == "-")
@@ -268,7 +272,7 @@ def diagnose(
 
 
 def _diagnose(
-    breaths: Breaths, plant: str, simulated: Path | None, lung: str | None, patient: bool,
+    breaths: Breaths, plant: str | Fmu, simulated: Path | None, lung: str | None, patient: bool,
     drive: str,
 ) -> Diagnosis:  # fmt: skip
     """Diagnose with a progress bar that says what is done and how long it will take."""

@@ -1,4 +1,4 @@
-"""``ventbench lungs``, ``coverage``, ``simulate`` and ``open-loop``: what simulators are worth."""
+"""``ventbench lungs``, ``coverage``, ``simulate``, ``open-loop``, ``fmu``: of simulators."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from ventbench.cli.options import (
     JsonFile,
     Pad,
     PlantName,
+    TrustFmu,
     bars,
     counted,
     emit,
     known_lungs,
     notes,
+    simulator_of,
 )
 from ventbench.task import protocol
 
@@ -122,6 +124,7 @@ def simulate(
         ),
     ] = None,
     plant: PlantName = "frozen",
+    in_process: TrustFmu = False,
 ) -> None:
     """Simulate the pressures for a file of valve commands, as CSV.
 
@@ -134,10 +137,11 @@ def simulate(
     from ventbench.base import files
     from ventbench.base.errors import InputError
 
+    chosen = simulator_of(plant, in_process)
     with open(controls, encoding="utf-8-sig", errors="replace") as file:
         many = "breath_id" in file.readline().replace('"', "").strip().split(",")
     if many:
-        done = simulation.simulate_breaths(controls, lung=lung, simulator=plant, start=start)
+        done = simulation.simulate_breaths(controls, lung=lung, simulator=chosen, start=start)
         if out is None:
             typer.echo(done.to_frame().to_csv(index=False), nl=False)
         else:
@@ -145,7 +149,7 @@ def simulate(
         return
     if lung is None:
         raise InputError("--lung is needed: the file names no lung; give one such as R20C50")
-    text = simulation.simulate(controls, lung=lung, simulator=plant, start=start).to_csv()
+    text = simulation.simulate(controls, lung=lung, simulator=chosen, start=start).to_csv()
     if out is None:
         typer.echo(text, nl=False)
     else:
@@ -157,6 +161,7 @@ def open_loop(
         Path, typer.Argument(help="CSV, CSV.GZ or Parquet file in the public schema.")
     ],
     plant: PlantName = "frozen",
+    in_process: TrustFmu = False,
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
@@ -191,7 +196,8 @@ def open_loop(
         )
     with bars() as shown:
         simulating = counted(shown, f"simulating {len(breaths)} breaths")
-        result = open_loop_report.open_loop(breaths, plant, progress=simulating)
+        chosen = simulator_of(plant, in_process)
+        result = open_loop_report.open_loop(breaths, chosen, progress=simulating)
     emit(result.as_dict(), json)
     console = Console(stderr=str(json) == "-")
     console.print(_open_loop_table(result.as_dict()))
@@ -226,9 +232,27 @@ def _open_loop_table(result: dict[str, Any]) -> Any:
     return table
 
 
+def fmu(
+    lung: Annotated[str, typer.Option(help="Lung, such as R20C50.", autocompletion=known_lungs)],
+    out: Annotated[Path, typer.Option(metavar="FILE.fmu", help="File to write.")],
+    plant: PlantName = "frozen",
+) -> None:
+    """Write a lung as an FMU for co-simulation in another program (FMI 3.0).
+
+    It runs where Python can import ventbench.
+
+    Example: `ventbench fmu --lung R20C50 --out R20C50.fmu`
+    """
+    from ventbench.plants.catalog import load_simulators
+    from ventbench.plants.fmu import export
+
+    typer.echo(f"wrote {export(load_simulators(plant).plant(lung), out, lung=lung)}")
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(lungs)
     app.command()(coverage)
     app.command()(simulate)
     app.command("open-loop")(open_loop)
+    app.command()(fmu)

@@ -10,6 +10,7 @@ What is given                         What it stands for
 ``FOLDER``                            what ``ventbench train simulator`` wrote
 ``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
 ``module:name``                       a function or class in plain Python, or a plant; or a mapping
+an ``Fmu``                            an FMU that is trusted; see :mod:`~ventbench.plants.fmu`
 a plant                               that plant for every lung
 a mapping                             plants, functions or classes by lung id
 a function, class or object           a simulator in plain Python or NumPy; see
@@ -39,6 +40,7 @@ from ventbench.base import files, precision
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
+from ventbench.plants.fmu import Fmu
 from ventbench.plants.plant_files import FAMILIES, load_plants, origin
 from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
 from ventbench.plants.simulators import Simulators
@@ -144,6 +146,8 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
         digest = _leaves_sha256(given)
         about = {"kind": "plants", "sha256": digest}
         return _plants(dict(given), "the given plants", about, digest)
+    if isinstance(given, Fmu):
+        return _of_function(given, given.path.name, given.sha256)
     if _is_python(given):
         name = getattr(given, "__qualname__", type(given).__name__)
         return _of_function(given, name)
@@ -221,6 +225,12 @@ def _by_text(text: str) -> Simulators:
         name = path.name.lower()
         if name.endswith((".csv", ".csv.gz", ".parquet")):
             return _pressures_file(path)
+        if name.endswith(".fmu"):
+            raise InputError(
+                f"{path} holds machine code, which runs with all your rights. If you trust it, "
+                "simulate, open-loop and diagnose take it with --in-process, and functions of "
+                "Python as ventbench.plants.fmu.Fmu(path); a closed loop needs states to set back"
+            )
         return _plant_file(path)
     module, colon, attribute = text.partition(":")
     if colon and all(part.isidentifier() for part in (*module.split("."), attribute)):

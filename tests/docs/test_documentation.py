@@ -42,7 +42,10 @@ SLOW = re.compile(r"diagnose\(|train_|\bfit\(|ventbench\.score\(")
 #: Blocks of commands that run as they are written, by page and number from 1, in one folder a page;
 #: with those before them, and with the page's own controller or diagnoser.
 QUICK = {"docs/mechanics.md": (1,), "docs/missing_physics.md": (2,)}
-WHOLE = {"docs/diagnosers.md": (1,), "docs/mechanics.md": (2,)}
+WHOLE = {
+    "README.md": (2,), "docs/submitting.md": (1,),
+    "docs/diagnosers.md": (1,), "docs/mechanics.md": (2,),
+}  # fmt: skip
 
 #: Examples of ``--help`` that run as they are written.
 EXAMPLES = (

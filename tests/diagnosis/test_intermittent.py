@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,13 @@ from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.intermittent import Intermittent, find
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
+from ventbench.pages.diagnosis import write_report
 from ventbench.physics import paths
 from ventbench.physics.catalogue import intermittent
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import make_data
 
-from . import small
+from . import made, small
 
 BREATHS = 24
 AFFECTED = np.array([3, 4, 9, 12, 16, 17, 22])
@@ -117,3 +119,20 @@ def test_commands_that_were_lost_are_found_and_followed():
     assert lost.sum() > 10
     assert np.mean(np.abs(told - true)[lost] < 1.0) > 0.9
     assert np.mean(np.abs(told - true)[~lost] < 4.0) > 0.98
+
+
+def test_the_affected_breaths_stand_in_the_first_sentence_the_json_and_the_page(tmp_path):
+    """Commands that are lost or late are one answer with two members."""
+    about = dataclasses.replace(
+        made.diagnosis(12).mechanisms[0], name="lost_commands", parameters={},
+        alternatives=("late_commands",), affected=(2, 3, 4, 9, 12),
+    )  # fmt: skip
+    told = dataclasses.replace(made.diagnosis(12), mechanisms=(about,), plants={})
+    first = str(told).splitlines()[0]
+    assert "never reach the valve, or commands that reach the valve late" in first
+    assert "in breaths 2 to 4, 9 and 12" in first
+    assert told.as_dict()["mechanisms"][0]["affected_breaths"] == [2, 3, 4, 9, 12]
+    drawn = write_report(tmp_path / "r.html", told).read_text()
+    # Three runs of breaths among twelve, from the ends of the session on.
+    for low, width in ((8.33, 25.0), (66.67, 8.33), (91.67, 8.33)):
+        assert re.search(rf'<rect x="{low}" width="{width}\d*"', drawn)

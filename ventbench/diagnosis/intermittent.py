@@ -74,8 +74,9 @@ _FEWEST, _LEFT = 2, 4
 #: p-value below which affected breaths have an order in time.
 _ORDERED = 0.002
 
-#: Samples by which commands may be late, and least share of them that are lost or late.
-_LAGS, _RARE = (2, 3, 4, 5), 0.003
+#: Samples by which commands may be late, least share of them that are lost or late, and nats by
+#: which two delays are alike.
+_LAGS, _RARE, _ALIKE = (2, 3, 4, 5), 0.003, 2.0
 
 #: Steps between the points of a grid, as shares of its own, by which a breath's course is refined.
 _FINER = (0.5, 0.25)
@@ -177,8 +178,7 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     for each in found:  # the likeliest of each name
         odds.setdefault(each.name, float(np.exp(each.total - best.total)))
     affected, u_in, estimates = _everywhere(best, data)
-    ordered = order_p_value(affected.astype(float), data.lung, evaluator.settings.residuals)
-    if affected.sum() < _FEWEST or (u_in is None and ordered < _ORDERED):
+    if affected.sum() < _FEWEST or (u_in is None and _is_change(affected, evaluator, data)):
         return None
     near = np.exp(-0.5 * evaluator.settings.refinement.close_criterion)
     missing = MissingMechanism(
@@ -187,6 +187,14 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         float(gained.sum()), affected=tuple(int(i) for i in ids[affected]),
     )  # fmt: skip
     return Intermittent(missing, ids, affected, u_in)
+
+
+def _is_change(affected: Flags, evaluator: Evaluator, data: Data) -> bool:
+    """Whether affected breaths have an order in time, as after a change of the session."""
+    if np.count_nonzero(np.diff(affected.astype(int))) == 1:
+        return True
+    ranked = affected + 1e-3 * np.random.default_rng(0).uniform(size=len(affected))  # no ties
+    return order_p_value(ranked, data.lung, evaluator.settings.residuals) < _ORDERED
 
 
 def _log_likelihood(model: IdentifiedModel) -> Floats:
@@ -303,8 +311,11 @@ def _everywhere(found: _Found, data: Data) -> tuple[Flags, Floats | None, dict[s
         estimates = {"share": Estimate(p, "1", (max(p - width, 0.0), min(p + width, 1.0)))}
         if found.strength:
             dt = float(np.median(data.dt[:, :-1]))
-            late = found.strength * dt
-            estimates["delay"] = Estimate(late, "s", (late - dt, late + dt))
+            near = [_paths(evaluator, found.fitted, partition, found.share, k).nats.sum()
+                    for k in _LAGS]  # fmt: skip
+            likely = np.array(_LAGS)[np.array(near) > max(near) - _ALIKE]
+            ends = (float(likely[0] - 1) * dt, float(likely[-1]) * dt)
+            estimates["delay"] = Estimate(0.5 * sum(ends), "s", ends)
         return paths.kept > 0, paths.u_in, estimates
     evidence = _Evidence.of(evaluator, found.fitted, partition, name)
     acts = evidence.acts(found.strength, found.share)

@@ -14,6 +14,7 @@ from ventbench.diagnosis.findings import (
 )
 from ventbench.diagnosis.number_text import (
     PHASES,
+    breaths_in_words,
     error_phrase,
     error_region,
     probability,
@@ -52,9 +53,6 @@ _LEAST_WEIGHT = 0.05
 
 #: Preference over other names below which a name is weak: another one, or all others, have more.
 _WEAK = 0.5
-
-#: Most breaths, or ranges of breaths, that a sentence lists.
-_LISTED_BREATHS = 10
 
 #: A strength this near to the end of its range, as a share of the range, stands there.
 _AT_END = 0.01
@@ -371,21 +369,7 @@ def told(missing: MissingMechanism, *, others: bool = False) -> str:
         rivals = [title(name) for name in missing.alternatives if others]
     if rivals:
         text = f"{text}, or {_listed(rivals, 'or')}"
-    return f"{text}, in {_breaths(missing.affected)}" if missing.affected else text
-
-
-def _breaths(ids: Sequence[int]) -> str:
-    """Ids of breaths in words; those that follow each other as a range."""
-    runs: list[list[int]] = []
-    for number in ids:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1] = [runs[-1][0], number]
-        else:
-            runs.append([number])
-    shown = [" to ".join(map(str, run)) for run in runs]
-    if len(shown) > _LISTED_BREATHS:
-        shown = [*shown[: _LISTED_BREATHS - 1], f"others up to {ids[-1]}"]
-    return f"breath{'s' * (len(ids) > 1)} {_listed(shown)}"
+    return f"{text}, in {breaths_in_words(missing.affected)}" if missing.affected else text
 
 
 def missing_mechanism(missing: MissingMechanism) -> str:

@@ -202,9 +202,7 @@ def timeline(diagnosis: Diagnosis, missing: MissingMechanism) -> list[tuple[floa
 
     Empty if it acts alike in all breaths.
     """
-    ids = np.array(
-        sorted({*missing.affected, *(i for own in diagnosis.split.values() for i in own)})
-    )
+    ids = np.union1d(diagnosis.traces.breaths.breath_id, missing.affected)
     acts = np.isin(ids, missing.affected)
     if missing.breaths is not None:
         acts = ids >= missing.breaths[0]

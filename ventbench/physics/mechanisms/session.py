@@ -28,7 +28,8 @@ _WARMING = Parameter(
     0.0, 10.0, 0.0, 0.0, 0.0, shape=True,
 )  # fmt: skip
 
-_GROWN = "g = (1 - exp(-warming x)) / (1 - exp(-warming)), x = position in the recording, 0..1"
+_POSITION = "x = position of the breath in the recording, 0..1"
+_GROWN = f"g = (1 - exp(-warming x)) / (1 - exp(-warming)), {_POSITION}"
 
 
 def _since(values: Values, position: Array) -> Array:
@@ -86,7 +87,7 @@ def _pair(
     mild, scan = sizes[0], (sizes[0], -sizes[0])
 
     def described(
-        kind: str, title: str, equation: str, form: Parameter, **more: str
+        kind: str, title: str, equation: str, form: Parameter, source: str, signature: str
     ) -> Description:
         when = "before" if kind == "step" else "from the first breath to the last"
         change = Parameter(
@@ -96,13 +97,13 @@ def _pair(
         return Description(
             name=f"{short}_{kind}", title=title, site=site, equation=equation,
             parameters=(change, form), confusable=confusable[kind == "drift"],
-            least=least, least_reason=reason, **more,
+            least=least, least_reason=reason, source=source, signature=signature,
         )  # fmt: skip
 
     return (
         ChangedParameter(described(
             "step", f"step of the {words}",
-            f"{path} = {path} (1 + change) after the position `at` of the recording", _AT,
+            f"{path} = {path} (1 + change) where x > at, {_POSITION}", _AT,
             source=step, signature=f"From one breath on, {sign}.",
         ), path),
         ChangedParameter(described(
@@ -150,7 +151,7 @@ MECHANISMS = (
         name="zero_step",
         title="step of the pressure sensor's zero",
         site="sensor",
-        equation="y = p + change after the position `at` of the recording",
+        equation=f"y = p + change where x > at, {_POSITION}",
         parameters=(
             Parameter(
                 "change", "cmH2O", "change of the offset",

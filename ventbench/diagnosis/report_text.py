@@ -226,7 +226,8 @@ def worth(findings: Findings) -> str:
         return f"it errs by {after} cmH2O{also} on {count} breaths set aside, and {left}"
     refit = rounded(errors.refit.rmse, 2)
     term = findings.nonparametric
-    if term is not None and term.x_unit.startswith("sample") and not findings.mechanisms:
+    by_breath = term is not None and term.x_unit.startswith("sample") and not findings.mechanisms
+    if by_breath or _swings(findings):
         return (
             "it differs from breath to breath, so that no correction of the simulator mends it: "
             f"the error on {count} breaths set aside stays at {after} cmH2O{also}, and {left}"
@@ -274,7 +275,7 @@ def would_change(findings: Findings) -> list[str]:
             "Breaths of another kind, such as short pulses, long holds or a second lung, may show "
             "what these cannot."
         )
-    elif findings.open_loop.unexplained > findings.open_loop.least_error:
+    elif findings.open_loop.unexplained > findings.open_loop.least_error and not _swings(findings):
         texts.append(
             "More than the noise is unexplained: a further effect may act, and with it the "
             "strengths given here may move."
@@ -291,6 +292,12 @@ def would_change(findings: Findings) -> list[str]:
             "how one is added."
         )
     return texts
+
+
+def _swings(findings: Findings) -> bool:
+    """Whether all that is missing oscillates, with a phase of its own in each breath."""
+    own = [each.name in events() and not each.affected for each in findings.mechanisms]
+    return bool(own) and all(own)
 
 
 def remaining(findings: Findings) -> str:

@@ -175,14 +175,14 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         return None
     best = found[0]
     odds: dict[str, float] = {}
-    for each in found:  # the likeliest of each name
-        odds.setdefault(each.name, float(np.exp(each.total - best.total)))
+    for each in found:
+        odds[each.name] = odds.get(each.name, 0.0) + float(np.exp(each.total - best.total))
     affected, u_in, estimates = _everywhere(best, data)
     if affected.sum() < _FEWEST or (u_in is None and _is_change(affected, evaluator, data)):
         return None
     near = np.exp(-0.5 * evaluator.settings.refinement.close_criterion)
     missing = MissingMechanism(
-        best.name, estimates, 1.0 / sum(odds.values()),
+        best.name, estimates, odds[best.name] / sum(odds.values()),
         tuple(name for name, value in odds.items() if value > near and name != best.name),
         float(gained.sum()), affected=tuple(int(i) for i in ids[affected]),
     )  # fmt: skip
@@ -268,6 +268,7 @@ def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_Found]:
         if total > least:
             tested = _paths(evaluator, fitted, evaluator.held_out, share, lag).nats
             name = COMMANDS[lag > 0]
+            total -= np.log(len(_LAGS)) if lag else 0.0  # each delay is as likely
             found.append(_Found(evaluator, name, fitted, lag, share, total, tested))
     return found
 

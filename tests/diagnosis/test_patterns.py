@@ -80,6 +80,11 @@ PATTERNS = {
     "places that cannot be told apart, and breaths that are not told": (
         "diagnosis/test_report_text.py::test_places_that_breaths_cannot_tell_apart_are_one_answer",
         "diagnosis/test_session.py::test_the_verdict_says_what_changes_by_how_much_from_which_breath_on",
+        "diagnosis/test_intermittent.py::test_an_effect_of_some_breaths_is_named_with_them",
+        "diagnosis/test_intermittent.py::test_the_affected_breaths_stand_in_the_first_sentence_the_json_and_the_page",
+    ),
+    "commands that were lost become efforts": (
+        "diagnosis/test_intermittent.py::test_commands_that_were_lost_are_found_and_followed",
     ),
     "trapped gas becomes a leak": ("diagnosis/test_session.py::test_trapped_gas_is_no_leak",),
     "a sentence that contradicts its chart": (

@@ -160,29 +160,29 @@ class Breath:
 
 def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, position=0.0):
     """Pressure, cmH2O, flow, mL/s, and volume, mL, at each sample, ``(3, T)``."""
-    drifted = m.get("sensor_drift", {})
-    fading = drifted.get("warming", 0.0)
-    grown = (1 - np.exp(-fading * position)) / (1 - np.exp(-fading)) if fading else position
+
+    def drift(name, of="change"):
+        own = m.get(name, {})
+        w = own.get("warming", 0.0)
+        return own.get(of, 0.0) * (
+            (1 - np.exp(-w * position)) / (1 - np.exp(-w)) if w else position
+        )
 
     def step(name):
         own = m.get(name, {"at": 0.0, "change": 0.0})
         return own["change"] if position > own["at"] else 0.0
 
-    drift = drifted.get("drift", 0.0) * grown + step("zero_step")
+    zero = drift("sensor_drift", "drift") + step("zero_step")
     bend = m.get("sensor_curve", {}).get("bend", 0.0)
 
     def shown(p):
-        return p + 4 * bend * p / 40 * (1 - p / 40) + drift
+        return p + 4 * bend * p / 40 * (1 - p / 40) + zero
 
-    R = R * (1 + m.get("resistance_drift", {}).get("change", 0.0) * position)
-    C = C * (1 + m.get("compliance_drift", {}).get("change", 0.0) * position)
-    R, C = R * (1 + step("resistance_step")), C * (1 + step("compliance_step"))
-    warm = m.get("gain_drift", {}).get("warming", 0.0)
-    since = (1 - np.exp(-warm * position)) / (1 - np.exp(-warm)) if warm else position
-    gain = gain * (1 + m.get("gain_drift", {}).get("change", 0.0) * since)
-    gain = gain * (1 + step("gain_step"))
+    R = R * (1 + drift("resistance_drift")) * (1 + step("resistance_step"))
+    C = C * (1 + drift("compliance_drift")) * (1 + step("compliance_step"))
+    gain = gain * (1 + drift("gain_drift")) * (1 + step("gain_step"))
     rig = Breath(R, C, m, R_ex, peep)
-    p0 = brentq(lambda p: shown(p) - start, -20.0, 60.0, xtol=1e-13) if bend else start - drift
+    p0 = brentq(lambda p: shown(p) - start, -20.0, 60.0, xtol=1e-13) if bend else start - zero
     inside = p0 + rig.get("trapped_gas", "pressure")
     v0 = brentq(lambda v: recoil(v, C, m) - inside, -0.01, 0.0239 * C, xtol=1e-14)
     times = np.concatenate([[0.0], np.cumsum(dt[:-1])])

@@ -71,6 +71,8 @@ def test_each_mechanism(name, level, predicted):
         ("patient_effort.relaxing", 0.3),
         ("sensor_drift.warming", 3.0),
         ("gain_drift.warming", 3.0),
+        ("resistance_drift.warming", 3.0),
+        ("compliance_drift.warming", 3.0),
         ("exhalation_valve_delay.slow", 1.0),
         ("exhalation_valve_delay.slow", 0.5),
     ],

@@ -34,6 +34,7 @@ from ventbench.diagnosis.identification import (
     usable,
     without_saturated,
 )
+from ventbench.diagnosis.intermittent import Intermittent, find
 from ventbench.diagnosis.residual_analysis import (
     compare_open_loop,
     flow_and_volume,
@@ -77,6 +78,9 @@ Drive: TypeAlias = Literal["auto", "valve", "flow"]
 #: identified; and the part of what is left that a step of an identification takes, so that the five
 #: or six steps of one effect come near the end.
 _STARTED, _IDENTIFIED, _STEP = 0.02, 0.9, 0.3
+
+#: Most effects that act in some breaths.
+_MOST_INTERMITTENT = 2
 
 _NOTE_ON_FLOW = (
     "No valve command: the recorded flow drives the model, so nothing is said of the valves, R_ex "
@@ -145,11 +149,45 @@ def diagnose(
         raise InputError(f"drive is {drive!r}; choose {', '.join(get_args(Drive))}")
     breaths = load(breaths)
     require_roles(breaths)
-    tell = progress or (lambda what, share: None)
     simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:
         breaths = _of_lung(breaths, parse_lung(lung).id)
     by_flow = drive == "flow" or (drive == "auto" and flow_drive.lacks_commands(breaths))
+    told: list[MissingMechanism] = []
+    while True:
+        found = _diagnose(
+            breaths, simulators, patient, by_flow, rigs, progress or (lambda what, share: None),
+            settings, look=not by_flow and len(told) < _MOST_INTERMITTENT,
+        )  # fmt: skip
+        if isinstance(found, Diagnosis):
+            break
+        told.append(found.missing)
+        breaths = found.rest_of(breaths)
+    return replace(
+        found,
+        verdict="named" if told else found.verdict,
+        mechanisms=(*told, *found.mechanisms),
+        simulator=_name(simulator, simulators),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _diagnose(
+    breaths: Breaths, simulators: Simulators, patient: bool, by_flow: bool, rigs: Sessions | None,
+    tell: Progress, settings: SelectionConfig, *, look: bool,
+) -> Diagnosis | Intermittent:  # fmt: skip
+    """Diagnose breaths in which all effects act alike; see :func:`diagnose`.
+
+    Args:
+        breaths: the breaths.
+        simulators: what to diagnose.
+        patient: whether somebody may breathe.
+        by_flow: whether the recorded flow drives the model.
+        rigs: the rigs of the recording.
+        tell: receives the current step.
+        settings: every threshold.
+        look: whether to look for an effect of some breaths, which is returned alone.
+    """
     notes_on_flow: list[str] = []
     if by_flow:
         breaths, notes_on_flow = flow_drive.with_flow(breaths)
@@ -181,6 +219,11 @@ def diagnose(
     recording_only_model = identify(
         data.select(seen), held, excluded, steps_between(tell, _STARTED, halfway), settings, fitted
     )
+    if look:
+        tell("looking for effects of some breaths", halfway)
+        some = find(recording_only_model, data, recorded.breath_id)
+        if some is not None and some.leaves_enough(recorded, simulators, settings):
+            return some
     recording_model, simulator_model = recording_only_model, None
     if not simulators.is_base_physics:
         tell("fitting the simulator's response", halfway)
@@ -265,9 +308,11 @@ def diagnose(
         settings=settings.residuals,
     )  # fmt: skip
     form, term = estimates.split_form(term, tuple(missing))
+    swings = None if term is None else estimates.oscillation(conclusion)
+    term = term if swings is None else None
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
     unnamed = unnamed or is_unexplained(open_loop, settings.correction) or adequacy.vetoed
-    verdict: Verdict = "named" if missing else "unnamed" if unnamed else "nothing_missing"
+    verdict: Verdict = "named" if missing or swings else "unnamed" if unnamed else "nothing_missing"
     limits: dict[str, float] = {}
     if verdict == "nothing_missing":
         limits = detection_limits(recording_model.evaluator, conclusion.named)
@@ -276,7 +321,7 @@ def diagnose(
         mechanisms=tuple(
             _missing_mechanism(name, changed, recording_model, simulator_model, breaths)
             for name, changed in missing.items()
-        ),
+        ) + ((swings,) if swings else ()),
         nonparametric=term,
         form=form,
         location=location,
@@ -294,14 +339,14 @@ def diagnose(
         gain_scatter=conclusion.gain_sd,
         detection_limits=limits,
         plants=correction.plants,
-        simulator=_name(simulator, simulators),
+        simulator=simulators.name,
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
         notes=(
             *notes, *notes_on_simulator, *correction.notes, *notes_on_lungs,
             *_note_on_slow_noise(conclusion, settings),
         ),
         settings=settings,
-        seconds=time.perf_counter() - began,
+        seconds=0.0,
     )  # fmt: skip
 
 

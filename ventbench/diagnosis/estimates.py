@@ -14,9 +14,15 @@ from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
-from ventbench.diagnosis.findings import NonparametricTerm
+from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
-from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
+from ventbench.diagnosis.latent_inputs import (
+    ALVEOLUS,
+    CIRCUIT,
+    MEASUREMENT,
+    SUPPLY,
+    LatentInput,
+)
 from ventbench.diagnosis.remaining_error import UnnamedEffect
 from ventbench.diagnosis.selection.screening import component_of
 from ventbench.diagnosis.settings import EstimateSettings
@@ -100,11 +106,16 @@ def without_absorbed(curve: Curve) -> Curve:
     return replace(curve, y=curve.y - powers @ np.linalg.lstsq(powers, curve.y, rcond=None)[0])
 
 
+#: Mechanisms that a periodic latent input is, by its place, and least weight of one that counts.
+_OSCILLATIONS = {SUPPLY: "supply_ripple", CIRCUIT: "circuit_water"}
+_LEAST_WEIGHT = 0.05
+
 #: What a latent input is, by the place where it enters.
 _LATENT_INPUTS = {
     ALVEOLUS: "a pressure at the alveolus that varies in time and that no command explains",
     SUPPLY: "a flow of the supply that varies in time and that no command explains",
     MEASUREMENT: "a pressure at the sensor that varies in time and that is not in the airway",
+    CIRCUIT: "a pressure in the circuit that swings while gas flows",
 }
 
 
@@ -329,6 +340,32 @@ def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
     meaning = NONPARAMETRIC_COMPONENTS[place.name].meaning
     return NonparametricTerm(
         place.name, meaning, explains, place.nats, x, x_unit, y, y_unit, places=place.places
+    )
+
+
+def oscillation(conclusion: Conclusion) -> MissingMechanism | None:
+    """The mechanism that a periodic latent input is; None if there is none, or no name for it."""
+    effect = conclusion.unnamed
+    source = None if effect is None else effect.latent_input
+    if effect is None or source is None or not source.periodic:
+        return None
+    names = [_OSCILLATIONS.get(place) for place, weight in effect.places if weight >= _LEAST_WEIGHT]
+    if _OSCILLATIONS.get(effect.name) is None or None in names:
+        return None
+    name, others = _OSCILLATIONS[effect.name], [each for each in names if each is not None]
+    each = np.sqrt(2.0 * np.mean(source.course**2, axis=1))  # amplitude of each breath
+    amplitude, wide = float(each.mean()), 1.96 * float(each.std()) / len(each) ** 0.5
+    frequency, sd = source.scale, 1.96 * source.scale_sd
+    unit = mechanism(name).description.strength.unit
+    return MissingMechanism(
+        name,
+        {
+            "amplitude": Estimate(amplitude, unit, (amplitude - wide, amplitude + wide)),
+            "frequency": Estimate(frequency, "Hz", (frequency - sd, frequency + sd)),
+        },
+        dict(effect.places).get(effect.name, 1.0),
+        tuple(other for other in others if other != name),
+        effect.nats,
     )
 
 

@@ -44,6 +44,7 @@ class MissingMechanism:
             NaN if unknown.
         breaths: of a change at a breath, the id of the first breath after it, and the ids between
             which that lies with 95 %; else None.
+        affected: ids of the breaths in which it acts, if it acts in some only.
     """
 
     name: str
@@ -55,6 +56,7 @@ class MissingMechanism:
     simulator_values: dict[str, float] = field(default_factory=dict)
     worth: float = float("nan")
     breaths: tuple[int, int, int] | None = None
+    affected: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """Latent inputs: effects that vary in time and that no command explains.
 
 A latent input is a Gaussian process, smooth or of one frequency, independent from breath to breath.
-It acts on the pressure at the alveolus, on the flow of the supply, or on the reading of the sensor.
+It acts on the pressure at the alveolus, on the flow of the supply, on the reading of the sensor, or
+swings in the circuit while gas flows.
 Its course is integrated out; its size, its scale and the noise beside it are those that make the
 recording likeliest (:mod:`ventbench.diagnosis.gaussian_process`). Coloured noise is such an input
 at the sensor, and an input that acts in the physics has to explain more than that. Scatter of the
@@ -28,12 +29,14 @@ from ventbench.diagnosis.gaussian_process import (
 )
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.settings import LatentInputSettings
+from ventbench.physics.events.oscillations import HALF_SWING
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import LEAST_SIGMA, MOST_AR, Noise
 
 #: Public names of the places where an input may act.
 ALVEOLUS, SUPPLY, MEASUREMENT = "f(t) at the alveolus", "f(t) at the supply", "measurement"
-PLACES = (ALVEOLUS, SUPPLY, MEASUREMENT)
+CIRCUIT = "f(t) in the circuit"
+PLACES = (ALVEOLUS, SUPPLY, MEASUREMENT, CIRCUIT)
 
 #: Replicates of the Bayesian bootstrap of :func:`place_weights`, and its seed: a weight of 10 % is
 #: known to half a percent, and the same recording always gets the same weights.
@@ -72,6 +75,7 @@ class LatentInput:
         training_log_likelihood: log-likelihood of all training breaths, nats.
         held_out_log_likelihood: log-likelihood of each held-out breath, nats, ``(n,)``.
         course: expected course in each training breath, ``(n, T)``.
+        scale_sd: standard deviation of a frequency, Hz; NaN if smooth.
     """
 
     place: str
@@ -82,6 +86,7 @@ class LatentInput:
     training_log_likelihood: float
     held_out_log_likelihood: Floats
     course: Floats
+    scale_sd: float = float("nan")
 
     @property
     def noise(self) -> Noise:
@@ -210,7 +215,8 @@ def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
         partition: n breaths of T samples.
         values: physical values of its parameters, ``(n, P + 1)``.
         place: pressure at the alveolus, cmH2O; flow of the supply, as a share of it; pressure at
-            the sensor, cmH2O; or the logarithm of the valve's gain.
+            the sensor, cmH2O, and in the circuit at a large flow; or the logarithm of the valve's
+            gain.
 
     Returns:
         ``(n, T, T)``, input first; for the gain ``(n, 1, T)``.
@@ -226,6 +232,16 @@ def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
     R, C, R_ex, gain = (values[:, names.index(name)] for name in ("R", "C", "R_ex", "gain"))
     C = C * 1e-3
     volume, responses = np.zeros((n, samples)), np.zeros((n, samples, samples))
+    if place == CIRCUIT:
+        above = values[:, -1] - values[:, names.index("PEEP")]  # pressure in the lung
+        for k in range(1, samples):
+            expiratory, dt = data.u_out[:, k - 1] > 0, data.dt[:, k - 1]
+            above = np.where(expiratory, above * np.exp(-dt / ((R + R_ex) * C)), above)
+            inwards = gain * 1e-3 * data.u_in[:, k - 1]
+            flow = np.abs(np.where(expiratory, above / (R + R_ex), inwards))
+            above = np.where(expiratory, above, above + inwards * dt / C)
+            responses[:, k, k] = flow / (flow + HALF_SWING)
+        return responses
     for k in range(1, samples):
         expiratory = data.u_out[:, k - 1] > 0
         decay = np.where(expiratory, np.exp(-data.dt[:, k - 1] / ((R + R_ex) * C)), 1.0)
@@ -294,6 +310,7 @@ class _Fit(NamedTuple):
         size: its standard deviation.
         noise: model of the measurement noise.
         coefficients: see :class:`~ventbench.diagnosis.gaussian_process.Marginal`.
+        scale_sd: see :class:`LatentInput`.
     """
 
     nats: float
@@ -301,6 +318,7 @@ class _Fit(NamedTuple):
     size: float
     noise: Noise
     coefficients: Floats | None
+    scale_sd: float = float("nan")
 
 
 def _fit_input(
@@ -320,6 +338,8 @@ def _fit_input(
     settings, training = evaluator.settings.latent_inputs, evaluator.training
     if place == GAIN_SCATTER:
         parts = {Kernel(False, 1.0): np.ones((len(training.data), 1, 1))}
+    if place == CIRCUIT:  # water swings; anything else there is a leak or another resistance
+        parts = {kernel: each for kernel, each in parts.items() if kernel.periodic}
 
     def climbed(linear: _Linear, noise: Noise, known: _Fit | None = None) -> _Fit:
         responses = input_responses(training, linear.model.values, place)
@@ -355,7 +375,7 @@ def _fit_input(
     whitened = LinearBreaths.of(problem, x).whitened(best.noise, process.responses)
     return LatentInput(
         place, kernel.periodic, kernel.scale, best.size, model, best.nats,
-        whitened.marginal(best.size).nats, course,
+        whitened.marginal(best.size).nats, course, best.scale_sd,
     )  # fmt: skip
 
 
@@ -453,7 +473,15 @@ def _climb_process(
         start.append(np.log(kernel.scale))
         limits.append((start[3] - settings.frequency_span, start[3] + settings.frequency_span))
     _climb(fall, np.array(start), limits, settings)
-    return best
+    if not kernel.periodic:
+        return best
+    top = best
+    frequency = top.process.kernel.scale
+    point = np.array([*_noise_point(top.noise), np.log(top.size), np.log(frequency)])
+    move = np.array([0.0, 0.0, 0.0, _STEPS[3]])
+    lost = fall(point - move) + fall(point + move) + 2.0 * top.nats  # a parabola's
+    sd = frequency * _STEPS[3] / np.sqrt(max(lost, 1e-9))
+    return best._replace(scale_sd=float(sd))
 
 
 def _climb(

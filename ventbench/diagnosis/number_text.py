@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from ventbench.diagnosis.findings import ErrorRegion
 from ventbench.diagnosis.residual_axes import EDGE
@@ -27,6 +28,9 @@ _NO_SIGN = 0.25
 
 #: Parameters of time below this are given in ms, s.
 _SHORT_PARAMETER = 0.5
+
+#: Most breaths, or ranges of breaths, that a sentence lists.
+_LISTED = 10
 
 
 def quantity(estimate: Estimate, path: str = "") -> str:
@@ -139,3 +143,18 @@ def where(region: ErrorRegion) -> str:
 
 def _time(seconds: float) -> str:
     return f"{1000 * seconds:.6g} ms" if seconds <= _SHORT_MOMENT else f"{seconds:.6g} s"
+
+
+def breaths_in_words(ids: Sequence[int]) -> str:
+    """Ids of breaths in words; those that follow each other as a range."""
+    runs: list[list[int]] = []
+    for number in ids:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1] = [runs[-1][0], number]
+        else:
+            runs.append([number])
+    shown = [" to ".join(map(str, run)) for run in runs]
+    if len(shown) > _LISTED:
+        shown = [*shown[: _LISTED - 1], f"others up to {ids[-1]}"]
+    text = " and ".join(filter(None, [", ".join(shown[:-1]), *shown[-1:]]))
+    return f"breath{'s' * (len(ids) > 1)} {text}"

@@ -14,6 +14,7 @@ from ventbench.diagnosis.findings import (
 )
 from ventbench.diagnosis.number_text import (
     PHASES,
+    breaths_in_words,
     error_phrase,
     error_region,
     probability,
@@ -33,6 +34,7 @@ from ventbench.mechanics.labels import (
     LungMatch,
 )
 from ventbench.physics import mechanism, parameter
+from ventbench.physics.catalogue import events
 
 #: Odds beyond these are called sure: no model is so right that larger ones mean anything.
 _SURE_ODDS = 1e6
@@ -224,7 +226,8 @@ def worth(findings: Findings) -> str:
         return f"it errs by {after} cmH2O{also} on {count} breaths set aside, and {left}"
     refit = rounded(errors.refit.rmse, 2)
     term = findings.nonparametric
-    if term is not None and term.x_unit.startswith("sample") and not findings.mechanisms:
+    by_breath = term is not None and term.x_unit.startswith("sample") and not findings.mechanisms
+    if by_breath or _swings(findings):
         return (
             "it differs from breath to breath, so that no correction of the simulator mends it: "
             f"the error on {count} breaths set aside stays at {after} cmH2O{also}, and {left}"
@@ -272,7 +275,7 @@ def would_change(findings: Findings) -> list[str]:
             "Breaths of another kind, such as short pulses, long holds or a second lung, may show "
             "what these cannot."
         )
-    elif findings.open_loop.unexplained > findings.open_loop.least_error:
+    elif findings.open_loop.unexplained > findings.open_loop.least_error and not _swings(findings):
         texts.append(
             "More than the noise is unexplained: a further effect may act, and with it the "
             "strengths given here may move."
@@ -289,6 +292,12 @@ def would_change(findings: Findings) -> list[str]:
             "how one is added."
         )
     return texts
+
+
+def _swings(findings: Findings) -> bool:
+    """Whether all that is missing oscillates, with a phase of its own in each breath."""
+    own = [each.name in events() and not each.affected for each in findings.mechanisms]
+    return bool(own) and all(own)
 
 
 def remaining(findings: Findings) -> str:
@@ -363,7 +372,11 @@ def told(missing: MissingMechanism, *, others: bool = False) -> str:
         text = f"{text.removeprefix('step of ')} {how} by {by} from breath {missing.breaths[0]} on"
     rivals = [name for name in missing.alternatives if others and about.uses_position]
     rivals = [title(name) for name in rivals if mechanism(name).uses_position]
-    return f"{text}, or {_listed(rivals, 'or')}" if rivals else text
+    if missing.affected or missing.name in events():  # places that are alike are one answer
+        rivals = [title(name) for name in missing.alternatives if others]
+    if rivals:
+        text = f"{text}, or {_listed(rivals, 'or')}"
+    return f"{text}, in {breaths_in_words(missing.affected)}" if missing.affected else text
 
 
 def missing_mechanism(missing: MissingMechanism) -> str:

@@ -227,6 +227,7 @@ def _mechanism(missing: MissingMechanism) -> dict[str, Any]:
         "changed": missing.changed,
         "simulator_has": missing.simulator_values,
         "first_breath": missing.breaths,
+        "affected_breaths": list(missing.affected),
     }
 
 

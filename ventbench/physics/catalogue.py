@@ -68,7 +68,7 @@ def library() -> dict[str, Mechanism]:
     """Every mechanism by name, in alphabetical order.
 
     Each module of the package ``mechanisms`` defines one, as ``MECHANISM``, whose name is that of
-    the module.
+    the module, or several alike, as ``MECHANISMS``.
     """
     return _catalogue().library
 
@@ -76,7 +76,7 @@ def library() -> dict[str, Mechanism]:
 def basis_terms() -> dict[str, Mechanism]:
     """Every basis term of the nonparametric components by name, in alphabetical order.
 
-    Modules of the package ``nonparametric`` define them, as ``TERMS``. They are not in the library;
+    Modules of the package ``nonparametric`` define them. They are not in the library;
     a fit has those that its caller names.
     """
     return _catalogue().basis_terms
@@ -85,10 +85,16 @@ def basis_terms() -> dict[str, Mechanism]:
 def events() -> dict[str, Mechanism]:
     """Every event by name, in alphabetical order.
 
-    Each module of the package ``events`` defines one, as ``MECHANISM``. They are not in the
-    library: no fit searches for them.
+    Modules of the package ``events`` define them. They are not in the library: they act in some
+    breaths only, or with a phase of each breath.
     """
     return _catalogue().events
+
+
+def intermittent() -> tuple[str, ...]:
+    """Events whose strength differs from breath to breath: those that act in some breaths."""
+    found = ((name, event.description.strength) for name, event in events().items())
+    return tuple(name for name, strength in found if strength.scope == "breath")
 
 
 def everything() -> dict[str, Mechanism]:
@@ -144,7 +150,7 @@ def strength_path(name: str) -> str:
 def _catalogue() -> Catalogue:
     global _current
     if _current is None:
-        _current = Catalogue(_by_module(mechanisms), _basis_terms(), _by_module(event_modules))
+        _current = Catalogue(_of(mechanisms), _of(nonparametric), _of(event_modules))
     return _current
 
 
@@ -159,20 +165,15 @@ def _paths(catalogue: Catalogue, names: tuple[str, ...] | None) -> tuple[str, ..
     return (*(parameter.name for parameter in BASE_PARAMETERS), *own)
 
 
-def _by_module(package: ModuleType) -> dict[str, Mechanism]:
-    by_name = {module.__name__.rpartition(".")[2]: module.MECHANISM for module in _in(package)}
-    for name, mechanism in by_name.items():
-        if mechanism.description.name != name:
-            raise ValueError(f"{name}.py describes {mechanism.description.name!r}")
-    return by_name
-
-
-def _basis_terms() -> dict[str, Mechanism]:
-    terms = [term for module in _in(nonparametric) for term in getattr(module, "TERMS", ())]
-    by_name = {term.description.name: term for term in terms}
-    if len(by_name) < len(terms):
-        raise ValueError("two basis terms have the same name")
-    return dict(sorted(by_name.items()))
+def _of(package: ModuleType) -> dict[str, Mechanism]:
+    """What the modules of a package define, one as ``MECHANISM`` or several as ``MECHANISMS``."""
+    found: dict[str, Mechanism] = {}
+    for module in _in(package):
+        one = getattr(module, "MECHANISM", None)
+        for each in getattr(module, "MECHANISMS", ()) if one is None else (one,):
+            if found.setdefault(each.description.name, each) is not each:
+                raise ValueError(f"two mechanisms have the name {each.description.name!r}")
+    return dict(sorted(found.items()))
 
 
 def _in(package: ModuleType) -> Iterator[ModuleType]:

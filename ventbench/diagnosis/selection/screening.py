@@ -23,7 +23,14 @@ from ventbench.diagnosis.hypothesis import (
 )
 from ventbench.diagnosis.patient_effort import breath_term
 from ventbench.diagnosis.settings import ScreeningSettings, SelectionConfig
-from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter, paths
+from ventbench.physics.catalogue import (
+    basis_terms,
+    intermittent,
+    library,
+    mechanism,
+    parameter,
+    paths,
+)
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Floats
 from ventbench.system_id.predictor import Predictor
@@ -212,7 +219,8 @@ def all_parameter_paths(
 
 
 def _compiled(excluded: Collection[str]) -> tuple[str, ...]:
-    return tuple(name for name in library() if name not in excluded or varies_by_breath(name))
+    kept = tuple(name for name in library() if name not in excluded or varies_by_breath(name))
+    return (*kept, *intermittent())
 
 
 def component_of(term: str) -> str:

@@ -22,7 +22,7 @@ from ventbench.diagnosis.findings import (
     NonparametricTerm,
     OpenLoopError,
 )
-from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY
+from ventbench.diagnosis.latent_inputs import ALVEOLUS, CIRCUIT, MEASUREMENT, SUPPLY
 from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
 from ventbench.pages.diagnosis import charts
 from ventbench.physics import mechanism
@@ -184,11 +184,27 @@ def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
         "nats": f"{missing.nats:.0f}",
         "alternatives": missing.alternatives,
         "chart": None if shown is None else charts.own_signal(about.title, shown),
+        "timeline": timeline(diagnosis, missing),
+        "affected": missing.affected,
         "parameters": [
             (key, meanings.get(key, key), number_text.quantity(value, f"{missing.name}.{key}"))
             for key, value in missing.parameters.items()
         ],
     }
+
+
+def timeline(diagnosis: Diagnosis, missing: MissingMechanism) -> list[tuple[float, float]]:
+    """Where in the session a mechanism acts, as left ends and widths, % of all breaths.
+
+    Empty if it acts alike in all breaths.
+    """
+    ids = np.union1d(diagnosis.traces.breaths.breath_id, missing.affected)
+    acts = np.isin(ids, missing.affected)
+    if missing.breaths is not None:
+        acts = ids >= missing.breaths[0]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], acts, [False]]).astype(int)))
+    shares = np.round(100.0 * edges / max(len(ids), 1), 2).reshape(-1, 2)
+    return [(float(low), float(high - low)) for low, high in shares]
 
 
 def _values(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, float]:
@@ -248,7 +264,7 @@ PARTS = {
 }
 
 #: Places of latent inputs.
-_LATENT = {ALVEOLUS: "alveolus", SUPPLY: "supply", MEASUREMENT: "sensor"}
+_LATENT = {ALVEOLUS: "alveolus", SUPPLY: "supply", MEASUREMENT: "sensor", CIRCUIT: "circuit"}
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,17 @@ class Disconnection(Mechanism):
         equation="q_out = conductance p while onset < t <= onset + duration",
         parameters=(
             Parameter(
-                "conductance", "mL/s per cmH2O", "of the open end", 0.0, 5000.0, 0.0, 1000.0, 1000.0
+                "conductance", "mL/s per cmH2O", "of the open end",
+                0.0, 5000.0, 0.0, 1000.0, 1000.0, scope="breath", scan=(80.0, 150.0, 300.0, 1000.0),
             ),
-            Parameter("onset", "s", "after the first sample", -1.0, 5.0, 0.0, 0.3, 0.3),
-            Parameter("duration", "s", "until it is put back", 0.0, 10.0, 0.3, 0.3, 1.0),
+            Parameter(
+                "onset", "s", "after the first sample", -1.0, 5.0, 0.0, 0.3, 0.3, scope="breath",
+                grid=tuple(0.1 * k for k in range(16)),
+            ),
+            Parameter(
+                "duration", "s", "until it is put back", 0.0, 10.0, 0.3, 0.3, 1.0, scope="breath",
+                grid=(0.15, 0.25, 0.35, 0.5, 1.0, 10.0),
+            ),
         ),
         source=(
             "An open adult tube of 22 mm drops about 1 cmH2O at 1 L/s; the lung and the valve "
@@ -30,7 +37,7 @@ class Disconnection(Mechanism):
         ),
         signature="Pressure falls to that of the room at once and rises again from there.",
         confusable=("leak",),
-    )
+    )  # fmt: skip
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Add the open end as a conductance."""

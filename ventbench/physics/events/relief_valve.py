@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import PneumaticNetwork, View
+from ventbench.physics.mechanism import Description
+from ventbench.physics.mechanisms.relief_leak import ReliefLeak
 from ventbench.physics.parameters import Parameter
 
 
-class ReliefValve(Mechanism):
+class ReliefValve(ReliefLeak):
     """A flow out of the circuit above a set pressure."""
 
     description = Description(
@@ -28,11 +28,6 @@ class ReliefValve(Mechanism):
         signature="Pressure does not rise above the opening pressure, whatever the command.",
         confusable=("leak",),
     )
-
-    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Tangent at the last pressure."""
-        slope = 1e-3 * values["conductance"] * (view.pressure > values["opening"])
-        return network.plus(leak=slope, leak_flow=-slope * values["opening"])
 
 
 MECHANISM = ReliefValve()

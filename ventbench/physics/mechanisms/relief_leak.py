@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ventbench.physics.events.relief_valve import ReliefValve
-from ventbench.physics.mechanism import Description
+from ventbench.physics.mechanism import Description, Mechanism, Values
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 
-class ReliefLeak(ReliefValve):
+class ReliefLeak(Mechanism):
     """A leak that opens at a pressure, as a valve with a weak spring or a mask that lifts."""
 
     description = Description(
@@ -35,6 +35,11 @@ class ReliefLeak(ReliefValve):
         least=1.0,
         least_reason="less than connectors are allowed to leak",
     )  # fmt: skip
+
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
+        """Tangent at the last pressure."""
+        slope = 1e-3 * values["conductance"] * (view.pressure > values["opening"])
+        return network.plus(leak=slope, leak_flow=-slope * values["opening"])
 
 
 MECHANISM = ReliefLeak()

@@ -182,7 +182,7 @@ class DirectionResistance(BasisTerm):
 
 
 #: Basis terms of this module.
-TERMS = (
+MECHANISMS = (
     LeakShape(),
     FlowShape(),
     VolumeResistance(),

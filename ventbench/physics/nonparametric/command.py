@@ -170,7 +170,7 @@ class CommandPlays(BasisTerm):
 
 
 #: Basis terms of this module.
-TERMS = (
+MECHANISMS = (
     ValveShape(),
     CommandMemory(),
     CommandPlays(),

@@ -136,7 +136,7 @@ class RecoilMemory(FilterBank):
 
 
 #: Basis terms of this module.
-TERMS = (
+MECHANISMS = (
     RecoilShape(),
     RecoilMemory(),
 )

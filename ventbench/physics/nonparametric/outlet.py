@@ -125,7 +125,7 @@ class OutletMemory(FilterBank):
 
 
 #: Basis terms of this module.
-TERMS = (
+MECHANISMS = (
     OutletShape(),
     OutletMemory(),
 )

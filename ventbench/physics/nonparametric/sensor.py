@@ -179,7 +179,7 @@ class DriftShape(BasisTerm):
 
 
 #: Basis terms of this module.
-TERMS = (
+MECHANISMS = (
     SensorShape(),
     SensorMemory(),
     DriftShape(),

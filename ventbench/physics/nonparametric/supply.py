@@ -57,4 +57,4 @@ class SupplyMemory(FilterBank):
 
 
 #: Basis terms of this module.
-TERMS = (SupplyMemory(),)
+MECHANISMS = (SupplyMemory(),)

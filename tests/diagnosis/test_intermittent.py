@@ -1,0 +1,139 @@
+"""Effects of some breaths, from recordings of other code: found, with their breaths, or not."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware_eval.emulation.cases import Base
+from proofs.challenge.faults.effects import FaultsCase
+from proofs.challenge.faults.laboratory import record
+from ventbench.diagnosis.conclusion import Conclusion
+from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.identification import IdentifiedModel
+from ventbench.diagnosis.intermittent import Intermittent, find
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
+from ventbench.pages.diagnosis import write_report
+from ventbench.physics import paths
+from ventbench.physics.catalogue import intermittent
+from ventbench.recordings.breaths import Breaths
+from ventbench.system_id import make_data
+
+from . import made, small
+
+BREATHS = 24
+AFFECTED = np.array([3, 4, 9, 12, 16, 17, 22])
+
+
+def session(name: str = "", affected: np.ndarray = AFFECTED, **values: float) -> Breaths:
+    """Breaths of the world of faults, of which some are from a rig with the fault."""
+    base = Base(R=20.0, C=20.0, R_ex=5.0, peep=5.0, gain=22.8)
+    case = FaultsCase(
+        "", 20.0, 20.0, (), base=base, noise=0.15, breaths=BREATHS, samples=50, step=0.05,
+        jitter=1e-4, interval=0.04, choice=5,
+    )  # fmt: skip
+    plain = record(case, np.random.default_rng(3))
+    if not name:
+        return plain
+    values = {"affected": 1.0} | values
+    if name == "disconnection":
+        values["share"] = 1.0
+    faulty = dataclasses.replace(case, effects=(small.effect(name, "plain", **values),))
+    other = record(faulty, np.random.default_rng(3))
+    chosen = np.isin(plain.breath_id, affected)[:, None]
+    return dataclasses.replace(
+        plain, u_in=np.where(chosen, other.u_in, plain.u_in),
+        pressure=np.where(chosen, other.pressure, plain.pressure),
+    )  # fmt: skip
+
+
+def found(breaths: Breaths, **changed: Any) -> Intermittent | None:
+    """What is found beside the base model, as if nothing else had been identified."""
+    data, held = make_data(breaths), np.arange(len(breaths)) % 3 == 1
+    settings = dataclasses.replace(
+        small.SETTINGS, data=dataclasses.replace(small.SETTINGS.data, batch_size=BREATHS)
+    )
+    evaluator: Evaluator = make_evaluator(data, held, paths(intermittent()), settings=settings)
+    evaluator = dataclasses.replace(evaluator, **changed)
+    base = fit_with_noise(evaluator, Hypothesis())
+    conclusion = Conclusion(base, base, base, None, base.noise, {}, {})
+    model = IdentifiedModel(evaluator, conclusion, None, evaluator.training)  # type: ignore[arg-type]
+    return find(model, data, breaths.breath_id)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "strength"),
+    [
+        ("intermittent_leak", {"conductance": 15.0}, ("conductance", 15.0)),
+        ("secretions", {"increase": 0.8}, ("increase", 0.8)),
+        ("cough", {"pressure": 9.0}, None),
+        ("disconnection", {}, None),
+    ],
+)
+def test_an_effect_of_some_breaths_is_named_with_them(name, values, strength):
+    """Its breaths are set aside, and no others."""
+    breaths = session(name, **values)
+    effect = found(breaths)
+    assert effect is not None
+    assert effect.missing.name == name
+    assert effect.missing.affected == tuple(AFFECTED)
+    assert set(effect.rest_of(breaths).breath_id) == set(breaths.breath_id) - set(AFFECTED)
+    if strength is not None:
+        estimate = effect.missing.parameters[strength[0]]
+        assert estimate.value == pytest.approx(strength[1], rel=0.2)
+
+
+def test_nothing_is_found_in_breaths_that_are_alike():
+    assert found(session()) is None
+
+
+def test_breaths_at_one_end_are_a_change_of_the_session():
+    late = np.arange(13, BREATHS + 1)
+    assert found(session("intermittent_leak", late, conductance=15.0)) is None
+
+
+def test_a_test_lung_does_not_cough():
+    effect = found(session("cough", pressure=9.0), excluded=("patient_effort",))
+    assert effect is None or effect.missing.name != "cough"
+
+
+def test_commands_that_were_lost_are_found_and_followed():
+    """Lost and late commands are one answer: at most samples, both act alike."""
+    breaths = session("lost_commands", np.arange(BREATHS + 1), share=0.12)
+    effect = found(breaths)
+    assert effect is not None
+    names = {effect.missing.name, *effect.missing.alternatives}
+    assert names == {"lost_commands", "late_commands"}
+    fate = np.random.default_rng((5, 2)).uniform(size=breaths.u_in.shape)
+    valve, kept = np.zeros(BREATHS), []
+    for k in range(breaths.u_in.shape[1] - 1):
+        valve = np.where(fate[:, k] < 0.12, valve, breaths.u_in[:, k])
+        kept.append(valve)
+    true, told = np.stack(kept, axis=1), effect.rest_of(breaths).u_in[:, :-1]
+    lost = np.abs(true - breaths.u_in[:, :-1]) > 4.0  # as many % as the pressure shows
+    assert lost.sum() > 10
+    assert np.mean(np.abs(told - true)[lost] < 1.0) > 0.9
+    assert np.mean(np.abs(told - true)[~lost] < 4.0) > 0.98
+
+
+def test_the_affected_breaths_stand_in_the_first_sentence_the_json_and_the_page(tmp_path):
+    """Commands that are lost or late are one answer with two members."""
+    about = dataclasses.replace(
+        made.diagnosis(12).mechanisms[0], name="lost_commands", parameters={},
+        alternatives=("late_commands",), affected=(2, 3, 4, 9, 12),
+    )  # fmt: skip
+    told = dataclasses.replace(made.diagnosis(12), mechanisms=(about,), plants={})
+    first = str(told).splitlines()[0]
+    assert "never reach the valve, or commands that reach the valve late" in first
+    assert "in breaths 2 to 4, 9 and 12" in first
+    assert told.as_dict()["mechanisms"][0]["affected_breaths"] == [2, 3, 4, 9, 12]
+    page = write_report(tmp_path / "r.html", told).read_text()
+    drawn = re.findall(r'<rect x="([\d.]+)" width="([\d.]+)" height="4"/>', page)
+    # Three runs among twelve breaths, as % of the session.
+    expected = [(100 / 12, 300 / 12), (800 / 12, 100 / 12), (1100 / 12, 100 / 12)]
+    np.testing.assert_allclose(np.array(drawn, float), expected, atol=0.01)

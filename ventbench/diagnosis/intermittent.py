@@ -1,0 +1,440 @@
+"""Effects that act in some breaths only: a mechanism, and in each breath whether it acts.
+
+An effect of the catalogue's events has parameters of each breath. With the likelihood ``L_b(z)`` of
+a breath in which it acts with the parameters ``z``, and ``L_b`` of one in which it does not, the
+breaths are a mixture,
+
+    p(breath b) = (1 - share) L_b + share sum_z p(z) L_b(z),
+
+a spike and a slab. Onsets and durations are uniform on the grid of the event's file, strengths
+lie around one of all affected breaths (a normal density of their logarithm). That strength and the
+share are the likeliest on the training breaths. Parameters that breaths share are fitted to the
+breaths in which the effect does not act, in turn with the question which these are. Commands that
+were lost or late have no grid: each of them was followed or not (:mod:`.command_path`).
+
+The effect is told if it predicts the held-out breaths better than all that was found without it. A
+set of breaths that begins or ends at one breath of the recording is a change of the session and no
+such effect. The breaths that are affected are then set aside, or get the commands that reached the
+valve, and the rest of the diagnosis goes on without the effect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from ventbench.diagnosis.adequacy import order_p_value
+from ventbench.diagnosis.command_path import Paths, follow
+from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.findings import MissingMechanism
+from ventbench.diagnosis.hypothesis import (
+    FittedModel,
+    Hypothesis,
+    Partition,
+    linearise,
+    make_partition,
+)
+from ventbench.diagnosis.identification import IdentifiedModel, held_out
+from ventbench.diagnosis.patient_effort import EFFORT
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise, fit_with_white_noise
+from ventbench.diagnosis.settings import SelectionConfig
+from ventbench.mechanics.labels import Estimate
+from ventbench.physics.catalogue import intermittent, mechanism
+from ventbench.plants.simulators import Simulators
+from ventbench.recordings.breaths import Breaths
+from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.predictor import START
+from ventbench.system_id.problem import Problem
+
+Flags = NDArray[np.bool_]
+
+#: Effects on the commands, which have no parameters of a breath.
+COMMANDS = ("lost_commands", "late_commands")
+
+#: Effects of the muscles, which a test lung has not.
+_MUSCLES = ("cough",)
+
+#: Shares of the breaths that are tried; more than half of the breaths is not "some".
+_SHARES = np.array([0.03, 0.08, 0.15, 0.25, 0.4, 0.6])
+
+#: Standard deviation of the logarithm of strengths between affected breaths.
+_SPREAD = 0.3
+
+#: Multiples of the strength that refine it, and most times that fit and breaths are found in turn.
+_MULTIPLES, _ROUNDS = np.geomspace(0.6, 1.0 / 0.6, 9), 4
+
+#: Fewest breaths that must be affected, and must not be.
+_FEWEST, _LEFT = 2, 4
+
+#: p-value below which affected breaths have an order in time.
+_ORDERED = 0.002
+
+#: Samples by which commands may be late, least share of them that are lost or late, and nats by
+#: which two delays are alike.
+_LAGS, _RARE, _ALIKE = (2, 3, 4, 5), 0.003, 2.0
+
+#: Steps between the points of a grid, as shares of its own, by which a breath's course is refined.
+_FINER = (0.5, 0.25)
+
+#: Multiples of the noise by which an affected breath may err, as the form of an effect is not
+#: known; a breath may err more than others without any.
+_ROUGH = np.array([1.0, 2.0, 4.0, 8.0])
+
+#: Simulations of all breaths that are kept at once.
+_AT_ONCE = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Intermittent:
+    """An effect that acts in some breaths.
+
+    Attributes:
+        missing: its finding, with the ids of the breaths that are affected.
+        ids: ids of the n breaths that were looked at, in order.
+        affected: which of them are, ``(n,)``.
+        u_in: commands that reached the valve, %, ``(n, T)``; None if the affected breaths are to be
+            set aside.
+    """
+
+    missing: MissingMechanism
+    ids: NDArray[np.int_]
+    affected: Flags
+    u_in: Floats | None
+
+    def leaves_enough(
+        self, breaths: Breaths, simulators: Simulators, settings: SelectionConfig
+    ) -> bool:
+        """Whether the diagnosis can go on without the effect."""
+        if self.u_in is not None:  # a table of pressures answers to its own commands alone
+            return self.u_in.shape == breaths.u_in.shape and simulators.kind != "pressures"
+        left = breaths.select(~self.affected)
+        return len(left) >= _LEFT * 2 and bool(held_out(left, settings.data).any())
+
+    def rest_of(self, breaths: Breaths) -> Breaths:
+        """Breaths of the same recording without the effect."""
+        known = np.isin(breaths.breath_id, self.ids)
+        if self.u_in is None:
+            return breaths.select(~np.isin(breaths.breath_id, self.missing.affected))
+        u_in = breaths.u_in.astype(float)
+        u_in[known] = self.u_in
+        return replace(breaths, u_in=u_in)
+
+
+class _Found(NamedTuple):
+    """An effect fitted to the training breaths.
+
+    Attributes:
+        evaluator: evaluator of the recording.
+        name: name of the event.
+        fitted: the model of the breaths without it.
+        strength: index of the strength; samples by which commands are late, 0 if they are lost.
+        share: share of the breaths, or of the commands.
+        training: log-likelihood of all training breaths, nats.
+        held_out: log-likelihood of each held-out breath, ``(h,)``.
+    """
+
+    evaluator: Evaluator
+    name: str
+    fitted: FittedModel
+    strength: int
+    share: float
+    training: float
+    held_out: Floats
+
+    @property
+    def total(self) -> float:
+        """Log-likelihood of training and held-out breaths, nats."""
+        return self.training + float(self.held_out.sum())
+
+
+def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermittent | None:
+    """The effect of some breaths that a recording needs more than all that was identified.
+
+    Args:
+        model: model identified from some of the breaths.
+        data: all n breaths.
+        ids: their ids, ``(n,)``.
+    """
+    evaluator, conclusion = model.evaluator, model.conclusion
+    known = conclusion.named.hypothesis
+    found: list[_Found] = []
+    for hypothesis in dict.fromkeys((known.without(*known.breath_terms), Hypothesis())):
+        own = evaluator if hypothesis.names else replace(evaluator, gain_sd=0.0)
+        alone = fit_with_noise(own, hypothesis)
+        names = [n for n in intermittent() if n not in _MUSCLES or EFFORT not in own.excluded]
+        found += [each for name in names if (each := _fit(own, alone, name)) is not None]
+        found += _fit_commands(own, alone)
+    found.sort(key=lambda each: -each.total)
+    gained = found[0].held_out - _log_likelihood(model) if found else np.zeros(1)
+    if float(gained.sum()) <= _least(evaluator):
+        return None
+    best = found[0]
+    odds: dict[str, float] = {}
+    for each in found:
+        odds[each.name] = odds.get(each.name, 0.0) + float(np.exp(each.total - best.total))
+    affected, u_in, estimates = _everywhere(best, data)
+    if affected.sum() < _FEWEST or (u_in is None and _is_change(affected, evaluator, data)):
+        return None
+    near = np.exp(-0.5 * evaluator.settings.refinement.close_criterion)
+    missing = MissingMechanism(
+        best.name, estimates, odds[best.name] / sum(odds.values()),
+        tuple(name for name, value in odds.items() if value > near and name != best.name),
+        float(gained.sum()), affected=tuple(int(i) for i in ids[affected]),
+    )  # fmt: skip
+    return Intermittent(missing, ids, affected, u_in)
+
+
+def _is_change(affected: Flags, evaluator: Evaluator, data: Data) -> bool:
+    """Whether affected breaths have an order in time, as after a change of the session."""
+    if np.count_nonzero(np.diff(affected.astype(int))) == 1:
+        return True
+    ranked = affected + 1e-3 * np.random.default_rng(0).uniform(size=len(affected))  # no ties
+    return order_p_value(ranked, data.lung, evaluator.settings.residuals) < _ORDERED
+
+
+def _log_likelihood(model: IdentifiedModel) -> Floats:
+    """Log-likelihood of the held-out breaths by all that was identified, nats, ``(h,)``."""
+    conclusion = model.conclusion
+    for effect in (conclusion.unnamed, conclusion.slow_noise):
+        if effect is not None and effect.latent_input is not None:
+            return effect.latent_input.held_out_log_likelihood
+    return model.evaluator.held_out_log_likelihood(conclusion.full)
+
+
+def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _Found | None:
+    """Fit an effect beside a model of all training breaths; None if it acts in no breath.
+
+    The first breaths are found at white noise, as coloured noise excuses whole breaths. Where most
+    breaths are affected, the model is one of these, and the others show the opposite effect.
+    """
+    training, names = evaluator.training, evaluator.training.predictor.names
+    fitted, known = fit_with_white_noise(evaluator, alone), np.zeros(len(training.data), bool)
+    for k in range(_ROUNDS):
+        evidence = _Evidence.of(evaluator, fitted, training, name)
+        strength, share, nats = evidence.likeliest()
+        acts = evidence.acts(strength, share)
+        against = [-s for s in evidence.strengths if -s >= mechanism(name).description.strength.low]
+        if k == 0 and against:
+            opposite = _Evidence.of(evaluator, fitted, training, name, tuple(against))
+            other, others, more = opposite.likeliest()
+            if more > nats:
+                acts = ~opposite.acts(other, others)
+        if np.array_equal(known, acts):
+            break
+        if (~acts).sum() < _LEFT or not acts.any():
+            return None
+        known, rest = acts, make_partition(training.data.select(~acts), names, evaluator.settings)
+        values = evaluator.transferred_values(fitted, rest)
+        start = {path: values[:, k] for k, path in enumerate(names) if path != "position"}
+        now = replace(evaluator, training=rest, folds=())
+        fitted = fit_with_noise(
+            now, alone.hypothesis, now.fit(alone.hypothesis, fitted.noise, start=start)
+        )
+    gained, ahead = evidence.gains(strength, share)
+    nats = float((evidence.plain + gained).sum())
+    least = float(evaluator.log_likelihood(alone, training).sum()) + _least(evaluator)
+    if not known.any() or nats < least or ahead < _least(evaluator):
+        return None
+    evidence = _Evidence.of(evaluator, fitted, evaluator.held_out, name)
+    gained, ahead = evidence.gains(strength, share)
+    if ahead < 0.0:
+        return None
+    return _Found(evaluator, name, fitted, strength, share, nats, evidence.plain + gained)
+
+
+def _least(evaluator: Evaluator) -> float:
+    """Log-likelihood that an effect must gain, nats: as much as any course in time."""
+    return evaluator.settings.latent_inputs.threshold
+
+
+def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_Found]:
+    """Lost and late commands beside a model of all training breaths."""
+    training, fitted, share, found = evaluator.training, alone, float(_SHARES[1]), []
+    least = float(evaluator.log_likelihood(alone, training).sum()) + _least(evaluator)
+    for _ in range(_ROUNDS):
+        paths = _paths(evaluator, fitted, training, share, 0)
+        share = float(np.clip(paths.kept.sum() / max(paths.sent.sum(), 1.0), _RARE, _SHARES[-1]))
+        now = replace(evaluator, training=_with_commands(evaluator, training, paths))
+        before, fitted = fitted, fit_with_noise(now, alone.hypothesis, fitted)
+        if not paths.kept.any() or before.noise == fitted.noise:
+            break
+    for lag in (0, *_LAGS):
+        total = float(_paths(evaluator, fitted, training, share, lag).nats.sum())
+        if total > least:
+            tested = _paths(evaluator, fitted, evaluator.held_out, share, lag).nats
+            name = COMMANDS[lag > 0]
+            total -= np.log(len(_LAGS)) if lag else 0.0  # each delay is as likely
+            found.append(_Found(evaluator, name, fitted, lag, share, total, tested))
+    return found
+
+
+def _paths(
+    evaluator: Evaluator, fitted: FittedModel, partition: Partition, share: float, lag: int
+) -> Paths:
+    """The commands that reached the valve in breaths whose shared parameters are known."""
+    problem, x = _from_first_readings(evaluator, fitted, partition)
+    for _ in range(2):  # the start is that of a breath with the commands that reached the valve
+        paths = follow(problem, x, partition, share, lag or None)
+        x = evaluator.refit_breath_parameters(fitted, _with_commands(evaluator, partition, paths))[
+            1
+        ]
+    return paths
+
+
+def _with_commands(evaluator: Evaluator, partition: Partition, paths: Paths) -> Partition:
+    data = replace(partition.data, u_in=paths.u_in)
+    return make_partition(data, partition.predictor.names, evaluator.settings)
+
+
+def _from_first_readings(
+    evaluator: Evaluator, fitted: FittedModel, partition: Partition
+) -> tuple[Problem, Floats]:
+    """Breaths that start at their first readings: a start fitted without an effect mends it."""
+    problem, x = evaluator.refit_breath_parameters(fitted, partition)
+    x[problem.unknowns.of(START)] = problem.fixed[:, -1]
+    return problem, x
+
+
+def _everywhere(found: _Found, data: Data) -> tuple[Flags, Floats | None, dict[str, Estimate]]:
+    """In which of n breaths the effect acts, with which commands, and how strong it is."""
+    evaluator, name = found.evaluator, found.name
+    names = evaluator.training.predictor.names
+    partition = make_partition(data, names, evaluator.settings)
+    if name in COMMANDS:
+        paths = _paths(evaluator, found.fitted, partition, found.share, found.strength)
+        kept, sent = int(paths.kept.sum()), max(int(paths.sent.sum()), 1)
+        p, width = kept / sent, 1.96 * np.sqrt(kept + 1.0) / sent
+        estimates = {"share": Estimate(p, "1", (max(p - width, 0.0), min(p + width, 1.0)))}
+        if found.strength:
+            dt = float(np.median(data.dt[:, :-1]))
+            near = [_paths(evaluator, found.fitted, partition, found.share, k).nats.sum()
+                    for k in _LAGS]  # fmt: skip
+            likely = np.array(_LAGS)[np.array(near) > max(near) - _ALIKE]
+            ends = (float(likely[0] - 1) * dt, float(likely[-1]) * dt)
+            estimates["delay"] = Estimate(0.5 * sum(ends), "s", ends)
+        return paths.kept > 0, paths.u_in, estimates
+    evidence = _Evidence.of(evaluator, found.fitted, partition, name)
+    acts = evidence.acts(found.strength, found.share)
+    about, centre = mechanism(name).description.strength, evidence.strengths[found.strength]
+    if len(evidence.strengths) < 2 or not acts.any():
+        return acts, None, {}
+    some = make_partition(data.select(acts), names, evaluator.settings)
+    fine = _Evidence.of(evaluator, found.fitted, some, name, tuple(centre * _MULTIPLES))
+    logs, each = np.log(centre * _MULTIPLES), logsumexp(fine.nats, axis=1)  # whatever its course
+    weights = np.exp(each - logsumexp(each, axis=0))  # (s, k)
+    own = logs @ weights
+    step = logs[1] - logs[0]
+    width = np.sqrt(np.maximum(logs**2 @ weights - own**2, step**2 / 12.0) + np.var(own))
+    middle, sd = np.average(own, weights=width**-2.0), np.sum(width**-2.0) ** -0.5
+    value, low, high = np.exp(middle + 1.96 * sd * np.array([0.0, -1.0, 1.0]))
+    return acts, None, {about.name: Estimate(float(value), about.unit, (float(low), float(high)))}
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What an effect does for the log-likelihood of n breaths.
+
+    Attributes:
+        strengths: the s strengths that were tried.
+        nats: gain of each breath at each strength and each of g courses, ``(s, g, n)``.
+        rough: gain of each breath if it only errs more than others, ``(n,)``.
+        plain: log-likelihood of each breath in which the effect does not act, nats, ``(n,)``.
+    """
+
+    strengths: tuple[float, ...]
+    nats: Floats
+    rough: Floats
+    plain: Floats
+
+    @classmethod
+    def of(
+        cls, evaluator: Evaluator, fitted: FittedModel, partition: Partition, name: str,
+        strengths: tuple[float, ...] | None = None,
+    ) -> _Evidence:  # fmt: skip
+        """Simulate the effect in breaths whose shared parameters are known.
+
+        What each breath has of its own, its start and perhaps its gain, is refitted to first order.
+        """
+        problem, x = _from_first_readings(evaluator, fitted, partition)
+        linear = linearise(problem, x, evaluator.settings.screening, clip=np.inf)
+        strength, *others = mechanism(name).description.parameters
+        strengths = strengths or strength.screening_strengths()
+        names, grids = [p.name for p in others if p.grid], [p.grid for p in others if p.grid]
+        columns = [partition.predictor.names.index(f"{name}.{p}") for p in names]
+        own = partition.predictor.names.index(f"{name}.{strength.name}")
+        count = problem.data.weight.sum(axis=(1, 2))
+
+        def density(white: Floats, scales: Floats) -> Floats:
+            """Logarithm of the mean density of residuals ``(n, q, m)`` over the scales, (n, q)."""
+            each = [
+                -problem.noise.loss(white / k).sum(axis=2) - count[:, None] * np.log(k)
+                for k in scales
+            ]
+            return logsumexp(each, axis=0) - np.log(len(scales))
+
+        plain = density(linear.residual[:, None], _ROUGH[:1])
+        rough = (density(linear.residual[:, None], _ROUGH[1:]) - plain)[:, 0]
+
+        def gained(courses: Floats) -> Floats:
+            """Gain ``(s, k, n)`` at each strength and k courses of each breath, (s, k, n, g)."""
+            points = np.tile(linear.values, (*courses.shape[:2], 1, 1))
+            points[..., own] = np.reshape(strengths, (-1, 1, 1))
+            points[..., columns] = courses
+            points, parts = points.reshape(-1, *linear.values.shape), []
+            for k in range(0, len(points), _AT_ONCE):
+                seen = partition.predictor.predict_all(points[k : k + _AT_ONCE])
+                change = linear.whiten(np.moveaxis(seen - linear.prediction, 0, 1))  # (n, q, m)
+                left = linear.residual[:, None] + linear.without_own(change)
+                parts.append((density(left, _ROUGH) - plain).T)
+            return np.nan_to_num(np.concatenate(parts), nan=-np.inf).reshape(courses.shape[:3])
+
+        grid = np.array(list(product(*grids)))
+        shape = (len(strengths), len(grid), len(problem.data), len(grids))
+        nats = gained(np.broadcast_to(grid[:, None], shape))
+        best = np.argmax(nats, axis=1)[:, None]  # (s, 1, n)
+        course, top = grid[best], np.take_along_axis(nats, best, axis=1)
+        for finer in _FINER if grids else ():  # between the points of the grid
+            step = np.stack(
+                [np.interp(course[..., k], g, np.gradient(g)) for k, g in enumerate(grids)], axis=-1
+            )
+            moves = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(grids))))
+            near = course + finer * moves[:, None] * step  # (s, k, n, g)
+            each = gained(near)
+            chosen = np.argmax(each, axis=1)[:, None]
+            course = np.take_along_axis(near, chosen[..., None], axis=1)
+            top = np.maximum(top, np.take_along_axis(each, chosen, axis=1))
+        np.put_along_axis(nats, best, top, axis=1)
+        constant = problem.noise.log_scale(problem.data.weight) + count * problem.noise.log_norm()
+        return cls(tuple(strengths), nats, rough, plain[:, 0] - constant)
+
+    def acting(self) -> Floats:
+        """Gain of each breath if the effect acts in it, at a common strength, ``(s, n)``."""
+        logs = np.log(np.abs(self.strengths))
+        near = -0.5 * ((logs[:, None] - logs) / _SPREAD) ** 2
+        near = near - logsumexp(near, axis=1, keepdims=True)
+        each = logsumexp(self.nats, axis=1) - np.log(self.nats.shape[1])
+        return logsumexp(near[:, :, None] + each, axis=1)
+
+    def likeliest(self) -> tuple[int, float, float]:
+        """The likeliest common strength, by its index, share of the breaths, and their gain."""
+        share = _SHARES[:, None, None]
+        total = np.logaddexp(np.log1p(-share), np.log(share) + self.acting()).sum(axis=2)
+        best = np.unravel_index(int(np.argmax(total)), total.shape)
+        return int(best[1]), float(_SHARES[best[0]]), float(total.max())
+
+    def gains(self, strength: int, share: float) -> tuple[Floats, float]:
+        """Gain of each breath by the mixture, ``(n,)``, and how far that is ahead of rough ones."""
+        gained, rough = (
+            np.logaddexp(np.log1p(-share), np.log(share) + each)
+            for each in (self.acting()[strength], self.rough)
+        )
+        return gained, float(np.sum(gained - rough))
+
+    def acts(self, strength: int, share: float) -> Flags:
+        """In which breaths it is likelier than not that the effect acts, ``(n,)``."""
+        return self.acting()[strength] > np.maximum(np.log1p(-share) - np.log(share), self.rough)

@@ -258,6 +258,8 @@ def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_Found]:
     least = float(evaluator.log_likelihood(alone, training).sum()) + _least(evaluator)
     for _ in range(_ROUNDS):
         paths = _paths(evaluator, fitted, training, share, 0)
+        if fitted is alone and float(paths.nats.sum()) < least:
+            return found  # late ones seem lost, too
         share = float(np.clip(paths.kept.sum() / max(paths.sent.sum(), 1.0), _RARE, _SHARES[-1]))
         now = replace(evaluator, training=_with_commands(evaluator, training, paths))
         before, fitted = fitted, fit_with_noise(now, alone.hypothesis, fitted)

@@ -41,7 +41,7 @@ def _controller(name: str) -> Any:
 def test_the_scheduled_pid_tells_lungs_apart(stiff, soft):
     controllers = [_controller("pid_scheduled") for _ in range(2)]
     for controller, lung in zip(controllers, (stiff, soft), strict=True):
-        _breaths(controller, *lung, 3)
+        _breaths(controller, lung[0], lung[1], 3)
     assert not np.allclose(controllers[0].gains, controllers[1].gains, rtol=0.2)
     inside = controllers[0].lungs["gains"]
     for controller in controllers:

@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
 
 from ventbench.diagnosis.hypothesis import Partition
 from ventbench.diagnosis.latent_inputs import SUPPLY, input_responses
@@ -88,5 +87,5 @@ def follow(
     path[:, :, -1] = data.u_in[:, -1:]
     changes = np.abs(np.diff(data.u_in[:, :-1], axis=1, prepend=0.0)) > _SAME
     constant = noise.log_scale(data.weight) + data.weight.sum(axis=(1, 2)) * noise.log_norm()
-    nats = logsumexp(score, axis=1) - noise.loss(first[:, 0, 0]) - constant
+    nats = np.logaddexp.reduce(score, axis=1) - noise.loss(first[:, 0, 0]) - constant
     return Paths(nats, path[:, 0], kept[:, 0], changes.sum(axis=1))

@@ -26,7 +26,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from ventbench.diagnosis.adequacy import order_p_value
 from ventbench.diagnosis.command_path import Paths, follow
@@ -327,8 +326,11 @@ def _everywhere(found: _Found, data: Data) -> tuple[Flags, Floats | None, dict[s
         return acts, None, {}
     some = make_partition(data.select(acts), names, evaluator.settings)
     fine = _Evidence.of(evaluator, found.fitted, some, name, tuple(centre * _MULTIPLES))
-    logs, each = np.log(centre * _MULTIPLES), logsumexp(fine.nats, axis=1)  # whatever its course
-    weights = np.exp(each - logsumexp(each, axis=0))  # (s, k)
+    logs, each = (
+        np.log(centre * _MULTIPLES),
+        np.logaddexp.reduce(fine.nats, axis=1),
+    )  # whatever its course
+    weights = np.exp(each - np.logaddexp.reduce(each, axis=0))  # (s, k)
     own = logs @ weights
     step = logs[1] - logs[0]
     width = np.sqrt(np.maximum(logs**2 @ weights - own**2, step**2 / 12.0) + np.var(own))
@@ -377,7 +379,7 @@ class _Evidence:
                 -problem.noise.loss(white / k).sum(axis=2) - count[:, None] * np.log(k)
                 for k in scales
             ]
-            return logsumexp(each, axis=0) - np.log(len(scales))
+            return np.logaddexp.reduce(each, axis=0) - np.log(len(scales))
 
         plain = density(linear.residual[:, None], _ROUGH[:1])
         rough = (density(linear.residual[:, None], _ROUGH[1:]) - plain)[:, 0]
@@ -418,9 +420,9 @@ class _Evidence:
         """Gain of each breath if the effect acts in it, at a common strength, ``(s, n)``."""
         logs = np.log(np.abs(self.strengths))
         near = -0.5 * ((logs[:, None] - logs) / _SPREAD) ** 2
-        near = near - logsumexp(near, axis=1, keepdims=True)
-        each = logsumexp(self.nats, axis=1) - np.log(self.nats.shape[1])
-        return logsumexp(near[:, :, None] + each, axis=1)
+        near = near - np.logaddexp.reduce(near, axis=1, keepdims=True)
+        each = np.logaddexp.reduce(self.nats, axis=1) - np.log(self.nats.shape[1])
+        return np.logaddexp.reduce(near[:, :, None] + each, axis=1)
 
     def likeliest(self) -> tuple[int, float, float]:
         """The likeliest common strength, by its index, share of the breaths, and their gain."""

@@ -177,7 +177,8 @@ class Fmu:
         except Exception as error:  # the library raises plain ones
             what = "a zip archive" if not zipfile.is_zipfile(path) else "an FMU"
             raise InputError(f"{path} is not {what}: {error}") from error
-        if self._about.coSimulation is None or self._about.fmiVersion.startswith("1"):
+        self._version = str(self._about.fmiVersion)
+        if self._about.coSimulation is None or self._version.startswith("1"):
             raise InputError(f"{path} is no FMU for co-simulation of FMI 2 or 3; export it as one")
         known = {variable.name: variable for variable in self._about.modelVariables}
         names = {key: (names or {}).get(key, key) for key in (*NEEDED, *PARAMETERS)}
@@ -198,7 +199,7 @@ class Fmu:
         for key, value in zip(PARAMETERS, (initial_pressure, R, C), strict=True):
             if key in self._variables:
                 self._set(key, value)
-        if self._about.fmiVersion.startswith("2"):
+        if self._version.startswith("2"):
             self._running.setupExperiment(startTime=0.0)
         self._running.enterInitializationMode()
         self._running.exitInitializationMode()

@@ -21,7 +21,7 @@ from ventbench.diagnosis.selection.screening import (
 )
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics import library, parameter
-from ventbench.physics.catalogue import basis_terms
+from ventbench.physics.catalogue import basis_terms, intermittent
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id import Noise
 
@@ -37,10 +37,10 @@ def test_every_basis_term_belongs_to_a_component():
     assert component_of("sensor_memory") == component_of("drift_shape") == "measurement"
 
 
-def test_all_parameter_paths_are_those_of_the_library_and_of_all_terms():
+def test_all_parameter_paths_are_those_of_the_library_of_events_and_of_all_terms():
     found = all_parameter_paths(SelectionConfig())
     owners = {path.rpartition(".")[0] for path in found} - {""}
-    assert owners == set(library()) | set(basis_terms())
+    assert owners == {*library(), *basis_terms(), *intermittent()}
     assert len(set(found)) == len(found)
 
 

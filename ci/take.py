@@ -15,8 +15,7 @@ from typing import NamedTuple
 from ci.git import Git, GitError, fetch
 from ventbench.base.errors import InputError
 from ventbench.entries.errors import printable
-from ventbench.entries.file_checks import collisions, kind_problem, path_problem
-from ventbench.entries.folder import MAX_BYTES, MAX_FILES
+from ventbench.entries.folder import MAX_BYTES, MAX_FILES, collisions, kind_problem, path_problem
 from ventbench.entries.manifest import NAME, NAME_RULE
 
 #: Folder of all submissions in the repository.

@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries import contract
-from ventbench.entries.contract_runs import STEPS
+from ventbench.entries.contract import STEPS
 from ventbench.entries.errors import SubmissionError
-from ventbench.entries.file_checks import check_files
+from ventbench.entries.folder import check_files
 from ventbench.entries.review import check_sources
 from ventbench.entries.runner import InProcessRunner
 from ventbench.sandbox.configuration import Allowance

@@ -7,8 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from ventbench.entries.file_checks import check_files, weights_problems
-from ventbench.entries.folder import MAX_BYTES
+from ventbench.entries.folder import MAX_BYTES, check_files, weights_problems
 
 
 def files(folder):

@@ -3,8 +3,15 @@ import sys
 
 import pytest
 
-from ventbench.sandbox.child.cell import ROW, Cell, Failed, controller_class, unpack
-from ventbench.sandbox.child.failures import SubmissionError, printable
+from ventbench.sandbox.child.cell import (
+    ROW,
+    Cell,
+    Failed,
+    SubmissionError,
+    controller_class,
+    printable,
+    unpack,
+)
 from ventbench.task.interfaces import Observation, Task
 
 ROBUSTNESS = Task("robustness", None, 0.03, 34)

@@ -10,6 +10,6 @@
   runs, and :mod:`~ventbench.entries.result` its form;
 - :mod:`~ventbench.entries.scaffold`: a new submission that scores at once;
 - :mod:`~ventbench.entries.contract`: everything that must hold before it is submitted, by
-  reading (``file_checks``, ``manifest``, ``review``) and by running (``contract_runs``);
+  reading (``folder``, ``manifest``, ``review``) and by running (``contract``);
 - :mod:`~ventbench.entries.errors`: what is wrong with a submission, in words for its author.
 """

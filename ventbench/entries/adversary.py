@@ -123,10 +123,7 @@ class Found:
 def mildest(margin: Margin, space: Space, settings: Sequence[float]) -> Found:
     """Search for the mildest point of each lung at which something goes wrong; see the module.
 
-    Args:
-        margin: of points.
-        space: the coordinates.
-        settings: at which each point may be tried, such as PIPs.
+    Each point may be tried at each of some settings, such as PIPs.
     """
     alone = space.alone
     count, lungs, size = alone.shape

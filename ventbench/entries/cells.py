@@ -65,9 +65,8 @@ class Cells:
     def stressed(self, draw: int) -> tuple[Stressed, Scenario]:
         """One draw under every condition, as 64-bit arrays: call it within ``float64()``.
 
-        Returns:
-            Plants as of :func:`~ventbench.plants.corrected.stressed_plants`, and cells of batch
-            shape ``(S * L,)``; there must be one PIP.
+        Plants as of :func:`~ventbench.plants.corrected.stressed_plants`, and cells of batch shape
+        ``(S * L,)``; there must be one PIP.
         """
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[None, :, draw : draw + 1, 0], self.plants)
         plants = stressed_plants(one, self.lungs, self.conditions)
@@ -216,11 +215,7 @@ class ProtocolRun:
 
 
 def as_float64(plants: PlantT, count: int) -> PlantT:
-    """Return stacked plants with 64-bit leaves.
-
-    Args:
-        plants: one plant whose leaves have the lungs on their leading axis.
-        count: number of lungs.
+    """Return plants, stacked over a number of lungs on their leading axis, with 64-bit leaves.
 
     Raises:
         ValueError: if a leaf has another leading axis.
@@ -279,11 +274,7 @@ def _of_cells(values: Array, batch: tuple[int, ...]) -> Floats:
 
 
 class PlantError(FloatingPointError):
-    """A plant answered with NaN or infinity.
-
-    Attributes:
-        index: of the plant on the leading axis.
-    """
+    """A plant, of an index on the leading axis, answered with NaN or infinity."""
 
     def __init__(self, index: int) -> None:
         super().__init__(f"simulator {index} answered with NaN or infinity")
@@ -386,18 +377,7 @@ def run_cells(
     """Run a submission on cells, batch shape ``(S, L, n, P)``. Call it within ``float64()``.
 
     Without stressors all cells run together; else the draws run one after the other, all
-    conditions and lungs of one together.
-
-    Args:
-        cells: S conditions, L lungs, n draws, P PIPs.
-        runner: runs the controllers.
-        submission: whose they are.
-        tasks: what is told of each lung, length L.
-        count: see :func:`step_through`.
-
-    Raises:
-        SubmissionError: if the submission cannot be run at all.
-        PlantError: if a plant answers with NaN or infinity.
+    conditions and lungs of one together. Arguments and errors as of :func:`step_through`.
     """
     lungs, conditions = len(cells.lungs), len(cells.conditions)
     if conditions == 1:
@@ -450,13 +430,8 @@ def replay(
 ) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
     """Apply recorded commands again, with the expirations. Call it within ``float64()``.
 
-    Args:
-        plants: from :func:`as_float64`, L lungs.
-        scenario: cells, as in :func:`step_through`.
-        requested: as in :class:`ProtocolRun`.
-
-    Returns:
-        Arrays of shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
+    Plants and cells as of :func:`step_through`, commands as of :class:`ProtocolRun`; arrays of
+    shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
     """
 
     def run(plant: Plant, scenario: Scenario, commands: Array) -> Any:

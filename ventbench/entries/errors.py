@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from ventbench.sandbox.child.failures import Failure as Failure
-from ventbench.sandbox.child.failures import SubmissionError as SubmissionError
-from ventbench.sandbox.child.failures import printable as printable
+from ventbench.sandbox.child.cell import Failure as Failure
+from ventbench.sandbox.child.cell import SubmissionError as SubmissionError
+from ventbench.sandbox.child.cell import printable as printable
 
 #: What is looked at, in this order.
 Group = Literal["files", "manifest", "source", "run", "repeat", "time"]

@@ -1,6 +1,7 @@
 """A submission is a folder: how it is found, what it may hold, what identifies it.
 
-For scoring from Python a class or a function can take its place.
+For scoring from Python a class or a function can take its place. Checks of names, kinds, sizes, and
+of weights that are plain numbers run and import nothing, and unpickle no array.
 """
 
 from __future__ import annotations
@@ -8,16 +9,23 @@ from __future__ import annotations
 import difflib
 import hashlib
 import inspect
+import json
+import math
 import os
 import re
-from collections.abc import Callable
+import stat
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
+
 from ventbench.base import files
-from ventbench.entries.errors import SubmissionError, printable
-from ventbench.entries.manifest import MANIFEST, TRACKS, Manifest, manifest_from_json
+from ventbench.entries.errors import Finding, SubmissionError, printable
+from ventbench.entries.manifest import MANIFEST, TRACKS, Manifest
 from ventbench.sandbox.child.sources import CONTROLLER as CONTROLLER
 from ventbench.sandbox.child.sources import walk
 from ventbench.sandbox.reader import UnreadableError, read_apart
@@ -28,8 +36,7 @@ MAX_BYTES = 5_000_000
 MAX_FILES = 1000
 
 # Written by Python and by desktops, not by the author.
-_IGNORED_FOLDERS = {"__pycache__"}
-_IGNORED_FILES = {".DS_Store"}
+_IGNORED_FOLDERS, _IGNORED_FILES = {"__pycache__"}, {".DS_Store"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,7 @@ class Submission:
         label: how the person named it; starts every message.
         folder: absolute path.
         manifest: what ``submission.toml`` says.
-        sha256: hash of the folder, see :func:`content_hash`; None for a class or function.
+        sha256: hash of the folder, see :func:`combined_hash`; None for a class or function.
         controller: makes a controller, for a class or function in place of a folder; it can only
             run in this process.
     """
@@ -59,10 +66,7 @@ def bundled() -> list[str]:
 
 
 def resolve(name: str) -> Path:
-    """Find the folder of a submission.
-
-    Args:
-        name: path of a folder, or the name of a bundled submission.
+    """Find the folder of a submission by its path, or by the name of a bundled one.
 
     Raises:
         SubmissionError: if there is neither.
@@ -80,17 +84,14 @@ def resolve(name: str) -> Path:
 
 
 def open_submission(name: str) -> Submission:
-    """Find a submission and check its folder and manifest.
-
-    Args:
-        name: path of a folder, or the name of a bundled submission.
+    """Find a submission as :func:`resolve` does, and check its folder and manifest.
 
     Raises:
         SubmissionError: naming every problem.
     """
     folder = resolve(name)
     problems = []
-    paths, size = [], 0
+    count, size = 0, 0
     for path in _walk(folder):
         relative = printable(path.relative_to(folder).as_posix())
         if path.is_symlink():
@@ -100,9 +101,9 @@ def open_submission(name: str) -> Submission:
         elif not path.is_file():
             problems.append(f"{name}: {relative} is neither a file nor a folder")
         else:
-            paths.append(path)
+            count += 1
             size += path.stat().st_size
-        if len(paths) > MAX_FILES:
+        if count > MAX_FILES:
             problems.append(f"{name}: more than {MAX_FILES} files")
             break
     if size > MAX_BYTES:
@@ -113,7 +114,7 @@ def open_submission(name: str) -> Submission:
     if problems:
         raise SubmissionError(*problems)
     manifest = _manifest(folder, f"{name}/{MANIFEST}".replace("//", "/"))
-    return Submission(name.rstrip("/"), folder, manifest, content_hash(folder, paths))
+    return Submission(name.rstrip("/"), folder, manifest, combined_hash(file_hashes(folder)))
 
 
 def _manifest(folder: Path, label: str) -> Manifest:
@@ -124,7 +125,7 @@ def _manifest(folder: Path, label: str) -> Manifest:
         raise SubmissionError(f"{label}: {error}") from None
     if answer["problems"]:
         raise SubmissionError(*answer["problems"])
-    return manifest_from_json(answer["manifest"])
+    return msgspec.convert(answer["manifest"], Manifest)
 
 
 def as_submission(given: Any) -> Submission:
@@ -184,11 +185,7 @@ def submission_of(controller: Any) -> Submission:
 
 
 def _check_calls(name: str, function: Any, given: str, *arguments: str) -> None:
-    """Check that a function takes as many arguments as it will be given.
-
-    Raises:
-        SubmissionError: if it does not.
-    """
+    """Check that a function takes as many arguments as it will be given."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # of compiled code
@@ -218,15 +215,6 @@ def _walk(folder: Path) -> list[Path]:
     return sorted(paths)
 
 
-def content_hash(folder: Path, paths: list[Path]) -> str:
-    """SHA-256 of the names and contents of a submission's files.
-
-    Of the text that ``sha256sum`` prints for the files, sorted by relative path:
-    ``HASH  PATH`` a line.
-    """
-    return combined_hash({p.relative_to(folder).as_posix(): files.sha256(p) for p in paths})
-
-
 def file_hashes(folder: Path) -> dict[str, str]:
     """SHA-256 of every file of a submission now, by relative path; links are left out."""
     paths = [path for path in _walk(folder) if path.is_file() and not path.is_symlink()]
@@ -234,6 +222,293 @@ def file_hashes(folder: Path) -> dict[str, str]:
 
 
 def combined_hash(hashes: dict[str, str]) -> str:
-    """Return :func:`content_hash` of files whose own hashes are known, by relative path."""
+    """SHA-256 of the names and contents of a submission's files, by the hash of each.
+
+    Of the text that ``sha256sum`` prints for the files, sorted by relative path: ``HASH  PATH``.
+    """
     text = "".join(f"{digest}  {name}\n" for name, digest in sorted(hashes.items()))
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
+
+
+_README = "README.md"
+_REQUIRED = {
+    CONTROLLER: "write it with a class Controller; `ventbench new` shows one",
+    MANIFEST: "write it; `ventbench new` shows one, submissions/README.md explains the keys",
+    _README: "say in a few sentences what it does and how it was made",
+}
+
+
+def check_files(folder: Path) -> list[Finding]:
+    """Look at every file of a submission's folder."""
+    findings: list[Finding] = []
+    sizes: dict[str, int] = {}
+    for path in _members(folder):
+        name = path.relative_to(folder).as_posix()
+        if len(sizes) >= MAX_FILES:
+            advice = "put what belongs together into one file"
+            findings.append(_problem("the folder", f"has more than {MAX_FILES} files", advice))
+            break
+        status = path.lstat()
+        if stat.S_ISREG(status.st_mode):
+            sizes[name] = status.st_size
+            findings += _file(path, name, status)
+        else:
+            findings.append(_irregular(name, status.st_mode))
+    findings += _size(sizes)
+    for first, second in collisions(sizes):
+        what = f"differs from {first} only in upper and lower case"
+        findings.append(_problem(second, what, "rename one of them"))
+    return findings + list(_required(folder))
+
+
+def _problem(file: str, what: str, advice: str) -> Finding:
+    return Finding("files", file, what, advice)
+
+
+def _note(file: str, what: str, advice: str) -> Finding:
+    return Finding("files", file, what, advice, problem=False)
+
+
+def _members(folder: Path) -> Iterator[Path]:
+    """Files, links, and hidden folders as one each; what Python caches is left out."""
+    for here, folders, names in walk(folder):
+        closed = [n for n in folders if (here / n).is_symlink() or n.startswith(".")]
+        folders[:] = sorted(set(folders) - {"__pycache__"} - set(closed))
+        yield from (here / name for name in sorted((*closed, *names)))
+
+
+def _irregular(name: str, mode: int) -> Finding:
+    if stat.S_ISLNK(mode):
+        advice = "put the file itself there; nothing outside of the folder can be read anyway"
+        return _problem(name, "is a symbolic link", advice)
+    if stat.S_ISDIR(mode):
+        return _problem(name, "is a hidden folder", "move or remove it")
+    return _problem(name, "is neither a file nor a folder", "remove it")
+
+
+def _file(path: Path, name: str, status: os.stat_result) -> Iterator[Finding]:
+    if path.name == ".DS_Store":
+        yield _note(name, "was written by macOS", "leave it out of the pull request")
+        return
+    wrong, advice = path_problem(name), kind_problem(name)
+    if wrong:
+        rename = "rename or remove it: a pull request that holds it is refused"
+        yield _problem(name, wrong, rename)
+    elif advice:
+        yield _problem(name, "is of a kind that is not accepted", advice)
+    elif status.st_size <= MAX_BYTES:  # a larger one is a problem already
+        yield from _content(path, name)
+    if os.name != "nt" and status.st_mode & 0o111:
+        refused = f"chmod -x {name}: a pull request with executables is refused"
+        yield _note(name, "is executable", refused)
+
+
+def _content(path: Path, name: str) -> Iterator[Finding]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        yield _problem(name, f"cannot be read: {error.strerror}", "make it readable")
+        return
+    if content.startswith(b"version https://git-lfs"):
+        advice = "commit the file itself, without LFS"
+        yield _problem(name, "is a pointer of git LFS, not the file", advice)
+    elif ending(name) in ARRAYS:
+        for what in weights_problems(path):
+            yield _problem(name, what, WEIGHTS_ADVICE[ending(name)])
+    elif ending(name) not in PICTURES:
+        yield from _text(content, name)
+
+
+def _text(content: bytes, name: str) -> Iterator[Finding]:
+    try:
+        clean = "\0" not in content.decode()
+    except UnicodeDecodeError:
+        clean = False
+    if not clean and not name.endswith((".py", ".toml")):  # their own checks say so
+        yield _problem(name, "is not UTF-8 text", "save it as UTF-8, or leave it out")
+
+
+def _size(sizes: dict[str, int]) -> Iterator[Finding]:
+    total = sum(sizes.values())
+    if total > MAX_BYTES:
+        largest = sorted(sizes, key=lambda name: -sizes[name])[:3]
+        listed = ", ".join(f"{name} ({sizes[name] / 1e6:.1f} MB)" for name in largest)
+        yield _problem(
+            "the folder",
+            f"has {total / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:g} MB are accepted",
+            f"the largest are {listed}; float32 or float16 weights take less",
+        )
+
+
+def _required(folder: Path) -> Iterator[Finding]:
+    for name, advice in _REQUIRED.items():
+        path = folder / name
+        if not path.is_file():
+            close = [p.name for p in folder.iterdir() if p.name.lower() == name.lower()]
+            hint = f"; {close[0]} is there: rename it" if close and close[0] != name else ""
+            yield _problem(name, f"is missing{hint}", advice)
+        elif path.stat().st_size == 0:
+            yield _problem(name, "is empty", advice)
+
+
+#: Longest path below the submission's folder, characters, and how many names it may have.
+MAX_PATH = 120
+MAX_DEPTH = 6
+
+_FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+_WINDOWS = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+
+#: Endings of text, weights and pictures: all others are refused.
+TEXT = {".py", ".toml", ".md", ".txt", ".rst", ".json", ".csv", ".svg", ".cff"}
+ARRAYS = {".npz", ".npy", ".safetensors"}
+PICTURES = {".png", ".jpg", ".jpeg"}
+#: Names without an ending that are accepted as text.
+TEXT_NAMES = {"LICENSE", "LICENCE", "COPYING", "NOTICE", "AUTHORS"}
+
+_CODE = "compiled code is not reviewed and not run; submit the Python source"
+_PICKLE = "pickles run code when they are read; save arrays as .npz or .safetensors"
+_ARCHIVE = "archives are not reviewed; put the files themselves there"
+_SCRIPT = "scripts of that kind are never run"
+_OTHER_KIND = (
+    "leave it out: only Python sources, text, pictures (.png, .jpg, .svg) "
+    "and weights (.npz, .npy, .safetensors) are accepted"
+)
+_KIND_ADVICE = {
+    **dict.fromkeys((".pyc", ".pyo", ".pyd", ".so", ".dll", ".dylib", ".a", ".o", ".exe"), _CODE),
+    **dict.fromkeys((".pkl", ".pickle", ".joblib", ".dill", ".pt", ".ckpt", ".h5"), _PICKLE),
+    **dict.fromkeys(
+        (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".whl", ".egg"), _ARCHIVE
+    ),
+    **dict.fromkeys((".pth", ".sh", ".bat", ".cmd", ".ps1"), _SCRIPT),
+}
+
+
+def path_problem(path: str) -> str | None:
+    """Say what is wrong with a path below the submission's folder, ``/`` between names.
+
+    For a sentence that starts with the path; None if nothing is.
+    """
+    names = path.split("/")
+    if len(path) > MAX_PATH or len(names) > MAX_DEPTH:
+        return f"is longer than {MAX_PATH} characters or {MAX_DEPTH} names"
+    for name in names:
+        if name in ("", ".", ".."):
+            return "is not a plain path"
+        if name.startswith("."):
+            return "is a hidden file or folder"
+        if name == "__pycache__":
+            return "is a cache that Python writes"
+        if not name.isascii():
+            return f"has other than ASCII characters in its name, {name!a}"
+        if not _FILE_NAME.fullmatch(name):
+            return "may have only letters, digits, '_', '-' and '.' in its name, '-' not first"
+        if name.endswith(".") or _WINDOWS.fullmatch(name):
+            return "has a name that some systems cannot store"
+    return None
+
+
+def ending(path: str) -> str:
+    """Lower-case ending of a path's last name, such as ``".py"``; empty if there is none."""
+    name = path.rpartition("/")[2]
+    dot = name.rfind(".")
+    return name[dot:].lower() if dot > 0 else ""
+
+
+def kind_problem(path: str) -> str | None:
+    """Return what to do about a file of a kind that is not accepted; None if it is accepted."""
+    kind = ending(path)
+    if kind in TEXT | ARRAYS | PICTURES or path.rpartition("/")[2] in TEXT_NAMES:
+        return None
+    return _KIND_ADVICE.get(kind, _OTHER_KIND)
+
+
+def collisions(paths: Iterable[str]) -> list[tuple[str, str]]:
+    """Pairs of files or folders, by the paths of all files, that are one where case is ignored."""
+    seen: dict[str, str] = {}
+    pairs = []
+    for path in sorted(paths):
+        names = path.split("/")
+        for depth in range(1, len(names) + 1):
+            part = "/".join(names[:depth])
+            other = seen.setdefault(part.casefold(), part)
+            if other != part:
+                pairs.append((other, part))
+    return sorted(set(pairs))
+
+
+#: Most bytes that the arrays of one file may take once they are unpacked.
+MAX_UNPACKED = 100_000_000
+
+_SAVE = "save it with numpy.savez(path, **arrays) of finite numbers"
+#: What to do about weights, by ending.
+WEIGHTS_ADVICE = {
+    ".npz": _SAVE,
+    ".npy": "save it with numpy.save(path, array) of finite numbers",
+    ".safetensors": "save it with safetensors.numpy.save_file(arrays, path)",
+}
+
+
+def weights_problems(path: Path) -> list[str]:
+    """Say what is wrong with a file of arrays, each for a sentence that starts with its name."""
+    try:
+        if path.suffix.lower() == ".safetensors":
+            return _safetensors(path)
+        return _npz(path) if path.suffix.lower() == ".npz" else _npy(path)
+    except Exception as error:  # whatever a hostile file brings numpy and zipfile to raise
+        return [f"cannot be read without pickle: {type(error).__name__}: {error}"]
+
+
+def _npy(path: Path) -> list[str]:
+    return _numbers({"it": np.load(path, mmap_mode="r", allow_pickle=False)})
+
+
+def _npz(path: Path) -> list[str]:
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(entry.file_size for entry in archive.infolist())
+        names = archive.namelist()
+    if unpacked > MAX_UNPACKED:
+        limit = f"at most {MAX_UNPACKED / 1e6:g} MB are accepted"
+        return [f"unpacks to {unpacked / 1e6:.0f} MB; {limit}"]
+    if len(set(names)) < len(names):
+        return ["holds two arrays of one name"]
+    other = [name for name in names if not name.endswith(".npy")]
+    if other:
+        return [f"holds {other[0]!r}, which is no array"]
+    with np.load(path, allow_pickle=False) as file:
+        return _numbers({f"array {key!r}": file[key] for key in file.files})
+
+
+def _numbers(arrays: Mapping[str, Any]) -> list[str]:
+    problems = []
+    for name, values in arrays.items():
+        if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
+            problems.append(f"{name} does not hold numbers")
+        elif not np.isfinite(values).all():
+            problems.append(f"{name} holds NaN or infinity")
+    return problems
+
+
+def _safetensors(path: Path) -> list[str]:
+    content = path.read_bytes()
+    size = int.from_bytes(content[:8], "little")
+    if len(content) < 8 or size > len(content) - 8:
+        return ["is not a safetensors file"]
+    header = json.loads(content[8 : 8 + size])
+    data, problems = content[8 + size :], []
+    for name, about in header.items():
+        if name == "__metadata__":
+            continue
+        begin, end = about["data_offsets"]
+        kind, count = about["dtype"], math.prod(about["shape"])
+        if not 0 <= begin <= end <= len(data):
+            problems.append(f"array {name!r} lies outside of the file")
+        elif kind in _FLOATS:
+            values = np.frombuffer(data[begin:end], _FLOATS[kind])
+            if len(values) != count:
+                problems.append(f"array {name!r} does not have the size of its shape")
+            elif not np.isfinite(values).all():
+                problems.append(f"array {name!r} holds NaN or infinity")
+    return problems
+
+
+_FLOATS = {"F16": "<f2", "F32": "<f4", "F64": "<f8"}

@@ -206,11 +206,7 @@ def _checked(
 
 
 def read_manifest(path: Path, label: str | None = None) -> Manifest:
-    """Read and check a manifest.
-
-    Args:
-        path: the ``submission.toml``.
-        label: how messages name it; the path if not given.
+    """Read and check a manifest, which messages name by its path or by ``label``.
 
     Raises:
         SubmissionError: naming every problem with file and key.
@@ -240,27 +236,15 @@ def read_manifest(path: Path, label: str | None = None) -> Manifest:
 
 
 def read_as_json(folder: str, label: str) -> dict[str, Any]:
-    """Read the manifest of a folder, for a process that answers in JSON.
+    """Read the manifest of a folder, for a process that answers in JSON; ``label`` names the file.
 
-    Args:
-        folder: the submission's.
-        label: how messages name the file.
-
-    Returns:
-        ``manifest``, for :func:`manifest_from_json`, or None; and ``problems``, in words.
+    ``manifest``, its values, or None; and ``problems``, in words.
     """
     try:
         manifest = read_manifest(Path(folder, MANIFEST), label)
     except SubmissionError as error:
         return {"manifest": None, "problems": error.problems}
     return {"manifest": dataclasses.asdict(manifest), "problems": ()}
-
-
-def manifest_from_json(values: dict[str, Any]) -> Manifest:
-    """Return the manifest of what :func:`read_as_json` answered."""
-    training = {**values["training"], "seeds": tuple(values["training"]["seeds"])}
-    lists = {key: tuple(values[key]) for key in ("authors", "tracks")}
-    return Manifest(**{**values, **lists, "training": Training(**training)})
 
 
 #: SPDX identifiers that most authors use.
@@ -300,14 +284,7 @@ _TOML_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)")
 
 
 def check_manifest(folder: Path) -> tuple[list[Finding], Manifest | None]:
-    """Read the manifest and look at what it says.
-
-    Args:
-        folder: the submission's folder.
-
-    Returns:
-        The findings, and the manifest unless it cannot be read.
-    """
+    """Read the manifest of a folder: the findings, and the manifest unless it cannot be read."""
     path = folder / MANIFEST
     if not path.is_file():
         return [], None  # reported by check_files

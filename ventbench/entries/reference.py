@@ -115,11 +115,9 @@ class Reference:
 
 
 def settings(simulators: Mapping[str, Any], draws: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What a reference belongs to, as JSON values.
+    """What a reference belongs to: version and hashes of simulators, and what draws say about them.
 
-    Args:
-        simulators: version and hashes of the simulators.
-        draws: what :meth:`ventbench.task.draws.Draws.about` says; None for nominal cells alone.
+    As JSON values; draws are None for nominal cells alone.
     """
     about = {"simulators": simulators.get("manifest_sha256"), "draws": draws}
     return json.loads(json.dumps(about))

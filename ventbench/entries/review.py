@@ -27,8 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from ventbench.entries.errors import Finding
-from ventbench.entries.file_checks import check_files
-from ventbench.entries.folder import CONTROLLER, MAX_BYTES
+from ventbench.entries.folder import CONTROLLER, MAX_BYTES, check_files
 from ventbench.entries.manifest import check_manifest
 from ventbench.sandbox.child.cell import CLASS, source_text
 from ventbench.sandbox.child.sources import Import, imports, module_files, sources
@@ -277,12 +276,9 @@ _ADVICE = "for the reviewer: make sure that it is what it seems to be"
 
 
 def review(folder: Path) -> list[Finding]:
-    """List what a reviewer should look at, as notes.
+    """List what a reviewer should look at in a folder, as notes.
 
     Call it in a limited process, see :mod:`ventbench.sandbox.reader`.
-
-    Args:
-        folder: the submission's.
     """
     notes = []
     for path in sources(folder):
@@ -396,10 +392,8 @@ def inspect_folder(folder: Path) -> tuple[Finding, ...]:
     """Return what is wrong with the manifest, the files and the sources of a submission.
 
     One process makes all checks. Where a check ends the process, each check gets its own, so that
-    the answer says which files cannot be read and still has what the other checks find.
-
-    Args:
-        folder: the submission's; nothing in it is run or imported.
+    the answer says which files cannot be read and still has what the other checks find. Nothing
+    in the folder is run or imported.
     """
     try:
         together = read_apart("ventbench.entries.review:all_findings_as_json", folder)

@@ -90,13 +90,10 @@ class Runner(Protocol):
 
 
 def pack(observation: Observation) -> Floats:
-    """Lay a batch of observations out as rows.
+    """Lay a batch of observations out as rows, batch axes flattened.
 
-    Args:
-        observation: fields of shape ``(...)``, ``targets_ahead`` ``(..., TARGETS_AHEAD)``.
-
-    Returns:
-        float64, shape ``(cells, ROW)``: the fields in their order, batch axes flattened.
+    Fields of shape ``(...)``, ``targets_ahead`` ``(..., TARGETS_AHEAD)``; float64, shape
+    ``(cells, ROW)``, the fields in their order.
     """
     shape = np.shape(observation.pressure)
     columns = [
@@ -167,11 +164,9 @@ class InProcessRunner:
 
 
 def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
-    """Choose how a submission runs.
+    """Choose how a submission runs: a folder in locked-down processes unless ``sandbox`` is False.
 
-    Args:
-        submission: a folder, or a class or function, which always runs in this process.
-        sandbox: run a folder in locked-down processes.
+    A class or function always runs in this process.
 
     Raises:
         SandboxError: if this machine cannot run submissions apart.

@@ -172,10 +172,8 @@ class Runs:
         """Means over cells with draws, rigs and ensemble members resampled, alike for all entries.
 
         PIPs are chosen, not drawn, and lungs and PIPs form a Latin square: what a PIP adds on
-        average is taken out before, as what a lung adds is.
-
-        Args:
-            values: ``(L, n)``, such as a mean over conditions; any unit.
+        average is taken out before, as what a lung adds is. Values ``(L, n)`` of any unit, such as
+        a mean over conditions.
         """
         levels, index, count = np.unique(self.pips, return_inverse=True, return_counts=True)
         if count.min() > 1:
@@ -185,11 +183,7 @@ class Runs:
         return resampled_scores(values, self.rig, self.member)
 
     def interval(self, values: Floats) -> tuple[float, float]:
-        """95 % interval of a mean over cells, by :meth:`resampled`.
-
-        Args:
-            values: ``(L, n)``, such as a mean over conditions; any unit.
-        """
+        """95 % interval of a mean over cells of values ``(L, n)``, by :meth:`resampled`."""
         if values.shape[1] < 2 or not np.isfinite(values).all():
             return math.nan, math.nan
         low, high = np.quantile(self.resampled(values), (0.025, 0.975))

@@ -155,12 +155,9 @@ def create(
 
 
 def contents(name: str, family: str, exported_from: Path | str | None = None) -> dict[str, bytes]:
-    """Files of a new submission, by name.
+    """Files of a new submission of an allowed name and a known family, by name.
 
-    Args:
-        name: what the entry is called; allowed.
-        family: the entry's family; known.
-        exported_from: safetensors file of a network; it is no ``"pid"`` then but ``"other"``.
+    What a safetensors file of a network gives is no ``"pid"`` but ``"other"``.
     """
     if exported_from is not None:
         return _exported_files(name, "other" if family == "pid" else family, Path(exported_from))

@@ -215,13 +215,7 @@ def _counted(progress: Progress | None, sessions: int) -> Callable[[], object]:
 def enter(
     submission: Submission, track: str | None, lungs: Sequence[str], runner: Runner
 ) -> tuple[str, list[Task]]:
-    """Say what a submission is told of each lung on a track.
-
-    Args:
-        submission: that is to be scored.
-        track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
-        lungs: ids.
-        runner: that will run it.
+    """Say what a submission is told of each lung on a track, which is the manifest's first if None.
 
     Returns:
         The track, and a task for each lung.
@@ -248,14 +242,7 @@ def enter(
 
 
 def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Sequence[Task]) -> Runs:
-    """Compute the figures of a run.
-
-    Args:
-        run: batch shape ``(S, L, n, P)``.
-        cells: that ran.
-        submission: that ran.
-        tasks: what it was told of each lung.
-    """
+    """Figures of a run of cells, batch shape ``(S, L, n, P)``; a task for each lung."""
     pip, dt = (
         np.broadcast_to(np.asarray(x), cells.pips.shape)
         for x in (cells.scenario.pip, cells.scenario.dt)
@@ -318,15 +305,7 @@ def transfer(
     runner: Runner | None = None,
     progress: Progress | None = None,
 ) -> Runs:
-    """Run an entry on all plants of all scored rigs, without noise.
-
-    Args:
-        submission: from :func:`ventbench.entries.folder.open_submission`.
-        rigs: from :func:`ventbench.plants.rigs.load_rigs`.
-        track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
-        runner: runs the controllers; if not given, the sandbox, and a class or function in this
-            process.
-        progress: as of :func:`score`.
+    """Run an entry on all plants of all scored rigs, without noise; arguments as of `run_protocol`.
 
     Returns:
         Figures of all PIPs on all plants; where a lung has fewer than another, its reference runs
@@ -357,16 +336,11 @@ def transfer(
 
 
 def by_group(runs: Runs, rigs: Rigs) -> dict[str, Any]:
-    """Errors of an entry by group and lung, as JSON values.
+    """Errors of an entry by group and lung, of runs from :func:`transfer`, as JSON values.
 
-    Args:
-        runs: from :func:`transfer`.
-        rigs: on which it ran.
-
-    Returns:
-        For each of :data:`GROUPS` the mean over the lungs that have such plants, the number of
-        plants, and the mean of each lung over its plants and the PIPs; null where a lung has no
-        such plant or the controller failed. cmH2O.
+    For each of :data:`GROUPS` the mean over the lungs that have such plants, the number of plants,
+    and the mean of each lung over its plants and the PIPs; null where a lung has no such plant or
+    the controller failed. cmH2O.
     """
     table = runs.to_frame().drop_duplicates(["lung", "pip_cmH2O", "rig", "member"])
     assert rigs.sessions is not None

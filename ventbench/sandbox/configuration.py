@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ventbench.base.errors import InputError
-from ventbench.sandbox.child.failures import SubmissionError
+from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.sandbox.child.zygote import NUMPY
 from ventbench.sandbox.reader import UnreadableError, read_apart
 
@@ -75,13 +75,7 @@ _THREADED_MEMORY = 4 * GIB
 
 
 def configuration(folder: str, label: str, allowance: Allowance) -> dict[str, object]:
-    """What a zygote is told.
-
-    Args:
-        folder: the submission's, absolute.
-        label: how messages name it.
-        allowance: what they may use.
-    """
+    """What a zygote is told of a submission: folder, name in messages, and what cells may use."""
     modules, threads = modules_needed(Path(folder))
     memory = max(allowance.memory, _THREADED_MEMORY) if threads else allowance.memory
     return {

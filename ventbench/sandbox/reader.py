@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ventbench.sandbox.child.reader import OUT_OF_MEMORY, TOO_DEEP
+from ventbench.sandbox.child.lockdown import OUT_OF_MEMORY, TOO_DEEP
 
 #: The folder that holds ``ventbench``, and the one of installed packages.
 ROOT = str(Path(__file__).resolve().parents[2])
@@ -51,8 +51,8 @@ PATIENCE_S = 600.0
 ANSWER = 4_000_000
 
 _BOOT = (
-    "import sys; sys.path.insert(0, sys.argv[2]); from ventbench.sandbox.child import reader; "
-    "reader.main(sys.argv[1])"
+    "import sys; sys.path.insert(0, sys.argv[2]); from ventbench.sandbox.child import lockdown; "
+    "lockdown.read(sys.argv[1])"
 )
 
 

@@ -1,21 +1,35 @@
-"""The runner that a scorer uses by default: every cell in a locked-down process of its own."""
+"""The runner that a scorer uses by default: every cell in a locked-down process of its own.
+
+While cells run, this process has room for the descriptors of their pipes and cannot be read by
+other processes of the same user. Whatever a cell says was written by the submission: it is cut,
+escaped and believed in nothing.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import platform
+import random
+import resource
+import signal
 import tempfile
-from collections.abc import Mapping, Sequence
-from typing import Any
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
-from ventbench.sandbox.child import landlock, libc, lockdown, wire
+import numpy as np
+
+from ventbench.base.arrays import Floats, Ints
+from ventbench.sandbox.child import libc, lockdown, privileges, wire
+from ventbench.sandbox.child.cell import Failure, SubmissionError, printable
 from ventbench.sandbox.child.lockdown import FLOOR, OFFICIAL
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
-from ventbench.sandbox.pipes import Clock, Pipes
-from ventbench.sandbox.session import SandboxSession, SubmittedFolder, said
-from ventbench.sandbox.zygote import ZygoteClient
+from ventbench.sandbox.pipes import Asked, Clock, Outcome, Pipes, ZygoteClient, signal_name
+from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 
 _PROBE_S = 30.0
@@ -119,7 +133,7 @@ class SandboxRunner:
         """Layers in force in every cell, for the record."""
         return {
             "layers": list(self._layers),
-            "landlock_abi": landlock.abi(),
+            "landlock_abi": privileges.landlock_abi(),
             "kernel": f"{platform.system()} {platform.release()}",
             "official": not self.missing,
         }
@@ -132,3 +146,329 @@ class SandboxRunner:
             SubmissionError: if the code cannot be imported.
         """
         return SandboxSession(submission, tasks, self._layers, self._allowance, self._clock)
+
+
+#: A silent cell is waited for this many patiences: the machine may be busy with others. But not
+#: once it has had a patience of processor time; of a processor alone it gets nearly all.
+_SILENCES, _BUSY = 6, 0.9
+
+#: How long an interrupted cell may take to say where it was, s.
+_GRACE_S = 0.5
+
+
+class SubmittedFolder(Protocol):
+    """What a session needs of a submission: where its code lies, and how messages name it."""
+
+    @property
+    def folder(self) -> Path:
+        """Absolute path."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """As the person named it."""
+        ...
+
+
+class SandboxSession(Asked):
+    """Fresh, locked-down controllers, one process each.
+
+    It is a :class:`ventbench.entries.runner.ControllerSession`.
+
+    Args:
+        submission: whose code runs.
+        tasks: one for each cell.
+        layers: what every cell must show to be in force.
+        allowance: what they may use.
+        clock: times the cells out.
+
+    Raises:
+        SandboxError: if a cell does not lock itself down.
+        SubmissionError: if the code cannot be imported.
+    """
+
+    def __init__(
+        self,
+        submission: SubmittedFolder,
+        tasks: Sequence[Task],
+        layers: tuple[str, ...],
+        allowance: Allowance,
+        clock: Clock | None = None,
+    ):
+        self.failures: dict[int, Failure] = {}
+        self._count, self._live = len(tasks), set(range(len(tasks)))
+        self._allowance, self._sequence = allowance, [0] * len(tasks)
+        self._asked, self._void = set[int](), set[int]()
+        self._clock = clock or Clock()
+        self._deadline = self._clock.now() + allowance.total_s
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(descriptors_for(2 * len(tasks)))
+            hide_process()
+            stack.callback(show_process)
+            self._pipes = Pipes(self._clock)
+            stack.callback(self._pipes.close_all)
+            self._zygote = ZygoteClient(
+                configuration(str(submission.folder), submission.label, allowance)
+            )
+            stack.callback(self._zygote.close)
+            # Ended first: cells then leave by themselves, and the zygote need not kill.
+            stack.callback(self._pipes.close_all)
+            self._lock_down(tasks, layers)
+            self._reset()
+            self._stack = stack.pop_all()
+
+    def _lock_down(self, tasks: Sequence[Task], layers: tuple[str, ...]) -> None:
+        # In an order that nobody knows: a process's number says nothing about its cell.
+        for cell in random.SystemRandom().sample(range(self._count), self._count):
+
+            def start(far: list[int], cell: int = cell) -> None:
+                self._zygote.start(cell, tasks[cell], far)
+
+            self._pipes.open(cell, start)
+        due = set(self._live)
+        replies, late = self._round(due, wire.LOCKED, self._allowance.start_patience_s)
+        for reply in replies.values():
+            if not isinstance(reply, Reply) or reply.kind != wire.LOCKED:
+                raise SandboxError(f"a cell could not be locked down: {said(reply)}")
+            lacking = set(layers) - set(lockdown.names(reply.value))
+            if lacking:
+                raise SandboxError(f"a cell lacks {', '.join(sorted(lacking))}")
+        if late:
+            raise SandboxError(f"{len(late)} cells did not start in time")
+
+    def _reset(self) -> None:
+        self._pipes.send(dict.fromkeys(self._live, wire.BEGIN))
+        due = set(self._live)
+        replies, late = self._round(due, wire.READY, self._allowance.start_patience_s)
+        for cell, reply in replies.items():
+            failure = self._judge(cell, reply)
+            if failure is not None and failure.kind == "import":
+                raise SubmissionError(failure.what)
+        self._give_up(late)
+
+    def ask(self, cells: Ints, observations: Floats) -> None:
+        """Ask some controllers for their next commands, as of ``ControllerSession``."""
+        for cell, outcome in self._pipes.early(self._asked).items():
+            self._judge(cell, outcome)
+        rows, frames = np.ascontiguousarray(observations, "<f8"), {}
+        for cell, row in zip(cells.tolist(), rows, strict=True):
+            self._sequence[cell] += 1
+            if cell in self._live:
+                frames[cell] = wire.pack_observation(self._sequence[cell], row.tobytes())
+        self._asked |= frames.keys()
+        self._void |= set(cells.tolist()) - frames.keys()
+        self._pipes.send(frames)
+
+    def answers(self) -> tuple[Ints, Floats]:
+        """Take the commands that are there, as of ``ControllerSession``."""
+        commands = dict.fromkeys(self._void, 0.0)
+        if self._asked and not self._void:
+            patience = self._allowance.patience_s
+            replies, late = self._round(set(self._asked), wire.COMMAND, patience, some=True)
+            for cell, reply in replies.items():
+                failed = self._judge(cell, reply) is not None
+                if cell in self._asked:  # else it wrote what nobody had asked for
+                    commands[cell] = 0.0 if failed else reply.value  # type: ignore[union-attr]
+            self._asked -= replies.keys()
+            self._give_up(late)
+            self._asked -= late
+            commands |= dict.fromkeys(late, 0.0)
+        self._void.clear()
+        return np.array(list(commands), np.int64), np.array(list(commands.values()))
+
+    def processor_time(self) -> float:
+        """Processor time that all cells have had, s, as the kernel counts it."""
+        return sum(self._zygote.processor_time(range(self._count)).values())
+
+    def close(self) -> None:
+        """End all controllers; may be called more than once."""
+        self._live.clear()
+        self._stack.close()
+
+    def _round(
+        self, due: set[int], kind: int, patience_s: float, *, some: bool = False
+    ) -> tuple[dict[int, Outcome], set[int]]:
+        """Wait for replies; cells that compute or are kept from it are waited for.
+
+        For as long as a reply may take of processor time, and :data:`_SILENCES` times as long on
+        the clock; ``some`` takes what is there once there is any.
+
+        Returns:
+            What came, by cell, and the cells that are out of time, their own or the session's.
+        """
+        over, outcomes = set[int](), dict[int, Outcome]()
+        used: dict[int, float] = {}  # when a cell was first found silent
+        for _ in range(_SILENCES):
+            outcomes |= self._pipes.collect(
+                due, self._sequence, kind, patience_s, self._deadline, some=some
+            )
+            if not due or (some and outcomes):
+                return outcomes, over
+            if self._clock.now() >= self._deadline:
+                break
+            now = self._zygote.processor_time(due)
+            over |= {c for c in due if now[c] - used.setdefault(c, now[c]) >= _BUSY * patience_s}
+            due -= over
+        return outcomes, due | over
+
+    def _judge(self, cell: int, outcome: Outcome) -> Failure | None:
+        """End a cell that has failed."""
+        if isinstance(outcome, Reply) and outcome.kind != wire.FAILED:
+            if np.isfinite(outcome.value):
+                return None
+            return self._fail(cell, Verdict("value", f"act returned {outcome.value}"))
+        if isinstance(outcome, Reply):
+            return self._fail(cell, failed(outcome.text, self._sequence[cell]))
+        if outcome is None:
+            return self._fail(cell, ended(self._zygote.status(cell, self._clock.status_s)))
+        return self._fail(
+            cell, Verdict("wire", "the controller broke the wire's rules", str(outcome))
+        )
+
+    def _give_up(self, late: set[int]) -> None:
+        """Time out cells; first ask each where it is."""
+        if not late:
+            return
+        outcomes: dict[int, Outcome] = {}
+        if not self._asked - late:  # nobody else may answer meanwhile
+            for cell in late:
+                self._zygote.interrupt(cell)
+            deadline = self._clock.now() + _GRACE_S + 0.01 * len(late)
+            outcomes = self._pipes.collect(
+                set(late), self._sequence, wire.FAILED, _GRACE_S, deadline
+            )
+        limit = f"{self._allowance.total_s:g} s for the whole score"
+        if self._clock.now() < self._deadline:
+            patience = self._allowance.patience_s
+            limit = f"{patience:g} s of processor time, or {_SILENCES * patience:g} s in all"
+        for cell in outcomes.keys() - late:  # had answered, and then wrote more or ended
+            self._judge(cell, outcomes[cell])
+        for cell in late:
+            self._fail(cell, not_answered(outcomes.get(cell), limit))
+
+    def _fail(self, cell: int, verdict: Verdict) -> Failure:
+        breath = step = None
+        if self._sequence[cell]:
+            breath, step = divmod(self._sequence[cell] - 1, protocol.INSPIRATION_STEPS)
+            breath, step = breath + 1, step + 1
+        self.failures[cell] = failure = Failure(*verdict, breath, step)
+        self._live.discard(cell)
+        self._pipes.close(cell)
+        self._zygote.kill(cell)
+        return failure
+
+
+def said(outcome: Outcome) -> str:
+    """Words of a cell that could not be locked down: before that it runs our code alone."""
+    if isinstance(outcome, Reply):
+        return outcome.text.decode(errors="replace").replace("\0", " ").strip()
+    return "it ended" if outcome is None else str(outcome)
+
+
+#: What else a process has open.
+_OTHER_DESCRIPTORS = 256
+
+
+@contextlib.contextmanager
+def descriptors_for(count: int) -> Iterator[None]:
+    """Raise the limit of open descriptors if need be, and restore it afterwards.
+
+    Raises:
+        SandboxError: if the system's own limit is too low.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = count + _OTHER_DESCRIPTORS
+    enough = soft == resource.RLIM_INFINITY or soft >= wanted
+    if not enough:
+        if hard != resource.RLIM_INFINITY and hard < wanted:
+            raise SandboxError(
+                f"{count} pipes are needed and the system allows {hard} open files; "
+                f"raise it (ulimit -Hn {wanted}) or score fewer cells at a time"
+            )
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    try:
+        yield
+    finally:
+        if not enough:
+            with contextlib.suppress(OSError, ValueError):
+                resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+_dumpable_lock = threading.Lock()
+_hiders = 0
+_dumpable_before = 1
+
+
+def hide_process() -> None:
+    """No tracing, no ``/proc/PID/mem`` for others; counts how often it was asked for."""
+    global _hiders, _dumpable_before
+    with _dumpable_lock:
+        if libc.LINUX and _hiders == 0:
+            _dumpable_before = libc.prctl(libc.PR_GET_DUMPABLE)
+            libc.prctl(libc.PR_SET_DUMPABLE, 0)
+        _hiders += 1
+
+
+def show_process() -> None:
+    """Undo one :func:`hide_process`; the last one restores what was before."""
+    global _hiders
+    with _dumpable_lock:
+        _hiders -= 1
+        # 2, "for root alone", cannot be set again by hand; 0 is what it means for others.
+        if libc.LINUX and _hiders == 0 and _dumpable_before == 1:
+            libc.prctl(libc.PR_SET_DUMPABLE, 1)
+
+
+#: Kinds that a cell may give itself, before the first observation and after it.
+_BEFORE, _DURING = ("reset", "import", "construct"), ("act", "type", "value")
+
+
+class Verdict(NamedTuple):
+    """Kind, words and detail of a ``child.failures.Failure``."""
+
+    kind: str
+    what: str
+    detail: str = ""
+
+
+def failed(text: bytes, sequence: int) -> Verdict:
+    """Verdict on a cell that reported a failure itself, as of :meth:`serve._Replies.fail`.
+
+    It was answering the observation of a number; 0 before the first.
+    """
+    kind, what, detail, printed = _fields(text)
+    kinds = _DURING if sequence else _BEFORE
+    kind = kind if kind in kinds else kinds[0]
+    # An import's problems are one on a line, and each is cut and escaped by itself.
+    what = "\n".join(printable(line) for line in what.splitlines()[:20])
+    return Verdict(kind, what or "the submission ended itself", _with_prints(detail, printed))
+
+
+def ended(status: int | None) -> Verdict:
+    """Verdict on a cell whose pipe closed without an answer, by its exit status, if it has one."""
+    if status is None:
+        return Verdict("wire", "the controller closed its pipe")
+    if status >= 0:
+        return Verdict("exit", f"the controller ended its process (exit code {status})")
+    if -status == signal.SIGXCPU:
+        return Verdict("cpu", "the controller used up its processor time (SIGXCPU)")
+    return Verdict("crash", f"the controller's process was ended by {signal_name(status)}")
+
+
+def not_answered(outcome: Outcome, limit: str) -> Verdict:
+    """Verdict on a cell that was out of time, by what it said when it was asked where it is."""
+    _, _, detail, printed = _fields(outcome.text if isinstance(outcome, Reply) else b"")
+    what = f"the controller did not answer within {limit}"
+    return Verdict("timeout", what, _with_prints(detail, printed))
+
+
+def _fields(text: bytes) -> list[str]:
+    fields = text.decode(errors="replace").split("\0", 3)
+    return [*fields, "", "", ""][:4]
+
+
+def _with_prints(detail: str, printed: str) -> str:
+    parts = [printable(detail)] if detail else []
+    if printed:
+        parts.append(f"it printed {printable(printed[-400:], 400)}")
+    return "; ".join(parts)

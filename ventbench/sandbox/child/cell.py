@@ -7,18 +7,69 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import dataclasses
 import itertools
 import math
 import sys
 import types
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ventbench.base.errors import InputError
 from ventbench.task.interfaces import Observation, Task
 from ventbench.task.protocol import TARGETS_AHEAD
 
-from .failures import Failure, SubmissionError, printable
+
+def printable(text: str, length: int = 300) -> str:
+    """One line that no terminal or page misreads: other characters escaped, cut to a length."""
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
+class SubmissionError(InputError):
+    """A submission that cannot be run at all.
+
+    Attributes:
+        problems: one sentence for each, with file and key or line.
+    """
+
+    def __init__(self, *problems: str):
+        self.problems = problems
+        super().__init__("\n".join(problems))
+
+
+@dataclass(frozen=True)
+class Failure:
+    """One controller that failed during a run; its entry is listed, not ranked.
+
+    Attributes:
+        kind: ``"construct"``, ``"reset"``, ``"act"`` (it raised there), ``"type"`` (no number),
+            ``"value"`` (NaN or infinite); a sandbox adds its own, such as ``"timeout"``.
+        what: what happened, such as ``"controller.py line 7 raised ValueError"``.
+        detail: the exception's text, or empty.
+        breath: counted from 1; None before the first step.
+        step: of the breath, counted from 1; None before the first step.
+    """
+
+    kind: str
+    what: str
+    detail: str = ""
+    breath: int | None = None
+    step: int | None = None
+
+    def message(self, submission: str, lung: str | None) -> str:
+        """One sentence for a person, with the folder as written and the lung's id, if known."""
+        when = "" if self.step is None else f" at step {self.step} of breath {self.breath}"
+        detail = f": {self.detail}" if self.detail else ""
+        where = f"(lung {lung or 'hidden'})"
+        return f"{submission}: {self.what}{when} {where}{detail}; the entry is not ranked."
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the attributes as JSON values."""
+        return dataclasses.asdict(self)
+
 
 #: Floats of one observation on the way to a controller, in the order of :class:`Observation`.
 ROW = 5 + TARGETS_AHEAD
@@ -60,10 +111,7 @@ class Cell:
         self._act = instance.act
 
     def act(self, row: Sequence[float]) -> float:
-        """Ask for the next command.
-
-        Args:
-            row: the observation, :data:`ROW` floats.
+        """Ask for the next command, by an observation of :data:`ROW` floats.
 
         Returns:
             ``u_in``, %, a finite float; clipping is the caller's.
@@ -186,9 +234,6 @@ def source_text(content: bytes) -> str:
 
     A source that names another one reads otherwise for Python than for people: in
     ``unicode_escape`` the end of a comment may be code.
-
-    Args:
-        content: of the file.
 
     Raises:
         ValueError: if it is not UTF-8.

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import importlib
+import json
 import os
 import socket
 import stat
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
-from . import isolation, landlock, libc, privileges, seccomp
+from . import isolation, libc, privileges, seccomp
 
 #: Every layer, in the order of the bits of a ``LOCKED`` reply.
 LAYERS = (
@@ -44,13 +48,7 @@ OFFICIAL = (
 
 @dataclass(frozen=True)
 class CellLimits:
-    """What one cell may use.
-
-    Attributes:
-        memory: bytes beyond the interpreter with its libraries.
-        cpu_s: seconds of processor time in total.
-        threads: whether it may start threads.
-    """
+    """What a cell may use: bytes beyond the interpreter with libraries, processor time, threads."""
 
     memory: int
     cpu_s: int
@@ -91,9 +89,9 @@ class Lockdown:
             elif isolation.read_only():
                 self._layers.append("read-only-mounts")
         privileges.undumpable()
-        if landlock.abi():
+        if privileges.landlock_abi():
             readable = [*readable, *([folder] if folder else [])]
-            handle = landlock.ruleset(readable, listable)
+            handle = privileges.ruleset(readable, listable)
             # Out of the way of the numbers that a cell's pipes will have.
             self._ruleset = fcntl.fcntl(handle, fcntl.F_DUPFD_CLOEXEC, 16)
             os.close(handle)
@@ -101,10 +99,7 @@ class Lockdown:
     def finish(self, limits: CellLimits, keep: int, parent: int | None = None) -> list[str]:
         """Lock this process, a fork of the zygote, down for good.
 
-        Args:
-            limits: what it may use.
-            keep: descriptors below this number are its wire; all others are closed.
-            parent: the process with which this one shall end.
+        Descriptors below ``keep`` are its wire, all others are closed; it ends with ``parent``.
 
         Returns:
             The layers that are in force, shown by trying.
@@ -129,7 +124,7 @@ class Lockdown:
                 privileges.die_with(parent)
             layers += ["no-new-privileges", "no-capabilities", "undumpable"]
         if self._ruleset is not None:
-            landlock.enforce(self._ruleset)
+            privileges.enforce(self._ruleset)
             layers.append("landlock")
         os.closerange(keep, 1 << 16)
         if self._ruleset is not None:
@@ -182,3 +177,37 @@ def names(number: float) -> tuple[str, ...]:
     if not 0 <= number < 1 << len(LAYERS):
         return ()
     return tuple(layer for bit, layer in enumerate(LAYERS) if int(number) >> bit & 1)
+
+
+#: Exit codes of a reader: the parser ran out of memory or of recursion depth.
+OUT_OF_MEMORY, TOO_DEEP = 3, 4
+
+#: Descriptors of a reader from here on are closed: 1 takes the answer.
+_READER_END = 3
+
+
+def read(request: str) -> NoReturn:
+    """Answer one request on hostile files on standard output, locked down like a cell.
+
+    One function of ventbench is imported, the process locks itself down, the function reads, and
+    its answer leaves as JSON. Whatever a parser does with a hostile file ends here.
+
+    Args:
+        request: JSON with ``function`` (``"module:name"``), ``arguments``, ``readable`` folders,
+            ``site``, ``memory`` in bytes, ``cpu_s``.
+    """
+    told = json.loads(request)
+    sys.path.append(told["site"])
+    module, _, name = told["function"].partition(":")
+    function = getattr(importlib.import_module(module), name)
+    limits = CellLimits(told["memory"], told["cpu_s"], threads=False)
+    Lockdown(told["readable"], []).finish(limits, _READER_END)
+    try:
+        data = json.dumps(function(*told["arguments"])).encode()
+        while data:
+            data = data[os.write(1, data) :]
+    except MemoryError:
+        os._exit(OUT_OF_MEMORY)
+    except RecursionError:
+        os._exit(TOO_DEEP)
+    os._exit(0)

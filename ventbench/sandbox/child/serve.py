@@ -17,8 +17,7 @@ from typing import NamedTuple, NoReturn
 from ventbench.task.interfaces import Task
 
 from . import lockdown, wire
-from .cell import Cell, Failed, controller_class, describe, source_text
-from .failures import SubmissionError
+from .cell import Cell, Failed, SubmissionError, controller_class, describe, source_text
 from .lockdown import CellLimits, Lockdown
 
 #: Descriptors of a cell: 0 to 2 are /dev/null.
@@ -27,13 +26,7 @@ OBSERVATIONS, REPLIES, END = 3, 4, 5
 
 @dataclass(frozen=True)
 class Setup:
-    """What all cells of a session share.
-
-    Attributes:
-        folder: the submission's folder.
-        label: how messages name it.
-        limits: what each cell may use.
-    """
+    """What all cells share: the submission's folder, its name in messages, what a cell may use."""
 
     folder: Path
     label: str
@@ -69,12 +62,9 @@ class _Replies:
 
 
 class Start(NamedTuple):
-    """What one cell alone gets from the zygote.
+    """What one cell alone gets from the zygote: task, ends of two pipes, the zygote's number.
 
-    Attributes:
-        task: what the controller is told, as JSON; empty to lock down, say so and end.
-        pipes: its ends of the two pipes, by number.
-        parent: process number of the zygote.
+    The task is JSON; empty to lock down, say so and end.
     """
 
     task: bytes

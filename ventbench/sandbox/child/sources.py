@@ -104,12 +104,7 @@ def _catches(handler: ast.ExceptHandler) -> bool:
 
 
 def module_files(imported: Import, name: str) -> Iterator[str]:
-    """Name the files of the folder that an import may run, on the way to the module and itself.
-
-    Args:
-        imported: the import.
-        name: path of the importing file below the folder.
-    """
+    """Name the files that an import may run, on the way to the module and itself, by path."""
     parent = name.split("/")[: -imported.level] if imported.level else []
     parts = [*parent, *imported.module.split(".")]
     for depth in range(len(parent) + 1, len(parts) + 1):

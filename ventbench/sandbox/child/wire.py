@@ -50,11 +50,7 @@ class Reply(NamedTuple):
 
 
 def pack_observation(sequence: int, row: bytes) -> bytes:
-    """Frame of one observation.
-
-    Args:
-        sequence: counts the observations of a cell from 1.
-        row: ``ROW`` little-endian float64.
+    """Frame of one observation, ``ROW`` little-endian float64; they are counted from 1.
 
     Raises:
         WireError: if the row has another size.

@@ -62,13 +62,7 @@ _PROCESS_CLOCK = 2
 
 
 class Zygote:
-    """The loop between requests and children.
-
-    Args:
-        control: socket to the scorer.
-        forks: starts processes.
-        cpu_s: seconds of processor time of a cell.
-    """
+    """The loop between requests and children, over a socket to the scorer."""
 
     def __init__(self, control: socket.socket, forks: isolation.Forks, cpu_s: int):
         self._control, self._forks, self._cpu_s = control, forks, cpu_s

@@ -104,7 +104,7 @@ class Diagnosis(Findings):
             InputError: if the extra ``ventbench[view]`` is missing.
         """
         errors.require("matplotlib")
-        return import_module(f"{_VIEWS}.plot").figure(self)
+        return import_module(f"{_VIEWS}.charts").figure(self)
 
     def save(self, folder: Path | str) -> list[Path]:
         """Write the diagnosis as JSON, a page and a rerun file, and what follows from it.

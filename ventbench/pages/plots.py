@@ -1,4 +1,4 @@
-"""Charts by matplotlib: stressor by severity, and the error of a PID over its gains.
+"""Charts by matplotlib: runs, stressor by severity, and the error of a PID over its gains.
 
 In the chart of stressors the colour of a field is the share of runs that held the set pressure.
 """
@@ -18,10 +18,13 @@ from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, require
 from ventbench.base.text import number
+from ventbench.pages import graphics, scores
+from ventbench.task import protocol
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, stressor
 
 if TYPE_CHECKING:
     from ventbench.train.pid_grid import PIDGrid
+    from ventbench.trajectories import Trajectories
 
 #: Values of D that are shown beside the best one, %/cmH2O.
 SLICES = (0.0, 0.3, 1.0, 3.0, 10.0)
@@ -73,13 +76,7 @@ def _row(figure: Any, axes: Any, name: str, gains: Floats, error: Floats) -> Non
     figure.colorbar(image, ax=list(axes), shrink=0.9, extend="max")
 
 
-def _map(
-    axis: Any,
-    gains: Floats,
-    error: Floats,
-    d: float,
-    limits: tuple[float, float],
-) -> Any:
+def _map(axis: Any, gains: Floats, error: Floats, d: float, limits: tuple[float, float]) -> Any:
     """One map; the values are not evenly spaced, so each is one cell wide."""
     here = gains[:, 2] == d
     (P, row), (I, column) = (  # noqa: E741
@@ -92,14 +89,10 @@ def _map(
     )
     y, x = np.unravel_index(int(np.nanargmin(values)), values.shape)
     axis.plot(x, y, marker="x", color="#e2603c", markersize=7, markeredgewidth=2)
-    for ticks, labels, put in (
-        (I, axis.set_xticks, axis.set_xlabel),
-        (P, axis.set_yticks, None),
-    ):
+    axis.set_xlabel("I", fontsize=8)
+    for ticks, labels in ((I, axis.set_xticks), (P, axis.set_yticks)):
         at = np.unique(np.linspace(0, ticks.size - 1, 5).round().astype(int))
         labels(at, [f"{ticks[k]:g}" for k in at], fontsize=7)
-        if put is not None:
-            put("I", fontsize=8)
     return image
 
 
@@ -216,18 +209,129 @@ def _number(value: float | None, sign: bool = False) -> str:
     return "0.0" if text == "+0.0" else text
 
 
-def _figure(size: tuple[float, float]) -> Any:
+def _figure(size: tuple[float, float], **options: Any) -> Any:
     """A figure that has no global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=size, **options or {"layout": "constrained"})
     FigureCanvasAgg(figure)
     return figure
 
 
-def _png(figure: Any) -> bytes:
+def _png(figure: Any, dpi: int = DPI) -> bytes:
     output = io.BytesIO()
     # Without the version of matplotlib, equal figures give equal bytes.
-    figure.savefig(output, format="png", dpi=DPI, metadata={"Software": None})
+    figure.savefig(output, format="png", dpi=dpi, metadata={"Software": None})
     return output.getvalue()
+
+
+#: Width of the small multiples of runs, pixels, and their resolution, dots an inch; heights in
+#: inches: of the head, of the panels of a lung, and of the foot.
+PIXELS, RUNS_DPI = 1800, 150
+HEAD, LUNG, FOOT = 0.9, 1.95, 0.3
+
+#: The font that comes with matplotlib.
+FONT = "DejaVu Sans"
+
+_TINY: dict[str, Any] = {"fontsize": 7, "parse_math": False, "family": FONT}
+
+
+def runs_png(runs: Sequence[Trajectories]) -> bytes:
+    """Return the small multiples of matching runs as a PNG; equal input gives equal bytes.
+
+    A panel is one lung and PIP: pressure above, u_in below, against time; the last scored breath
+    from its start to just after the target's fall. What is scored lies on a band.
+
+    Args:
+        runs: matching runs, the one to look at first.
+    """
+    lungs, pips = runs[0].lungs, runs[0].pips
+    width, height = PIXELS / RUNS_DPI, HEAD + LUNG * len(lungs) + FOOT
+    figure = _figure((width, height), dpi=RUNS_DPI, facecolor="white")
+    axes = figure.subplots(
+        2 * len(lungs), len(pips), squeeze=False,
+        gridspec_kw={
+            "height_ratios": [2.6, 1.0] * len(lungs), "hspace": 0.26, "wspace": 0.16,
+            "left": 0.05, "right": 0.99, "top": 1.0 - HEAD / height, "bottom": FOOT / height,
+        },
+    )  # fmt: skip
+    numbers, names = scores.collect(runs), _drawn(scores.labels(runs))
+    for j in range(len(pips)):
+        limits = graphics.pressure_limits(runs, j)
+        for i, lung in enumerate(lungs):
+            upper, lower = axes[2 * i, j], axes[2 * i + 1, j]
+            _panel(upper, lower, runs, (i, j), limits)
+            upper.set_title(f"PIP {pips[j]:g}", loc="left", pad=3, **_TINY)
+            for k, error in enumerate(numbers.cells[:, i, j].tolist()):
+                _error(upper, number(error), k, len(runs))
+            if j == 0:
+                upper.set_ylabel(f"{lung}, cmH2O", **_TINY | {"weight": "bold"})
+                lower.set_ylabel("u_in, %", **_TINY)
+            else:
+                lower.tick_params(labelleft=False)
+        axes[-1, j].tick_params(labelbottom=True)
+    figure.text(0.012, 1.0 - 0.3 / height, names[0], fontsize=13, weight="bold", parse_math=False)
+    read = (
+        f"{scores.shared_tracks(runs)}. Breath {graphics.BREATH + 1} on each lung at each PIP, "
+        "against time, s. Black: target. Band: scored. Numbers: mean absolute error, cmH2O."
+    )
+    (read,) = _drawn([read])
+    figure.text(0.012, 1.0 - 0.5 / height, read, color=palette.QUIET, **_TINY)
+    for k, name in enumerate(names):
+        place = 0.012 + 0.98 * k / max(len(names), 4)
+        figure.text(place, 1.0 - 0.68 / height, f"— {name}", color=_color(k), **_TINY)
+    return few_colours(_png(figure, RUNS_DPI))
+
+
+def _panel(
+    upper: Any,
+    lower: Any,
+    runs: Sequence[Trajectories],
+    at: tuple[int, int],
+    limits: tuple[float, float],
+) -> None:
+    """Draw the runs of a lung and PIP, the first one above the others."""
+    time, scored = graphics.shown_times(), slice(protocol.INSPIRATION_STEPS)
+    target = runs[0].target[at][graphics.WINDOW]
+    # Limits first, and apart from one another: to find common ones takes longest.
+    upper.set(ylim=limits, yticks=(float(target.min()), runs[0].pips[at[1]]))
+    lower.set(ylim=(-3.0, protocol.U_MAX + 3.0), yticks=graphics.VALVE_MARKS)
+    for axes in (upper, lower):
+        axes.set(xlim=(0.0, time[-1]), xticks=graphics.TIMES)
+        axes.tick_params(length=0.0, labelsize=7, labelcolor=palette.QUIET, labelbottom=False)
+        axes.spines[:].set_visible(False)
+        axes.grid(axis="y", color=palette.LINE, linewidth=0.7)
+        axes.axvspan(0.0, protocol.INSPIRATION_STEPS * protocol.DT, color=palette.BAND, zorder=0)
+    for k in reversed(range(len(runs))):
+        pressure, u_in = (x[at][graphics.WINDOW] for x in (runs[k].pressure, runs[k].u_in))
+        pressure = np.where(np.isfinite(pressure), pressure, np.nan)
+        upper.plot(time, pressure, color=_color(k), linewidth=0.9, alpha=0.5)
+        upper.plot(time[scored], pressure[scored], color=_color(k), linewidth=1.9 - 0.5 * (k > 0))
+        lower.step(time, u_in, color=_color(k), linewidth=1.0, where="post")
+        if k == 0:
+            upper.fill_between(time[scored], target[scored], pressure[scored], color=_color(k),
+                               alpha=0.16, linewidth=0.0)  # fmt: skip
+    upper.plot(time, target, color=palette.INK, linewidth=1.1, zorder=1)
+
+
+def _error(axes: Any, text: str, run: int, runs: int) -> None:
+    """The number of a run at the upper right of a panel, in rows of four."""
+    row, place = divmod(run, 4)
+    last = min(runs - 4 * row, 4) - 1
+    axes.text(
+        1.0 - 0.17 * (last - place), 1.03 - 0.13 * row, text, transform=axes.transAxes,
+        ha="right", color=_color(run), weight="bold" if run == 0 else "normal", **_TINY,
+    )  # fmt: skip
+
+
+def _drawn(texts: Sequence[str]) -> list[str]:
+    """Texts with a question mark for characters that the font lacks."""
+    from matplotlib import font_manager
+
+    font = font_manager.get_font(font_manager.findfont(FONT))
+    return ["".join(c if font.get_char_index(ord(c)) else "?" for c in text) for text in texts]
+
+
+def _color(run: int) -> str:
+    return palette.RUNS[palette.run_index(run)]

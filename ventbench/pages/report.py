@@ -69,9 +69,9 @@ def write_figure(path: Path | str, runs: Sequence[Trajectories]) -> Path:
     """Write the small multiples as a PNG, 1800 pixels wide; see :func:`write_report`."""
     check(runs)
     errors.require("matplotlib")
-    from ventbench.pages import figure
+    from ventbench.pages import plots
 
-    return _write(path, figure.png(runs))
+    return _write(path, plots.runs_png(runs))
 
 
 def has_display() -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,37 +69,46 @@ def recording(runs: Sequence[Trajectories]) -> bytes:
         InputError: if rerun is switched off by its environment variable.
     """
     names = shown_names(runs)
-    layout = blueprint(runs, names)
+
+    def log(stream: rr.RecordingStream) -> None:
+        log_target(stream, runs[0])
+        log_scored(stream, runs[0])
+        log_run(stream, runs[0])
+        for index in range(1, len(runs)):
+            log_reference(stream, runs[index], names[index], index - 1)
+
+    return written(names[0], blueprint(runs, names), markdown(runs, names), log)
+
+
+def written(
+    name: str, layout: rrb.Blueprint, text: str, log: Callable[[rr.RecordingStream], None]
+) -> bytes:
+    """Return an ``.rrd`` file of what a function logs, with a layout and a text beside.
+
+    Raises:
+        InputError: if rerun is switched off by its environment variable.
+    """
     stream = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4())
     if not rr.is_enabled(stream):
         raise InputError("rerun is switched off by the environment variable RERUN; unset it")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "run.rrd")
         stream.save(file, default_blueprint=layout)
-        stream.send_recording_name(names[0])
-        log_about(stream, runs, names)
-        log_target(stream, runs[0])
-        log_scored(stream, runs[0])
-        log_run(stream, runs[0])
-        for index in range(1, len(runs)):
-            log_reference(stream, runs[index], names[index], index - 1)
+        stream.send_recording_name(name)
+        stream.log(ABOUT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+        log(stream)
         stream.disconnect()  # writes the rest and the footer
         return file.read_bytes()
 
 
+def known(text: str) -> str:
+    """Text with characters of the viewer's font only: it ends itself over any other."""
+    return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "\u017e" else "?" for c in text)
+
+
 def shown_names(runs: Sequence[Trajectories]) -> list[str]:
-    """Labels that the viewer's font can show: it ends itself over a character it lacks."""
-    known = [
-        "".join(c if " " <= c <= "~" or "\xa1" <= c <= "\u017e" else "?" for c in label)
-        for label in labels(runs, cut="...")
-    ]
-    return distinct(known)
-
-
-def log_about(stream: rr.RecordingStream, runs: Sequence[Trajectories], names: list[str]) -> None:
-    """The text panel: what is seen, and the score table."""
-    text = markdown(runs, names)
-    stream.log(ABOUT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+    """Labels that the viewer's font can show."""
+    return distinct([known(label) for label in labels(runs, cut="...")])
 
 
 def log_target(stream: rr.RecordingStream, run: Trajectories) -> None:
@@ -112,14 +121,14 @@ def log_target(stream: rr.RecordingStream, run: Trajectories) -> None:
     acting = phase < protocol.INSPIRATION_STEPS
     for lung, values in zip(run.lungs, run.target, strict=True):
         level = np.where(acting, values, np.nan)
-        _send(stream, f"/{lung}/target", run.time, level, series, [palette.TARGET], 1.0)
+        send(stream, f"/{lung}/target", run.time, level, series, [palette.TARGET], 1.0)
 
 
 def log_scored(stream: rr.RecordingStream, run: Trajectories) -> None:
     """A bar along the bottom of every plot where the run is scored."""
     bar = np.where(scored(), 0.0, np.nan)[None]
     for lung in run.lungs:
-        _send(stream, f"/{lung}/scored", run.time, bar, ["scored part"], [palette.SCORED], 6.0)
+        send(stream, f"/{lung}/scored", run.time, bar, ["scored part"], [palette.SCORED], 6.0)
 
 
 def log_run(stream: rr.RecordingStream, run: Trajectories) -> None:
@@ -128,7 +137,7 @@ def log_run(stream: rr.RecordingStream, run: Trajectories) -> None:
     for quantity, unit, array in _quantities(run):
         series = [f"PIP {pip:g}, {unit}" for pip in run.pips]
         for lung, values in zip(run.lungs, array, strict=True):
-            _send(stream, f"/{lung}/{quantity}", run.time, values, series, colors, 2.0)
+            send(stream, f"/{lung}/{quantity}", run.time, values, series, colors, 2.0)
 
 
 def log_reference(stream: rr.RecordingStream, run: Trajectories, name: str, index: int) -> None:
@@ -138,7 +147,7 @@ def log_reference(stream: rr.RecordingStream, run: Trajectories, name: str, inde
         series = [f"{name}, {unit}"] * len(run.pips)
         for lung, values in zip(run.lungs, array, strict=True):
             entity = reference_path(name, lung, quantity)
-            _send(stream, entity, run.time, values, series, colors, 1.2)
+            send(stream, entity, run.time, values, series, colors, 1.2)
 
 
 def _quantities(run: Trajectories) -> tuple[tuple[str, str, Floats], ...]:
@@ -150,16 +159,11 @@ def _quantities(run: Trajectories) -> tuple[tuple[str, str, Floats], ...]:
     )
 
 
-def _send(
-    stream: rr.RecordingStream,
-    entity: str,
-    time: Floats,
-    values: Floats,
-    series: list[str],
-    colors: list[str],
-    width: float,
-) -> None:
-    """Style once, values in bulk; ``values`` has shape ``(series, T)``."""
+def send(
+    stream: rr.RecordingStream, entity: str, time: Floats, values: Floats, series: list[str],
+    colors: list[str], width: float, timeline: str = TIMELINE,
+) -> None:  # fmt: skip
+    """Log lines: style once, values in bulk; ``values`` has shape ``(series, T)``."""
     n = len(series)
     look = rr.SeriesLines(
         colors=[palette.rgb(colors[i % len(colors)]) for i in range(n)],
@@ -171,7 +175,7 @@ def _send(
     stream.log(entity, look, static=True)
     stream.send_columns(
         entity,
-        indexes=[rr.TimeColumn(TIMELINE, duration=time)],
+        indexes=[rr.TimeColumn(timeline, duration=time)],
         columns=rr.Scalars.columns(scalars=np.ascontiguousarray(values.T, dtype=float)),
     )
 
@@ -212,13 +216,17 @@ def blueprint(runs: Sequence[Trajectories], names: Sequence[str], tab: int = 0) 
         for plot in plots
     ]
     details = [_lung_tab(lung, plots, names[1:]) for lung in lungs]
+    tabs = rrb.Tabs(*grids, *details, active_tab=tab, name="Run")
+    return beside_text(tabs, "What you see", 3.6, TIMELINE)
+
+
+def beside_text(tabs: rrb.Tabs, name: str, share: float, timeline: str) -> rrb.Blueprint:
+    """Views with the text panel beside them, so many times as wide, and all else closed."""
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Tabs(*grids, *details, active_tab=tab, name="Run"),
-            rrb.TextDocumentView(origin=ABOUT, name="What you see"),
-            column_shares=[3.6, 1],
+            tabs, rrb.TextDocumentView(origin=ABOUT, name=name), column_shares=[share, 1]
         ),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="paused"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         auto_layout=False,

@@ -1,19 +1,25 @@
-"""Charts of a diagnosis as numbers for the template: lines, bands and ticks in picture units."""
+"""Charts of a diagnosis: lines, bands and ticks in picture units for the template; a figure."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ventbench import palette
 from ventbench.base.arrays import Floats
+from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
 from ventbench.diagnosis.residual_analysis import Profile, profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages import graphics
 from ventbench.physics.characteristics import Characteristic
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Room for the labels: left, right, top, bottom, picture units.
 LEFT, RIGHT, TOP, BOTTOM = 40.0, 16.0, 16.0, 30.0
@@ -418,3 +424,61 @@ def _open(time: np.ndarray, u_out: np.ndarray) -> list[tuple[float, float]]:
     changes = np.flatnonzero(np.diff(is_open.astype(int)))
     ends = np.append(time, time[-1])
     return [(float(ends[a]), float(ends[b])) for a, b in changes.reshape(-1, 2)]
+
+
+#: Colours of the recording and of the three simulators in the figure, on white.
+COLORS = {
+    "recorded": palette.INK, "before": palette.GREY, "refit": palette.RUNS[1],
+    "after": palette.RUNS[0],
+}  # fmt: skip
+
+
+def figure(diagnosis: Diagnosis) -> Figure:
+    """Draw the held-out breaths with the largest errors, and the errors of all held-out breaths.
+
+    A matplotlib figure without global state; a notebook shows it, ``savefig`` writes it.
+    """
+    from matplotlib.figure import Figure
+
+    shown = [(key, text) for key, text, _ in stages(diagnosis)]
+    chosen = [index for index, _ in worst(diagnosis)[:WORST]]
+    plot = Figure(figsize=(4.2 * (len(chosen) + 1), 3.6), layout="constrained")
+    axes = np.atleast_1d(plot.subplots(1, len(chosen) + 1))
+    for axis, index in zip(axes, chosen, strict=False):
+        _breath(axis, diagnosis, index, shown)
+    if chosen:
+        axes[0].set_ylabel("airway pressure, cmH2O")
+        axes[0].legend(frameon=False, fontsize="small")
+    _error_bars(axes[-1], diagnosis, shown)
+    plot.suptitle(report_text.headline(diagnosis), fontsize="medium", wrap=True)
+    return plot
+
+
+def _breath(axis: Any, diagnosis: Diagnosis, index: int, shown: list[tuple[str, str]]) -> None:
+    traces = diagnosis.traces
+    valid = traces.breaths.valid[index]
+    time = traces.breaths.time[index][valid]
+    recorded = traces.breaths.pressure[index][valid]
+    axis.plot(time, recorded, color=COLORS["recorded"], linewidth=2.0, label="recorded")
+    for key, text in shown:
+        pressure = getattr(traces, key)[index][valid]
+        axis.plot(time, pressure, color=COLORS[key], linewidth=1.2, label=text)
+    lung = traces.breaths.lung_ids[index]
+    axis.set_title(f"breath {traces.breaths.breath_id[index]}, {lung}", fontsize="small")
+    axis.set_xlabel("time, s")
+
+
+def _error_bars(axis: Any, diagnosis: Diagnosis, shown: list[tuple[str, str]]) -> None:
+    """Root-mean-square errors as bars, with the noise of the measurement as a line."""
+    errors = diagnosis.open_loop
+    for row, (key, _) in enumerate(shown):
+        error = getattr(errors, key).rmse
+        axis.barh(row, error, color=COLORS[key])
+        axis.annotate(f"{error:.2f}", (error, row), (4, 0), textcoords="offset points", va="center")
+    if np.isfinite(errors.noise_floor):
+        axis.axvline(errors.noise_floor, color="#5b636d", linestyle=":")
+        axis.set_xlabel("RMS error, cmH2O (dotted: noise)")
+    axis.set_yticks(range(len(shown)), [text for _, text in shown])
+    axis.invert_yaxis()
+    axis.margins(x=0.2)
+    axis.set_title(f"{len(errors.held_out_breaths)} held-out breaths", fontsize="small")

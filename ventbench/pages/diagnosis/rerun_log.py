@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import tempfile
-import uuid
-from pathlib import Path
-
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from ventbench import palette
 from ventbench.base.arrays import Floats
-from ventbench.base.errors import InputError
 from ventbench.base.text import escape_markdown
 from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages.diagnosis.charts import rmse, stages
-
-APPLICATION = "ventbench"
+from ventbench.pages.rerun_log import beside_text, known, send, written
 
 #: Colours of the three simulators, and of the recording, on dark and light ground.
 COLORS = {
@@ -34,9 +28,6 @@ _ZOOM = 6
 #: Name of the timeline; its values are seconds with a lung's breaths end to end.
 TIMELINE = "recording_time"
 
-#: Entity of the text panel.
-ABOUT = "/about"
-
 
 def recording(diagnosis: Diagnosis) -> bytes:
     """Return a whole ``.rrd`` file.
@@ -49,31 +40,20 @@ def recording(diagnosis: Diagnosis) -> bytes:
     Raises:
         InputError: if rerun is switched off by its environment variable.
     """
-    stream = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4())
-    if not rr.is_enabled(stream):
-        raise InputError("rerun is switched off by the environment variable RERUN; unset it")
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "diagnosis.rrd")
-        stream.save(file, default_blueprint=blueprint(diagnosis))
-        stream.send_recording_name(f"diagnosis of {plain(diagnosis.simulator)}")
-        text = rr.TextDocument(markdown(diagnosis), media_type=rr.MediaType.MARKDOWN)
-        stream.log(ABOUT, text, static=True)
+
+    def log(stream: rr.RecordingStream) -> None:
         for lung, index in diagnosis.traces.breaths.by_lung_index.items():
             log_lung(stream, diagnosis, lung, index)
         log_by_breath(stream, diagnosis)
         log_maps(stream, diagnosis)
-        stream.disconnect()  # writes the rest and the footer
-        return file.read_bytes()
 
-
-def plain(text: str) -> str:
-    """Text with characters of the viewer's font only: the viewer crashes on any other."""
-    return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "\u017e" else "?" for c in text)
+    name = f"diagnosis of {known(diagnosis.simulator)}"
+    return written(name, blueprint(diagnosis), markdown(diagnosis), log)
 
 
 def markdown(diagnosis: Diagnosis) -> str:
     """The text panel: the diagnosis in words, and a guide to the views."""
-    verdict, *others = (escape_markdown(plain(text)) for text in report_text.sentences(diagnosis))
+    verdict, *others = (escape_markdown(known(text)) for text in report_text.sentences(diagnosis))
     places = [
         escape_markdown(number_text.error_region(place, diagnosis.noise[0]))
         for place in diagnosis.location[:5]
@@ -106,29 +86,19 @@ def log_lung(
     time = (start + breaths.time).ravel()
     order = breaths.valid.ravel()
 
-    def send(entity: str, values: Floats, name: str, color: str, width: float) -> None:
-        look = rr.SeriesLines(
-            colors=[palette.rgb(color)],
-            widths=[width],
-            names=[name],
-            interpolation_mode="StepAfter" if entity.startswith("u_") else "Linear",
-        )
-        stream.log(f"/{lung}/{entity}", look, static=True)
-        stream.send_columns(
-            f"/{lung}/{entity}",
-            indexes=[rr.TimeColumn(TIMELINE, duration=time[order])],
-            columns=rr.Scalars.columns(scalars=np.ravel(values).astype(float)[order]),
-        )
+    def line(part: str, values: Floats, name: str, color: str, width: float) -> None:
+        entity, shown = f"/{lung}/{part}", np.ravel(values).astype(float)[None, order]
+        send(stream, entity, time[order], shown, [name], [color], width, TIMELINE)
 
-    send("pressure/recorded", breaths.pressure, "recorded", COLORS["recorded"], 3.0)
+    line("pressure/recorded", breaths.pressure, "recorded", COLORS["recorded"], 3.0)
     for key, text, _ in stages(diagnosis):
         simulated = getattr(traces, key)[index]
-        send(f"pressure/{key}", simulated, text, COLORS[key], 1.5)
-        send(f"error/{key}", breaths.pressure - simulated, text, COLORS[key], 1.5)
-    send("u_in", breaths.u_in, "u_in, %", palette.PIPS[4], 1.5)
-    send("u_out", np.asarray(breaths.u_out, float), "u_out, 1 open", palette.PIPS[0], 1.5)
+        line(f"pressure/{key}", simulated, text, COLORS[key], 1.5)
+        line(f"error/{key}", breaths.pressure - simulated, text, COLORS[key], 1.5)
+    line("u_in", breaths.u_in, "u_in, %", palette.PIPS[4], 1.5)
+    line("u_out", np.asarray(breaths.u_out, float), "u_out, 1 open", palette.PIPS[0], 1.5)
     held = np.where(traces.held_out[index][:, None] & breaths.valid, 0.0, np.nan)
-    send("held_out", held, "held out of every fit", palette.REFERENCES[0], 6.0)
+    line("held_out", held, "held out of every fit", palette.REFERENCES[0], 6.0)
 
 
 def log_by_breath(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
@@ -177,25 +147,15 @@ def blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
         for key in keys[1:]
     ]
     linked = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Tabs(
-                _lung(*_worst(diagnosis), "Worst held-out breath"),
-                *(_lung(lung, linked, lung) for lung in lungs),
-                rrb.Vertical(*bars, name="Errors by breath"),
-                rrb.Horizontal(*maps, name="Maps of the error"),
-                active_tab=0,
-                name="Diagnosis",
-            ),
-            rrb.TextDocumentView(origin=ABOUT, name="In words"),
-            column_shares=[2.6, 1],
-        ),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        auto_layout=False,
-        auto_views=False,
+    tabs = rrb.Tabs(
+        _lung(*_worst(diagnosis), "Worst held-out breath"),
+        *(_lung(lung, linked, lung) for lung in lungs),
+        rrb.Vertical(*bars, name="Errors by breath"),
+        rrb.Horizontal(*maps, name="Maps of the error"),
+        active_tab=0,
+        name="Diagnosis",
     )
+    return beside_text(tabs, "In words", 2.6, TIMELINE)
 
 
 def span(diagnosis: Diagnosis) -> float:

@@ -20,7 +20,6 @@ from ventbench.cli import (
     round,
     score,
     simulators,
-    stress,
     train,
     tune,
     view,
@@ -53,17 +52,12 @@ def _root(
     options.be_quiet(quiet)
 
 
-score.register(app)
-stress.register(app)
-tune.register(app)
-simulators.register(app)
-train.register(app)
-view.register(app)
-board.register(app)
-round.register(app)
-diagnose.register(app)
-doctor.register(app)
-app.add_typer(data.app)
+for _module in (score, tune, simulators, view, diagnose):
+    for _command in _module.COMMANDS:
+        app.command(_command.__name__.replace("_", "-"))(_command)
+app.command()(doctor.doctor)
+for _module in (tune, train, board, round, data):
+    app.add_typer(_module.app)
 
 
 def main() -> None:

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, Scheduler, bars, counted, emit, known_lungs, notes
+from ventbench.cli.options import (
+    JsonFile,
+    Scheduler,
+    bars,
+    counted,
+    emit,
+    known_lungs,
+    notes,
+    table_of,
+    told,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -198,8 +208,6 @@ def verify(
     """
     import dataclasses
 
-    from rich.console import Console
-
     from ventbench.base.errors import InputError
     from ventbench.base.text import plain
     from ventbench.board import verify as verifier
@@ -207,13 +215,12 @@ def verify(
 
     if records and not rerun:
         raise InputError("records are chosen for --rerun; without it all are verified")
-    console = Console(stderr=str(json) == "-")
     with bars() as shown:
         progress = counted(shown, "replaying records")
         report = verifier.verify(folder, frozen.load, progress=progress)
     if rerun and not report.problems:  # else the records are not what they were
         _rerun(report, folder, records or [], source or [], jobs, scheduler)
-    emit(dataclasses.asdict(report), json)
+    console = told(dataclasses.asdict(report), json)
     for note in report.notes:
         console.print(f"note: {plain(note)}", markup=False, highlight=False)
     for problem in report.problems:
@@ -279,8 +286,6 @@ def show(
 
     Example: `ventbench board show --lung R20C50`
     """
-    from rich.console import Console
-
     from ventbench.board import frames, ranking
 
     tracks = ranking.newest(frames.load_tracks(folder))
@@ -289,13 +294,12 @@ def show(
         | ({} if lung is None else {"cells": frames.cell_means(line.row.record, lung)})
         for line in frames.lines(tracks)
     ]
-    emit({"rows": rows}, json)
-    console = Console(stderr=str(json) == "-")
+    console = told({"rows": rows}, json)
     for track in tracks:
         if lung is not None:
             console.print(_lung_table(track, lung))
-            continue
-        _print_track(console, track)
+        else:
+            _print_track(console, track)
 
 
 def tables_of(folder: Path, name: str, *, err: bool = False) -> None:
@@ -332,26 +336,17 @@ def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
 
     Example: `ventbench board records`
     """
-    from rich.console import Console
-
     from ventbench.base.text import plain
     from ventbench.board import frames
 
     rows = frames.record_index(folder)
-    emit({"records": rows}, json)
     table = _plain_table("")
     for name in ("record", "entry", "track", "kind", "made", "state"):
         table.add_column(name, overflow="fold")
     for row in rows:
-        table.add_row(
-            row["record"][:SHOWN],
-            plain(row["name"]),
-            row["track"],
-            row["kind"],
-            row["created"][:10],
-            row["state"],
-        )
-    console = Console(stderr=str(json) == "-")
+        record, made = row["record"][:SHOWN], row["created"][:10]
+        table.add_row(record, plain(row["name"]), row["track"], row["kind"], made, row["state"])
+    console = told({"records": rows}, json)
     console.print(table)
     console.print(
         f"{len(rows)} records in {folder / 'records'}; the beginning of a hash is enough."
@@ -375,20 +370,14 @@ def _plain_table(title: str) -> Table:
 
 def _lung_table(track: Track, lung: str) -> Table:
     """Entries by PIP of one lung, or by lung."""
-    from rich.table import Table
-
     from ventbench.board import frames
 
-    table = Table(title=f"{track.name}, {lung}: normalised score over draws")
-    table.add_column("rank", justify="right")
-    table.add_column("entry", no_wrap=True)
-    names: list[str] = []
-    for _, row in track.rows:
-        cells = frames.cell_means(row.record, lung)
-        for name in cells if not names else ():
-            names.append(name)
-            table.add_column(name, justify="right")
-        texts = ("failed" if x is None else f"{x:.1f}" for x in cells.values())
+    cells = [frames.cell_means(row.record, lung) for _, row in track.rows]
+    columns = ("rank", "entry", *(cells[0] if cells else ()))
+    table = table_of(f"{track.name}, {lung}: normalised score over draws", columns, left=["entry"])
+    table.columns[1].no_wrap = True
+    for (_, row), own in zip(track.rows, cells, strict=True):
+        texts = ("failed" if x is None else f"{x:.1f}" for x in own.values())
         table.add_row("" if row.rank is None else str(row.rank), row.record.name, *texts)
     return table
 
@@ -435,8 +424,3 @@ def _stress_table(track: Track) -> Table:
             str(row["unsafe"]),
         )
     return table
-
-
-def register(parent: typer.Typer) -> None:
-    """Add the group of commands."""
-    parent.add_typer(app)

@@ -29,11 +29,6 @@ app = typer.Typer(
 )
 
 
-@app.callback()
-def _group() -> None:
-    pass
-
-
 @app.command()
 def check(
     file: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet in the public schema.")],

@@ -17,12 +17,12 @@ from ventbench.cli.options import (
     bars,
     claim_out,
     counted,
-    emit,
     known_lungs,
     notes,
     simulator_of,
+    table_of,
+    told,
 )
-from ventbench.cli.options import bars as progress_bars
 
 if TYPE_CHECKING:
     from ventbench.mechanics import Mechanics, SurveyedRun
@@ -48,17 +48,13 @@ def mechanics(
 
     Example: `ventbench mechanics lab.csv`
     """
-    from rich.console import Console
-
-    console = Console(stderr=str(json) == "-")
     if _is_respiraworks(recordings):
         with bars() as shown:
             runs = _survey(recordings, counted(shown, f"identifying the lungs of {recordings}"))
-        emit([_run(run) for run in runs], json)
-        _say_runs(console, runs)
+        _say_runs(told([_run(run) for run in runs], json), runs)
         return
     lungs = _identify(recordings, clip=clip, pad=pad)
-    emit([_lung(lung) for lung in lungs], json)
+    console = told([_lung(lung) for lung in lungs], json)
     console.print(_table(lungs))
     for lung in lungs:
         for note in lung.notes:
@@ -143,26 +139,23 @@ def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
 
 
 def _table(lungs: tuple[Mechanics, ...]) -> Any:
-    from rich.table import Table
-
     from ventbench.mechanics.labels import label_texts, tolerance_text, value_text
 
-    table = Table(
-        title="Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O",
-        caption=f"A label holds with {tolerance_text()}, beyond the intervals.",
-    )
-    for name in ("label", "R", "C", "label holds", "may be", "also needs"):
-        table.add_column(name)
-    for lung in lungs:
-        match = lung.match
-        table.add_row(
+    columns = ("label", "R", "C", "label holds", "may be", "also needs")
+    rows = (
+        (
             lung.label,
-            value_text(match.fitted_R, match.ci95_R),
-            value_text(match.fitted_C, match.ci95_C),
-            *label_texts(match, lung.settings),
+            value_text(lung.match.fitted_R, lung.match.ci95_R),
+            value_text(lung.match.fitted_C, lung.match.ci95_C),
+            *label_texts(lung.match, lung.settings),
             ", ".join(term.name for term in lung.terms) or "-",
         )
-    return table
+        for lung in lungs
+    )
+    return table_of(
+        "Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O", columns, rows,
+        left=columns, caption=f"A label holds with {tolerance_text()}, beyond the intervals.",
+    )  # fmt: skip
 
 
 #: What a session on a bench, and a collection, calls its recording.
@@ -237,8 +230,6 @@ def diagnose(
 
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
     """
-    from rich.console import Console
-
     from ventbench import recordings as files
     from ventbench.base import errors
     from ventbench.base.errors import InputError
@@ -254,15 +245,14 @@ def diagnose(
     if recordings.is_dir() and (recordings / SESSION).is_file():
         recordings = recordings / SESSION
     said = notes()
-    with progress_bars() as shown:
+    with bars() as shown:
         reading = counted(shown, f"reading {recordings}")
         breaths = files.load(recordings, clip=clip, pad=pad, progress=reading)
     for note in breaths.notes:
         said.print(f"note: {note}", markup=False, highlight=False)
     diagnosis = _diagnose(breaths, simulator_of(plant, in_process), simulated, lung, patient, drive)
     written = diagnosis.save(out)
-    emit(diagnosis.as_dict(), json)
-    console = Console(stderr=str(json) == "-")
+    console = told(diagnosis.as_dict(), json)
     verdict, *others = str(diagnosis).splitlines()
     console.print(verdict, style="bold", markup=False, highlight=False)
     for text in others:
@@ -291,32 +281,22 @@ def _diagnose(
         TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(),
         TextColumn("{task.fields[left]}"),
     )  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as bars:
-        task = bars.add_task("diagnosing", total=1.0, left="")
+    with Progress(*columns, console=console, transient=True) as shown:
+        task = shown.add_task("diagnosing", total=1.0, left="")
 
         def progress(what: str, share: float) -> None:
-            elapsed = bars.tasks[task].elapsed or 0.0
-            left = remaining(elapsed, share)
-            bars.update(task, description=what, completed=share, left=left)
+            left = remaining(shown.tasks[task].elapsed or 0.0, share)
+            shown.update(task, description=what, completed=share, left=left)
 
         return find(
-            breaths,
-            simulator=simulators,
-            lung=lung,
-            patient=patient,
+            breaths, simulator=simulators, lung=lung, patient=patient,
             drive=drive,  # type: ignore[arg-type]
             progress=progress,
-        )
+        )  # fmt: skip
 
 
 def expected_time(breaths: int, lungs: int, warm: bool) -> str:
-    """How long a diagnosis usually takes, in words.
-
-    Args:
-        breaths: number of breaths.
-        lungs: number of lungs among them.
-        warm: whether compiled functions are kept on this machine.
-    """
+    """How long a diagnosis of some breaths usually takes, in words; ``warm``: once compiled."""
     usual = "10 s to a minute" if lungs == 1 else "one to five minutes"
     text = (
         f"diagnosing {breaths} breaths of {lungs} lung{'s' if lungs > 1 else ''}: usually {usual}"
@@ -362,9 +342,6 @@ def isolability(
 
     Example: `ventbench isolability --lung R20C50 --controls plan.csv --sensors pressure,flow`
     """
-    from rich.console import Console
-    from rich.table import Table
-
     from ventbench.base import compilation
     from ventbench.diagnosis.isolability import isolability as compute
 
@@ -373,25 +350,21 @@ def isolability(
         controls, lung=lung, sensors=[each.strip() for each in sensors.split(",")],
         noise={"pressure": noise}, names=[each for each in names.split(",") if each] or None,
     )  # fmt: skip
-    emit(found.as_dict(), json)
-    console = Console(stderr=str(json) == "-")
+    console = told(found.as_dict(), json)
     for group in found.groups:
-        told = "told from all others" if len(group) == 1 else "not told apart"
-        console.print(f"{', '.join(group)}: {told}", highlight=False)
-    table = Table(title="What the plan does not tell apart, or not show at a mild strength")
-    for name in ("mechanisms", "nats", "what would", "nats then"):
-        table.add_column(name, justify="right" if "nats" in name else "left")
-    for pair in (*found.confused, *found.unseen):
-        remedy = pair.remedy or "nothing that is known"
-        table.add_row(" / ".join(pair.names), f"{pair.nats:.1f}", remedy, f"{pair.gained:.1f}")
-    if table.row_count:
-        console.print(table)
+        apart = "told from all others" if len(group) == 1 else "not told apart"
+        console.print(f"{', '.join(group)}: {apart}", highlight=False)
+    nothing = "nothing that is known"
+    rows = [
+        (" / ".join(pair.names), f"{pair.nats:.1f}", pair.remedy or nothing, f"{pair.gained:.1f}")
+        for pair in (*found.confused, *found.unseen)
+    ]
+    if rows:
+        title = "What the plan does not tell apart, or not show at a mild strength"
+        columns = ("mechanisms", "nats", "what would", "nats then")
+        console.print(table_of(title, columns, rows, left=["what would"]))
     if found.confused:
         raise typer.Exit(1)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(diagnose)
-    app.command()(mechanics)
-    app.command()(isolability)
+COMMANDS = (diagnose, mechanics, isolability)

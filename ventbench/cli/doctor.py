@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, told
 
 #: Packages whose version matters to a score, and those of each extra.
 _CORE = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy", "pandas", "pyarrow")
@@ -36,14 +36,11 @@ def doctor(json: JsonFile = None) -> None:
 
     Example: `ventbench doctor`
     """
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     report = examine()
-    emit(report, json)
-    console = Console(stderr=str(json) == "-")
-    table = Table(show_header=False)
+    console, table = told(report, json), Table(show_header=False)
     for name, value in report["facts"].items():
         table.add_row(escape(name), escape(value))
     console.print(table)
@@ -153,8 +150,3 @@ def _ports() -> str:
     patterns = ("ttyUSB*", "ttyACM*", "ttyAMA*", "cu.usb*")
     names = [str(path) for pattern in patterns for path in sorted(Path("/dev").glob(pattern))]
     return ", ".join(names) or "none"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(doctor)

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, NoReturn, TypeVar
@@ -22,6 +22,7 @@ from ventbench.base.text import plain
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, ProgressColumn
+    from rich.table import Table
 
     from ventbench.entries.folder import Submission
     from ventbench.plants.fmu import Fmu
@@ -39,11 +40,7 @@ def claim_out(folder: Path | None) -> Path | None:
 
 
 def claim_json(path: Path | None) -> Path | None:
-    """Check the file of ``--json`` before anything is computed.
-
-    Raises:
-        InputError: if it is a folder, or lies in what is none.
-    """
+    """Check the file of ``--json`` before anything is computed; InputError if it cannot be one."""
     from ventbench.base.errors import InputError
 
     if path is None or str(path) == "-":
@@ -140,11 +137,7 @@ def simulator_of(plant: str, in_process: bool) -> str | Fmu:
 
 
 def recordings_folder(given: Path | None) -> Path:
-    """Return the folder of the public recordings.
-
-    Raises:
-        InputError: if there is none.
-    """
+    """Return the folder of the public recordings; InputError if there is none."""
     from ventbench.base.errors import InputError
     from ventbench.recordings import recordings_dir
 
@@ -165,6 +158,30 @@ def emit(value: object, target: Path | None) -> None:
         print(files.as_json(value), end="")
     else:
         files.write_json(target, value)
+
+
+def told(value: object, json: Path | None) -> Console:
+    """Write a result as of :func:`emit`; return the console for people, beside that of the JSON."""
+    from rich.console import Console
+
+    emit(value, json)
+    return Console(stderr=str(json) == "-")
+
+
+def table_of(
+    title: str, columns: Iterable[str], rows: Iterable[Iterable[str]] = (), *,
+    left: Iterable[str] = (), no_wrap: bool = False, caption: str | None = None,
+) -> Table:  # fmt: skip
+    """Return a table of texts: the first column and those named stand to the left, others right."""
+    from rich.table import Table
+
+    table, kept = Table(title=title, caption=caption), set(left)
+    for place, name in enumerate(columns):
+        justify = "left" if place == 0 or name in kept else "right"
+        table.add_column(name, justify=justify, no_wrap=no_wrap)
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 _quiet = False

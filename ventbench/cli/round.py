@@ -167,7 +167,7 @@ def score(
     own = rounds.load(folder, name)
     if plan:
         runs = round_scoring.plan(own)
-        seconds = round_scoring.processor_time(runs)
+        seconds = sum(round_scoring.SECONDS[track] for _, track in runs)
         emit({"runs": runs, "processor_s": seconds}, json)
         typer.echo(
             f"{len(runs)} runs of {len({x for x, _ in runs})} entries: about "
@@ -258,8 +258,3 @@ def _told(own: Round, json: Path | None) -> None:
     following = {"open": "freeze", "frozen": "draw", "drawn": "score"}.get(own.state)
     next_ = f"ventbench round {following} {own.name}" if following else "ventbench board build"
     typer.echo(f"next: {next_}", err=err)
-
-
-def register(root: typer.Typer) -> None:
-    """Add the commands."""
-    root.add_typer(app)

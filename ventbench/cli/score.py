@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -21,6 +21,8 @@ from ventbench.cli.options import (
     known_entries,
     notes,
     of_each_entry,
+    table_of,
+    told,
 )
 
 if TYPE_CHECKING:
@@ -113,8 +115,6 @@ def score(
     """
     from functools import partial
 
-    from rich.console import Console
-
     from ventbench.base import errors
     from ventbench.base.errors import InputError
     from ventbench.entries.folder import open_submission
@@ -158,8 +158,7 @@ def score(
             results, of_each_entry(what, before, unstressed, workers, scheduler), strict=True
         ):
             values["given"] = _given(given, other.to_json(), values)
-    emit(results[0] if len(results) == 1 else {"submissions": results}, json)
-    console = Console(stderr=str(json) == "-")
+    console = told(results[0] if len(results) == 1 else {"submissions": results}, json)
     console.print(_table(results))
     if given in simulator_names():
         console.print(_corrected_table(results))
@@ -171,9 +170,7 @@ def score(
         _compare(console, scores)
     because = dict.fromkeys(reason for result in scores for reason in result.not_official_because)
     if because:
-        Console(stderr=True).print(
-            f"These scores are not official: {', '.join(because)}.", style="yellow"
-        )
+        typer.secho(f"These scores are not official: {', '.join(because)}.", fg="yellow", err=True)
     failures = [
         failure
         for result in scores
@@ -181,7 +178,7 @@ def score(
         for failure in failures[:3]
     ]
     for failure in failures:
-        Console(stderr=True).print(failure.message, style="red", markup=False)
+        typer.secho(failure.message, fg="red", err=True)
     if out is not None:
         for path in _keep(out, scores, report):
             console.print(f"wrote {path}", markup=False, highlight=False)
@@ -189,7 +186,8 @@ def score(
         from ventbench.board import create
         from ventbench.plants import frozen
 
-        for path in create.keep(record, scores, frozen.load()):
+        drafts = [create.create(result, frozen.load()) for result in scores]
+        for path in [draft.save(record) for draft in drafts]:
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     if failures:
         raise typer.Exit(1)
@@ -204,25 +202,39 @@ def _run(
     return scoring.score(entry, track=track, stress=stress, progress=progress, **options)
 
 
-def _table(scores: list[dict[str, Any]]) -> Table:
-    """Return a table with a row for each lung and a column for each submission."""
-    from rich.table import Table
+def _shown(value: float | None, digits: int = 3) -> str:
+    return "failed" if value is None else f"{value:.{digits}f}"
 
-    def show(value: float | None) -> str:
-        return "failed" if value is None else f"{value:.3f}"
 
-    table = Table(title="Mean |pressure - target|, cmH2O (lower is better)")
-    table.add_column("lung")
-    for entry in scores:
-        table.add_column(f"{entry['name']}\n{entry['track']}", justify="right")
-    for lung in scores[0]["lungs"]:
-        table.add_row(lung, *(show(entry["lungs"][lung]["score"]) for entry in scores))
+def _by_lung(
+    title: str, scores: list[dict[str, Any]], cell: Callable[[dict[str, Any], str], str],
+    total: Callable[[dict[str, Any]], str],
+) -> Table:  # fmt: skip
+    """Return a table with a row for each lung and the mean, and a column for each submission."""
+    columns = ("lung", *(f"{entry['name']}\n{entry['track']}" for entry in scores))
+    rows = ((lung, *(cell(entry, lung) for entry in scores)) for lung in scores[0]["lungs"])
+    table = table_of(title, columns, rows)
     table.add_section()
-    table.add_row("mean", *(show(entry["score"]) for entry in scores), style="bold")
+    table.add_row("mean", *map(total, scores), style="bold")
+    return table
+
+
+def _add_interval(table: Table, drawn: list[dict[str, Any]], digits: int = 3) -> None:
+    limits = ("..".join(_shown(limit, digits) for limit in own["ci95"]) for own in drawn)
+    table.add_row("95 % interval", *limits)
+
+
+def _table(scores: list[dict[str, Any]]) -> Table:
+    """Return the paper's scores."""
+    table = _by_lung(
+        "Mean |pressure - target|, cmH2O (lower is better)", scores,
+        lambda entry, lung: _shown(entry["lungs"][lung]["score"]),
+        lambda entry: _shown(entry["score"]),
+    )  # fmt: skip
     if scores[0]["draws"]:
         drawn = [entry["draws"] for entry in scores]
-        table.add_row("mean of the draws", *(show(draws["score"]) for draws in drawn))
-        table.add_row("95 % interval", *("..".join(map(show, draws["ci95"])) for draws in drawn))
+        table.add_row("mean of the draws", *(_shown(own["score"]) for own in drawn))
+        _add_interval(table, drawn)
     return table
 
 
@@ -235,8 +247,7 @@ def _given(name: str, before: dict[str, Any], after: dict[str, Any]) -> dict[str
 
 
 def _corrected_table(results: list[dict[str, Any]]) -> Table:
-    """Return each entry's score before and after the correction: a row for each lung."""
-    from rich.table import Table
+    """Return each entry's score before and after the correction."""
 
     def cells(given: float | None, corrected: float | None) -> str:
         if given is None or corrected is None:
@@ -244,17 +255,11 @@ def _corrected_table(results: list[dict[str, Any]]) -> Table:
         return f"{given:.3f} -> {corrected:.3f} ({corrected - given:+.3f})"
 
     name = results[0]["given"]["simulators"]
-    table = Table(title=f"From {name}, the given simulator, to the corrected one, cmH2O")
-    table.add_column("lung")
-    for entry in results:
-        table.add_column(f"{entry['name']}\n{entry['track']}", justify="right")
-    for lung in results[0]["lungs"]:
-        pairs = ((e["given"]["lungs"][lung], e["lungs"][lung]["score"]) for e in results)
-        table.add_row(lung, *(cells(*pair) for pair in pairs))
-    table.add_section()
-    means = ((entry["given"]["score"], entry["score"]) for entry in results)
-    table.add_row("mean", *(cells(*pair) for pair in means), style="bold")
-    return table
+    return _by_lung(
+        f"From {name}, the given simulator, to the corrected one, cmH2O", results,
+        lambda entry, lung: cells(entry["given"]["lungs"][lung], entry["lungs"][lung]["score"]),
+        lambda entry: cells(entry["given"]["score"], entry["score"]),
+    )  # fmt: skip
 
 
 def _why_corrected(console: Console, origin: Mapping[str, Any], given: str, plant: str) -> None:
@@ -278,54 +283,46 @@ def _why_corrected(console: Console, origin: Mapping[str, Any], given: str, plan
 
 
 def _normalised_table(scores: list[dict[str, Any]]) -> Table:
-    """Return the normalised scores: a row for each lung, a column for each submission."""
-    from rich.table import Table
+    """Return the normalised scores."""
 
-    def show(value: float | None) -> str:
-        return "failed" if value is None else f"{value:.1f}"
-
-    def mean(values: dict[str, Any]) -> float | None:
-        return (values["draws"] or {"score": values["nominal"]})["score"]
+    def mean(values: dict[str, Any]) -> str:
+        own = values["normalised"]
+        return _shown((own["draws"] or {"score": own["nominal"]})["score"], 1)
 
     over = "over the draws" if scores[0]["draws"] else "nominal"
-    table = Table(title=f"Normalised score, {over}: 0 = best attainable, 100 = best PID")
-    table.add_column("lung")
-    for entry in scores:
-        table.add_column(f"{entry['name']}\n{entry['track']}", justify="right")
-    for lung in scores[0]["lungs"]:
-        table.add_row(lung, *(show(mean(entry["lungs"][lung]["normalised"])) for entry in scores))
-    table.add_section()
-    table.add_row("mean", *(show(mean(entry["normalised"])) for entry in scores), style="bold")
+    table = _by_lung(
+        f"Normalised score, {over}: 0 = best attainable, 100 = best PID", scores,
+        lambda entry, lung: mean(entry["lungs"][lung]), mean,
+    )  # fmt: skip
     if scores[0]["draws"]:
-        drawn = [entry["normalised"]["draws"] for entry in scores]
-        table.add_row("95 % interval", *("..".join(map(show, draws["ci95"])) for draws in drawn))
+        _add_interval(table, [entry["normalised"]["draws"] for entry in scores], 1)
     return table
 
 
 def _stress_table(scores: list[dict[str, Any]]) -> Table:
     """Return a table of scores under missing physics: figures, then a row for each category."""
-    from rich.table import Table
+    title = "Missing physics: mean |airway pressure - PIP|, cmH2O (lower is better)"
+    table = table_of(title, ("", *(entry["name"] for entry in scores)))
+    for column in table.columns[1:]:
+        column.overflow = "fold"
+    table.add_row("all stressors", *(_shown(entry["score"]) for entry in scores), style="bold")
+    if None not in scores[0]["ci95"]:
+        _add_interval(table, scores, 2)
 
-    def show(value: float | None, digits: int = 2) -> str:
-        return "failed" if value is None else f"{value:.{digits}f}"
+    def add(name: str, text: Callable[[dict[str, Any]], str]) -> None:
+        table.add_row(name, *map(text, scores))
 
-    table = Table(title="Missing physics: mean |airway pressure - PIP|, cmH2O (lower is better)")
-    table.add_column("")
-    for entry in scores:
-        table.add_column(entry["name"], justify="right", overflow="fold")
-    table.add_row("all stressors", *(show(entry["score"], 3) for entry in scores), style="bold")
-    limits = [entry["ci95"] for entry in scores]
-    if None not in limits[0]:
-        table.add_row("95 % interval", *("..".join(map(show, ends)) for ends in limits))
-    table.add_row("without stressors", *(show(entry["unstressed"], 3) for entry in scores))
-    table.add_row("runs survived", *(f"{100 * entry['survived']:.1f} %" for entry in scores))
-    table.add_row("unsafe runs", *(f"{e['unsafe_runs']} of {e['stressed_runs']}" for e in scores))
-    table.add_row("longest above PIP + 15 %, mean, s", *(show(e["above_alarm_s"]) for e in scores))
-    table.add_row("worst", *(f"{show(e['worst_error'])}\n{e['worst_condition']}" for e in scores))
+    add("without stressors", lambda e: _shown(e["unstressed"]))
+    add("runs survived", lambda e: f"{100 * e['survived']:.1f} %")
+    add("unsafe runs", lambda e: f"{e['unsafe_runs']} of {e['stressed_runs']}")
+    add("longest above PIP + 15 %, mean, s", lambda e: _shown(e["above_alarm_s"], 2))
+    add("worst", lambda e: f"{_shown(e['worst_error'], 2)}\n{e['worst_condition']}")
     table.add_section()
     for category in scores[0]["categories"]:
         each = [entry["categories"][category] for entry in scores]
-        shown = (f"{show(e['error_cmH2O'])}, {100 * e['survived']:.0f} % survived" for e in each)
+        shown = (
+            f"{_shown(e['error_cmH2O'], 2)}, {100 * e['survived']:.0f} % survived" for e in each
+        )
         table.add_row(category, *shown)
     return table
 
@@ -395,9 +392,6 @@ def transfer(
 
     Example: `ventbench transfer pid_best residual_mlp --json transfer.json`
     """
-    from rich.console import Console
-    from rich.table import Table
-
     from ventbench.entries import scoring as transfers
     from ventbench.entries.folder import open_submission
     from ventbench.entries.runner import runner_of
@@ -413,23 +407,22 @@ def transfer(
             runs = transfers.transfer(entry, rigs, track=chosen, runner=runner, progress=told)
         groups = transfers.by_group(runs, rigs)
         results.append({"name": entry.manifest.name, "track": chosen, "groups": groups})
-    emit({"entries": results}, json)
-    table = Table(title="Mean |pressure - target| on rigs, cmH2O (lower is better)")
-    table.add_column("entry")
-    best = {}
-    for group in transfers.GROUPS:
-        own = [result["groups"][group] for result in results]
-        table.add_column(f"{group}\n{own[0]['plants']} plants", justify="right")
-        errors = [one["error_cmH2O"] for one in own if one["error_cmH2O"] is not None]
-        best[group] = min(errors, default=None)
-    for result in results:
-        cells = []
-        for group in transfers.GROUPS:
-            value = result["groups"][group]["error_cmH2O"]
-            text = "-" if value is None else f"{value:.3f}"
-            cells.append(f"[bold]{text}[/bold]" if value == best[group] else text)
-        table.add_row(f"{result['name']}, {result['track']}", *cells)
-    Console(stderr=str(json) == "-").print(table)
+    plants = results[0]["groups"]
+    columns = ("entry", *(f"{group}\n{plants[group]['plants']} plants" for group in plants))
+    errors = [[result["groups"][group]["error_cmH2O"] for group in plants] for result in results]
+    best = [
+        min((x for x in own if x is not None), default=None) for own in zip(*errors, strict=True)
+    ]
+    rows = []
+    for result, own in zip(results, errors, strict=True):
+        texts = ("-" if value is None else f"{value:.3f}" for value in own)
+        cells = (
+            f"[bold]{text}[/bold]" if value == least else text
+            for text, value, least in zip(texts, own, best, strict=True)
+        )
+        rows.append((f"{result['name']}, {result['track']}", *cells))
+    title = "Mean |pressure - target| on rigs, cmH2O (lower is better)"
+    told({"entries": results}, json).print(table_of(title, columns, rows))
 
 
 def new(
@@ -499,9 +492,4 @@ def check(
         raise typer.Exit(1)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(score)
-    app.command()(transfer)
-    app.command()(new)
-    app.command()(check)
+COMMANDS = (score, transfer, new, check)

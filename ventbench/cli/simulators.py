@@ -15,10 +15,11 @@ from ventbench.cli.options import (
     TrustFmu,
     bars,
     counted,
-    emit,
     known_lungs,
     notes,
     simulator_of,
+    table_of,
+    told,
 )
 from ventbench.task import protocol
 
@@ -32,28 +33,26 @@ def lungs(json: JsonFile = None) -> None:
 
     Example: `ventbench lungs`
     """
-    from rich.console import Console
-    from rich.table import Table
-
     from ventbench.plants import frozen
 
     official = frozen.load()
     known = official.lungs()
-    table = Table(title="The six lungs: error of their simulators on breaths held out, cmH2O")
     kinds = {"own_rig": "own rig", "unseen_rig": "unseen rig", "held_out": "by clock"}
-    table.caption = "Mean / median. R in cmH2O/(L/s), C in mL/cmH2O."
-    for name in ("lung", "R", "C", "rigs", *kinds.values(), "breaths"):
-        table.add_column(name, justify="left" if name == "lung" else "right", no_wrap=True)
-    emit(known, json)
 
     def shown(about: dict[str, Any], kind: str) -> str:
         return f"{about[f'{kind}_mae']:.2f} / {about[f'{kind}_median_mae']:.2f}"
 
+    rows = []
     for rigs, (lung_id, about) in zip(official.rigs, known.items(), strict=True):
         setting = (f"{about['R']:g}", f"{about['C']:g}", str(len(rigs)))
         figures = (shown(about, kind) for kind in kinds)
-        table.add_row(lung_id, *setting, *figures, str(about["held_out_breaths"]))
-    console = Console(stderr=str(json) == "-")
+        rows.append((lung_id, *setting, *figures, str(about["held_out_breaths"])))
+    table = table_of(
+        "The six lungs: error of their simulators on breaths held out, cmH2O",
+        ("lung", "R", "C", "rigs", *kinds.values(), "breaths"), rows, no_wrap=True,
+        caption="Mean / median. R in cmH2O/(L/s), C in mL/cmH2O.",
+    )  # fmt: skip
+    console = told(known, json)
     console.print(table)
     for session, reason in official.rejected.items():
         label = official.sessions.table[session].lung
@@ -76,9 +75,6 @@ def coverage(
     """
     from dataclasses import asdict
 
-    from rich.console import Console
-    from rich.table import Table
-
     from ventbench.base.errors import InputError
     from ventbench.board import record as records
     from ventbench.board import store
@@ -91,14 +87,14 @@ def coverage(
     lungs = frozen.load().lungs()
     commands = store.load_commands(entry, record.parent).clip(0.0, 100.0)
     by_lung = open_loop.by_lung(dict(zip(entry.lungs, commands, strict=True)), lungs)
-    emit({name: asdict(share) for name, share in by_lung.items()}, json)
-    table = Table(title="Commands beyond the recordings, % of all")
-    for name in ("lung", "70 % and above", "ranges hardly recorded", "recorded at 70 % and above"):
-        table.add_column(name, justify="left" if name == "lung" else "right")
-    for name, share in by_lung.items():
-        recorded = f"{share.recorded_wide_open} of {share.recorded}"
-        table.add_row(name, f"{100 * share.wide_open:.1f}", f"{100 * share.sparse:.1f}", recorded)
-    Console(stderr=str(json) == "-").print(table)
+    columns = ("lung", "70 % and above", "ranges hardly recorded", "recorded at 70 % and above")
+    rows = (
+        (name, f"{100 * share.wide_open:.1f}", f"{100 * share.sparse:.1f}",
+         f"{share.recorded_wide_open} of {share.recorded}")
+        for name, share in by_lung.items()
+    )  # fmt: skip
+    table = table_of("Commands beyond the recordings, % of all", columns, rows)
+    told({name: asdict(share) for name, share in by_lung.items()}, json).print(table)
 
 
 def simulate(
@@ -177,7 +173,6 @@ def open_loop(
     Example: `ventbench open-loop recording.csv --json errors.json`
     """
     import numpy as np
-    from rich.console import Console
 
     from ventbench import open_loop_report
     from ventbench import recordings as files
@@ -198,38 +193,28 @@ def open_loop(
         simulating = counted(shown, f"simulating {len(breaths)} breaths")
         chosen = simulator_of(plant, in_process)
         result = open_loop_report.open_loop(breaths, chosen, progress=simulating)
-    emit(result.as_dict(), json)
-    console = Console(stderr=str(json) == "-")
+    console = told(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
     for line in result.misfit_lines():
         console.print(line, markup=False, highlight=False)
 
 
 def _open_loop_table(result: dict[str, Any]) -> Any:
-    from rich.table import Table
-
-    table = Table(title=f"Open-loop MAE of the {result['plant']} simulators, cmH2O")
-    table.add_column("lung")
-    for name in ("n", "mean", "median", "held-out", "95 %", "median", "no misfits"):
-        table.add_column(name, justify="right", no_wrap=True)
-
     def show(value: float | None) -> str:
         return "-" if value is None else f"{value:.2f}"
 
+    rows = []
     for lung, figures in result["lungs"].items():
-        low, high = figures["held_out_ci95"]
         apart = figures["fitting_label"]
-        table.add_row(
-            lung,
-            str(figures["breaths"]),
-            show(figures["mae"]),
-            show(figures["median_mae"]),
-            show(figures["held_out_mae"]),
-            f"{show(low)}..{show(high)}",
+        rows.append((
+            lung, str(figures["breaths"]), show(figures["mae"]), show(figures["median_mae"]),
+            show(figures["held_out_mae"]), "..".join(map(show, figures["held_out_ci95"])),
             show(figures["held_out_median_mae"]),
             f"{show(apart['held_out_mae'])} ({apart['held_out_breaths']})",
-        )
-    return table
+        ))  # fmt: skip
+    title = f"Open-loop MAE of the {result['plant']} simulators, cmH2O"
+    columns = ("lung", "n", "mean", "median", "held-out", "95 %", "median", "no misfits")
+    return table_of(title, columns, rows, no_wrap=True)
 
 
 def fmu(
@@ -249,10 +234,4 @@ def fmu(
     typer.echo(f"wrote {export(load_simulators(plant).plant(lung), out, lung=lung)}")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(lungs)
-    app.command()(coverage)
-    app.command()(simulate)
-    app.command("open-loop")(open_loop)
-    app.command()(fmu)
+COMMANDS = (lungs, coverage, simulate, open_loop, fmu)

@@ -13,12 +13,13 @@ from ventbench.cli.options import (
     RecordingsDir,
     bars,
     claim_out,
-    emit,
     known_lungs,
     recordings_folder,
+    table_of,
+    told,
 )
 
-train = typer.Typer(name="train", help="Train simulators and controllers.", no_args_is_help=True)
+app = typer.Typer(name="train", help="Train simulators and controllers.", no_args_is_help=True)
 
 Lung = Annotated[
     str | None,
@@ -44,12 +45,7 @@ Steps = Annotated[
 ]
 
 
-@train.callback()
-def _group() -> None:
-    pass
-
-
-@train.command()
+@app.command()
 def simulator(
     recordings: RecordingsDir = None,
     out: Annotated[
@@ -94,7 +90,7 @@ def simulator(
     typer.echo(f"wrote {out}")
 
 
-@train.command()
+@app.command()
 def population(
     simulators: Annotated[
         Path,
@@ -120,7 +116,7 @@ def population(
     typer.echo(f"wrote {simulators / 'population.npz'}")
 
 
-@train.command()
+@app.command()
 def residual(
     lung: Lung = None,
     every: All = False,
@@ -165,8 +161,6 @@ def residual(
 
     Example: `ventbench train residual --all --out runs/residual_all`
     """
-    from rich.console import Console
-
     from ventbench.base.errors import InputError
     from ventbench.train.plants import ALL
     from ventbench.train.residual import ResidualConfig
@@ -182,8 +176,7 @@ def residual(
         round_robin=round_robin,
     )
     result = _train_residual(names, out, config, seed, plant)
-    emit(result, json)
-    console = Console(stderr=str(json) == "-")
+    console = told(result, json)
     console.print(_residual_table(result))
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 
@@ -211,20 +204,17 @@ def _train_residual(
 
 
 def _residual_table(result: dict[str, Any]) -> Any:
-    from rich.table import Table
-
-    table = Table(title="Nominal mean |pressure - target|, cmH2O")
-    for name in ("network", "lung", "PID", "corrected", "change"):
-        table.add_column(name, justify="left" if name in ("network", "lung") else "right")
+    rows = []
     for network, figures in result["networks"].items():
         for lung, error in figures["error"].items():
             before = figures["error_pid"][lung]
             change = f"{100 * (error / before - 1):+.1f} %"
-            table.add_row(network, lung, f"{before:.3f}", f"{error:.3f}", change)
-    return table
+            rows.append((network, lung, f"{before:.3f}", f"{error:.3f}", change))
+    columns = ("network", "lung", "PID", "corrected", "change")
+    return table_of("Nominal mean |pressure - target|, cmH2O", columns, rows, left=["lung"])
 
 
-@train.command()
+@app.command()
 def ppo(
     lung: Lung = None,
     all_lungs: All = False,
@@ -248,7 +238,7 @@ def ppo(
     _train_policies("ppo", lung, all_lungs, seed, seeds, steps, out, plant, json)
 
 
-@train.command()
+@app.command()
 def dqn(
     lung: Lung = None,
     all_lungs: All = False,
@@ -283,8 +273,6 @@ def _train_policies(
     plant: str,
     json: Path | None,
 ) -> None:
-    from rich.console import Console
-
     from ventbench.base.errors import InputError
     from ventbench.train.plants import ALL
     from ventbench.train.rl.train import train_dqn, train_ppo
@@ -310,32 +298,24 @@ def _train_policies(
             simulator=plant,
             progress=progress,
         )
-    emit(trained.report, json)
-    console = Console(stderr=str(json) == "-")
+    console = told(trained.report, json)
     console.print(_trained(trained.report))
     console.print(f"wrote {out}", markup=False, highlight=False)
 
 
 def _trained(about: dict[str, Any]) -> Any:
-    from rich.table import Table
+    def values(errors: list[float]) -> str:
+        return " ".join(f"{error:.3f}" for error in errors)
 
-    title = f"{about['method']}: mean |pressure - target|, cmH2O"
-    table = Table(
-        title=title, caption="Fresh cells: new deviations, drawn like the published draws."
-    )
-    for name in ("network", "breaths", "PID", "at the end", "fresh cells", "best seed"):
-        table.add_column(name, justify="left" if name == "network" else "right")
-    for name, network in about["networks"].items():
-        ends, fresh = (_values(network[key]) for key in ("error_nominal_at_end", "error_fresh"))
-        breaths, pid = str(network["breaths"]), f"{network['error_pid']:.3f}"
-        table.add_row(name, breaths, pid, ends, fresh, str(network["seed"]))
-    return table
-
-
-def _values(values: list[float]) -> str:
-    return " ".join(f"{value:.3f}" for value in values)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the group."""
-    app.add_typer(train)
+    rows = (
+        (
+            name, str(own["breaths"]), f"{own['error_pid']:.3f}",
+            values(own["error_nominal_at_end"]), values(own["error_fresh"]), str(own["seed"]),
+        )
+        for name, own in about["networks"].items()
+    )  # fmt: skip
+    columns = ("network", "breaths", "PID", "at the end", "fresh cells", "best seed")
+    return table_of(
+        f"{about['method']}: mean |pressure - target|, cmH2O", columns, rows,
+        caption="Fresh cells: new deviations, drawn like the published draws.",
+    )  # fmt: skip

@@ -1,14 +1,18 @@
-"""``ventbench tune`` and ``headroom``: best gains of a PID, and the bounds of any controller."""
+"""``ventbench tune``, ``headroom``, ``stressors``, ``adversary``: searches for gains and limits.
+
+Best gains of a PID, the bounds of any controller, and how little missing physics is too much.
+"""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from ventbench.cli.options import (
+    InProcess,
     JsonFile,
     PlantName,
     Scheduler,
@@ -17,7 +21,11 @@ from ventbench.cli.options import (
     claim_out,
     counted,
     emit,
+    known_entries,
     known_lungs,
+    table_of,
+    told,
+    waiting,
 )
 
 #: Cells of the second optimiser: every so many of all.
@@ -49,7 +57,6 @@ def headroom(
     Example: `ventbench headroom --check data/bounds-v2.npz`
     """
     import numpy as np
-    from rich.console import Console
 
     from ventbench.base.executor import executor
     from ventbench.entries import reference as references
@@ -57,7 +64,6 @@ def headroom(
     from ventbench.task import draws, protocol
     from ventbench.train.best_pid import best_pids
 
-    console = Console(stderr=str(json) == "-")
     rigs = load_rigs()
     drawn = rigs.draws(draws.COUNT)
     plants, cells = rigs.cells(drawn, protocol.PIPS)
@@ -66,7 +72,7 @@ def headroom(
         computed = references.load(check)
         references.reference_of(rigs.about, drawn.about(), computed)
         result = references.checked(computed, plants, cells, every=_EVERY)
-        emit(result, json)
+        console = told(result, json)
         for key, value in result.items():
             console.print(f"{key}: {value}", highlight=False)
         if not result["sound"]:
@@ -77,14 +83,9 @@ def headroom(
         pids = best_pids(rigs, progress=counted(progress, "best PID of each lung"))
         with executor(workers, scheduler) as pool:
             computed = references.compute(
-                plants,
-                cells,
-                pids.gains,
-                about,
-                folder=parts,
-                pool=pool,
+                plants, cells, pids.gains, about, folder=parts, pool=pool,
                 progress=counted(progress, "best attainable"),
-            )
+            )  # fmt: skip
     sha256 = computed.save(out)
     shutil.rmtree(parts)  # they are in the file now
     summary = {
@@ -100,8 +101,7 @@ def headroom(
         "pid": float(computed.pid.mean()),
         "largest_gap": float(np.max(computed.attainable - computed.lower)),
     }
-    emit(summary, json)
-    console.print(
+    told(summary, json).print(
         f"wrote {out}\nmean over cells, first step left out: best attainable "
         f"{summary['attainable']:.3f} cmH2O (at least {summary['lower']:.3f}), best PID "
         f"{summary['pid']:.3f}\nSHA-256 {sha256}",
@@ -168,8 +168,6 @@ def pid(
 
     Example: `ventbench tune pid --all --out runs/pid`
     """
-    from rich.console import Console
-
     from ventbench.base.errors import InputError
     from ventbench.base.files import write_json
     from ventbench.train.best_pid import tune_beyond
@@ -192,8 +190,7 @@ def pid(
                 simulator=plant, progress=counted(shown, "trajectories"),
             )  # fmt: skip
             written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
-    emit(result, json)
-    console = Console(stderr=str(json) == "-")
+    console = told(result, json)
     console.print(_table(result))
     for name in written:
         console.print(f"wrote {out / name}", markup=False, highlight=False, soft_wrap=True)
@@ -215,25 +212,100 @@ def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
 
 
 def _table(result: dict[str, Any]) -> Any:
-    from rich.table import Table
+    def row(name: str, entry: dict[str, Any]) -> tuple[str, ...]:
+        return name, *(f"{gain:g}" for gain in entry["gains"]), f"{entry['error']:.3f}"
 
-    table = Table(title="Best PID gains; mean |pressure - target|, cmH2O")
-    for name in ("lung", "P", "I", "D", "error"):
-        table.add_column(name, justify="left" if name == "lung" else "right")
-
-    def add(name: str, entry: dict[str, Any], **style: Any) -> None:
-        gains = (f"{gain:g}" for gain in entry["gains"])
-        table.add_row(name, *gains, f"{entry['error']:.3f}", **style)
-
-    for name, entry in result.get("lungs", {}).items():
-        add(name, entry)
+    rows = (row(name, entry) for name, entry in result.get("lungs", {}).items())
+    title = "Best PID gains; mean |pressure - target|, cmH2O"
+    table = table_of(title, ("lung", "P", "I", "D", "error"), rows)
     if "single" in result:
         table.add_section()
-        add("all six", result["single"], style="bold")
+        table.add_row(*row("all six", result["single"]), style="bold")
     return table
 
 
-def register(app_: typer.Typer) -> None:
-    """Add the commands."""
-    app_.command()(headroom)
-    app_.add_typer(app)
+def stressors(json: JsonFile = None) -> None:
+    """List the stressors, which are missing physics, and their strengths.
+
+    Example: `ventbench stressors`
+    """
+    import dataclasses
+
+    from ventbench.task.stressors import PAIRS, STRESSORS, VERSION
+
+    rows = []
+    for line in STRESSORS:
+        strengths = (f"{value:.3g}" for value in (line.mild, line.strong))
+        how = {"add": "", "scale": " (factor)", "label": " (label)"}[line.rule]
+        rows.append((line.category, line.name, line.title, line.strength + how, *strengths))
+    columns = ("category", "stressor", "what happens", "changes", "mild", "strong")
+    lines, pairs = [dataclasses.asdict(x) for x in STRESSORS], [list(pair) for pair in PAIRS]
+    console = told({"version": VERSION, "stressors": lines, "pairs": pairs}, json)
+    console.print(table_of(f"Stressors, version {VERSION}", columns, rows, left=columns[:4]))
+    console.print("Pairs, both mild: " + ", ".join(" + ".join(pair) for pair in PAIRS))
+
+
+def adversary(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="SUBMISSION",
+            help="Folder or name of a bundled submission.",
+            autocompletion=known_entries,
+        ),
+    ],
+    lung: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Lung to search on; may be repeated. Default: all.", autocompletion=known_lungs
+        ),
+    ] = None,
+    stressor: Annotated[
+        list[str] | None,
+        typer.Option(help="Stressor that may act; may be repeated. Default: all, and the rig."),
+    ] = None,
+    track: Annotated[
+        Literal["performance", "robustness"] | None,
+        typer.Option(help="What the controller is told; default: the first of the submission."),
+    ] = None,
+    plant: PlantName = "frozen",
+    in_process: InProcess = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", callback=claim_out, help="Write adversary.json and adversary.txt here."
+        ),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Search for the mildest plausible physics that makes a controller unsafe.
+
+    Severity 0 is the rig in the middle of the population, 1 the end of the range: a stressor at its
+    strong strength, or a rig three standard deviations away; what acts together adds as squares.
+    The exit code is 1 if something unsafe was found.
+
+    Example: `ventbench adversary pid_robust --lung R5C10`
+    """
+    from dataclasses import asdict
+
+    from ventbench.base import compilation, files
+    from ventbench.entries.adversary import adversary as search
+
+    compilation.keep()
+    with waiting(f"searching for what makes {name} unsafe"):
+        found = search(
+            name, simulator=plant, track=track, lungs=lung or (), stressors=stressor or (),
+            sandbox=not in_process,
+        )  # fmt: skip
+    values = {"submission": name, "lungs": [asdict(one) for one in found]}
+    text = "\n".join(line for one in found for line in one.lines())
+    emit(values, json)
+    typer.echo(text, err=str(json) == "-")
+    if out is not None:
+        files.write_json(out / "adversary.json", values)
+        files.write_text(out / "adversary.txt", text + "\n")
+    if any(one.severity is not None for one in found):
+        raise typer.Exit(1)
+
+
+COMMANDS = (headroom, stressors, adversary)

@@ -86,7 +86,4 @@ def report(
         typer.echo(f"wrote {pages.write_figure(figure, loaded)}")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(view)
-    app.command()(report)
+COMMANDS = (view, report)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import actions, canonical, create, ranking, store
+from ventbench.board import canonical, create, ranking, store
 from ventbench.board.verify import verify
 
 from ..textbook_rigs import TextbookRigs
@@ -25,7 +25,7 @@ def performance(folder: Path) -> ranking.Track:
 def test_a_bomb_of_zeros_takes_no_memory() -> None:
     bomb = zlib.compress(bytes(10**8))
     with pytest.raises(InputError, match="does not hold commands of shape"):
-        actions.decode(bomb, (6, 21, 6, 3, 34), "it")
+        store.decode(bomb, (6, 21, 6, 3, 34), "it")
 
 
 def test_a_link_is_no_record(drafts, tmp_path: Path) -> None:

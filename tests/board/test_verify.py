@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import actions, canonical, record, store
+from ventbench.board import canonical, record, store
 from ventbench.board.verify import Report, verify
 
 from ..textbook_rigs import TextbookRigs
@@ -53,7 +53,7 @@ def _sound(folder: Path, only: str) -> list[str]:
     return wrong
 
 
-@pytest.mark.parametrize("suffix", [record.SUFFIX, actions.SUFFIX])
+@pytest.mark.parametrize("suffix", [record.SUFFIX, canonical.ACTIONS_SUFFIX])
 def test_every_flipped_byte_of_a_record_is_found(leaderboard: Path, suffix: str) -> None:
     random = np.random.default_rng(7)
     paths = sorted((leaderboard / store.RECORDS).glob(f"*{suffix}"))

@@ -3,9 +3,8 @@
 - :mod:`~ventbench.board.canonical`: the one text of a JSON value, its hash, and file names;
 - :mod:`~ventbench.board.schema`: what a record's JSON must look like;
 - :mod:`~ventbench.board.record`: a record as arrays; :mod:`~ventbench.board.create` makes one;
-- :mod:`~ventbench.board.actions`: every command of a scored run, without loss;
 - :mod:`~ventbench.board.replay`: recorded commands through the frozen simulators again;
-- :mod:`~ventbench.board.store`: the folder ``leaderboard/``;
+- :mod:`~ventbench.board.store`: the folder ``leaderboard/``, commands of scored runs without loss;
 - :mod:`~ventbench.board.attestation`: signatures of records, and who may sign;
 - :mod:`~ventbench.board.ranking`: which record of an entry counts, ranks, intervals, differences;
 - :mod:`~ventbench.board.frames`: the columns of the board, its CSV and pandas frames;

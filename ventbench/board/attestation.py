@@ -15,7 +15,6 @@ submission; see ``ci/propose.py``.
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
@@ -44,11 +43,7 @@ _Hex32 = Annotated[str, schema.matching("[0-9a-f]{64}")]
 _KeyId = Annotated[str, schema.matching("[0-9a-f]{16}")]
 
 
-class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table with exactly these keys."""
-
-
-class Key(_Table, frozen=True):
+class Key(schema.Table, frozen=True):
     """A public key that may sign; ``id`` is the beginning of its SHA-256."""
 
     id: _KeyId
@@ -57,7 +52,7 @@ class Key(_Table, frozen=True):
     holder: schema.Text
 
 
-class SecondRun(_Table, frozen=True):
+class SecondRun(schema.Table, frozen=True):
     """A record whose code the maintainers ran again, and what they saw."""
 
     record: schema.Sha256
@@ -65,7 +60,7 @@ class SecondRun(_Table, frozen=True):
     date: date
 
 
-class BenchLog(_Table, frozen=True):
+class BenchLog(schema.Table, frozen=True):
     """A hardware record that the maintainers saw made, or whose raw recording they have read."""
 
     record: schema.Sha256
@@ -74,15 +69,15 @@ class BenchLog(_Table, frozen=True):
     date: date
 
 
-class Attestations(_Table, frozen=True):
+class Attestations(schema.Table, frozen=True):
     """Content of ``attestations.toml``."""
 
-    keys: list[Key] = []
-    second_runs: list[SecondRun] = []
-    bench_logs: list[BenchLog] = []
+    keys: list[Key] = msgspec.field(default_factory=list)
+    second_runs: list[SecondRun] = msgspec.field(default_factory=list)
+    bench_logs: list[BenchLog] = msgspec.field(default_factory=list)
 
 
-class _Signature(_Table, frozen=True):
+class _Signature(schema.Table, frozen=True):
     """Content of ``records/HASH.sig``."""
 
     key: _KeyId
@@ -91,7 +86,7 @@ class _Signature(_Table, frozen=True):
 
 
 def attested(folder: Path, records: Mapping[str, str | None]) -> tuple[frozenset[str], list[str]]:
-    """Find the records that somebody who may do so vouches for.
+    """Find the records of a leaderboard that somebody who may do so vouches for.
 
     Args:
         folder: of the leaderboard.
@@ -103,7 +98,6 @@ def attested(folder: Path, records: Mapping[str, str | None]) -> tuple[frozenset
 
     Raises:
         InputError: if there are signatures and no library to check them with.
-        OSError: if a file cannot be read.
     """
     vouched: set[str] = set()
     problems: list[str] = []
@@ -144,22 +138,14 @@ def attested(folder: Path, records: Mapping[str, str | None]) -> tuple[frozenset
 
 
 def check(path: Path, sha256: str, keys: dict[str, Key]) -> None:
-    """Check the signature of a record.
-
-    Args:
-        path: of the signature.
-        sha256: of the record.
-        keys: that may sign, by id.
+    """Check the signature of a record, named by its SHA-256, by one of some keys, by id.
 
     Raises:
-        InputError: if it is not a signature of this record by one of the keys, or there is no
-            library to check it with.
+        InputError: if it is not such a signature, or there is no library to check it with.
     """
     if path.stat().st_size > _MAX_SIGNATURE_BYTES:
         raise InputError(f"{path} is no signature: it is too large")
-    content = path.read_bytes()
-    canonical.parse(content, str(path))
-    signature = schema.decoded(_SIGNATURE, content, str(path))
+    signature = schema.read_canonical(_SIGNATURE, path)
     if signature.record != sha256:
         raise InputError(f"{path} signs another record, {signature.record[:12]}")
     key = keys.get(signature.key)
@@ -174,15 +160,7 @@ def check(path: Path, sha256: str, keys: dict[str, Key]) -> None:
 
 
 def sign(folder: Path, sha256: str, secret: str) -> Path:
-    """Sign a record of a leaderboard.
-
-    Args:
-        folder: of the leaderboard.
-        sha256: of the record.
-        secret: key, 64 hexadecimal digits.
-
-    Returns:
-        Path of the signature.
+    """Sign a record of a leaderboard by a secret, 64 hexadecimal digits; return the path.
 
     Raises:
         InputError: if the secret is not a key, its public key is not one of the leaderboard's, or
@@ -195,23 +173,15 @@ def sign(folder: Path, sha256: str, secret: str) -> Path:
     if own is None or own.public != public.hex():
         where = folder / ATTESTATIONS
         raise InputError(f"the public key of {SECRET}, {key_id(public)}, is not in {where}")
-    content = canonical.canonical(
-        {
-            "key": own.id,
-            "record": sha256,
-            "signature": private.sign(_message(sha256)).hex(),
-        }
-    )
+    signature = private.sign(_message(sha256)).hex()
+    content = canonical.canonical({"key": own.id, "record": sha256, "signature": signature})
     path = signature_path(folder, sha256)
     files.write_atomically(path, lambda file: file.write(content))
     return path
 
 
 def new_key() -> tuple[str, str]:
-    """Make a key.
-
-    Returns:
-        The secret, 64 hexadecimal digits, and the lines for ``attestations.toml``.
+    """Make a key: its secret, 64 hexadecimal digits, and the lines for ``attestations.toml``.
 
     Raises:
         InputError: if there is no library to make one with.
@@ -264,14 +234,9 @@ def read_list(folder: Path) -> Attestations:
         InputError: if it is not such a file.
     """
     path = folder / ATTESTATIONS
-    if not path.exists():
-        return Attestations()
-    if path.is_symlink() or path.stat().st_size > _MAX_LIST_BYTES:
-        raise InputError(f"{path} is a link, or larger than {_MAX_LIST_BYTES} bytes")
-    try:
-        return msgspec.convert(tomllib.loads(path.read_text("utf-8")), Attestations)
-    except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or not of this form
-        raise InputError(f"{path}: {error}") from None
+    return (
+        schema.read_toml(path, Attestations, _MAX_LIST_BYTES) if path.exists() else Attestations()
+    )
 
 
 _SIGNATURE = msgspec.json.Decoder(_Signature)

@@ -25,7 +25,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 from ventbench.board import schema
 
 #: Domain of the hash to the curve (RFC 9380).
@@ -39,7 +39,7 @@ _MAX_BYTES, _TIMEOUT_S = 10_000, 20.0
 _PURPOSE = b"ventbench round 1\n"
 
 
-class Chain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Chain(schema.Table, frozen=True):
     """A beacon: its key in G2, compressed, and the time of round 1 and between rounds, s."""
 
     public_key: Annotated[str, schema.matching("[0-9a-f]{192}")]
@@ -66,7 +66,7 @@ QUICKNET = Chain(
 )
 
 
-class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Value(schema.Table, frozen=True):
     """What a beacon published in one round."""
 
     round: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
@@ -79,13 +79,17 @@ class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return hmac.digest(key, _PURPOSE + bytes.fromhex(frozen), "sha256")
 
 
+#: Of values as relays publish them.
+DECODER = msgspec.json.Decoder(Value)
+
+
 def read(content: bytes, label: str) -> Value:
     """Read a value as relays publish it.
 
     Raises:
         InputError: if it is none.
     """
-    return schema.decoded(_DECODER, content, label)
+    return schema.decoded(DECODER, content, label)
 
 
 def fetch(chain: Chain, number: int) -> bytes:
@@ -106,13 +110,7 @@ def fetch(chain: Chain, number: int) -> bytes:
 
 
 def check(value: Value, chain: Chain, number: int, label: str) -> None:
-    """Check that a value is that of a round, signed by the beacon.
-
-    Args:
-        value: to be checked.
-        chain: of the beacon.
-        number: of the round that it must be of.
-        label: names the value in messages.
+    """Check that a value is that of a round, signed by the beacon; ``label`` names it in messages.
 
     Raises:
         InputError: if it is of another round or not genuine, or there is no library to check it.
@@ -133,14 +131,10 @@ def _genuine(signature: str, key: str, number: int) -> bool:
     """Whether both sides of the pairing agree; all points must lie in their groups."""
     limit = sys.getrecursionlimit()
     try:
+        require("py_ecc", extra="rounds", what="values of a beacon")
         from py_ecc import optimized_bls12_381
         from py_ecc.bls import hash_to_curve, point_compression
         from py_ecc.bls.typing import G1Compressed, G2Compressed
-    except ImportError as error:
-        raise InputError(
-            "values of a beacon need py_ecc: install ventbench[rounds] "
-            f"(pip install 'ventbench[rounds]'); import failed with: {error}"
-        ) from error
     finally:  # py_ecc raises it so far that deep JSON of a stranger would end the process
         sys.setrecursionlimit(limit)
     curve: Any = optimized_bls12_381
@@ -174,6 +168,3 @@ def chain_of(path: Path) -> Chain:
         return msgspec.convert(json.loads(path.read_text("utf-8")), Chain)
     except (OSError, ValueError) as error:
         raise InputError(f"{path} describes no beacon: {error}") from None
-
-
-_DECODER = msgspec.json.Decoder(Value)

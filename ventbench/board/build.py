@@ -16,7 +16,7 @@ import numpy as np
 
 from ventbench.base import files
 from ventbench.base.text import flatten
-from ventbench.board import canonical, comparison, drawings, frames, pages, ranking, store
+from ventbench.board import canonical, comparison, frames, pages, ranking, store
 from ventbench.board.frames import Line
 from ventbench.board.gate import Evidence
 from ventbench.board.ranking import BASELINES, Row, Track
@@ -39,13 +39,7 @@ SHOWN = [column for column in frames.COLUMNS if column.title]
 
 @dataclass(frozen=True)
 class Built:
-    """What a build did.
-
-    Attributes:
-        records: how many there are.
-        files: how many pages there are, CSV included.
-        changed: relative paths that were written or removed.
-    """
+    """What a build did: numbers of records and of files, and paths that were written or removed."""
 
     records: int
     files: int
@@ -54,9 +48,6 @@ class Built:
 
 def content(leaderboard: Store) -> dict[str, bytes]:
     """Return every built file by its path.
-
-    Args:
-        leaderboard: all of its records.
 
     Raises:
         InputError: if jinja2 is not installed.
@@ -77,13 +68,9 @@ def content(leaderboard: Store) -> dict[str, bytes]:
 
 
 def build(folder: Path, out: Path) -> Built:
-    """Write the site of a leaderboard: pages, CSV, and the records that they link to.
+    """Write the site of a leaderboard into a folder: pages, CSV, and the records that they link to.
 
     Only files that differ are written; pages of an earlier build that are no more are removed.
-
-    Args:
-        folder: of the leaderboard.
-        out: folder of the site.
 
     Raises:
         InputError: if a record was changed, or jinja2 is not installed.
@@ -171,10 +158,10 @@ def _track(track: Track) -> dict[str, Any]:
                 "cells": [column.cell(Line(track, "ranked", row)) for column in SHOWN],
                 "path": pages.address(row.record),
                 "baseline": row.record.name == BASELINES[track.name],
-                "plot": drawings.interval(row, low, high),
+                "plot": pages.interval_plot(row, low, high),
                 "hardware": None if measured is None else pages.hardware_shown(measured),
                 "name": row.record.name,
-                "profile": drawings.profile(row.record),
+                "profile": pages.profile(row.record),
             }
         )
     return {
@@ -228,7 +215,7 @@ def _entry_pages(
     """Return the pages of all entries of a track by their paths."""
     template = environment.get_template("entry.html.j2")
     base = track.baseline
-    other = None if base is None else drawings.paths(base)
+    other = None if base is None else pages.paths(base)
     made: dict[str, bytes] = {}
     for status, row in track.rows:
         name = row.record.name
@@ -237,7 +224,7 @@ def _entry_pages(
             continue
         same = base is not None and row.record.sha256 == base.sha256
         values = _values(Line(track, status, row), None if same else base, evidence)
-        drawn = drawings.panels(drawings.paths(row.record), None if same else other)
+        drawn = pages.panels(pages.paths(row.record), None if same else other)
         values["panels"] = [[pages.trusted(panel) for panel in lung] for lung in drawn]
         measured = (own for own in track.hardware if own.record.name == name)
         values["hardware"] = [pages.hardware_shown(own) for own in measured]
@@ -252,7 +239,7 @@ def _entry_pages(
 def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, Any]:
     track, status, row = line
     record, header = row.record, row.record.header
-    draws = drawings.dumbbells(record, base)
+    draws = pages.dumbbells(record, base)
     cells = {column.names[0]: column.cell(line) for column in SHOWN}
     return {
         "record": record,
@@ -268,26 +255,24 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
             for column in SHOWN
             if column.names[0] not in ("rank", "name", "normalised")
         ],
-        "scaled": drawings.heat_map(
-            record.headroom.normalised, record, drawings.NORMALISED_LIMITS, 0
-        ),
+        "scaled": pages.heat_map(record.headroom.normalised, record, pages.NORMALISED_LIMITS, 0),
         "compared": base.name if base else None,
-        "heat": drawings.heat_map(
-            np.concatenate([record.nominal[None], record.drawn]), record, drawings.ERROR_LIMITS
+        "heat": pages.heat_map(
+            np.concatenate([record.nominal[None], record.drawn]), record, pages.ERROR_LIMITS
         ),
-        "differences": drawings.difference_map(record, base) if base else None,
+        "differences": pages.difference_map(record, base) if base else None,
         "draws": draws,
-        "dots": pages.trusted(draws.drawing) if draws else None,
+        "dots": pages.trusted(draws["drawing"]) if draws else None,
         "safety": _safety(record),
         "failures": header.failures[:MAX_FAILURES],
-        "frames": [pages.trusted(drawings.frame(pip)) for pip in record.pips],
+        "frames": [pages.trusted(pages.frame(pip)) for pip in record.pips],
         "pips": [f"{pip:g}" for pip in record.pips],
         "lungs": [(name, *_setting(name)) for name in record.lungs],
         "breath": record.breath,
         "provenance": _provenance(header),
         "history": _history(row, evidence),
         "protocol": protocol,
-        "box": f"0 0 {drawings.WIDTH} {drawings.HEIGHT}",
+        "box": f"0 0 {pages.WIDTH} {pages.HEIGHT}",
     }
 
 

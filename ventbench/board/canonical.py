@@ -48,10 +48,7 @@ _PART = re.compile(
 
 
 def canonical(value: Any) -> bytes:
-    """Return the canonical text of a JSON value.
-
-    Args:
-        value: of dicts with text keys, lists or tuples, text, numbers, booleans and None.
+    """Return the canonical text of a JSON value: dicts by text, lists or tuples, and scalars.
 
     Raises:
         ValueError: if a number is not finite.
@@ -70,12 +67,8 @@ def digest(content: bytes) -> str:
 def parse(content: bytes, label: str) -> Any:
     """Read a canonical text, and no other one: not even with a space more or a key twice.
 
-    Args:
-        content: of the file.
-        label: names it in messages.
-
     Raises:
-        InputError: if it is not JSON, or not canonical.
+        InputError: if it is not JSON, or not canonical; ``label`` names it.
     """
     try:
         value = json.loads(content)
@@ -118,11 +111,7 @@ def named(name: str) -> bool:
 
 
 def walk(folder: Path) -> tuple[set[str], list[str]]:
-    """List a folder without following links.
-
-    Returns:
-        Relative paths of plain files, and those of links, devices and the like.
-    """
+    """List a folder, following no link: relative paths of plain files, and those of the rest."""
     plain: set[str] = set()
     odd: list[str] = []
     if folder.is_symlink():

@@ -57,13 +57,13 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Ranks:
-    """Ranks of N entries, in the order in which they were given.
+    """Ranks of N entries, in the order in which they were given, each of shape ``(N,)``.
 
     Attributes:
         better: whether row i is better than column j beyond doubt, shape ``(N, N)``.
-        rank: from 1, shape ``(N,)``; equal where entries cannot be told apart.
-        best: best rank that each may have, shape ``(N,)``.
-        worst: worst rank, shape ``(N,)``.
+        rank: from 1; equal where entries cannot be told apart.
+        best: best rank that each may have.
+        worst: worst rank.
     """
 
     better: Bools
@@ -110,13 +110,7 @@ def _line_of(k: int, source: Sequence[int | None]) -> list[int]:
 def p_values(values: Floats, rig: Ints, matters: float) -> Floats:
     """Probability of such a lead of row i over column j, did it not exceed what matters.
 
-    Args:
-        values: of each lung and draw, shape ``(N, L, K)``.
-        rig: of each lung and draw, shape ``(L, K)``.
-        matters: least difference that matters.
-
-    Returns:
-        Shape ``(N, N)``; 1 on the diagonal.
+    Takes what :func:`ranks` does; shape ``(N, N)``, 1 on the diagonal.
     """
     count, lungs, _ = values.shape
     means = values.mean(axis=(1, 2))
@@ -189,12 +183,8 @@ def sources(commands: Sequence[Floats]) -> list[int | None]:
 def _apart(own: Floats, other: Floats) -> Floats:
     """What is left of each run when another, times the factor that fits best, is taken off.
 
-    Args:
-        own: shape ``(runs, steps)``.
-        other: shape ``(..., runs, steps)``.
-
-    Returns:
-        Root mean square over that of the run, shape ``(..., runs)``.
+    Root mean square over that of the run, shape ``(..., runs)``, of ``(runs, steps)`` and
+    ``(..., runs, steps)``.
     """
     squares = [np.maximum((x**2).sum(axis=-1), _ROUNDING) for x in (own, other)]
     product = np.einsum("rs,...rs->...r", own, other)

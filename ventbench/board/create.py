@@ -5,12 +5,12 @@ A record also says where it was made, and, once amended, which record it correct
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import math
 import os
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from ventbench.base import VERSION, files
+from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.board import actions, canonical, record, schema
+from ventbench.board import canonical, record, schema, store
 from ventbench.board.record import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
 from ventbench.entries.folder import combined_hash, file_hashes
-from ventbench.entries.result import Score
+from ventbench.entries.result import Score, package_versions
 from ventbench.entries.runs import DRAWS, CellFailure, Runs
 from ventbench.task import draws as draw_tables
 from ventbench.task import stressors
@@ -35,7 +35,8 @@ from ventbench.task.draws import Draws
 #: How many failures keep their whole text, and how much of it the others keep, characters.
 _IN_FULL, _SHORT = 40, 240
 
-_PACKAGES = ("flax", "jax", "jaxlib", "numpy", "safetensors", "scipy")
+#: Packages besides those of every score.
+_PACKAGES = ("flax", "safetensors", "scipy")
 
 #: Instruction sets that decide how matrix products round, as /proc/cpuinfo names them, widest last.
 _ISA = ("asimd", "sve", "sve2", "sse4_2", "avx", "avx2", "fma", "avx512f")
@@ -43,23 +44,14 @@ _ISA = ("asimd", "sve", "sve2", "sse4_2", "avx", "avx2", "fma", "avx512f")
 
 @dataclass(frozen=True)
 class Draft:
-    """A new record and its commands, not yet in any folder.
-
-    Attributes:
-        content: bytes of the record.
-        commands: bytes of its action file.
-    """
+    """A new record and its commands as bytes of two files, not yet in any folder."""
 
     content: bytes
     commands: bytes
 
     def save(self, folder: Path) -> Path:
-        """Write both files, each named by its hash.
-
-        Returns:
-            The record's path, for ``ventbench board add``.
-        """
-        commands = folder / f"{canonical.digest(self.commands)}{actions.SUFFIX}"
+        """Write both files, each named by its hash; return the record's path."""
+        commands = folder / f"{canonical.digest(self.commands)}{canonical.ACTIONS_SUFFIX}"
         path = folder / f"{canonical.digest(self.content)}{record.SUFFIX}"
         files.write_atomically(commands, lambda file: file.write(self.commands))
         files.write_atomically(path, lambda file: file.write(self.content))
@@ -103,7 +95,7 @@ def create(
     if combined_hash(hashes) != score.submission.sha256:
         raise InputError(f"{label} was changed while it was scored; score it again")
     (replayed,) = replay(simulators, score.pips, [score.requested], score.rig_draws)
-    commands = actions.encode(score.requested)
+    commands = store.encode(score.requested)
     errors = np.concatenate([score.nominal[None], score.drawn])
     content: dict[str, Any] = {
         "format": schema.FORMAT,
@@ -145,7 +137,7 @@ def create(
         "actions": {
             "sha256": canonical.digest(commands),
             "bytes": len(commands),
-            "encoding": actions.ENCODING,
+            "encoding": schema.ENCODING,
             "shape": list(score.requested.shape),
         },
         "sandbox": None if sandbox is None else dict(sandbox),
@@ -211,28 +203,6 @@ def stress_digest(stressed: Runs) -> str:
     return canonical.digest(np.ascontiguousarray(stressed.requested, "<f8").tobytes())
 
 
-def keep(
-    folder: Path,
-    scores: Sequence[Score],
-    simulators: ReplayPlants,
-) -> list[Path]:
-    """Write the records of some scores.
-
-    Args:
-        folder: for records and commands.
-        scores: over all lungs, PIPs and published draws.
-        simulators: that they were scored on.
-
-    Returns:
-        Paths of the records, for ``ventbench board add``.
-
-    Raises:
-        InputError: as of :func:`create`; nothing has then been written.
-    """
-    drafts = [create(score, simulators) for score in scores]
-    return [draft.save(folder) for draft in drafts]
-
-
 def amend(
     path: Path,
     *,
@@ -240,12 +210,12 @@ def amend(
     reason: str = "",
     source: Mapping[str, str] | None = None,
 ) -> Path:
-    """Say which record a new one corrects, and where its submission came from.
+    """Say which record a new one corrects and why, and where its submission came from.
 
-    The amended record is a file of its own, beside the given one.
+    The amended record is a file of its own, beside the given one, whose commands lie there too.
 
     Args:
-        path: of the record; its commands lie beside it.
+        path: of the record.
         supersedes: SHA-256 of the record that it corrects.
         reason: why, for the page.
         source: where the submission came from, such as its commit; joins what is there.
@@ -279,12 +249,10 @@ def amend(
 
 def versions() -> dict[str, str]:
     """Versions of Python and packages, and the hash of the lock file where there is one."""
-    known = {"ventbench": VERSION, "python": platform.python_version()}
+    known = package_versions()
     for name in _PACKAGES:
-        try:
+        with contextlib.suppress(metadata.PackageNotFoundError):
             known[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     lock = Path(files.__file__).parent.resolve().parent.parent / "requirements.lock"
     if lock.is_file():
         known["requirements.lock"] = files.sha256(lock)
@@ -296,22 +264,18 @@ def machine() -> dict[str, Any]:
     info = _cpuinfo()
     flags = set(info.get("flags", info.get("Features", "")).split())
     limit = re.search(r"--xla_cpu_max_isa=(\w+)", os.environ.get("XLA_FLAGS", ""))
+    kernel = system = f"{platform.system()} {platform.release()}"
+    with contextlib.suppress(OSError, KeyError):
+        system = platform.freedesktop_os_release()["PRETTY_NAME"]
     return {
-        "system": _system(),
-        "kernel": f"{platform.system()} {platform.release()}",
+        "system": system,
+        "kernel": kernel,
         "architecture": platform.machine(),
         "cpu": info.get("model name", platform.processor()),
         "isa": [name for name in _ISA if name in flags],
         "isa_limit": limit[1] if limit else None,
         "cores": os.cpu_count() or 0,
     }
-
-
-def _system() -> str:
-    try:
-        return platform.freedesktop_os_release()["PRETTY_NAME"]
-    except (OSError, KeyError):
-        return f"{platform.system()} {platform.release()}"
 
 
 def _cpuinfo() -> dict[str, str]:
@@ -336,9 +300,7 @@ def trace(replayed: Replayed) -> dict[str, Any]:
 
 def _plain(values: Floats) -> Any:
     """Nested lists, null for NaN."""
-    if values.ndim:
-        return [_plain(row) for row in values]
-    return float(values) if math.isfinite(values) else None
+    return files.json_values(values.tolist())
 
 
 def _failure(score: Score, failure: CellFailure, in_full: bool) -> dict[str, Any]:

@@ -226,20 +226,12 @@ def load_board(folder: Path | str | None = None, *, track: str | None = None) ->
 
 
 def load_cells(folder: Path | str | None = None, *, track: str | None = None) -> pd.DataFrame:
-    """Read every cell of every entry: one row a lung, PIP and draw.
+    """Read every cell of every entry: one row a lung, PIP and draw; see :func:`load_board`.
 
     Columns: ``track``, ``draws``, ``name``, ``lung``, ``pip`` (cmH2O), ``draw`` (0 is the nominal
     run, draws count from 1), ``error_cmH2O`` (mean absolute error over the scored
     inspirations; NaN if the cell failed), ``peak_cmH2O`` (highest pressure, to 0.01) and
     ``steps_above`` (longest time above the safety limit, control steps).
-
-    Args:
-        folder: of the leaderboard; ``leaderboard`` in the working directory by default.
-        track: ``"performance"`` or ``"robustness"``; both by default.
-
-    Raises:
-        InputError: if there is no leaderboard, a record was changed, or the track is not there.
-        OSError: if a file cannot be read.
     """
     import numpy as np
     import pandas as pd
@@ -290,10 +282,7 @@ def lines(tracks: Sequence[Track]) -> list[Line]:
 
 
 def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
-    """List every record of a leaderboard: whose each file is.
-
-    Args:
-        folder: of the leaderboard; ``leaderboard`` in the working directory by default.
+    """List every record of a leaderboard: whose each file is; errors as of :func:`load_board`.
 
     Returns:
         For each record ``record`` and ``commands`` (SHA-256, or None: they name the files in
@@ -301,9 +290,6 @@ def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
         ``name`` (of what is withdrawn, for a withdrawal), ``created`` (UTC) and ``state``:
         ``"ranked"``, ``"practice"``, ``"not ranked"``, ``"not official"``, ``"superseded"``,
         ``"withdrawn"``, or empty for what has none.
-
-    Raises:
-        InputError: if there is no leaderboard, or a record was changed.
     """
     leaderboard = _loaded(folder)
     shown = lines(ranking.board(leaderboard))
@@ -332,14 +318,9 @@ def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
 
 
 def cell_means(record: Record, lung: str) -> dict[str, float | None]:
-    """Normalised scores over the ranked draws of one lung by PIP, or of all lungs.
+    """Normalised scores over the ranked draws of one lung by PIP, or of ``"all"`` by lung.
 
-    Args:
-        record: of an entry.
-        lung: id of a lung, or ``"all"``.
-
-    Returns:
-        By lung or by PIP, with their mean; None where a cell failed.
+    The last is their mean; None where a cell failed.
 
     Raises:
         InputError: if the record has no such lung.

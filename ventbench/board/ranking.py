@@ -75,13 +75,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A score, and its differences to others.
+    """A score as mean over draws, and of the middle half of all runs, and differences to others.
 
-    Attributes:
-        score: mean over draws.
-        to_baseline: difference to the track's PID; None for the PID itself, or without one.
-        to_above: difference to the entry above; None for the first.
-        middle: mean of the middle half of all runs.
+    There is none to the baseline for the track's PID itself or without one, and none to the entry
+    above for the first.
     """
 
     score: Interval
@@ -311,15 +308,9 @@ def _commands(leaderboard: Store, record: Record) -> Floats:
 
 
 def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Row]:
-    """Rank complete entries.
+    """Rank complete entries, in any order, all over the same draws of a track.
 
-    Args:
-        entries: to be ranked, in any order; all over the same draws.
-        track: that they are on.
-        ranks: whether their order is a ranking, not only practice.
-
-    Returns:
-        Best first; entries of equal score by name.
+    Best first, those of equal score by name; without ``ranks`` the order is only practice.
     """
     ordered = sorted(entries, key=lambda e: (_rounded(e.record.ranked_values), e.record.name))
     if not ordered:

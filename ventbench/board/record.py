@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,14 +30,11 @@ from ventbench.task.stressors import condition_of
 #: What the key ``track`` says of every such record.
 TRACK = "hardware"
 
-#: Recorded errors may differ from those of the pressures, which are rounded to 0.001, cmH2O.
-_TOLERANCE = 0.001
+#: Recorded pressures are rounded so: errors and peaks may differ from theirs by it, cmH2O.
+_ROUNDED = 0.001
 
 #: Most of the way from PEEP to PIP that a lung may be before the first command acts.
 _HALF_WAY = 0.5
-
-# Recorded pressures are rounded to 0.001 cmH2O.
-_ROUNDED = 0.001
 
 #: Most repetitions of one cell.
 MAX_REPEATS = 100
@@ -194,7 +192,7 @@ class Record(schema.Submitted):
         return self.headroom.normalised[1:].mean(axis=2).T
 
 
-class Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Device(schema.Table, frozen=True):
     """What ran: the ventilator's own computer, as it says of itself, and what the host knows.
 
     Attributes:
@@ -213,7 +211,7 @@ class Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     about: schema.FreeForm
 
 
-class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Stop(schema.Table, frozen=True):
     """A run that a safety check or a failure of the controller ended; it has no error."""
 
     lung: schema.LungId
@@ -222,7 +220,7 @@ class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     reason: schema.Text
 
 
-class HardwareTrace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HardwareTrace(schema.Table, frozen=True):
     """Scored inspirations of every run, ``(L, P, K)``; null for a stopped run.
 
     Each run is ``(scored breaths, INSPIRATION_STEPS)``.
@@ -232,7 +230,7 @@ class HardwareTrace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     u_in_tenths_percent: list[list[list[_Run]]]
 
 
-class Recording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Recording(schema.Table, frozen=True):
     """The raw recording: a file of the laboratory that the record names by its hash."""
 
     sha256: schema.Sha256
@@ -313,14 +311,7 @@ class HardwareRecord(schema.Submitted):
 
 @dataclass(frozen=True)
 class Withdrawal:
-    """Takes a record back; its entry is not ranked until a newer one arrives.
-
-    Attributes:
-        sha256: of its bytes: its name.
-        withdraws: SHA-256 of the record.
-        reason: for the page.
-        created: UTC.
-    """
+    """Takes a record back; its entry is not ranked until a newer one arrives."""
 
     sha256: str
     withdraws: str
@@ -342,12 +333,9 @@ def created_of(entry: AnyRecord) -> str:
 
 
 def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
-    """Read and check a record.
+    """Read and check a record; ``label`` names the file in messages.
 
-    Args:
-        content: of the file.
-        label: names the file in messages.
-        strict: also check the canonical form; not needed where the hash is known to be right.
+    Where the hash is known to be right, it need not be ``strict``: the canonical form is as it was.
 
     Raises:
         InputError: if it is not a record.
@@ -373,18 +361,14 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
         u_in=np.array(values.trace.u_in_tenths_percent) / 10.0,
         peak=np.array(values.safety.peak_centi_cmH2O) / 100.0,
         steps_above=np.array(values.safety.steps_above),
-        headroom=_headroom(values),
+        headroom=RecordHeadroom(
+            np.array(values.rigs.session),
+            np.array(values.rigs.member),
+            np.array(values.headroom.error, float),
+            np.array(values.headroom.attainable, float),
+            np.array(values.headroom.pid, float),
+        ),
         stress=_stress(values, label),
-    )
-
-
-def _headroom(values: schema.ScoreContent) -> RecordHeadroom:
-    return RecordHeadroom(
-        np.array(values.rigs.session),
-        np.array(values.rigs.member),
-        np.array(values.headroom.error, float),
-        np.array(values.headroom.attainable, float),
-        np.array(values.headroom.pid, float),
     )
 
 
@@ -436,22 +420,9 @@ def load(path: Path, *, strict: bool = True) -> AnyRecord:
 
 
 def withdrawal(withdraws: str, reason: str, now: datetime | None = None) -> bytes:
-    """Return the bytes of a record that takes another one back.
-
-    Args:
-        withdraws: SHA-256 of the other one.
-        reason: for the page.
-        now: time of the record; the clock's if not given.
-    """
-    return canonical.canonical(
-        {
-            "format": schema.FORMAT,
-            "kind": "withdrawal",
-            "created": timestamp(now),
-            "withdraws": withdraws,
-            "reason": reason,
-        }
-    )
+    """Return the bytes of a record that takes another one, named by its SHA-256, back."""
+    about = {"format": schema.FORMAT, "kind": "withdrawal", "created": timestamp(now)}
+    return canonical.canonical({**about, "withdraws": withdraws, "reason": reason})
 
 
 def timestamp(now: datetime | None = None) -> str:
@@ -460,38 +431,62 @@ def timestamp(now: datetime | None = None) -> str:
 
 
 def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecord:
-    """Check what ties the keys of a hardware record together.
+    """Check what ties the keys of a hardware record together, and what it says of its pressures.
+
+    Errors, highest pressure, safety, the pressure before the first command acts, and that no two
+    breaths of a lung are equal to the last digit.
 
     Raises:
         InputError: naming the first key that is wrong.
     """
     schema.check_free(content.device.about, f"{label}, key device.about")
     _check_tables(content, label)
-    errors = np.array(content.errors, float)
-    pressures = content.trace.pressure_milli_cmH2O
-    for lung, pip, repeat in np.ndindex(*errors.shape):
-        run = pressures[lung][pip][repeat]
-        recorded = errors[lung, pip, repeat]
-        place = f"{content.lungs[lung]}, PIP {content.pips[pip]:g}, repetition {repeat + 1}"
-        if (run is None) != np.isnan(recorded):
-            raise InputError(f"{label}, key errors: {place} has an error without pressures")
-        if run is None:
-            continue
-        given = float(np.mean(np.abs(np.array(run) / 1000.0 - content.pips[pip])))
-        if abs(given - recorded) > _TOLERANCE:
+    errors, missing = np.array(content.errors, float), set()
+    seen: set[bytes] = set()
+    for at, lung in enumerate(content.lungs):
+        highest, safe = -np.inf, True
+        for j, k in np.ndindex(*errors.shape[1:]):
+            pip, recorded = content.pips[j], errors[at, j, k]
+            run = content.trace.pressure_milli_cmH2O[at][j][k]
+            where = f"{lung}, PIP {pip:g}, repetition {k + 1}"
+            if (run is None) != np.isnan(recorded):
+                raise InputError(f"{label}, key errors: {where} has an error without pressures")
+            if run is None:
+                missing.add((lung, pip, k + 1))
+                continue
+            pressure = np.array(run) / 1000.0
+            given = float(np.mean(np.abs(pressure - pip)))
+            if abs(given - recorded) > _ROUNDED:
+                raise InputError(
+                    f"{label}, key errors: {where} says {recorded:.4f} cmH2O, its pressures give "
+                    f"{given:.4f}"
+                )
+            highest = max(highest, float(pressure.max()))
+            safe &= bool(np.all(passes_safety_gate(pressure, pip, protocol.DT)))
+            first = float(np.abs(pressure[:, 0] - protocol.PEEP).max())
+            if first > _HALF_WAY * (pip - protocol.PEEP):
+                raise InputError(
+                    f"{label}, key trace: {where} begins {first:.1f} cmH2O from PEEP, before any "
+                    "command acts"
+                )
+            for breath in pressure:
+                if breath.tobytes() in seen and not content.device.emulated:
+                    raise InputError(
+                        f"{label}, key trace: {where} repeats a breath to the last digit"
+                    )
+                seen.add(breath.tobytes())
+        if content.peak_pressure_cmH2O[at] < highest - _ROUNDED:
             raise InputError(
-                f"{label}, key errors: {place} says {recorded:.4f} cmH2O, its pressures give "
-                f"{given:.4f}"
+                f"{label}, key peak_pressure_cmH2O: {lung} says "
+                f"{content.peak_pressure_cmH2O[at]:.3f}, its pressures reach {highest:.3f}"
             )
-    stopped = {(stop.lung, stop.pip, stop.repeat) for stop in content.stops}
-    missing = {
-        (content.lungs[lung], content.pips[pip], repeat + 1)
-        for lung, pip, repeat in np.argwhere(np.isnan(errors)).tolist()
-    }
-    if stopped != missing or len(stopped) != len(content.stops):
+        if content.safe[at] and not safe:
+            raise InputError(
+                f"{label}, key safe: {lung} says true, its pressures are above the limit"
+            )
+    stopped = [(stop.lung, stop.pip, stop.repeat) for stop in content.stops]
+    if set(stopped) != missing or len(stopped) != len(missing):
         raise InputError(f"{label}, key stops: do not fit the errors")
-    for problem in _measured_problems(content):
-        raise InputError(f"{label}, {problem}")
     return HardwareRecord(sha256, content, errors)
 
 
@@ -502,62 +497,15 @@ def _check_tables(content: HardwareContent, label: str) -> None:
     if not set(content.pips) <= set(protocol.PIPS):
         raise InputError(f"{label}, key pips: are not those of the protocol")
     run = (len(protocol.SCORED_BREATHS), protocol.INSPIRATION_STEPS)
-    tables: tuple[tuple[str, Any], ...] = (
-        ("errors", content.errors),
-        ("trace.pressure_milli_cmH2O", content.trace.pressure_milli_cmH2O),
-        ("trace.u_in_tenths_percent", content.trace.u_in_tenths_percent),
+    traces = ("trace.pressure_milli_cmH2O", "trace.u_in_tenths_percent")
+    shapes = dict.fromkeys(("errors", *traces), size)
+    schema.check_shapes(
+        content, label, shapes | {"safe": size[:1], "peak_pressure_cmH2O": size[:1]}
     )
-    for key, table in tables:
-        if not schema.has_shape(table, size):
-            raise InputError(f"{label}, key {key}: does not have the shape {size}")
-        if key == "errors":
-            continue
+    for key in traces:
+        table = attrgetter(key)(content)
         runs = [cell for row in table for cells in row for cell in cells if cell is not None]
         if not all(schema.has_shape(cell, run) for cell in runs):
             raise InputError(f"{label}, key {key}: a run does not have the shape {run}")
-    for key, values in (
-        ("safe", content.safe),
-        ("peak_pressure_cmH2O", content.peak_pressure_cmH2O),
-    ):
-        if len(values) != size[0]:
-            raise InputError(f"{label}, key {key}: does not have one value a lung")
     if content.simulated_track not in content.submission.manifest.tracks:
         raise InputError(f"{label}, key simulated_track: the submission does not enter it")
-
-
-def _measured_problems(content: HardwareContent) -> list[str]:
-    """What a hardware record says of its pressures and they do not, by key.
-
-    Highest pressure, safety, the pressure before the first command acts, and that no two breaths of
-    a lung are equal to the last digit. Types, ranges and shapes must be right.
-    """
-    problems: list[str] = []
-    seen: set[bytes] = set()
-    for at, lung in enumerate(content.lungs):
-        highest, safe = -np.inf, True
-        for pip, cell in zip(content.pips, content.trace.pressure_milli_cmH2O[at], strict=True):
-            for repeat, run in enumerate(cell, 1):
-                if run is None:
-                    continue
-                pressure = np.array(run) / 1000.0
-                where = f"{lung}, PIP {pip:g}, repetition {repeat}"
-                highest = max(highest, float(pressure.max()))
-                safe &= bool(np.all(passes_safety_gate(pressure, pip, protocol.DT)))
-                first = float(np.abs(pressure[:, 0] - protocol.PEEP).max())
-                if first > _HALF_WAY * (pip - protocol.PEEP):
-                    problems.append(
-                        f"key trace: {where} begins {first:.1f} cmH2O from PEEP, before any "
-                        "command acts"
-                    )
-                for breath in pressure:
-                    if breath.tobytes() in seen and not content.device.emulated:
-                        problems.append(f"key trace: {where} repeats a breath to the last digit")
-                    seen.add(breath.tobytes())
-        if content.peak_pressure_cmH2O[at] < highest - _ROUNDED:
-            problems.append(
-                f"key peak_pressure_cmH2O: {lung} says {content.peak_pressure_cmH2O[at]:.3f}, its "
-                f"pressures reach {highest:.3f}"
-            )
-        if content.safe[at] and not safe:
-            problems.append(f"key safe: {lung} says true, its pressures are above the limit")
-    return problems

@@ -57,22 +57,15 @@ _CENTI, _TENTH = 0.005 + 1e-6, 0.05 + 1e-6
 
 
 class ReplayPlants(Protocol):
-    """What :func:`ventbench.plants.frozen.load` returns.
-
-    Attributes:
-        plants: stacked over the lungs.
-        ensemble: the plants of every seed, stacked over members, then lungs.
-    """
+    """What :func:`ventbench.plants.frozen.load` returns."""
 
     @property
     def plants(self) -> Any:
-        """See the class."""
-        ...
+        """Stacked over the lungs."""
 
     @property
     def ensemble(self) -> Any:
-        """See the class."""
-        ...
+        """The plants of every seed, stacked over members, then lungs."""
 
     def about(self) -> Mapping[str, Any]:
         """Version and hashes, as they go into a record."""
@@ -160,16 +153,13 @@ def pressures(
     requested: Floats,
     draws: Draws | None,
 ) -> Floats:
-    """Airway pressures that commands give.
+    """Airway pressures that commands of L lungs give, cmH2O, shape of ``requested``.
 
     Args:
         simulators: L lungs.
         pips: cmH2O, length P.
         requested: %, shape ``(N, L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``, nominal cells first.
         draws: K of them; None for nominal cells alone.
-
-    Returns:
-        cmH2O, shape of ``requested``.
     """
     with precision.float64():
         plants, cells = rigs_of(simulators).cells(draws, pips)
@@ -208,15 +198,10 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
 
 
 def draws_of(header: ScoreHeader, simulators: ReplayPlants, rounds: Mapping[str, Round]) -> Draws:
-    """Make the draws that a record names again.
-
-    Args:
-        header: of the record.
-        simulators: that it names.
-        rounds: that have draws, by name.
+    """Make the draws that a record names again: the development draws, or those of a round by name.
 
     Raises:
-        InputError: if the draws are neither the development draws nor those of a round.
+        InputError: if they are neither.
     """
     recorded, rigs = header.draws.about(), rigs_of(simulators)
     own = rounds.get(header.draws.season)
@@ -286,12 +271,7 @@ def deviation(record: Record, replayed: Replayed) -> float:
 
 
 def differences(record: Record, replayed: Replayed) -> list[str]:
-    """What differs, by key of the record; empty if the record is what its commands give.
-
-    Args:
-        record: as it was written.
-        replayed: from its commands.
-    """
+    """What differs, by key of the record; empty if the record is what its commands give."""
     header, clipped = record.header, record.header.clipped
     size = int(np.prod(header.actions.shape))
     failed = np.isnan(record.nominal).any(axis=1) | np.isnan(record.drawn).any(axis=(0, 2))
@@ -300,12 +280,7 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("errors.drawn", record.drawn, replayed.drawn, TOLERANCE),
         ("spread", record.spread, replayed.spread, TOLERANCE),
         ("safe", header.safe, replayed.safe & ~failed, 0.0),
-        (
-            "peak_pressure_cmH2O",
-            header.peak_pressure_cmH2O,
-            replayed.peak.max(axis=(0, 2)),
-            TOLERANCE,
-        ),
+        ("peak_pressure_cmH2O", header.peak_pressure_cmH2O, replayed.peak.max((0, 2)), TOLERANCE),
         ("safety.peak_centi_cmH2O", record.peak, replayed.peak, _CENTI),
         ("safety.steps_above", record.steps_above, replayed.steps_above, 0.0),
         ("clipped.below", clipped.below, replayed.below, 0.0),

@@ -6,7 +6,6 @@ stress track. No file of an earlier run is trusted; several processes can share 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.base import files
-from ventbench.base.arrays import Bools, Floats
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.board import canonical, create, store
@@ -26,6 +25,7 @@ from ventbench.entries.folder import Submission, file_hashes, open_submission
 from ventbench.entries.runner import Runner
 from ventbench.entries.runs import Runs
 from ventbench.entries.scoring import run_protocol
+from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import stressors
 
@@ -56,7 +56,6 @@ class Outcome:
         state: ``"reproduced"``, ``"different"`` or ``"not re-run"``.
         detail: what differs, or why it was not run again; for a reproduced record how close its
             commands are.
-        seconds: that the run took.
     """
 
     record: str
@@ -64,7 +63,6 @@ class Outcome:
     track: str
     state: str
     detail: str = ""
-    seconds: float = 0.0
 
     def __str__(self) -> str:
         detail = f": {self.detail}" if self.detail else ""
@@ -82,17 +80,6 @@ def sandboxed() -> Runner:
     return SandboxRunner(require_official=True)
 
 
-def frozen_simulators() -> ReplayPlants:
-    """The frozen simulators.
-
-    Raises:
-        InputError: if they were changed.
-    """
-    from ventbench.plants import frozen
-
-    return frozen.load()
-
-
 def rerun(
     folder: Path,
     *,
@@ -100,7 +87,7 @@ def rerun(
     sources: Sequence[Path] = (),
     jobs: int = 1,
     scheduler: str | None = None,
-    load: Callable[[], ReplayPlants] = frozen_simulators,
+    load: Callable[[], ReplayPlants] = frozen.load,
     runner: Callable[[], Runner] = sandboxed,
     progress: Callable[[Outcome], None] | None = None,
 ) -> list[Outcome]:
@@ -184,7 +171,6 @@ def _run(
     score = store.find_record(store.load(folder), sha256, Record)
     assert isinstance(score, Record)
     simulators, apart = load(), runner()
-    begun = time.perf_counter()
     try:
         submission = open_submission(str(code))
         _check_same(submission, score)
@@ -207,9 +193,8 @@ def _run(
             closeness += f", stress {'to the bit' if same else 'within tolerance'}"
     except (InputError, FloatingPointError) as error:
         detail, closeness = f"its code cannot be run: {error}", ""
-    seconds = round(time.perf_counter() - begun, 1)
     state = DIFFERENT if detail else REPRODUCED
-    return Outcome(score.sha256, score.name, score.track, state, detail or closeness, seconds)
+    return Outcome(score.sha256, score.name, score.track, state, detail or closeness)
 
 
 def _check_same(submission: Submission, score: Record) -> None:
@@ -244,25 +229,15 @@ def _closeness(recorded: Floats, again: Floats) -> str:
     """Say how close commands of equal shape are."""
     if recorded.shape != again.shape:
         return ""
-    if not _bits_apart(recorded, again).any():
+    if recorded.tobytes() == again.tobytes():
         return "to the bit"
     return f"commands within {np.abs(recorded - again).max():.1e} %"
 
 
-def _bits_apart(recorded: Floats, again: Floats) -> Bools:
-    bits = (np.ascontiguousarray(x, np.float64).view(np.uint64) for x in (recorded, again))
-    return np.not_equal(*bits)
-
-
 def difference(score: Record, recorded: Floats, again: Floats) -> str:
-    """Describe how commands differ from the recorded ones; empty if they agree.
+    """Describe how commands ``(L, 1 + K, P, BREATHS, STEPS)`` differ; empty if they agree.
 
     They agree within `COMMAND_TOLERANCE`, of which a processor's last bits are a small part.
-
-    Args:
-        score: whose commands they are.
-        recorded: %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
-        again: commands of the second run, of the same shape.
     """
     if recorded.shape != again.shape:
         return f"commands of shape {again.shape}, {recorded.shape} in the record"

@@ -7,10 +7,8 @@ result says why.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +28,7 @@ from ventbench.entries.reference import Reference
 from ventbench.entries.runner import Runner
 from ventbench.entries.runs import DRAWS
 from ventbench.entries.scoring import run_protocol
+from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import attainable, protocol
 
@@ -41,21 +40,6 @@ Load = Callable[[], ReplayPlants]
 Progress = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class Scored:
-    """What became of an entry on a track.
-
-    Attributes:
-        record: path of the draft of its record; empty if it could not be run.
-        failed: why not.
-        seconds: that it took.
-    """
-
-    record: str = ""
-    failed: str = ""
-    seconds: float = 0.0
-
-
 def plan(own: Round) -> list[tuple[str, str]]:
     """Name and track of every run of a round that has draws.
 
@@ -65,11 +49,6 @@ def plan(own: Round) -> list[tuple[str, str]]:
     if own.state != "drawn" or own.frozen is None:
         raise InputError(f"round {own.name} is {own.state}; it is scored once it is drawn")
     return [(entry.name, track) for entry in own.frozen.entries for track in entry.tracks]
-
-
-def processor_time(runs: Iterable[tuple[str, str]]) -> float:
-    """Estimate what runs of :func:`plan` take besides the bounds, by :data:`SECONDS`, s."""
-    return sum(SECONDS[track] for _, track in runs)
 
 
 def code_of(own: Round, places: Iterable[Path]) -> dict[str, Path]:
@@ -119,7 +98,7 @@ def score(
     work: Path,
     *,
     places: Iterable[Path],
-    load: Load = rerun.frozen_simulators,
+    load: Load = frozen.load,
     runner: Callable[[], Runner] = rerun.sandboxed,
     secret: str | None = None,
     starts: tuple[int, ...] = attainable.STARTS,
@@ -162,16 +141,16 @@ def score(
     }  # fmt: skip
     tell("entries", len(runs) - len(jobs), len(runs))
     for count, (job, scored) in enumerate(results(pool, _score_entry, jobs), 1):
-        done.put(job, asdict(scored))
+        done.put(job, scored)
         tell("entries", len(runs) - len(jobs) + count, len(runs))
     records: dict[str, str] = {}
     failed: dict[str, str] = {}
     for at, (entry, track) in enumerate(runs):
-        scored, key = Scored(**done.read(f"{entry}-{track}")), f"{entry} ({track})"
-        if scored.failed:
-            failed[key] = scored.failed[: schema.MAX_TEXT]
+        scored, key = done.read(f"{entry}-{track}"), f"{entry} ({track})"
+        if "failed" in scored:
+            failed[key] = scored["failed"][: schema.MAX_TEXT]
             continue
-        path = Path(scored.record)
+        path = Path(scored["record"])
         kept = leaderboard / canonical.RECORDS / path.name
         if not kept.exists():
             store.add(leaderboard, path, simulators)
@@ -187,9 +166,8 @@ def score(
 def _score_entry(
     leaderboard: Path, name: str, code: Path, track: str, work: Path, load: Load,
     runner: Callable[[], Runner],
-) -> Scored:  # fmt: skip
-    """Score one entry on one track, and keep the draft of its record."""
-    begun = time.perf_counter()
+) -> dict[str, str]:  # fmt: skip
+    """Score one entry on one track; return the path of its record's draft, or why it failed."""
     own, simulators = rounds.load(leaderboard, name), load()
     rigs = rigs_of(simulators)
     drawn = own.draws(rigs)
@@ -205,8 +183,8 @@ def _score_entry(
         draft = create.create(result, simulators, source=about)
         path = draft.save(work / "drafts")
     except (InputError, FloatingPointError) as error:
-        return Scored(failed=str(error), seconds=round(time.perf_counter() - begun, 1))
-    return Scored(str(path), seconds=round(time.perf_counter() - begun, 1))
+        return {"failed": str(error)}
+    return {"record": str(path)}
 
 
 def _silent(what: str, done: int, count: int) -> None:

@@ -16,12 +16,11 @@ fixed by the time of the freeze. A round whose chain is not the pinned public on
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 import tomli_w
@@ -51,14 +50,9 @@ _MAX_BYTES = 5_000_000
 
 _Name = Annotated[str, schema.matching(canonical.ROUND_NAME)]
 _Account = Annotated[str, schema.matching(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,62}[A-Za-z0-9])?")]
-TableT = TypeVar("TableT", bound="_Table")
 
 
-class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table with exactly these keys."""
-
-
-class Opened(_Table, frozen=True):
+class Opened(schema.Table, frozen=True):
     """Content of ``round.toml``.
 
     Attributes:
@@ -85,7 +79,7 @@ class Opened(_Table, frozen=True):
         return self.chain != QUICKNET
 
 
-class Request(_Table, frozen=True):
+class Request(schema.Table, frozen=True):
     """Who asked for an entry, as the platform says, never the entry itself, and when."""
 
     name: schema.EntryName
@@ -93,7 +87,7 @@ class Request(_Table, frozen=True):
     asked: datetime
 
 
-class Entered(_Table, frozen=True):
+class Entered(schema.Table, frozen=True):
     """A frozen entry; entries of the project have no account."""
 
     name: schema.EntryName
@@ -102,22 +96,22 @@ class Entered(_Table, frozen=True):
     tracks: list[schema.Track]
 
 
-class Frozen(_Table, frozen=True):
+class Frozen(schema.Table, frozen=True):
     """Content of ``frozen.toml``; ``left_out`` says why an entry that was asked for is not in."""
 
     round: schema.Sha256
     protocol: schema.Sha256
     frozen: datetime
     entries: Annotated[list[Entered], msgspec.Meta(min_length=1)]
-    left_out: dict[str, str] = {}
+    left_out: dict[str, str] = msgspec.field(default_factory=dict)
 
 
-class Result(_Table, frozen=True):
+class Result(schema.Table, frozen=True):
     """Content of ``result.json``: by entry and track a record, or why there is none."""
 
     bounds: schema.Sha256
     records: dict[str, schema.Sha256]
-    failed: dict[str, str] = {}
+    failed: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -222,15 +216,10 @@ def load(leaderboard: Path, name: str) -> Round:
     made = Round(folder, opened, frozen, frozen_sha256=files.sha256(folder / FROZEN))
     if not (folder / BEACON).exists():
         return made
-    path = folder / BEACON
-    canonical.parse(path.read_bytes(), str(path))
-    value = beacon.read(path.read_bytes(), str(path))
-    beacon.check(value, opened.chain, made.number, str(path))
-    result = None
-    if (folder / RESULT).exists():
-        path = folder / RESULT
-        canonical.parse(path.read_bytes(), str(path))
-        result = schema.decoded(_RESULT, path.read_bytes(), str(path))
+    value = schema.read_canonical(beacon.DECODER, folder / BEACON)
+    beacon.check(value, opened.chain, made.number, str(folder / BEACON))
+    there = (folder / RESULT).exists()
+    result = schema.read_canonical(_RESULT, folder / RESULT) if there else None
     return Round(folder, opened, frozen, value, result, made.frozen_sha256)
 
 
@@ -361,13 +350,7 @@ def _owners(leaderboard: Path) -> dict[str, str]:
 
 
 def draw(leaderboard: Path, name: str, content: bytes, *, now: datetime | None = None) -> Round:
-    """Take the beacon's value.
-
-    Args:
-        leaderboard: its folder.
-        name: of the round.
-        content: value as relays publish it.
-        now: the clock's if not given.
+    """Take the beacon's value, as relays publish it.
 
     Raises:
         InputError: if the round is not frozen, the time has not come, or the value is not the one
@@ -430,15 +413,11 @@ def _seconds(when: datetime | None) -> datetime:
     return (when or datetime.now(UTC)).astimezone(UTC).replace(microsecond=0)
 
 
-def _toml(path: Path, kind: type[TableT]) -> TableT:
+def _toml(path: Path, kind: type[schema.TableT]) -> schema.TableT:
     try:
-        if path.is_symlink() or path.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{path} is a link, or larger than {_MAX_BYTES} bytes")
-        table = msgspec.convert(tomllib.loads(path.read_text("utf-8")), kind)
+        table = schema.read_toml(path, kind, _MAX_BYTES)
     except FileNotFoundError:
         raise InputError(f"{path} is not there: there is no such round") from None
-    except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or not of this form
-        raise InputError(f"{path}: {error}") from None
     for key in ("opened", "closes", "frozen"):
         when = getattr(table, key, None)
         if isinstance(when, datetime) and when.tzinfo is None:

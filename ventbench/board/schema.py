@@ -8,15 +8,18 @@ and pages need not; text is escaped where it is shown. msgspec checks types and 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
 from datetime import datetime
+from operator import attrgetter
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from ventbench.base.errors import InputError
 from ventbench.base.text import deceptive, plain
-from ventbench.board import actions
+from ventbench.board import canonical
 from ventbench.entries.folder import CONTROLLER, combined_hash
 from ventbench.entries.manifest import FAMILIES, MANIFEST, NAME, TRACKS
 from ventbench.task import protocol
@@ -24,6 +27,9 @@ from ventbench.task.lungs import LUNG_IDS
 
 #: What every record says of its form: records of another one are not read.
 FORMAT, PROTOCOL = 1, 2
+
+#: How the bytes of commands are laid out in their file, see :mod:`ventbench.board.store`.
+ENCODING = "zlib, byte planes of little-endian float64"
 
 #: Largest record, bytes.
 MAX_BYTES = 2 * 2**20
@@ -80,11 +86,14 @@ FreeForm = dict[str, Any]
 T = TypeVar("T")
 
 
-class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A JSON object with exactly these keys."""
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A JSON object or a table of TOML with exactly these keys."""
 
 
-class RecordedManifest(_Table, frozen=True):
+TableT = TypeVar("TableT", bound=Table)
+
+
+class RecordedManifest(Table, frozen=True):
     """What the authors say about a submission; see :class:`ventbench.entries.manifest`."""
 
     name: EntryName
@@ -97,7 +106,7 @@ class RecordedManifest(_Table, frozen=True):
     training: FreeForm
 
 
-class RecordedSubmission(_Table, frozen=True):
+class RecordedSubmission(Table, frozen=True):
     """What was scored: the SHA-256 of all files together and of each by its path."""
 
     sha256: Sha256
@@ -121,7 +130,7 @@ class Submitted:
         return self.manifest.name
 
 
-class Draws(_Table, frozen=True):
+class Draws(Table, frozen=True):
     """The draws, keys in the order of pages: ``sha256`` is the commitment of their seed."""
 
     count: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
@@ -134,21 +143,21 @@ class Draws(_Table, frozen=True):
         return msgspec.structs.asdict(self)
 
 
-class Errors(_Table, frozen=True):
+class Errors(Table, frozen=True):
     """Mean absolute error of each cell, cmH2O: ``(L, P)`` nominal and ``(K, L, P)`` drawn."""
 
     nominal: list[list[Error]]
     drawn: list[list[list[Error]]]
 
 
-class Safety(_Table, frozen=True):
+class Safety(Table, frozen=True):
     """Highest pressure, 0.01 cmH2O, and longest time above the limit, steps: ``(1 + K, L, P)``."""
 
     peak_centi_cmH2O: list[list[list[SmallInt]]]
     steps_above: list[list[list[Annotated[int, msgspec.Meta(ge=0, le=2**31)]]]]
 
 
-class Clipped(_Table, frozen=True):
+class Clipped(Table, frozen=True):
     """Commands below 0 % and above 100 % of each lung, ``(L,)``, and how many there were at all."""
 
     below: list[Count]
@@ -156,7 +165,7 @@ class Clipped(_Table, frozen=True):
     commands: Count
 
 
-class RecordedFailure(_Table, frozen=True):
+class RecordedFailure(Table, frozen=True):
     """A failed cell; ``draw`` is null in the nominal run."""
 
     lung: LungId
@@ -170,14 +179,14 @@ class RecordedFailure(_Table, frozen=True):
     message: Text
 
 
-class RecordedRigs(_Table, frozen=True):
+class RecordedRigs(Table, frozen=True):
     """Session and member of the ensemble of each lung and draw, ``(L, K)``."""
 
     session: list[list[Count]]
     member: list[list[Count]]
 
 
-class RecordedHeadroom(_Table, frozen=True):
+class RecordedHeadroom(Table, frozen=True):
     """Errors without the first step of the entry, the best commands and the best PID.
 
     Nominal runs first, cmH2O, ``(1 + K, L, P)``.
@@ -188,7 +197,7 @@ class RecordedHeadroom(_Table, frozen=True):
     pid: list[list[list[Annotated[float, msgspec.Meta(ge=0.0)]]]]
 
 
-class RecordedStress(_Table, frozen=True):
+class RecordedStress(Table, frozen=True):
     """Runs under missing physics; S conditions, L lungs, n of the record's draws.
 
     Tables have shape ``(S, L, n)``, the first condition is none; ``pips`` has shape ``(L, n)``.
@@ -208,7 +217,7 @@ class RecordedStress(_Table, frozen=True):
     commands_sha256: Sha256
 
 
-class Trace(_Table, frozen=True):
+class Trace(Table, frozen=True):
     """A nominal inspiration of each cell, ``(L, P, S)``, for the page."""
 
     breath: Count
@@ -216,16 +225,16 @@ class Trace(_Table, frozen=True):
     u_in_tenths_percent: list[list[list[SmallInt]]]
 
 
-class Actions(_Table, frozen=True):
+class Actions(Table, frozen=True):
     """The file of the commands; ``shape`` is ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``."""
 
     sha256: Sha256
     bytes: Count
-    encoding: Annotated[str, _among([actions.ENCODING])]
+    encoding: Annotated[str, _among([ENCODING])]
     shape: Annotated[list[Count], msgspec.Meta(min_length=5, max_length=5)]
 
 
-class SubmittedContent(_Table, frozen=True):
+class SubmittedContent(Table, frozen=True):
     """What all records of a submission say, simulated or on hardware."""
 
     format: Version
@@ -275,7 +284,7 @@ class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
         return ScoreHeader(**{key: getattr(self, key) for key in keys})
 
 
-class WithdrawalContent(_Table, frozen=True, tag_field="kind", tag="withdrawal"):
+class WithdrawalContent(Table, frozen=True, tag_field="kind", tag="withdrawal"):
     """The record that takes another one back."""
 
     format: Version
@@ -287,15 +296,10 @@ class WithdrawalContent(_Table, frozen=True, tag_field="kind", tag="withdrawal")
 def read(
     content: bytes, label: str, decoder: msgspec.json.Decoder[Any]
 ) -> SubmittedContent | WithdrawalContent:
-    """Read and check the content of a record.
-
-    Args:
-        content: JSON, canonical or not.
-        label: names the file in messages.
-        decoder: of the kinds of records that are accepted.
+    """Read and check the content of a record, canonical or not, of the kinds of a decoder.
 
     Raises:
-        InputError: naming the first key that is wrong.
+        InputError: naming the first key that is wrong; ``label`` names the file.
     """
     record = decoded(decoder, content, label)
     for key, known in (("format", FORMAT), ("protocol", PROTOCOL)):
@@ -344,6 +348,33 @@ def decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
         raise InputError(f"{label} is not JSON of a record: {_short(str(error))}") from None
 
 
+def read_canonical(decoder: msgspec.json.Decoder[T], path: Path) -> T:
+    """Decode a file of canonical JSON.
+
+    Raises:
+        InputError: naming the first key that is wrong, or if it is not canonical.
+        OSError: if it cannot be read.
+    """
+    content = path.read_bytes()
+    canonical.parse(content, str(path))
+    return decoded(decoder, content, str(path))
+
+
+def read_toml(path: Path, kind: type[TableT], most: int) -> TableT:
+    """Read a table of TOML that is no link and has at most so many bytes.
+
+    Raises:
+        InputError: if it is not such a file.
+        FileNotFoundError: if there is none.
+    """
+    if path.is_symlink() or path.stat().st_size > most:
+        raise InputError(f"{path} is a link, or larger than {most} bytes")
+    try:
+        return msgspec.convert(tomllib.loads(path.read_text("utf-8")), kind)
+    except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or not of this form
+        raise InputError(f"{path}: {error}") from None
+
+
 def _short(message: str) -> str:
     message = plain(message)
     return message if len(message) <= _MAX_MESSAGE else f"{message[:_MAX_MESSAGE]}…"
@@ -368,35 +399,30 @@ def check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
 
 def _check_shapes(record: ScoreContent, label: str) -> None:
     """Check the lengths of all tables, before numpy makes arrays of them."""
-    lungs, pips, draws = len(record.lungs), len(record.pips), record.draws.count
-    steps = protocol.INSPIRATION_STEPS
-    shapes: Mapping[str, tuple[Any, tuple[int, ...]]] = {
-        "errors.nominal": (record.errors.nominal, (lungs, pips)),
-        "errors.drawn": (record.errors.drawn, (draws, lungs, pips)),
-        "safe": (record.safe, (lungs,)),
-        "peak_pressure_cmH2O": (record.peak_pressure_cmH2O, (lungs,)),
-        "safety.peak_centi_cmH2O": (record.safety.peak_centi_cmH2O, (1 + draws, lungs, pips)),
-        "safety.steps_above": (record.safety.steps_above, (1 + draws, lungs, pips)),
-        "clipped.below": (record.clipped.below, (lungs,)),
-        "clipped.above": (record.clipped.above, (lungs,)),
-        "spread": (record.spread, (lungs, pips)),
-        "trace.pressure_centi_cmH2O": (record.trace.pressure_centi_cmH2O, (lungs, pips, steps)),
-        "trace.u_in_tenths_percent": (record.trace.u_in_tenths_percent, (lungs, pips, steps)),
-    }
-    for key in ("session", "member"):
-        shapes = {**shapes, f"rigs.{key}": (getattr(record.rigs, key), (lungs, draws))}
-    for key in ("error", "attainable", "pid"):
-        table = getattr(record.headroom, key)
-        shapes = {**shapes, f"headroom.{key}": (table, (1 + draws, lungs, pips))}
-    if record.stress is not None:
-        cells = (lungs, min(draws, len(record.stress.pips[0])) if record.stress.pips else 0)
-        shapes = {**shapes, "stress.pips": (record.stress.pips, cells)}
-        size = (len(record.stress.conditions), *cells)
+    lungs, draws = len(record.lungs), record.draws.count
+    cells, trace = (lungs, len(record.pips)), (lungs, len(record.pips), protocol.INSPIRATION_STEPS)
+    every = (1 + draws, *cells)
+    shapes: dict[str, tuple[int, ...]] = {
+        "errors.nominal": cells, "errors.drawn": (draws, *cells),
+        "safe": (lungs,), "peak_pressure_cmH2O": (lungs,),
+        "safety.peak_centi_cmH2O": every, "safety.steps_above": every,
+        "clipped.below": (lungs,), "clipped.above": (lungs,), "spread": cells,
+        "trace.pressure_centi_cmH2O": trace, "trace.u_in_tenths_percent": trace,
+        "rigs.session": (lungs, draws), "rigs.member": (lungs, draws),
+        "headroom.error": every, "headroom.attainable": every, "headroom.pid": every,
+    }  # fmt: skip
+    if (own := record.stress) is not None:
+        of_pips = (lungs, min(draws, len(own.pips[0])) if own.pips else 0)
         keys = ("errors", "safe", "survived", "above_alarm_ms", "peak_centi_cmH2O", "volume_mL")
-        for key in keys:
-            shapes = {**shapes, f"stress.{key}": (getattr(record.stress, key), size)}
-    for key, (table, shape) in shapes.items():
-        if not has_shape(table, shape):
+        shapes["stress.pips"] = of_pips
+        shapes |= {f"stress.{key}": (len(own.conditions), *of_pips) for key in keys}
+    check_shapes(record, label, shapes)
+
+
+def check_shapes(record: Any, label: str, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Check the shapes of tables by their dotted keys; InputError names the first wrong one."""
+    for key, shape in shapes.items():
+        if not has_shape(attrgetter(key)(record), shape):
             raise InputError(f"{label}, key {key}: does not have the shape {shape}")
 
 
@@ -413,7 +439,8 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
         raise InputError(f"{label}, key stress: belongs to the robustness track")
     if tuple(lungs) != LUNG_IDS or tuple(pips) != protocol.PIPS:
         raise InputError(f"{label}: does not cover all lungs and PIPs of the protocol")
-    if record.actions.shape != list(actions.shape(len(lungs), draws, len(pips))):
+    runs_of = [len(lungs), 1 + draws, len(pips), protocol.BREATHS, protocol.INSPIRATION_STEPS]
+    if record.actions.shape != runs_of:
         raise InputError(f"{label}, key actions.shape: does not fit lungs, draws and PIPs")
     # Every failed cell has no error and one failure, and no other cell has either.
     runs = [(None, record.errors.nominal), *enumerate(record.errors.drawn, 1)]

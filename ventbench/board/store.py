@@ -8,15 +8,18 @@ publishes refuses to drop one; see ``ci/publish.py``.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.board import actions, attestation, canonical, record, rounds, schema
+from ventbench.board import attestation, canonical, record, rounds, schema
 from ventbench.board.canonical import RECORDS
 from ventbench.board.gate import Evidence
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
@@ -24,6 +27,9 @@ from ventbench.board.rounds import Round
 
 if TYPE_CHECKING:
     from ventbench.board.replay import ReplayPlants
+
+#: Largest file of commands, bytes: float64 noise does not compress, but hardly grows.
+MAX_COMMANDS_BYTES = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -114,11 +120,7 @@ def _follows(entry: AnyRecord) -> str:
 
 
 def read_record(path: Path, *, strict: bool = False) -> AnyRecord:
-    """Read a record of a leaderboard.
-
-    Args:
-        path: of the record, named by its SHA-256.
-        strict: also check the canonical form again.
+    """Read a record, named by its SHA-256; ``strict``: check its canonical form again.
 
     Raises:
         InputError: if it was changed.
@@ -150,15 +152,10 @@ def _what_changed(content: bytes) -> str:
 def find_record(
     store: Store, sha256: str, kind: type[Record | HardwareRecord] | None = None
 ) -> Record | HardwareRecord:
-    """Find a record by its hash or the unique beginning of one.
-
-    Args:
-        store: the leaderboard.
-        sha256: of the record, or its beginning.
-        kind: of record; scores and hardware if not given.
+    """Find a record, a score or of hardware, by its hash or the unique beginning of one.
 
     Raises:
-        InputError: if none or several begin so.
+        InputError: if none or several of the kind begin so.
     """
     known = [x for x in store.records if isinstance(x, kind or Record | HardwareRecord)]
     matches = [entry for entry in known if entry.sha256.startswith(sha256)]
@@ -174,23 +171,16 @@ def require_replay(
     label: str,
     known: Mapping[str, Round],
 ) -> None:
-    """Replay a record.
-
-    Args:
-        score: the record.
-        commands: content of its action file.
-        simulators: the frozen ones.
-        label: names it in messages.
-        known: rounds that have draws, by name.
+    """Replay a record by the content of its action file; rounds that have draws are ``known``.
 
     Raises:
-        InputError: if it was scored on other simulators, or does not replay.
+        InputError: if it was scored on other simulators, or does not replay; ``label`` names it.
     """
     from ventbench.board.replay import differences, draws_of, replay
 
     if score.header.simulators != canonical.through_json(simulators.about()):
         raise InputError(f"{label} was scored on other simulators than those of this ventbench")
-    requested = actions.decode(commands, score.header.actions.shape, label)
+    requested = decode(commands, score.header.actions.shape, label)
     drawn = draws_of(score.header, simulators, known)
     (replayed,) = replay(simulators, score.pips, [requested], drawn)
     problems = differences(score, replayed)
@@ -201,15 +191,12 @@ def require_replay(
 def add(
     folder: Path, path: Path, simulators: ReplayPlants | None = None
 ) -> Record | HardwareRecord:
-    """Add a record to a leaderboard.
+    """Add a record, beside which its commands lie, to a leaderboard, which is made if missing.
 
     Args:
-        folder: of the leaderboard; made if missing.
-        path: of the record; its action file lies beside it, that of a hardware record excepted.
+        folder: of the leaderboard.
+        path: of the record.
         simulators: to replay it on first; not replayed if not given.
-
-    Returns:
-        The record.
 
     Raises:
         InputError: if it is not a record, does not replay, or does not fit those that are there.
@@ -235,12 +222,9 @@ def add(
 
 
 def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
-    """Take a record back; it stays in the history, its entry is no longer ranked.
+    """Take a record back, named by the beginning of its SHA-256, for a reason that the page shows.
 
-    Args:
-        folder: of the leaderboard.
-        sha256: of the record, or the unique beginning of it.
-        reason: for the page.
+    It stays in the history, its entry is no longer ranked.
 
     Raises:
         InputError: if there is no such record, no reason, or it was withdrawn before.
@@ -284,12 +268,8 @@ def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
 class _Before:
     """What the records before one say.
 
-    Attributes:
-        first: record of a score on each draws, by their name.
-        newest: of each entry, by draws, track and name.
-        known: all scores, by their hash.
-        hardware: hashes of all hardware records.
-        withdrawn: hashes of those that were taken back.
+    The first score on each draws, by their name; the newest of each entry, by draws, track and
+    name; all scores, by hash; hashes of hardware records, and of what was taken back.
     """
 
     first: dict[str, Record] = field(default_factory=dict)
@@ -356,15 +336,11 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
 
 def commands_path(record: Record, folder: Path) -> Path:
     """Where the commands of a record lie."""
-    return folder / f"{record.header.actions.sha256}{actions.SUFFIX}"
+    return folder / f"{record.header.actions.sha256}{canonical.ACTIONS_SUFFIX}"
 
 
 def load_commands(record: Record, folder: Path) -> Floats:
-    """Read the commands of a record.
-
-    Args:
-        record: whose they are.
-        folder: that holds the file.
+    """Read the commands of a record from a folder.
 
     Returns:
         %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
@@ -375,12 +351,52 @@ def load_commands(record: Record, folder: Path) -> Floats:
     path, named = commands_path(record, folder), record.header.actions
     if not path.is_file() or path.is_symlink():
         raise InputError(f"{path} is missing: the commands of record {record.sha256[:12]}")
-    if path.stat().st_size > actions.MAX_BYTES:
-        raise InputError(f"{path} is larger than {actions.MAX_BYTES / 1e6:g} MB")
+    if path.stat().st_size > MAX_COMMANDS_BYTES:
+        raise InputError(f"{path} is larger than {MAX_COMMANDS_BYTES / 1e6:g} MB")
     content = path.read_bytes()
     sha256 = canonical.digest(content)
     if sha256 != named.sha256:
         raise InputError(f"{path} has been changed: its SHA-256 is {sha256}")
     if len(content) != named.bytes:
         raise InputError(f"record {record.sha256}, key actions.bytes: {path} has {len(content)}")
-    return actions.decode(content, named.shape, str(path))
+    return decode(content, named.shape, str(path))
+
+
+def encode(requested: Floats) -> bytes:
+    """Return the content of the file of finite commands, %, of any shape, bit for bit.
+
+    The file is zlib over byte planes: the first bytes of all little-endian float64 numbers, then
+    their second bytes, and so on; sign and exponent then compress, the noisy mantissa does not.
+
+    Raises:
+        ValueError: if a command is not finite.
+    """
+    if not np.all(np.isfinite(requested)):
+        raise ValueError("a command is not finite")
+    numbers: Any = np.ascontiguousarray(requested, "<f8")
+    planes = numbers.view(np.uint8).reshape(-1, 8).T
+    return zlib.compress(np.ascontiguousarray(planes).tobytes(), 6)
+
+
+def decode(content: bytes, shape: Sequence[int], label: str) -> Floats:
+    """Return the commands, %, in the shape that the record states; ``label`` names the file.
+
+    Never takes more memory than the shape says, whatever the content is.
+
+    Raises:
+        InputError: if the content is not such a file of this shape.
+    """
+    size = 8 * int(np.prod(shape, dtype=np.int64))
+    inflate = zlib.decompressobj()
+    try:
+        raw = inflate.decompress(content, size + 1)
+    except zlib.error as error:
+        raise InputError(f"{label} is not an action file: {error}") from None
+    if len(raw) != size or not inflate.eof or inflate.unused_data:
+        raise InputError(f"{label} does not hold commands of shape {tuple(shape)}")
+    planes = np.frombuffer(raw, np.uint8).reshape(8, -1)
+    values: Any = np.ascontiguousarray(planes.T)
+    requested = values.view("<f8").reshape(tuple(shape)).astype(np.float64)
+    if not np.all(np.isfinite(requested)):
+        raise InputError(f"{label} holds a command that is not finite")
+    return requested

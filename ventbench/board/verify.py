@@ -74,12 +74,7 @@ class Report:
 
 
 def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Report:
-    """Verify a leaderboard.
-
-    Args:
-        folder: of the leaderboard.
-        load: of the frozen simulators; raises InputError where they were changed.
-        progress: called after each batch of records.
+    """Verify a leaderboard; ``progress`` is called after each batch of records.
 
     Raises:
         InputError: if there is no leaderboard.

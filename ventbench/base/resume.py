@@ -39,17 +39,11 @@ def opened() -> Path | None:
 
 
 class Format(NamedTuple):
-    """Format in which a result is stored.
+    """Format in which a result is stored."""
 
-    Attributes:
-        suffix: suffix of the file name, with the dot.
-        write: stores a value at a path, in one step.
-        read: returns the value stored at a path.
-    """
-
-    suffix: str
-    write: Callable[[Path, Any], object]
-    read: Callable[[Path], Any]
+    suffix: str  #: suffix of the file name, with the dot.
+    write: Callable[[Path, Any], object]  #: stores a value at a path, in one step.
+    read: Callable[[Path], Any]  #: returns the value stored at a path.
 
 
 #: JSON values.

@@ -57,19 +57,12 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Ranks:
-    """Ranks of N entries, in the order in which they were given, each of shape ``(N,)``.
+    """Ranks of N entries, in the order in which they were given, each of shape ``(N,)``."""
 
-    Attributes:
-        better: whether row i is better than column j beyond doubt, shape ``(N, N)``.
-        rank: from 1; equal where entries cannot be told apart.
-        best: best rank that each may have.
-        worst: worst rank.
-    """
-
-    better: Bools
-    rank: Ints
-    best: Ints
-    worst: Ints
+    better: Bools  #: whether row i is better than column j beyond doubt, shape ``(N, N)``.
+    rank: Ints  #: from 1; equal where entries cannot be told apart.
+    best: Ints  #: best rank that each may have.
+    worst: Ints  #: worst rank.
 
 
 def ranks(

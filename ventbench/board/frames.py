@@ -31,28 +31,21 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True)
 class Column:
-    """One figure of an entry, wherever the board is shown.
+    """One figure of an entry, wherever the board is shown."""
 
-    Attributes:
-        names: of its columns in the CSV and in frames: one, or value, low and high end.
-        value: of an entry: text, a number, None, or an :class:`~ventbench.board.ranking.Interval`.
-        about: what it is, with its unit; on the page as the hint of its heading.
-        title: heading on the page; empty where the page does not show it.
-        digits: that page and terminal show.
-        sign: whether it is a difference to another entry, of which less than zero is better.
-        unit: that follows the number on the page.
-        small: below the number on the page, where it is no interval.
-        terminal: headings of the number, and of what is below it, in the terminal.
-    """
-
+    #: of its columns in the CSV and in frames: one, or value, low and high end.
     names: tuple[str, ...]
+    #: of an entry: text, a number, None, or an :class:`~ventbench.board.ranking.Interval`.
     value: Callable[[Line], Any]
-    about: str
-    title: str = ""
-    digits: int = 3
+    about: str  #: what it is, with its unit; on the page as the hint of its heading.
+    title: str = ""  #: heading on the page; empty where the page does not show it.
+    digits: int = 3  #: that page and terminal show.
+    #: whether it is a difference to another entry, of which less than zero is better.
     sign: bool = False
-    unit: str = ""
+    unit: str = ""  #: that follows the number on the page.
+    #: below the number on the page, where it is no interval.
     small: Callable[[Line], str] = lambda line: ""
+    #: headings of the number, and of what is below it, in the terminal.
     terminal: tuple[str, ...] = ()
 
     def cell(self, line: Line) -> dict[str, Any]:

@@ -34,17 +34,13 @@ NEEDED_PARTS = {"sensor": "the sensor's zero", "lung": "which lung was mounted"}
 
 @dataclass(frozen=True)
 class Evidence:
-    """What stands behind the records of a leaderboard.
+    """What stands behind the records of a leaderboard."""
 
-    Attributes:
-        vouched: hashes of records that are signed, were run again, or have a bench log.
-        withdrawn: why records were taken back, by hash.
-        rounds: that have draws, by name.
-    """
-
+    #: hashes of records that are signed, were run again, or have a bench log.
     vouched: frozenset[str] = frozenset()
+    #: why records were taken back, by hash.
     withdrawn: Mapping[str, str] = field(default_factory=dict)
-    rounds: Mapping[str, Round] = field(default_factory=dict)
+    rounds: Mapping[str, Round] = field(default_factory=dict)  #: that have draws, by name.
 
     def official(self, record: Record) -> bool:
         """Whether its sandbox deserves the word, and somebody vouches for that."""

@@ -43,18 +43,12 @@ _MEASURED_DECIMALS = 3
 
 @dataclass(frozen=True)
 class Entry:
-    """A submission on one track and on the same draws, by the record that counts.
+    """A submission on one track and on the same draws, by the record that counts."""
 
-    Attributes:
-        record: the newest one: of the official ones if there are any.
-        history: all of its records, newest first.
-        reasons: why it is not ranked; empty if it is.
-        source: name of the earlier entry whose commands it follows; empty if there is none.
-    """
-
-    record: Record
-    history: tuple[Record, ...]
-    reasons: tuple[str, ...]
+    record: Record  #: the newest one: of the official ones if there are any.
+    history: tuple[Record, ...]  #: all of its records, newest first.
+    reasons: tuple[str, ...]  #: why it is not ranked; empty if it is.
+    #: name of the earlier entry whose commands it follows; empty if there is none.
     source: str = ""
 
 
@@ -89,24 +83,15 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Row:
-    """One ranked entry, or one shown beside them.
+    """One ranked entry, or one shown beside them."""
 
-    Attributes:
-        entry: whose row it is.
-        rank: from 1; None if it is not ranked. See :mod:`ventbench.board.comparison`.
-        ranks: ranks that it may have; None if it is not ranked.
-        normalised: the normalised score, which ranks; None if a cell failed.
-        error: the error of the same runs, cmH2O; None if a cell failed.
-        nominal: the paper's score, cmH2O; NaN if a cell failed.
-        worst: highest mean over draws of one cell, cmH2O, its lung and PIP; NaN if one failed.
-    """
-
-    entry: Entry
-    rank: int | None
-    ranks: tuple[int, int] | None
-    normalised: Comparison | None
-    error: Interval | None
-    nominal: float
+    entry: Entry  #: whose row it is.
+    rank: int | None  #: from 1; None if it is not ranked. See :mod:`ventbench.board.comparison`.
+    ranks: tuple[int, int] | None  #: ranks that it may have; None if it is not ranked.
+    normalised: Comparison | None  #: the normalised score, which ranks; None if a cell failed.
+    error: Interval | None  #: the error of the same runs, cmH2O; None if a cell failed.
+    nominal: float  #: the paper's score, cmH2O; NaN if a cell failed.
+    #: highest mean over draws of one cell, cmH2O, its lung and PIP; NaN if one failed.
     worst: tuple[float, str, float]
 
     @property
@@ -117,21 +102,13 @@ class Row:
 
 @dataclass(frozen=True)
 class StressRow:
-    """One entry under missing physics.
+    """One entry under missing physics."""
 
-    Attributes:
-        row: of the entry on the robustness track.
-        tables: its stressed runs.
-        score: stress score with its interval, cmH2O; None if a run failed.
-        rank: as of :class:`Row`; None if a run failed, or it has no rank.
-        ranks: ranks that it may have.
-    """
-
-    row: Row
-    tables: Runs
-    score: Interval | None = None
-    rank: int | None = None
-    ranks: tuple[int, int] | None = None
+    row: Row  #: of the entry on the robustness track.
+    tables: Runs  #: its stressed runs.
+    score: Interval | None = None  #: stress score with its interval, cmH2O; None if a run failed.
+    rank: int | None = None  #: as of :class:`Row`; None if a run failed, or it has no rank.
+    ranks: tuple[int, int] | None = None  #: ranks that it may have.
 
     @property
     def name(self) -> str:
@@ -141,25 +118,16 @@ class StressRow:
 
 @dataclass(frozen=True)
 class HardwareRow:
-    """One hardware record beside the simulated one of the same entry.
+    """One hardware record beside the simulated one of the same entry."""
 
-    Attributes:
-        record: the hardware record.
-        reasons: why it has no rank; empty if it has one.
-        newest: whether no later one of the same entry and kind of device counts instead.
-        simulated: row of the entry in the simulated ranking; None if there is none.
-        nominal: nominal simulated score over the same lungs and PIPs, cmH2O; NaN without one.
-        rank: among the newest records over the same lungs and PIPs, from 1; None if it has none.
-        count: how many were ranked.
-    """
-
-    record: HardwareRecord
-    reasons: tuple[str, ...]
-    newest: bool
-    simulated: Row | None
-    nominal: float
+    record: HardwareRecord  #: the hardware record.
+    reasons: tuple[str, ...]  #: why it has no rank; empty if it has one.
+    newest: bool  #: whether no later one of the same entry and kind of device counts instead.
+    simulated: Row | None  #: row of the entry in the simulated ranking; None if there is none.
+    nominal: float  #: nominal simulated score over the same lungs and PIPs, cmH2O; NaN without one.
+    #: among the newest records over the same lungs and PIPs, from 1; None if it has none.
     rank: int | None = None
-    count: int = 0
+    count: int = 0  #: how many were ranked.
 
     @property
     def gap(self) -> float:
@@ -184,30 +152,20 @@ class HardwareRow:
 
 @dataclass(frozen=True)
 class Track:
-    """One track of a round, or of practice on the development draws.
+    """One track of a round, or of practice on the development draws."""
 
-    Attributes:
-        name: ``"performance"`` or ``"robustness"``.
-        draws: name of the draws: of the round, or ``"development"``.
-        round: that ranks; None for practice, where nothing is.
-        ranked: best first; in practice whatever could be ranked on other draws.
-        unranked: official entries that are not ranked, with reasons, by name.
-        unofficial: entries that nobody vouches for, or without a full sandbox, by name.
-        baseline: record of the track's PID, that the others are compared with; None if there is no
-            ranked one.
-        stress: ranked entries that ran under the newest table of stressors, best first.
-        hardware: hardware records of the track, newest first.
-    """
-
-    name: str
-    draws: str
-    round: Round | None
-    ranked: tuple[Row, ...]
-    unranked: tuple[Row, ...]
+    name: str  #: ``"performance"`` or ``"robustness"``.
+    draws: str  #: name of the draws: of the round, or ``"development"``.
+    round: Round | None  #: that ranks; None for practice, where nothing is.
+    ranked: tuple[Row, ...]  #: best first; in practice whatever could be ranked on other draws.
+    unranked: tuple[Row, ...]  #: official entries that are not ranked, with reasons, by name.
+    #: entries that nobody vouches for, or without a full sandbox, by name.
     unofficial: tuple[Row, ...]
+    #: record of the track's PID, that the others are compared with; None if there is no ranked one.
     baseline: Record | None
+    #: ranked entries that ran under the newest table of stressors, best first.
     stress: tuple[StressRow, ...]
-    hardware: tuple[HardwareRow, ...] = ()
+    hardware: tuple[HardwareRow, ...] = ()  #: hardware records of the track, newest first.
 
     @property
     def rows(self) -> list[tuple[str, Row]]:

@@ -47,22 +47,15 @@ SUFFIX = canonical.RECORD_SUFFIX
 
 @dataclass(frozen=True)
 class RecordHeadroom:
-    """Rigs of the draws, and the errors that the score is relative to; L lungs, P PIPs, K draws.
+    """Rigs of the draws, and the errors that the score is relative to; L lungs, P PIPs, K draws."""
 
-    Attributes:
-        session: rig of each draw, shape ``(L, K)``.
-        member: member of the ensemble, shape ``(L, K)``.
-        error: error without the first step, nominal runs first, cmH2O, shape ``(1 + K, L, P)``;
-            NaN where a controller failed.
-        attainable: best attainable error, cmH2O, of that shape.
-        pid: error of the lung's best PID, cmH2O, of that shape.
-    """
-
-    session: Ints
-    member: Ints
+    session: Ints  #: rig of each draw, shape ``(L, K)``.
+    member: Ints  #: member of the ensemble, shape ``(L, K)``.
+    #: error without the first step, nominal runs first, cmH2O, shape ``(1 + K, L, P)``; NaN where a
+    #: controller failed.
     error: Floats
-    attainable: Floats
-    pid: Floats
+    attainable: Floats  #: best attainable error, cmH2O, of that shape.
+    pid: Floats  #: error of the lung's best PID, cmH2O, of that shape.
 
     @property
     def ranked(self) -> Bools:
@@ -77,52 +70,34 @@ class RecordHeadroom:
 
 @dataclass(frozen=True)
 class RecordStress:
-    """Runs under missing physics, as a record has them.
+    """Runs under missing physics, as a record has them."""
 
-    Attributes:
-        stressors: version of the table of stressors.
-        tables: figures of all runs; volumes to 1 mL, times to 1 ms.
-        commands_sha256: of all commands.
-    """
-
-    stressors: int
-    tables: Runs
-    commands_sha256: str
+    stressors: int  #: version of the table of stressors.
+    tables: Runs  #: figures of all runs; volumes to 1 mL, times to 1 ms.
+    commands_sha256: str  #: of all commands.
 
 
 @dataclass(frozen=True)
 class Record(schema.Submitted):
-    """A record's content, checked; L lungs, P PIPs, K draws.
+    """A record's content, checked; L lungs, P PIPs, K draws."""
 
-    Attributes:
-        sha256: of its bytes: its name.
-        header: everything but the tables that are arrays here.
-        nominal: error of the nominal runs, cmH2O, shape ``(L, P)``; NaN where a controller failed.
-        drawn: error of the drawn runs, cmH2O, shape ``(K, L, P)``; NaN where a controller failed.
-        spread: disagreement of the ensemble, cmH2O, shape ``(L, P)``; NaN where a controller
-            failed.
-        breath: the breath that the page shows, counted from 1.
-        pressure: nominal inspirations of that breath, cmH2O, to 0.01, shape ``(L, P, S)``.
-        u_in: commands of that breath as applied, %, to 0.1, shape ``(L, P, S)``.
-        peak: highest pressure of each run, nominal runs first, cmH2O, to 0.01, shape
-            ``(1 + K, L, P)``.
-        steps_above: longest time above the safety limit of each run, steps, shape
-            ``(1 + K, L, P)``.
-        headroom: rigs, and what the score is relative to.
-        stress: runs under missing physics, on the robustness track; None without.
-    """
-
-    sha256: str
-    header: schema.ScoreHeader
+    sha256: str  #: of its bytes: its name.
+    header: schema.ScoreHeader  #: everything but the tables that are arrays here.
+    #: error of the nominal runs, cmH2O, shape ``(L, P)``; NaN where a controller failed.
     nominal: Floats
+    #: error of the drawn runs, cmH2O, shape ``(K, L, P)``; NaN where a controller failed.
     drawn: Floats
+    #: disagreement of the ensemble, cmH2O, shape ``(L, P)``; NaN where a controller failed.
     spread: Floats
-    breath: int
-    pressure: Floats
-    u_in: Floats
+    breath: int  #: the breath that the page shows, counted from 1.
+    pressure: Floats  #: nominal inspirations of that breath, cmH2O, to 0.01, shape ``(L, P, S)``.
+    u_in: Floats  #: commands of that breath as applied, %, to 0.1, shape ``(L, P, S)``.
+    #: highest pressure of each run, nominal runs first, cmH2O, to 0.01, shape ``(1 + K, L, P)``.
     peak: Floats
+    #: longest time above the safety limit of each run, steps, shape ``(1 + K, L, P)``.
     steps_above: Ints
-    headroom: RecordHeadroom
+    headroom: RecordHeadroom  #: rigs, and what the score is relative to.
+    #: runs under missing physics, on the robustness track; None without.
     stress: RecordStress | None = None
 
     @property
@@ -193,22 +168,15 @@ class Record(schema.Submitted):
 
 
 class Device(schema.Table, frozen=True):
-    """What ran: the ventilator's own computer, as it says of itself, and what the host knows.
+    """What ran: the ventilator's own computer, as it says of itself, and what the host knows."""
 
-    Attributes:
-        name: identity of the device.
-        firmware: its version.
-        calibration: hash of its calibration, as the device reports it.
-        emulated: whether software stood in for valves and lung: by the port that the host opened,
-            or by the device's own word.
-        about: what else it says.
-    """
-
-    name: schema.Text
-    firmware: schema.Text
-    calibration: schema.Text
+    name: schema.Text  #: identity of the device.
+    firmware: schema.Text  #: its version.
+    calibration: schema.Text  #: hash of its calibration, as the device reports it.
+    #: whether software stood in for valves and lung: by the port that the host opened, or by the
+    #: device's own word.
     emulated: bool
-    about: schema.FreeForm
+    about: schema.FreeForm  #: what else it says.
 
 
 class Stop(schema.Table, frozen=True):
@@ -266,17 +234,11 @@ class HardwareContent(schema.SubmittedContent, frozen=True, tag_field="kind", ta
 
 @dataclass(frozen=True)
 class HardwareRecord(schema.Submitted):
-    """A checked hardware record; L lungs, P PIPs, K repetitions.
+    """A checked hardware record; L lungs, P PIPs, K repetitions."""
 
-    Attributes:
-        sha256: of its bytes: its name.
-        header: its content.
-        errors: error of every run, cmH2O, shape ``(L, P, K)``; NaN for a stopped one.
-    """
-
-    sha256: str
-    header: HardwareContent
-    errors: Floats
+    sha256: str  #: of its bytes: its name.
+    header: HardwareContent  #: its content.
+    errors: Floats  #: error of every run, cmH2O, shape ``(L, P, K)``; NaN for a stopped one.
 
     @property
     def track(self) -> str:

@@ -74,40 +74,24 @@ class ReplayPlants(Protocol):
 
 @dataclass(frozen=True)
 class Replayed:
-    """What the commands of one record give; L lungs, P PIPs, K draws.
+    """What the commands of one record give; L lungs, P PIPs, K draws."""
 
-    Attributes:
-        nominal: error of the nominal runs, cmH2O, shape ``(L, P)``.
-        drawn: error of the drawn runs, cmH2O, shape ``(K, L, P)``.
-        safe: whether all runs of a lung pass the safety gate, shape ``(L,)``.
-        peak: highest pressure of each run, nominal ones first, cmH2O, shape ``(1 + K, L, P)``.
-        steps_above: longest time above the safety limit of each run, steps, shape
-            ``(1 + K, L, P)``.
-        below: how many commands were below 0 %, nominal and drawn, shape ``(L,)``.
-        above: how many commands were above 100 %, nominal and drawn, shape ``(L,)``.
-        spread: see :func:`spread`, cmH2O, shape ``(L, P)``.
-        pressure: nominal inspiration of :data:`TRACE_BREATH`, cmH2O, shape ``(L, P, S)``.
-        u_in: commands of that inspiration as applied, %, shape ``(L, P, S)``.
-        first: first command of each run, %, shape ``(1 + K, L, P)``.
-        controllable: error without the first step, cmH2O, shape ``(1 + K, L, P)``.
-        session: rig of each draw, shape ``(L, K)``.
-        member: member of the ensemble, shape ``(L, K)``.
-    """
-
-    nominal: Floats
-    drawn: Floats
-    safe: Bools
+    nominal: Floats  #: error of the nominal runs, cmH2O, shape ``(L, P)``.
+    drawn: Floats  #: error of the drawn runs, cmH2O, shape ``(K, L, P)``.
+    safe: Bools  #: whether all runs of a lung pass the safety gate, shape ``(L,)``.
+    #: highest pressure of each run, nominal ones first, cmH2O, shape ``(1 + K, L, P)``.
     peak: Floats
+    #: longest time above the safety limit of each run, steps, shape ``(1 + K, L, P)``.
     steps_above: Ints
-    below: Ints
-    above: Ints
-    spread: Floats
-    pressure: Floats
-    u_in: Floats
-    first: Floats
-    controllable: Floats
-    session: Ints
-    member: Ints
+    below: Ints  #: how many commands were below 0 %, nominal and drawn, shape ``(L,)``.
+    above: Ints  #: how many commands were above 100 %, nominal and drawn, shape ``(L,)``.
+    spread: Floats  #: see :func:`spread`, cmH2O, shape ``(L, P)``.
+    pressure: Floats  #: nominal inspiration of :data:`TRACE_BREATH`, cmH2O, shape ``(L, P, S)``.
+    u_in: Floats  #: commands of that inspiration as applied, %, shape ``(L, P, S)``.
+    first: Floats  #: first command of each run, %, shape ``(1 + K, L, P)``.
+    controllable: Floats  #: error without the first step, cmH2O, shape ``(1 + K, L, P)``.
+    session: Ints  #: rig of each draw, shape ``(L, K)``.
+    member: Ints  #: member of the ensemble, shape ``(L, K)``.
 
 
 @jax.jit

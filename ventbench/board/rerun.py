@@ -47,21 +47,14 @@ MAX_FOLDERS = 5000
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the second run of a record showed.
+    """What the second run of a record showed."""
 
-    Attributes:
-        record: SHA-256 of the record.
-        name: of the entry.
-        track: of the record.
-        state: ``"reproduced"``, ``"different"`` or ``"not re-run"``.
-        detail: what differs, or why it was not run again; for a reproduced record how close its
-            commands are.
-    """
-
-    record: str
-    name: str
-    track: str
-    state: str
+    record: str  #: SHA-256 of the record.
+    name: str  #: of the entry.
+    track: str  #: of the record.
+    state: str  #: ``"reproduced"``, ``"different"`` or ``"not re-run"``.
+    #: what differs, or why it was not run again; for a reproduced record how close its commands
+    #: are.
     detail: str = ""
 
     def __str__(self) -> str:

@@ -53,25 +53,17 @@ _Account = Annotated[str, schema.matching(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,62}[A-Z
 
 
 class Opened(schema.Table, frozen=True):
-    """Content of ``round.toml``.
+    """Content of ``round.toml``."""
 
-    Attributes:
-        name: of the round.
-        opened: when, UTC.
-        closes: when entries are frozen at the earliest, UTC.
-        delay_s: least time from the freeze to the beacon's value, s.
-        limit: most entries of an account.
-        project: entries of the project, which no account asks for, baselines among them.
-        chain: of the beacon.
-    """
-
-    name: _Name
-    opened: datetime
-    closes: datetime
+    name: _Name  #: of the round.
+    opened: datetime  #: when, UTC.
+    closes: datetime  #: when entries are frozen at the earliest, UTC.
+    #: least time from the freeze to the beacon's value, s.
     delay_s: Annotated[int, msgspec.Meta(ge=1, le=10**7)]
-    limit: Annotated[int, msgspec.Meta(ge=1, le=1000)]
+    limit: Annotated[int, msgspec.Meta(ge=1, le=1000)]  #: most entries of an account.
+    #: entries of the project, which no account asks for, baselines among them.
     project: list[schema.EntryName]
-    chain: Chain
+    chain: Chain  #: of the beacon.
 
     @property
     def rehearsal(self) -> bool:
@@ -116,23 +108,14 @@ class Result(schema.Table, frozen=True):
 
 @dataclass(frozen=True)
 class Round:
-    """A round as far as it has come; make one with :func:`load`.
+    """A round as far as it has come; make one with :func:`load`."""
 
-    Attributes:
-        folder: of the round.
-        opened: how it was opened.
-        frozen: its entries; None before.
-        value: of the beacon, checked; None before.
-        result: None before it is scored.
-        frozen_sha256: of ``frozen.toml``; empty before.
-    """
-
-    folder: Path
-    opened: Opened
-    frozen: Frozen | None = None
-    value: Value | None = None
-    result: Result | None = None
-    frozen_sha256: str = ""
+    folder: Path  #: of the round.
+    opened: Opened  #: how it was opened.
+    frozen: Frozen | None = None  #: its entries; None before.
+    value: Value | None = None  #: of the beacon, checked; None before.
+    result: Result | None = None  #: None before it is scored.
+    frozen_sha256: str = ""  #: of ``frozen.toml``; empty before.
 
     @property
     def name(self) -> str:

@@ -34,20 +34,14 @@ MAX_COMMANDS_BYTES = 2_000_000
 
 @dataclass(frozen=True)
 class Store:
-    """All records of a leaderboard, each after those that it names.
+    """All records of a leaderboard, each after those that it names."""
 
-    Attributes:
-        folder: of the leaderboard.
-        records: all of them.
-        attested: hashes of the records that somebody who may do so vouches for; see
-            :mod:`ventbench.board.attestation`.
-        rounds: all of them, the newest first.
-    """
-
-    folder: Path
-    records: tuple[AnyRecord, ...]
+    folder: Path  #: of the leaderboard.
+    records: tuple[AnyRecord, ...]  #: all of them.
+    #: hashes of the records that somebody who may do so vouches for; see
+    #: :mod:`ventbench.board.attestation`.
     attested: frozenset[str]
-    rounds: tuple[Round, ...] = ()
+    rounds: tuple[Round, ...] = ()  #: all of them, the newest first.
 
     @property
     def evidence(self) -> Evidence:

@@ -51,25 +51,17 @@ Progress = Callable[[int, int], None]
 
 @dataclass
 class Report:
-    """What a verification saw.
+    """What a verification saw."""
 
-    Attributes:
-        records: how many there are.
-        replayed: how many were replayed.
-        reproduced: how many were run again and gave the same commands; see
-            :func:`ventbench.board.rerun.rerun`.
-        second_runs: what each second run showed, one sentence a record.
-        deviation: largest difference between a recorded error and its replay, cmH2O.
-        problems: one sentence each; empty if all is well.
-        notes: what could not be checked, which is no problem.
-    """
-
-    records: int = 0
-    replayed: int = 0
+    records: int = 0  #: how many there are.
+    replayed: int = 0  #: how many were replayed.
+    #: how many were run again and gave the same commands; see :func:`ventbench.board.rerun.rerun`.
     reproduced: int = 0
+    #: what each second run showed, one sentence a record.
     second_runs: list[str] = field(default_factory=list)
-    deviation: float = 0.0
-    problems: list[str] = field(default_factory=list)
+    deviation: float = 0.0  #: largest difference between a recorded error and its replay, cmH2O.
+    problems: list[str] = field(default_factory=list)  #: one sentence each; empty if all is well.
+    #: what could not be checked, which is no problem.
     notes: list[str] = field(default_factory=list)
 
 

@@ -69,17 +69,11 @@ Margin = Callable[[Floats, Floats], Floats]
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Coordinates of the search, A of them, for L lungs.
+    """Coordinates of the search, A of them, for L lungs."""
 
-    Attributes:
-        metric: a point ``x`` has the severity ``sqrt(x' metric x)``, shape ``(L, A, A)``.
-        group: of each coordinate; at most one of a group is not zero in a point, length A.
-        signed: whether a coordinate may be negative, length A.
-    """
-
-    metric: Floats
-    group: Ints
-    signed: Bools
+    metric: Floats  #: a point ``x`` has the severity ``sqrt(x' metric x)``, shape ``(L, A, A)``.
+    group: Ints  #: of each coordinate; at most one of a group is not zero in a point, length A.
+    signed: Bools  #: whether a coordinate may be negative, length A.
 
     def directions(self, points: Floats) -> Floats:
         """Points of severity 1 in given directions, with the rules kept, shape ``(..., L, A)``."""
@@ -102,21 +96,15 @@ class Space:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Result of :func:`mildest` for L lungs.
+    """Result of :func:`mildest` for L lungs."""
 
-    Attributes:
-        severity: shape ``(L,)``; NaN where nothing went wrong.
-        point: the coordinates, shape ``(L, A)``; where nothing went wrong the worst of severity 1.
-        setting: of these points, shape ``(L,)``.
-        margin: of these points, shape ``(L,)``; see :data:`Margin`.
-        alone: severity of each of :attr:`Space.alone` at the worst setting, shape ``(J, L)``; NaN
-            where nothing went wrong.
-    """
-
-    severity: Floats
+    severity: Floats  #: shape ``(L,)``; NaN where nothing went wrong.
+    #: the coordinates, shape ``(L, A)``; where nothing went wrong the worst of severity 1.
     point: Floats
-    setting: Floats
-    margin: Floats
+    setting: Floats  #: of these points, shape ``(L,)``.
+    margin: Floats  #: of these points, shape ``(L,)``; see :data:`Margin`.
+    #: severity of each of :attr:`Space.alone` at the worst setting, shape ``(J, L)``; NaN where
+    #: nothing went wrong.
     alone: Floats
 
 
@@ -216,23 +204,16 @@ PIPS = (protocol.PIPS[0], protocol.PIPS[-1])
 
 @dataclass(frozen=True)
 class Critical:
-    """The mildest unsafe physics of a lung that was found.
+    """The mildest unsafe physics of a lung that was found."""
 
-    Attributes:
-        lung: id.
-        severity: 0 to 1; None if nothing unsafe was found up to the end of the range.
-        pip: cmH2O.
-        excess: highest pressure that was held for longer than the gate allows, less what is safe,
-            cmH2O; of severity 1 where nothing was found; None where the controller failed.
-        physics: what deviates, in physical units, by name.
-        alone: critical severity of each coordinate alone, by name; only those that were found.
-    """
-
-    lung: str
-    severity: float | None
-    pip: float
+    lung: str  #: id.
+    severity: float | None  #: 0 to 1; None if nothing unsafe was found up to the end of the range.
+    pip: float  #: cmH2O.
+    #: highest pressure that was held for longer than the gate allows, less what is safe, cmH2O; of
+    #: severity 1 where nothing was found; None where the controller failed.
     excess: float | None
-    physics: dict[str, str]
+    physics: dict[str, str]  #: what deviates, in physical units, by name.
+    #: critical severity of each coordinate alone, by name; only those that were found.
     alone: dict[str, float]
 
     def lines(self) -> list[str]:

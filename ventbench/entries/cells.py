@@ -40,27 +40,16 @@ from ventbench.task.stressors import Condition, conditions, stressor
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of L lungs under S conditions: n draws and P PIPs of each.
+    """Cells of L lungs under S conditions: n draws and P PIPs of each."""
 
-    Attributes:
-        lungs: length L.
-        conditions: length S; the first is none.
-        plants: leaves ``(L, n, 1, ...)``, or ``(L, ...)`` where each lung has one rig.
-        scenario: deviations, batch shape ``(L, n, P)``.
-        pips: PIP before its deviation, cmH2O, ``(L, n, P)``.
-        draw: counted from 1; 0 without deviations, ``(n,)``.
-        rig: session of each lung, ``(L, n)``.
-        member: member of the ensemble, ``(L, n)``.
-    """
-
-    lungs: tuple[Lung, ...]
-    conditions: tuple[Condition, ...]
-    plants: Plant
-    scenario: Scenario
-    pips: Floats
-    draw: Ints
-    rig: Ints
-    member: Ints
+    lungs: tuple[Lung, ...]  #: length L.
+    conditions: tuple[Condition, ...]  #: length S; the first is none.
+    plants: Plant  #: leaves ``(L, n, 1, ...)``, or ``(L, ...)`` where each lung has one rig.
+    scenario: Scenario  #: deviations, batch shape ``(L, n, P)``.
+    pips: Floats  #: PIP before its deviation, cmH2O, ``(L, n, P)``.
+    draw: Ints  #: counted from 1; 0 without deviations, ``(n,)``.
+    rig: Ints  #: session of each lung, ``(L, n)``.
+    member: Ints  #: member of the ensemble, ``(L, n)``.
 
     def stressed(self, draw: int) -> tuple[Stressed, Scenario]:
         """One draw under every condition, as 64-bit arrays: call it within ``float64()``.
@@ -79,23 +68,16 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Protocol:
-    """All that a score depends on besides the submission; make it with :func:`protocol_of`.
+    """All that a score depends on besides the submission; make it with :func:`protocol_of`."""
 
-    Attributes:
-        rigs: the plants.
-        pips: nominal PIPs, cmH2O, length P.
-        drawn: K draws; None without.
-        cells: nominal cells on the reference rigs in front of the draws, without a stressor.
-        stressed: the same draws under missing physics, one PIP of each lung and draw; or None.
-        reference: best attainable and best PID of the first cells; None where it was not computed
-            for these simulators and draws.
-    """
-
-    rigs: Rigs
-    pips: tuple[float, ...]
-    drawn: Draws | None
-    cells: Cells
+    rigs: Rigs  #: the plants.
+    pips: tuple[float, ...]  #: nominal PIPs, cmH2O, length P.
+    drawn: Draws | None  #: K draws; None without.
+    cells: Cells  #: nominal cells on the reference rigs in front of the draws, without a stressor.
+    #: the same draws under missing physics, one PIP of each lung and draw; or None.
     stressed: Cells | None
+    #: best attainable and best PID of the first cells; None where it was not computed for these
+    #: simulators and draws.
     reference: Reference | None
 
     @property
@@ -196,21 +178,14 @@ class ProtocolRun:
     """Inspirations of all cells; arrays of shape ``(..., BREATHS, INSPIRATION_STEPS)``.
 
     ``(...)`` is the batch shape of the cells, lungs first, or conditions and then lungs.
-
-    Attributes:
-        pressure: airway pressure at each step, which is scored, cmH2O.
-        requested: what the controllers asked for, %; 0 once a cell has failed.
-        u_in: what was applied, %.
-        volume: gas in the lung, mL; None where the plants have no such signal.
-        failures: what failed, by index of the cell.
-        act_seconds: time on the clock that an answer took on average, s, each time that some came.
     """
 
-    pressure: Floats
-    requested: Floats
-    u_in: Floats
-    volume: Floats | None
-    failures: Mapping[tuple[int, ...], Failure]
+    pressure: Floats  #: airway pressure at each step, which is scored, cmH2O.
+    requested: Floats  #: what the controllers asked for, %; 0 once a cell has failed.
+    u_in: Floats  #: what was applied, %.
+    volume: Floats | None  #: gas in the lung, mL; None where the plants have no such signal.
+    failures: Mapping[tuple[int, ...], Failure]  #: what failed, by index of the cell.
+    #: time on the clock that an answer took on average, s, each time that some came.
     act_seconds: Floats
 
 

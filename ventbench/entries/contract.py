@@ -204,17 +204,11 @@ _WARM_UP = 3
 
 @dataclass(frozen=True)
 class Answers:
-    """What came of the runs.
+    """What came of the runs."""
 
-    Attributes:
-        commands: answers of each run, %, up to its end or failure.
-        failures: what failed, by number of the run.
-        act_seconds: processor time of one ``act`` in each round, s, without the first ones.
-    """
-
-    commands: tuple[Floats, ...]
-    failures: dict[int, Failure]
-    act_seconds: Floats
+    commands: tuple[Floats, ...]  #: answers of each run, %, up to its end or failure.
+    failures: dict[int, Failure]  #: what failed, by number of the run.
+    act_seconds: Floats  #: processor time of one ``act`` in each round, s, without the first ones.
 
 
 def joined(first: Answers, second: Answers) -> Answers:

@@ -17,25 +17,15 @@ GROUPS: tuple[Group, ...] = ("files", "manifest", "source", "run", "repeat", "ti
 
 @dataclass(frozen=True)
 class Finding:
-    """One problem or note.
+    """One problem or note."""
 
-    Attributes:
-        group: what was looked at, one of :data:`GROUPS`.
-        file: path below the folder, or words such as ``"the folder"``; printable.
-        what: is wrong with it; printable.
-        advice: what to do; printable.
-        line: counted from 1; None where there is none.
-        column: counted from 1; None where there is none.
-        problem: whether it stops the submission.
-    """
-
-    group: Group
-    file: str
-    what: str
-    advice: str
-    line: int | None = None
-    column: int | None = None
-    problem: bool = True
+    group: Group  #: what was looked at, one of :data:`GROUPS`.
+    file: str  #: path below the folder, or words such as ``"the folder"``; printable.
+    what: str  #: is wrong with it; printable.
+    advice: str  #: what to do; printable.
+    line: int | None = None  #: counted from 1; None where there is none.
+    column: int | None = None  #: counted from 1; None where there is none.
+    problem: bool = True  #: whether it stops the submission.
 
     def __post_init__(self) -> None:
         # File names, values and exceptions are the author's; a terminal and a page show this.
@@ -61,20 +51,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All findings of a submission.
+    """All findings of a submission."""
 
-    Attributes:
-        label: the submission, as the person named it.
-        findings: all of them, in the order of :data:`GROUPS`.
-        left_out: groups that could not be looked at because of the problems.
-        sandbox: layers that the dry run had; None if it ran in this process, or did not run.
-        act_us: mean and largest time of an ``act``, microseconds; None if it did not run.
-    """
-
-    label: str
-    findings: tuple[Finding, ...]
-    left_out: tuple[Group, ...] = ()
+    label: str  #: the submission, as the person named it.
+    findings: tuple[Finding, ...]  #: all of them, in the order of :data:`GROUPS`.
+    left_out: tuple[Group, ...] = ()  #: groups that could not be looked at because of the problems.
+    #: layers that the dry run had; None if it ran in this process, or did not run.
     sandbox: dict[str, Any] | None = None
+    #: mean and largest time of an ``act``, microseconds; None if it did not run.
     act_us: tuple[float, float] | None = None
 
     @property

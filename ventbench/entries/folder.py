@@ -41,21 +41,15 @@ _IGNORED_FOLDERS, _IGNORED_FILES = {"__pycache__"}, {".DS_Store"}
 
 @dataclass(frozen=True)
 class Submission:
-    """A submission whose folder and manifest are in order; its code has not been touched.
+    """A submission whose folder and manifest are in order; its code has not been touched."""
 
-    Attributes:
-        label: how the person named it; starts every message.
-        folder: absolute path.
-        manifest: what ``submission.toml`` says.
-        sha256: hash of the folder, see :func:`combined_hash`; None for a class or function.
-        controller: makes a controller, for a class or function in place of a folder; it can only
-            run in this process.
-    """
-
-    label: str
-    folder: Path
-    manifest: Manifest
+    label: str  #: how the person named it; starts every message.
+    folder: Path  #: absolute path.
+    manifest: Manifest  #: what ``submission.toml`` says.
+    #: hash of the folder, see :func:`combined_hash`; None for a class or function.
     sha256: str | None
+    #: makes a controller, for a class or function in place of a folder; it can only run in this
+    #: process.
     controller: Callable[[], Any] | None = None
 
 

@@ -48,46 +48,28 @@ NAME_RULE = (
 
 @dataclass(frozen=True)
 class Training:
-    """Table ``[training]``: where the parameters come from; every key may be left out.
+    """Table ``[training]``: where the parameters come from; every key may be left out."""
 
-    Attributes:
-        data: what they were learned or tuned on.
-        simulators: version of the frozen simulators used; empty if none.
-        seeds: those of all runs.
-        compute: such as ``"20 min on 2 CPU cores"``.
-        per_lung: whether there is one set of parameters for each lung.
-    """
-
-    data: str = ""
-    simulators: str = ""
-    seeds: tuple[int, ...] = ()
-    compute: str = ""
-    per_lung: bool = False
+    data: str = ""  #: what they were learned or tuned on.
+    simulators: str = ""  #: version of the frozen simulators used; empty if none.
+    seeds: tuple[int, ...] = ()  #: those of all runs.
+    compute: str = ""  #: such as ``"20 min on 2 CPU cores"``.
+    per_lung: bool = False  #: whether there is one set of parameters for each lung.
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """The content of ``submission.toml``.
+    """The content of ``submission.toml``."""
 
-    Attributes:
-        name: lower-case letters, digits and underscores, at most 40.
-        authors: at least one.
-        licence: SPDX identifier, such as ``"Apache-2.0"``.
-        api_version: version of the submission interface, now 1.
-        family: one of :data:`FAMILIES`.
-        tracks: one or both of :data:`TRACKS`; the first is scored if none is asked for.
-        description: a sentence or two.
-        training: see :class:`Training`.
-    """
-
-    name: str
-    authors: tuple[str, ...]
-    licence: str
-    api_version: int
-    family: str
+    name: str  #: lower-case letters, digits and underscores, at most 40.
+    authors: tuple[str, ...]  #: at least one.
+    licence: str  #: SPDX identifier, such as ``"Apache-2.0"``.
+    api_version: int  #: version of the submission interface, now 1.
+    family: str  #: one of :data:`FAMILIES`.
+    #: one or both of :data:`TRACKS`; the first is scored if none is asked for.
     tracks: tuple[str, ...]
-    description: str
-    training: Training = field(default_factory=Training)
+    description: str  #: a sentence or two.
+    training: Training = field(default_factory=Training)  #: see :class:`Training`.
 
 
 # A check takes a TOML value and returns the value to keep, or raises ValueError with what is wrong.

@@ -73,25 +73,20 @@ class Reference:
 
     All errors leave the first step of an inspiration out, see
     :func:`ventbench.task.metrics.score.controllable_error`.
-
-    Attributes:
-        about: hashes of the simulators, and name, commitment and number of the draws.
-        gains: P, I, D of each lung's best PID, %/cmH2O, shape ``(L, 3)``.
-        attainable: error that :attr:`commands` attain, cmH2O, shape ``(L, 1 + K, P)``.
-        lower: error of the rise alone, below which none can be, cmH2O, shape ``(L, 1 + K, P)``.
-        stationarity: first-order decrease that is left, cmH2O, shape ``(L, 1 + K, P)``; see
-            :class:`ventbench.task.attainable.Attainable`.
-        pid: error of the best PID with the noise of the draw, cmH2O, shape ``(L, 1 + K, P)``.
-        commands: of each scored inspiration, %, shape ``(L, 1 + K, P, B, COMMANDS)``.
     """
 
+    #: hashes of the simulators, and name, commitment and number of the draws.
     about: Mapping[str, Any]
-    gains: Floats
-    attainable: Floats
+    gains: Floats  #: P, I, D of each lung's best PID, %/cmH2O, shape ``(L, 3)``.
+    attainable: Floats  #: error that :attr:`commands` attain, cmH2O, shape ``(L, 1 + K, P)``.
+    #: error of the rise alone, below which none can be, cmH2O, shape ``(L, 1 + K, P)``.
     lower: Floats
+    #: first-order decrease that is left, cmH2O, shape ``(L, 1 + K, P)``; see
+    #: :class:`ventbench.task.attainable.Attainable`.
     stationarity: Floats
+    #: error of the best PID with the noise of the draw, cmH2O, shape ``(L, 1 + K, P)``.
     pid: Floats
-    commands: Floats
+    commands: Floats  #: of each scored inspiration, %, shape ``(L, 1 + K, P, B, COMMANDS)``.
 
     def normalised(self, error: ArrayLike) -> Floats:
         """Normalised score of errors over the same cells, shape ``(L, 1 + k, P)`` with k <= K."""

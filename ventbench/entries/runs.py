@@ -48,23 +48,14 @@ PLATEAU_TOLERANCE, PLATEAU_SHARE = 2.0, 0.04
 
 @dataclass(frozen=True)
 class CellFailure:
-    """A failure and its cell.
+    """A failure and its cell."""
 
-    Attributes:
-        condition: id of the condition.
-        lung: id; also where the submission did not know it.
-        pip: nominal PIP, cmH2O.
-        draw: counted from 1; None for the nominal cell.
-        failure: what went wrong.
-        message: the failure in one sentence for a person.
-    """
-
-    condition: str
-    lung: str
-    pip: float
-    draw: int | None
-    failure: Failure
-    message: str
+    condition: str  #: id of the condition.
+    lung: str  #: id; also where the submission did not know it.
+    pip: float  #: nominal PIP, cmH2O.
+    draw: int | None  #: counted from 1; None for the nominal cell.
+    failure: Failure  #: what went wrong.
+    message: str  #: the failure in one sentence for a person.
 
     def to_json(self) -> dict[str, Any]:
         """The cell and the failure as JSON values."""
@@ -77,44 +68,30 @@ class Runs:
     """Figures of every run of an entry; S conditions, L lungs, n cells of each lung.
 
     The first condition is none: the same cells without a stressor.
-
-    Attributes:
-        conditions: length S.
-        lungs: ids, length L.
-        pips: nominal PIP, cmH2O, ``(L, n)``.
-        rig: session of each lung in each cell, ``(L, n)``.
-        member: member of the ensemble, ``(L, n)``.
-        error: mean |airway pressure - PIP| over the scored inspirations, cmH2O, ``(S, L, n)``; NaN
-            where the controller failed.
-        safe: whether a run passed the safety gate in all breaths, ``(S, L, n)``.
-        survived: see the module, ``(S, L, n)``.
-        alarm_s: time above PIP + 15 % in a breath, the longest of the run, s, ``(S, L, n)``.
-        peak: highest pressure, cmH2O, ``(S, L, n)``.
-        volume: volume in the lung at the end of the scored inspirations, mean, mL, ``(S, L, n)``;
-            NaN where the plants have no such signal.
-        draw: of each cell, counted from 1; 0 without deviations, ``(n,)``.
-        plateau_error: |mean of the last 0.3 s - PIP| of the last breath, cmH2O, ``(S, L, n)``; not
-            in records.
-        requested: all commands, %, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``, 0 once a cell has
-            failed; not in records.
-        failures: what failed; not in records.
     """
 
-    conditions: tuple[Condition, ...]
-    lungs: tuple[str, ...]
-    pips: Floats
-    rig: Ints
-    member: Ints
+    conditions: tuple[Condition, ...]  #: length S.
+    lungs: tuple[str, ...]  #: ids, length L.
+    pips: Floats  #: nominal PIP, cmH2O, ``(L, n)``.
+    rig: Ints  #: session of each lung in each cell, ``(L, n)``.
+    member: Ints  #: member of the ensemble, ``(L, n)``.
+    #: mean |airway pressure - PIP| over the scored inspirations, cmH2O, ``(S, L, n)``; NaN where
+    #: the controller failed.
     error: Floats
-    safe: Bools
-    survived: Bools
-    alarm_s: Floats
-    peak: Floats
+    safe: Bools  #: whether a run passed the safety gate in all breaths, ``(S, L, n)``.
+    survived: Bools  #: see the module, ``(S, L, n)``.
+    alarm_s: Floats  #: time above PIP + 15 % in a breath, the longest of the run, s, ``(S, L, n)``.
+    peak: Floats  #: highest pressure, cmH2O, ``(S, L, n)``.
+    #: volume in the lung at the end of the scored inspirations, mean, mL, ``(S, L, n)``; NaN where
+    #: the plants have no such signal.
     volume: Floats
-    draw: Ints
+    draw: Ints  #: of each cell, counted from 1; 0 without deviations, ``(n,)``.
+    #: |mean of the last 0.3 s - PIP| of the last breath, cmH2O, ``(S, L, n)``; not in records.
     plateau_error: Floats | None = None
+    #: all commands, %, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``, 0 once a cell has failed; not in
+    #: records.
     requested: Floats | None = None
-    failures: Sequence[CellFailure] = ()
+    failures: Sequence[CellFailure] = ()  #: what failed; not in records.
 
     @property
     def score(self) -> float:

@@ -85,26 +85,17 @@ WINDOW = slice(BREATH * protocol.BREATH_STEPS, BREATH * protocol.BREATH_STEPS + 
 
 @dataclass(frozen=True)
 class RunPanel:
-    """One lung and PIP, in panel units (y downwards).
+    """One lung and PIP, in panel units (y downwards)."""
 
-    Attributes:
-        lung: id.
-        pip: cmH2O.
-        ticks: ticks of the pressure axis, value in cmH2O and y.
-        target: polyline, shape ``(SHOWN + 1, 2)``.
-        pressures: one polyline a run, shape ``(SHOWN + 1, 2)``; NaN where there is no finite
-            pressure.
-        valves: one polyline a run, u_in as a staircase, shape ``(2 * SHOWN + 1, 2)``.
-        above: highest pressure of the first run if that is above the frame, cmH2O.
-    """
-
-    lung: str
-    pip: float
-    ticks: tuple[tuple[float, float], ...]
-    target: Floats
+    lung: str  #: id.
+    pip: float  #: cmH2O.
+    ticks: tuple[tuple[float, float], ...]  #: ticks of the pressure axis, value in cmH2O and y.
+    target: Floats  #: polyline, shape ``(SHOWN + 1, 2)``.
+    #: one polyline a run, shape ``(SHOWN + 1, 2)``; NaN where there is no finite pressure.
     pressures: tuple[Floats, ...]
+    #: one polyline a run, u_in as a staircase, shape ``(2 * SHOWN + 1, 2)``.
     valves: tuple[Floats, ...]
-    above: float | None
+    above: float | None  #: highest pressure of the first run if that is above the frame, cmH2O.
 
 
 def panels(runs: Sequence[Trajectories]) -> list[list[RunPanel]]:

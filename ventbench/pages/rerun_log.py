@@ -41,19 +41,12 @@ COLUMN = 16
 
 @dataclass(frozen=True)
 class Plot:
-    """Plot of one quantity.
+    """Plot of one quantity."""
 
-    Attributes:
-        quantity: last part of the entity path.
-        title: title with the unit.
-        range: range of the axis; None to fit the data.
-        share: share of a lung tab's height.
-    """
-
-    quantity: str
-    title: str
-    range: tuple[float, float] | None
-    share: float
+    quantity: str  #: last part of the entity path.
+    title: str  #: title with the unit.
+    range: tuple[float, float] | None  #: range of the axis; None to fit the data.
+    share: float  #: share of a lung tab's height.
 
 
 def recording(runs: Sequence[Trajectories]) -> bytes:

@@ -120,17 +120,11 @@ NOT_PROVENANCE = frozenset(
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of N runs, cmH2O; NaN where a run failed.
+    """Scores of N runs, cmH2O; NaN where a run failed."""
 
-    Attributes:
-        overall: shape ``(N,)``.
-        lungs: shape ``(N, L)``.
-        cells: shape ``(N, L, P)``.
-    """
-
-    overall: Floats
-    lungs: Floats
-    cells: Floats
+    overall: Floats  #: shape ``(N,)``.
+    lungs: Floats  #: shape ``(N, L)``.
+    cells: Floats  #: shape ``(N, L, P)``.
 
 
 def collect(

@@ -20,22 +20,16 @@ MIB, GIB = 1 << 20, 1 << 30
 
 @dataclass(frozen=True)
 class Allowance:
-    """Limits of a session; the processor is shared by all its cells, hence patience, not a pace.
+    """Limits of a session; the processor is shared by all its cells, hence patience, not a pace."""
 
-    Attributes:
-        memory: bytes of one cell beyond the interpreter with its libraries.
-        cpu_s: seconds of processor time of one cell: import, reset and three breaths.
-        start_patience_s: processor time in which a controller is imported and reset.
-        patience_s: processor time of one answer. Cells that wait for something, or for a processor,
-            time out when none of them has answered for a multiple of it on the clock.
-        total_s: all cells time out when a session has taken this long on the clock, so that no
-            entry keeps others waiting for longer.
-    """
-
-    memory: int = 512 * MIB
-    cpu_s: int = 60
-    start_patience_s: float = 20.0
+    memory: int = 512 * MIB  #: bytes of one cell beyond the interpreter with its libraries.
+    cpu_s: int = 60  #: seconds of processor time of one cell: import, reset and three breaths.
+    start_patience_s: float = 20.0  #: processor time in which a controller is imported and reset.
+    #: processor time of one answer. Cells that wait for something, or for a processor, time out
+    #: when none of them has answered for a multiple of it on the clock.
     patience_s: float = 5.0
+    #: all cells time out when a session has taken this long on the clock, so that no entry keeps
+    #: others waiting for longer.
     total_s: float = 900.0
 
     def __post_init__(self) -> None:

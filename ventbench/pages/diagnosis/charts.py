@@ -55,32 +55,22 @@ REQUESTED = 4
 
 @dataclass
 class Chart:
-    """Axes with linear scales, or a logarithmic horizontal one; y of the picture runs downwards.
+    """Axes with linear scales, or a logarithmic horizontal one; y of the picture runs downwards."""
 
-    Attributes:
-        x: ends of the horizontal axis.
-        y: ends of the vertical axis.
-        x_label: label under the frame, with the unit.
-        y_label: label above the frame, with the unit.
-        alt: description of the picture for those who cannot see it.
-        width: width of the picture.
-        height: height of the picture.
-        paths: class and path data of lines, the lowest first.
-        areas: class and path data of filled areas, below the lines.
-        bands: left end and width of shaded ranges.
-        log: whether the horizontal axis is logarithmic; smaller values stand at its left end.
-    """
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    x_label: str
-    y_label: str
-    alt: str
-    width: float = 300.0
-    height: float = 170.0
+    x: tuple[float, float]  #: ends of the horizontal axis.
+    y: tuple[float, float]  #: ends of the vertical axis.
+    x_label: str  #: label under the frame, with the unit.
+    y_label: str  #: label above the frame, with the unit.
+    alt: str  #: description of the picture for those who cannot see it.
+    width: float = 300.0  #: width of the picture.
+    height: float = 170.0  #: height of the picture.
+    #: class and path data of lines, the lowest first.
     paths: list[tuple[str, str]] = field(default_factory=list)
+    #: class and path data of filled areas, below the lines.
     areas: list[tuple[str, str]] = field(default_factory=list)
+    #: left end and width of shaded ranges.
     bands: list[tuple[float, float]] = field(default_factory=list)
+    #: whether the horizontal axis is logarithmic; smaller values stand at its left end.
     log: bool = False
 
     @property
@@ -190,25 +180,15 @@ def limits(*arrays: ArrayLike, around: float = 0.06, least: float = 0.0) -> tupl
 
 @dataclass(frozen=True, eq=False)
 class BreathPanel:
-    """One breath.
+    """One breath."""
 
-    Attributes:
-        title: title, such as ``breath 17``.
-        why: reason why the breath is shown.
-        errors: root mean square over the inspiration by stage, cmH2O.
-        pressure: chart of the pressure.
-        near: the part of it where the refitted simulator errs most, magnified.
-        error: chart of recorded minus simulated pressure.
-        valve: chart of the command.
-    """
-
-    title: str
-    why: str
-    errors: dict[str, float]
-    pressure: Chart
-    near: Chart
-    error: Chart
-    valve: Chart
+    title: str  #: title, such as ``breath 17``.
+    why: str  #: reason why the breath is shown.
+    errors: dict[str, float]  #: root mean square over the inspiration by stage, cmH2O.
+    pressure: Chart  #: chart of the pressure.
+    near: Chart  #: the part of it where the refitted simulator errs most, magnified.
+    error: Chart  #: chart of recorded minus simulated pressure.
+    valve: Chart  #: chart of the command.
 
 
 def rmse(traces: Traces, simulated: Floats) -> Floats:

@@ -269,37 +269,24 @@ _LATENT = {ALVEOLUS: "alveolus", SUPPLY: "supply", MEASUREMENT: "sensor", CIRCUI
 
 @dataclass(frozen=True)
 class Part:
-    """One part of the picture.
+    """One part of the picture."""
 
-    Attributes:
-        name: its name in the picture.
-        look: class: ``"lit"`` if a named mechanism acts there, ``"suspect"`` if an effect acts
-            there that the library does not have, else ``""``.
-        badge: numbers of the entries of the key that act there, such as ``"1, 3"``.
-    """
-
-    name: str
+    name: str  #: its name in the picture.
+    #: class: ``"lit"`` if a named mechanism acts there, ``"suspect"`` if an effect acts there that
+    #: the library does not have, else ``""``.
     look: str = ""
-    badge: str = ""
+    badge: str = ""  #: numbers of the entries of the key that act there, such as ``"1, 3"``.
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the key beside the picture.
+    """One line of the key beside the picture."""
 
-    Attributes:
-        number: number in the picture.
-        title: what is missing.
-        value: its strength with its interval; ``""`` if it has none.
-        look: class, as in :class:`Part`.
-        part: name of the part in which it acts.
-    """
-
-    number: int
-    title: str
-    value: str
-    look: str
-    part: str
+    number: int  #: number in the picture.
+    title: str  #: what is missing.
+    value: str  #: its strength with its interval; ``""`` if it has none.
+    look: str  #: class, as in :class:`Part`.
+    part: str  #: name of the part in which it acts.
 
 
 def site_of_term(term: NonparametricTerm) -> str:

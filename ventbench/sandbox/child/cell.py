@@ -42,22 +42,15 @@ class SubmissionError(InputError):
 
 @dataclass(frozen=True)
 class Failure:
-    """One controller that failed during a run; its entry is listed, not ranked.
+    """One controller that failed during a run; its entry is listed, not ranked."""
 
-    Attributes:
-        kind: ``"construct"``, ``"reset"``, ``"act"`` (it raised there), ``"type"`` (no number),
-            ``"value"`` (NaN or infinite); a sandbox adds its own, such as ``"timeout"``.
-        what: what happened, such as ``"controller.py line 7 raised ValueError"``.
-        detail: the exception's text, or empty.
-        breath: counted from 1; None before the first step.
-        step: of the breath, counted from 1; None before the first step.
-    """
-
+    #: ``"construct"``, ``"reset"``, ``"act"`` (it raised there), ``"type"`` (no number),
+    #: ``"value"`` (NaN or infinite); a sandbox adds its own, such as ``"timeout"``.
     kind: str
-    what: str
-    detail: str = ""
-    breath: int | None = None
-    step: int | None = None
+    what: str  #: what happened, such as ``"controller.py line 7 raised ValueError"``.
+    detail: str = ""  #: the exception's text, or empty.
+    breath: int | None = None  #: counted from 1; None before the first step.
+    step: int | None = None  #: of the breath, counted from 1; None before the first step.
 
     def message(self, submission: str, lung: str | None) -> str:
         """One sentence for a person, with the folder as written and the lung's id, if known."""

@@ -137,18 +137,12 @@ def errno_action(error: int) -> int:
 
 
 class Condition(NamedTuple):
-    """Holds when ``argument & mask`` is one of the values.
+    """Holds when ``argument & mask`` is one of the values."""
 
-    Attributes:
-        argument: index of the argument.
-        values: what may be left.
-        mask: bits of its lower 32 that count.
-        whole: the upper 32 bits must be zero (pointers); elsewhere the kernel drops them.
-    """
-
-    argument: int
-    values: Sequence[int]
-    mask: int = 0xFFFFFFFF
+    argument: int  #: index of the argument.
+    values: Sequence[int]  #: what may be left.
+    mask: int = 0xFFFFFFFF  #: bits of its lower 32 that count.
+    #: the upper 32 bits must be zero (pointers); elsewhere the kernel drops them.
     whole: bool = False
 
 

@@ -55,21 +55,13 @@ def sources(folder: Path) -> list[Path]:
 
 
 class Import(NamedTuple):
-    """One imported name.
+    """One imported name."""
 
-    Attributes:
-        module: dotted name.
-        level: number of leading dots.
-        node: the statement.
-        optional: whether a failing import is caught.
-        late: whether it stands in a function.
-    """
-
-    module: str
-    level: int
-    node: ast.stmt
-    optional: bool
-    late: bool
+    module: str  #: dotted name.
+    level: int  #: number of leading dots.
+    node: ast.stmt  #: the statement.
+    optional: bool  #: whether a failing import is caught.
+    late: bool  #: whether it stands in a function.
 
 
 def imports(body: list[ast.stmt], optional: bool = False, late: bool = False) -> Iterator[Import]:

@@ -36,17 +36,11 @@ class WireError(ValueError):
 
 
 class Reply(NamedTuple):
-    """One frame from a cell.
+    """One frame from a cell."""
 
-    Attributes:
-        kind: ``LOCKED``, ``READY``, ``COMMAND`` or ``FAILED``.
-        value: ``u_in``, %, of a command; the layers' bits of ``LOCKED``.
-        text: what a failure says.
-    """
-
-    kind: int
-    value: float
-    text: bytes
+    kind: int  #: ``LOCKED``, ``READY``, ``COMMAND`` or ``FAILED``.
+    value: float  #: ``u_in``, %, of a command; the layers' bits of ``LOCKED``.
+    text: bytes  #: what a failure says.
 
 
 def pack_observation(sequence: int, row: bytes) -> bytes:

@@ -23,13 +23,7 @@ class InputError(ValueError):
 
 
 class InputTypeError(InputError, TypeError):
-    """What was given is of a type that is not taken there.
-
-    Args:
-        what: was given, and for what, such as ``"recording"``.
-        given: the value.
-        wanted: what to give instead, in words.
-    """
+    """What was given is of a type that is not taken; the message says what is wanted instead."""
 
     def __init__(self, what: str, given: object, wanted: str):
         super().__init__(f"{what} is of type {type(given).__name__}; give {wanted}")
@@ -46,10 +40,7 @@ _MANY = re.compile(r"(Sequence|Iterable|Mapping)\[(?:str, )?(\w+)\]")
 def check_types(signature: Signature, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
     """Check arguments whose annotation is of plain types: text, paths, numbers, many of these.
 
-    Args:
-        signature: of the function, its annotations as text.
-        args: by position.
-        kwargs: by name.
+    The signature has its annotations as text.
 
     Raises:
         InputTypeError: if one is of another type.
@@ -92,12 +83,7 @@ def _is(value: Any, part: str) -> bool | None:
 
 
 def require(*modules: str, extra: str = "view", what: str = "pictures") -> None:
-    """Check that packages of an extra are here; call it when they are needed.
-
-    Args:
-        modules: names to import.
-        extra: of ventbench, that brings them.
-        what: needs them, in words.
+    """Check that modules of an extra are here when ``what``, in words, needs them.
 
     Raises:
         InputError: if one is missing, with the command that brings it.

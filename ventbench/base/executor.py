@@ -127,12 +127,7 @@ def results(
     function: Callable[..., ResultT],
     jobs: Mapping[str, tuple[Any, ...]],
 ) -> Iterator[tuple[str, ResultT]]:
-    """Run jobs and yield the name and the result of each as it ends.
-
-    Args:
-        pool: executor.
-        function: what every job runs.
-        jobs: arguments of each job, by name.
+    """Run jobs, arguments by name, and yield the name and the result of each as it ends.
 
     Raises:
         InputError: if a worker process has died.
@@ -160,17 +155,9 @@ def in_order(
     arguments: Iterable[tuple[Any, ...]],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[ResultT]:
-    """Return the results of jobs in the order of their arguments.
+    """Return the results of jobs in the order of their arguments; errors as of :func:`results`.
 
-    Args:
-        pool: executor.
-        function: what every job runs.
-        arguments: of each job.
-        progress: called with the number of jobs that are done and the number of all.
-
-    Raises:
-        InputError: if a worker process has died.
-        Exception: whatever a job raises.
+    ``progress`` is called with the number of jobs that are done and the number of all.
     """
     jobs = {str(index): own for index, own in enumerate(arguments)}
     kept: dict[str, ResultT] = {}

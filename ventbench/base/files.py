@@ -29,11 +29,9 @@ except ImportError:  # not a POSIX system
 
 
 def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Create or replace a file in one step.
+    """Create or replace a file in one step, and its folder if it is missing.
 
-    Args:
-        path: target; its folder is created if missing.
-        write: receives a binary file object and writes the content to it.
+    ``write`` receives a binary file object and writes the content to it.
 
     Raises:
         OSError: if the folder or file cannot be written; it names the target, whose old content
@@ -83,11 +81,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def as_json(value: Any) -> str:
-    """Text of a JSON file.
-
-    Raises:
-        ValueError: if a number is not finite.
-    """
+    """Text of a JSON file; ValueError if a number is not finite."""
     return json.dumps(value, indent=2, allow_nan=False) + "\n"
 
 
@@ -166,10 +160,7 @@ def _folder(name: str) -> Path:
 
 
 def data_path(name: str) -> Path:
-    """Path of a file that travels with ventbench.
-
-    Args:
-        name: relative to the folder ``data``, such as ``"draws-v1.npz"``.
+    """Path of a file below ``data``, which travels with ventbench, such as ``"draws-v1.npz"``.
 
     Raises:
         InputError: if it is not there.

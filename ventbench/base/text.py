@@ -98,11 +98,7 @@ def page_templates(
 ) -> jinja2.Environment:
     """Environment of the templates in ``templates/`` of a package, with one set of rules.
 
-    Text is escaped, and a missing value is an error.
-
-    Args:
-        package: such as ``"ventbench.pages"``.
-        shown: what a value is passed through before it is escaped.
+    Text is passed through ``shown`` and escaped, and a missing value is an error.
 
     Raises:
         InputError: if jinja2 is not installed.

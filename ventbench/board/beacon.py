@@ -84,20 +84,12 @@ DECODER = msgspec.json.Decoder(Value)
 
 
 def read(content: bytes, label: str) -> Value:
-    """Read a value as relays publish it.
-
-    Raises:
-        InputError: if it is none.
-    """
+    """Read a value as relays publish it; InputError if it is none."""
     return schema.decoded(DECODER, content, label)
 
 
 def fetch(chain: Chain, number: int) -> bytes:
-    """Get a value from a public relay.
-
-    Raises:
-        InputError: if it does not answer with one.
-    """
+    """Get a value from a public relay; InputError if it does not answer with one."""
     address = f"{RELAY}/{chain.hash}/public/{number}"
     try:
         with urllib.request.urlopen(address, timeout=_TIMEOUT_S) as answer:

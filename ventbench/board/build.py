@@ -47,11 +47,7 @@ class Built:
 
 
 def content(leaderboard: Store) -> dict[str, bytes]:
-    """Return every built file by its path.
-
-    Raises:
-        InputError: if jinja2 is not installed.
-    """
+    """Return every built file by its path; InputError if jinja2 is not installed."""
     tracks = ranking.board(leaderboard)
     environment = pages.environment()
     built = {

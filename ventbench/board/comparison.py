@@ -189,14 +189,8 @@ def agreement(cells: Floats, rig: Ints, lungs: Sequence[str], pips: Sequence[flo
 ]:  # fmt: skip
     """Kendall's tau between the order by all runs and that by one rig, one lung or one PIP.
 
-    Args:
-        cells: normalised scores, shape ``(N, K, L, P)``, N at least 2.
-        rig: of each lung and draw, shape ``(L, K)``.
-        lungs: ids, length L.
-        pips: cmH2O, length P.
-
-    Returns:
-        For ``"rig"``, ``"lung"`` and ``"PIP"``, tau by name; NaN where all are equal.
+    Of normalised scores of at least two entries, ``(N, K, L, P)``, on a rig of each lung and draw,
+    ``(L, K)``: for ``"rig"``, ``"lung"`` and ``"PIP"``, tau by name; NaN where all are equal.
     """
     means = cells.mean(axis=(1, 2, 3))
 
@@ -223,9 +217,7 @@ def profile(cells: Floats) -> Floats:
 def interquartile_mean(cells: Floats, rig: Ints) -> tuple[float, float, float]:
     """Mean of the middle half of all runs (Agarwal et al. 2021), with its 95 % interval over rigs.
 
-    Args:
-        cells: normalised scores of one entry, shape ``(K, L, P)``.
-        rig: of each lung and draw, shape ``(L, K)``.
+    Of normalised scores of an entry, ``(K, L, P)``, on a rig of each lung and draw, ``(L, K)``.
     """
     flat = cells.ravel()
     order = np.argsort(flat, kind="stable")

@@ -342,13 +342,9 @@ def _row(draw: int, own: float, other: float) -> str:
 def heat_map(
     values: Floats, record: Record, limits: tuple[float, ...], digits: int = 2
 ) -> list[dict[str, Any]]:
-    """Rows of a map of means over draws; the nominal value beside each.
+    """Rows of a map of means over draws of values ``(1 + K, L, P)``; the first ones stand beside.
 
-    Args:
-        values: nominal runs first, shape ``(1 + K, L, P)``.
-        record: whose they are.
-        limits: between the shades.
-        digits: that are shown.
+    Shades change at the limits.
     """
     means = values[1:].mean(axis=0)
     return [

@@ -159,13 +159,8 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
     over the scored inspiratory steps. An entry that lives on errors of one simulator shows a large
     one; its mean over all cells is the exploitation index.
 
-    Args:
-        simulators: L lungs, M members.
-        pips: cmH2O, length P.
-        requested: nominal commands, %, shape ``(N, L, P, BREATHS, INSPIRATION_STEPS)``.
-
-    Returns:
-        cmH2O, shape ``(N, L, P)``; NaN for fewer than two members.
+    Of nominal commands, %, ``(N, L, P, BREATHS, INSPIRATION_STEPS)``: cmH2O, ``(N, L, P)``; NaN for
+    fewer than two members.
     """
     leaves = jax.tree.leaves(simulators.ensemble)
     members, lungs = leaves[0].shape[:2]
@@ -201,13 +196,9 @@ def replay(
     requested: Sequence[Floats],
     draws: Draws,
 ) -> Iterator[Replayed]:
-    """Replay the commands of records of one shape, a few at a time.
+    """Replay the commands of records of one shape over K draws, a few at a time.
 
-    Args:
-        simulators: L lungs.
-        pips: cmH2O, length P.
-        requested: of each record, %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
-        draws: K of them.
+    Each record has commands, %, of shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
     """
     if not requested:
         return

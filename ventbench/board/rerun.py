@@ -63,11 +63,7 @@ class Outcome:
 
 
 def sandboxed() -> Runner:
-    """The runner of official scores.
-
-    Raises:
-        SandboxError: if this machine lacks a layer that they need.
-    """
+    """The runner of official scores; SandboxError if this machine lacks a layer that they need."""
     from ventbench.sandbox.runner import SandboxRunner
 
     return SandboxRunner(require_official=True)

@@ -130,11 +130,7 @@ class Round:
 
     @property
     def seed(self) -> bytes:
-        """Seed of the draws.
-
-        Raises:
-            InputError: if the beacon's value is not there yet.
-        """
+        """Seed of the draws; InputError if the beacon's value is not there yet."""
         if self.value is None:
             raise InputError(f"round {self.name} is {self.state}: it has no draws yet")
         return self.value.seed(self.frozen_sha256)
@@ -256,15 +252,9 @@ def freeze(
     *,
     now: datetime | None = None,
 ) -> Round:
-    """Take the hashes of all entries; later changes do not count.
+    """Take the hashes of all entries, one folder each; later changes do not count.
 
-    Args:
-        leaderboard: its folder.
-        name: of the round.
-        submissions: folder of the submissions, one each.
-        requests: who asked for each; entries of the project need none.
-        simulators: version and hashes.
-        now: time of the freeze; the clock's if not given.
+    Requests say who asked for each; entries of the project need none.
 
     Raises:
         InputError: if the round is not open or has not closed yet, or nothing can be frozen.

@@ -57,11 +57,7 @@ class Store:
 
 
 def record_paths(folder: Path) -> list[Path]:
-    """Paths of the records of a leaderboard.
-
-    Raises:
-        InputError: if there is no such folder.
-    """
+    """Paths of the records of a leaderboard; InputError if there is no such folder."""
     if not folder.is_dir():
         raise InputError(
             f"{folder}: there is no such folder; the published leaderboard is a folder of the "
@@ -242,12 +238,8 @@ def _write(folder: Path, added: AnyRecord, content: bytes) -> None:
 def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
     """Find records that contradict those before them: what no record can say by itself.
 
-    Args:
-        records: in the order of :func:`in_order`.
-        start: index of the first one to check; those before are taken as they are.
-
-    Returns:
-        One sentence for each conflict, with the record's hash.
+    Records are in the order of :func:`in_order`; those before ``start`` are taken as they are. One
+    sentence for each conflict, with the record's hash.
     """
     sentences: list[str] = []
     before = _Before()

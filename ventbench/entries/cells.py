@@ -96,7 +96,7 @@ def protocol_of(
     stressors: Sequence[str] = (),
     reference: Reference | None = None,
 ) -> Protocol:
-    """Say what is scored.
+    """Say what is scored on some rigs: see :func:`ventbench.score` for draws, stress and stressors.
 
     Args:
         rigs: from :func:`ventbench.plants.rigs.load_rigs`.

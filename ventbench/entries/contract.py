@@ -230,14 +230,9 @@ def run_all(
     clock: Callable[[ControllerSession], float] = processor_time,
     count: Callable[[], None] = lambda: None,
 ) -> Answers:
-    """Run fresh runs side by side; ``count`` is called after each round.
+    """Run fresh runs of a submission's controller side by side; each round is counted.
 
-    Args:
-        submission: whose controller is asked.
-        runs: fresh ones.
-        runner: runs the controllers.
-        clock: times the calls of ``act``, s; by default as the system counts a process's time.
-        count: called after each round.
+    ``clock`` times the calls of ``act``, s; by default as the system counts a process's time.
 
     Raises:
         SubmissionError: if the code cannot be imported.
@@ -340,14 +335,10 @@ def check(
 
 
 def assert_ready(name: str, runner: Runner | None = None) -> None:
-    """Fail, saying everything that is wrong, unless a submission can be submitted.
-
-    Args:
-        name: path of its folder.
-        runner: runs the controller; the sandbox if not given.
+    """Fail, saying everything that is wrong, unless the submission in a folder can be submitted.
 
     Raises:
-        AssertionError: if it has a problem.
+        AssertionError: if it has a problem. The sandbox runs it if no runner is given.
     """
     report = check(name, runner)
     if not report.ok:

@@ -119,11 +119,7 @@ def settings(simulators: Mapping[str, Any], draws: Mapping[str, Any] | None) -> 
 
 
 def load(path: Path) -> Reference:
-    """Read a file of :meth:`Reference.save`.
-
-    Raises:
-        InputError: if it is missing or is not such a file.
-    """
+    """Read a file of :meth:`Reference.save`; InputError if it is missing or is not such a file."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path} is larger than {MAX_BYTES / 1e6:g} MB")
@@ -300,12 +296,9 @@ def _inspirations(plants: Plant, cells: Scenario, breath: int) -> tuple[Plant, S
 
 
 def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floats:
-    """Errors that the recorded commands of a reference attain, cmH2O, shape ``(L, 1 + K, P)``.
+    """Errors that the commands of a reference attain, cmH2O, ``(L, 1 + K, P)``.
 
-    Args:
-        reference: whose commands they are.
-        plants: leaves ``(L, 1 + K, 1, ...)``.
-        cells: batch shape ``(L, 1 + K, P)``.
+    Plants and cells as of :func:`compute`.
     """
     errors = []
     for breath in range(len(protocol.SCORED_BREATHS)):
@@ -322,11 +315,7 @@ def checked(
 ) -> dict[str, Any]:
     """Check a reference: its commands attain its errors, and nothing better is found by Adam.
 
-    Args:
-        reference: to be checked.
-        plants: of its cells, leaves ``(L, 1 + K, 1, ...)``.
-        cells: batch shape ``(L, 1 + K, P)``.
-        every: the second optimiser runs on one cell of so many.
+    Plants and cells as of :func:`compute`; the second optimiser runs on one cell of ``every``.
 
     Returns:
         ``cells`` and ``second_optimiser_cells``, how many were checked; ``witness_deviation``,

@@ -30,21 +30,16 @@ class ControllerSession(Protocol):
         ...
 
     def ask(self, cells: Ints, observations: Floats) -> None:
-        """Give some controllers their next observation; each is asked by itself.
+        """Give some controllers, ``(n,)``, their next observations, ``(n, ROW)``; see :func:`pack`.
 
-        Of each controller once for each step of each inspiration, in order, after its answer.
-
-        Args:
-            cells: their indices, shape ``(n,)``.
-            observations: one row each, see :func:`pack`, shape ``(n, ROW)``.
+        Each is asked by itself, once for each step of each inspiration, in order, after its answer.
         """
         ...
 
     def answers(self) -> tuple[Ints, Floats]:
         """Take the commands that have come, and wait for one if there is none.
 
-        Returns:
-            Cells, shape ``(m,)``, and their ``u_in``, %: finite, 0 for a failed cell, not clipped.
+        Cells, shape ``(m,)``, and their ``u_in``, %: finite, 0 for a failed cell, not clipped.
         """
         ...
 
@@ -62,26 +57,17 @@ class ControllerSession(Protocol):
 
 
 class Runner(Protocol):
-    """Starts sessions.
-
-    Attributes:
-        sandbox: the layers that keep a submission apart, as they go into the record; None if there
-            is none, and the result then is not official.
-    """
+    """Starts sessions."""
 
     @property
     def sandbox(self) -> Mapping[str, Any] | None:
-        """Layers for the record, or None."""
+        """Layers that keep a submission apart, for the record; None makes a result not official."""
         ...
 
     def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
-        """Make and reset one fresh controller for each cell.
+        """Make and reset one fresh controller of a submission for each task, which is a cell's.
 
         A controller that cannot be made or reset is a failure of its cell, found in the session.
-
-        Args:
-            submission: whose folder holds the code.
-            tasks: one for each cell.
 
         Raises:
             SubmissionError: if the code cannot be imported or lacks what it must have.

@@ -307,18 +307,12 @@ def _layers(found: dict[str, NDArray[Any]], path: Path) -> dict[str, NDArray[np.
 
 
 def initial_weights(family: str) -> dict[str, NDArray[np.float32]]:
-    """Weights that a network starts from: it controls at once.
+    """Weights ``w0``, ``b0``, ... that a network of a family starts from: it controls at once.
 
     The first four units of each hidden layer carry the positive and negative parts of error and
     averaged error; the last layer makes of them zero (residual), the action of a PI controller
     (ppo), or values of commands that are highest near its command (dqn). The other units are small
     and random, for training to use.
-
-    Args:
-        family: ``"residual"``, ``"ppo"`` or ``"dqn"``.
-
-    Returns:
-        ``w0``, ``b0``, ``w1``, ``b1``, ``w2``, ``b2``.
     """
     random = np.random.default_rng(0)
     w0 = 0.3 * random.standard_normal((_INPUTS, _HIDDEN))

@@ -121,19 +121,10 @@ def run_protocol(
 ) -> Score:
     """Run a submission through the protocol, on any rigs and by any runner.
 
-    Args:
-        submission: from :func:`ventbench.entries.folder.open_submission`.
-        rigs: from :func:`ventbench.plants.rigs.load_rigs`.
-        track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
-        draws: see :func:`ventbench.entries.cells.protocol_of`, as of what follows.
-        drawn: other draws instead.
-        reference: best attainable and best PID of these simulators and draws.
-        pips: cmH2O.
-        stress: how many draws to run under missing physics.
-        stressors: names of the stressors; all conditions if empty.
-        runner: runs the controllers; if not given, the sandbox, and a class or function in this
-            process.
-        progress: called after each round of commands with rounds done and all rounds.
+    Rigs are from :func:`ventbench.plants.rigs.load_rigs`; what is run is as of
+    :func:`ventbench.entries.cells.protocol_of`, on the manifest's first track if none is given.
+    Without a runner a folder runs in the sandbox, a class or function in this process.
+    ``progress`` is called after each round of commands with rounds done and all rounds.
 
     Raises:
         SubmissionError: if the submission cannot be run at all, or does not enter the track.

@@ -17,12 +17,9 @@ from ventbench.trajectories import Trajectories
 
 
 def path(line: Floats) -> str:
-    """Path data of a polyline; it breaks where a point is not finite.
+    """Path data of a polyline ``(n, 2)``; it breaks where a point is not finite.
 
     Coordinates are rounded to a tenth and written relative to the point before, without drift.
-
-    Args:
-        line: points, shape ``(n, 2)``.
     """
     tenths = np.round(line * 10.0)
     parts: list[str] = []

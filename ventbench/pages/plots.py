@@ -39,10 +39,7 @@ DPI = 110
 def gain_map_png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> bytes:
     """Draw the grid of PID gains: error over P and I, one row a lung, one map a value of D.
 
-    Args:
-        grid: grid of one lung or more.
-        each: show each lung.
-        single: show the mean over lungs.
+    ``each`` shows each lung, ``single`` the mean over several lungs.
 
     Raises:
         InputError: if matplotlib is missing.
@@ -104,14 +101,11 @@ COLORS = ("#8c1d18", "#c8452f", "#ec8a5e", "#f7cfae", "#ffffff")
 
 
 def write_stress_chart(path: Path | str, scores: Sequence[Mapping[str, Any]]) -> Path:
-    """Write the chart as a PNG.
+    """Write the chart as a PNG, and return the path; equal input gives equal bytes.
 
     Args:
         path: target, ``.png`` by custom.
         scores: the key ``stress`` of what ``ventbench score --json`` wrote for each entry.
-
-    Returns:
-        The path; equal input gives equal bytes.
 
     Raises:
         InputError: if there is no score, or the extra is missing.
@@ -242,9 +236,6 @@ def runs_png(runs: Sequence[Trajectories]) -> bytes:
 
     A panel is one lung and PIP: pressure above, u_in below, against time; the last scored breath
     from its start to just after the target's fall. What is scored lies on a band.
-
-    Args:
-        runs: matching runs, the one to look at first.
     """
     lungs, pips = runs[0].lungs, runs[0].pips
     width, height = PIXELS / RUNS_DPI, HEAD + LUNG * len(lungs) + FOOT

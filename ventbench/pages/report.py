@@ -82,13 +82,9 @@ def has_display() -> bool:
 
 
 def open_viewer(path: Path | str) -> bool:
-    """Open a rerun file in the viewer, which outlives this process.
+    """Open a rerun file in the viewer, which outlives this process; say whether that was possible.
 
-    Args:
-        path: path of the ``.rrd`` file.
-
-    Returns:
-        Whether a viewer was started; if not, how to open the file was printed.
+    If not, how to open the file was printed.
 
     Raises:
         InputError: if the extra is missing.
@@ -118,11 +114,7 @@ SHADE_LIMITS, SHADES = (0.02, 0.2, 0.7, 2.0), (12, 24, 38, 55)
 
 
 def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None) -> str:
-    """Return the whole page.
-
-    Args:
-        runs: matching runs, the one to look at first; differences are to the second.
-        given: score files in the order of the runs, or None.
+    """Return the page of matching runs, the one to look at first; differences are to the second.
 
     Raises:
         InputError: if the score files do not belong to the runs.
@@ -163,14 +155,9 @@ def comparison(
     other: int,
     given: Sequence[Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Where the first run is better than another one and where worse, cell by cell.
+    """Where the first run is better than another one, by index, and where worse, cell by cell.
 
-    Args:
-        runs: matching runs.
-        names: their labels.
-        numbers: their scores.
-        other: index of the run to compare with.
-        given: score files in the order of the runs: the difference over their draws is paired.
+    With score files, in the order of the runs, the difference over their draws is paired.
     """
     difference = numbers.cells[0] - numbers.cells[other]
     lungs = numbers.lungs[0] - numbers.lungs[other]

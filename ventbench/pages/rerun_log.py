@@ -50,13 +50,10 @@ class Plot:
 
 
 def recording(runs: Sequence[Trajectories]) -> bytes:
-    """Return a whole ``.rrd`` file.
+    """Return a whole ``.rrd`` file of matching runs, the one to look at first.
 
     Entities: ``/<lung>/{target,pressure,u_in,u_out,error,scored}`` of the first run, one value a
     PIP; ``/compare/<name>/<lung>/{pressure,u_in,u_out,error}`` of the others; ``/about``.
-
-    Args:
-        runs: matching runs, the one to look at first.
 
     Raises:
         InputError: if rerun is switched off by its environment variable.
@@ -190,13 +187,7 @@ def _plots(runs: Sequence[Trajectories]) -> tuple[Plot, ...]:
 
 
 def blueprint(runs: Sequence[Trajectories], names: Sequence[str], tab: int = 0) -> rrb.Blueprint:
-    """Return the one blueprint.
-
-    Args:
-        runs: matching runs, the one to look at first.
-        names: names of the runs.
-        tab: the one to open at: pressure, u_in, error, then the lungs.
-    """
+    """Return the one blueprint; it opens at a tab: pressure, u_in, error, then the lungs."""
     lungs = runs[0].lungs
     columns = len({parse_lung(lung).C for lung in lungs})
     plots = _plots(runs)
@@ -285,12 +276,7 @@ def _top(arrays: Sequence[np.ndarray]) -> float:
 
 
 def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:
-    """Say what is seen and how the runs scored.
-
-    Args:
-        runs: matching runs, the one to look at first.
-        names: labels of the runs; foreign text, which is escaped here.
-    """
+    """Say what is seen and how the runs, the first one above all, scored; names are escaped."""
     given, names = names, [escape_markdown(name) for name in names]
     first, last = min(protocol.SCORED_BREATHS) + 1, max(protocol.SCORED_BREATHS) + 1
     breath = protocol.BREATH_STEPS * protocol.DT

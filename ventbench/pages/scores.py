@@ -26,9 +26,6 @@ NAME_LENGTH = 40
 def check(runs: Sequence[Trajectories]) -> None:
     """Check that runs can be shown together.
 
-    Args:
-        runs: any number.
-
     Raises:
         InputError: if there is none, one has arrays of a wrong shape, or they differ in
             lungs, PIPs or times.
@@ -62,11 +59,9 @@ def check(runs: Sequence[Trajectories]) -> None:
 
 
 def labels(runs: Sequence[Trajectories], cut: str = "…") -> list[str]:
-    """Short, printable, distinct names of runs, for legends; not escaped for any format.
+    """Short, printable, distinct names of runs, for legends; ``cut`` ends one that was too long.
 
-    Args:
-        runs: any number.
-        cut: ends a name that was too long.
+    Not escaped for any format.
     """
     names = []
     for run in runs:
@@ -130,11 +125,7 @@ class Scores:
 def collect(
     runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None
 ) -> Scores:
-    """Scores of runs.
-
-    Args:
-        runs: matching runs.
-        given: score files in the order of the runs, or None: then computed from the runs.
+    """Scores of matching runs by their files, in the same order, or computed if there is none.
 
     Raises:
         InputError: if the files are not as many as the runs, or lack one of their lungs.

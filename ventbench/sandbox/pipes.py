@@ -282,12 +282,9 @@ class ZygoteClient:
             raise SandboxError(f"the sandbox's process ended before it was ready: {said}")
 
     def start(self, cell: int, task: Task | None, pipes: Sequence[int]) -> None:
-        """Start a cell.
+        """Start a cell, which the zygote knows by a random token, with far ends of its two pipes.
 
-        Args:
-            cell: names it in this process; the zygote knows it by a random token.
-            task: what it is told, or None for one that only locks itself down.
-            pipes: the ends for its observations and its replies; may be closed afterwards.
+        Those may be closed afterwards; without a task it only locks itself down.
         """
         self._tokens[cell] = secrets.token_bytes(TOKEN)
         told = b"" if task is None else json.dumps(task).encode()

@@ -171,16 +171,9 @@ class SubmittedFolder(Protocol):
 
 
 class SandboxSession(Asked):
-    """Fresh, locked-down controllers, one process each.
+    """Fresh, locked-down controllers, one process each, which must show some layers to be in force.
 
-    It is a :class:`ventbench.entries.runner.ControllerSession`.
-
-    Args:
-        submission: whose code runs.
-        tasks: one for each cell.
-        layers: what every cell must show to be in force.
-        allowance: what they may use.
-        clock: times the cells out.
+    It is a :class:`ventbench.entries.runner.ControllerSession`, and begins with a task a cell.
 
     Raises:
         SandboxError: if a cell does not lock itself down.

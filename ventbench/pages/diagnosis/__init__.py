@@ -14,14 +14,9 @@ __all__ = ["write_report", "write_rerun"]
 
 
 def write_report(path: Path | str, diagnosis: Diagnosis) -> Path:
-    """Write a self-contained HTML report in one step: no script, no network.
+    """Write a self-contained HTML report, ``.html`` by custom, and return the path.
 
-    Args:
-        path: target, ``.html`` by custom.
-        diagnosis: what to show.
-
-    Returns:
-        The path; equal input gives equal bytes.
+    It has no script and no network; equal input gives equal bytes.
 
     Raises:
         InputError: if the extra is missing.
@@ -36,14 +31,7 @@ def write_report(path: Path | str, diagnosis: Diagnosis) -> Path:
 
 
 def write_rerun(path: Path | str, diagnosis: Diagnosis) -> Path:
-    """Write a rerun recording with its blueprint in one step.
-
-    Args:
-        path: target, ``.rrd`` by custom.
-        diagnosis: what to show.
-
-    Returns:
-        The path.
+    """Write a rerun recording with its blueprint, ``.rrd`` by custom, and return the path.
 
     Raises:
         InputError: if the extra is missing, or rerun is switched off.

@@ -161,13 +161,7 @@ def log_ticks(low: float, high: float) -> tuple[list[float], list[str]]:
 
 
 def limits(*arrays: ArrayLike, around: float = 0.06, least: float = 0.0) -> tuple[float, float]:
-    """Ends of an axis that holds all finite values with some air.
-
-    Args:
-        arrays: arrays of any shape.
-        around: air at either end, as a share of the height.
-        least: height at least.
-    """
+    """Ends of an axis that holds all finite values, of a least height, with air at either end."""
     flat = np.concatenate([np.ravel(np.asarray(array, float)) for array in arrays])
     flat = flat[np.isfinite(flat)]
     if flat.size == 0:
@@ -273,12 +267,9 @@ def _panel(
 
 
 def window(time: Floats, recorded: Floats, simulated: Floats) -> tuple[float, float]:
-    """Ends of the part of a breath around its largest error, s.
+    """Ends of the part of a breath around its largest error, s, of samples ``(T,)``.
 
-    Args:
-        time: of the samples, s, ``(T,)``.
-        recorded: pressure, cmH2O, NaN where it is unknown, ``(T,)``.
-        simulated: pressure, cmH2O, ``(T,)``.
+    A recorded pressure is NaN where it is unknown.
     """
     size = np.nan_to_num(np.abs(recorded - simulated), nan=0.0)
     # Two neighbours together: a single outlier is no place.

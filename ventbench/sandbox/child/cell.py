@@ -82,13 +82,9 @@ class Failed(Exception):
 
 
 class Cell:
-    """A controller that is asked step by step.
+    """A controller that is asked step by step; made of a class, and told a task.
 
-    Args:
-        controller: the submission's class.
-        task: what it is told.
-        folder: the submission's, to name files and lines in it.
-        source: what messages name where no line of the folder is to blame.
+    Messages name files and lines in the submission's folder, and ``source`` where none is to blame.
 
     Raises:
         Failed: if it cannot be made or reset.
@@ -188,10 +184,6 @@ def controller_class(folder: Path, label: str | None = None) -> Callable[[], Any
     The code runs in this process with all its rights: only for code that is trusted, or in a
     sandbox.
 
-    Args:
-        folder: the submission's folder.
-        label: how messages name it; the folder if not given.
-
     Raises:
         SubmissionError: if it cannot be imported, or lacks the class or a method; with file and
             line where there is one.
@@ -280,16 +272,10 @@ def _search_path(folder: Path) -> Iterator[None]:
 
 
 def describe(error: BaseException, folder: Path, source: str | None = None) -> tuple[str, str]:
-    """Say where in the submission an exception was raised, and what it says.
+    """Say where in the submission's folder an exception was raised, and what it says.
 
-    Args:
-        error: the exception.
-        folder: the submission's folder.
-        source: its name where no line of the folder raised it; ``controller.py`` if not given.
-
-    Returns:
-        Such as ``"controller.py line 12 raised ValueError"`` and ``"no gains for R5C10"``; both
-        printable and short.
+    ``source`` names what raised it elsewhere. Such as ``"controller.py line 12 raised ValueError"``
+    and ``"no gains for R5C10"``; both printable and short.
     """
     place = source or FILE
     trace = error.__traceback__

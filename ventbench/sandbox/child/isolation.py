@@ -102,14 +102,7 @@ class Forks:
         self._own = os.open("/proc/self/ns/pid", flags) if apart else None
 
     def fork(self) -> int:
-        """Fork.
-
-        Returns:
-            Number of the child in this process, 0 in the child.
-
-        Raises:
-            OSError: if the kernel refuses.
-        """
+        """Fork: the child's number in this process, 0 in the child; OSError if it is refused."""
         if self._own is not None:
             libc.unshare(_PROCESSES)
         child = os.fork()

@@ -212,14 +212,10 @@ def taken_away(version: int) -> tuple[int, int, int]:
 
 
 def ruleset(readable: Iterable[str], listable: Iterable[str] = ()) -> int:
-    """Prepare what :func:`enforce` puts into force.
+    """Prepare a descriptor of what :func:`enforce` puts into force.
 
-    Args:
-        readable: folders (with all below) and files that stay readable; missing ones are skipped.
-        listable: folders of which, with all below, the names alone stay readable.
-
-    Returns:
-        A descriptor.
+    Folders (with all below) and files stay readable, missing ones are skipped; of others the names
+    alone stay readable.
 
     Raises:
         OSError: if the kernel refuses.

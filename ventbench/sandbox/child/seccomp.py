@@ -308,9 +308,5 @@ def install(program: bytes) -> None:
 
 
 def restrict(threads: bool) -> None:
-    """Confine this process to the calls of a cell.
-
-    Raises:
-        OSError: if the kernel refuses.
-    """
+    """Confine this process to the calls of a cell; OSError if the kernel refuses."""
     install(cell_filter(libc.MACHINE, os.getpid(), threads))

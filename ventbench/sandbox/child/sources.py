@@ -24,13 +24,8 @@ def walk(folder: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Walk as ``os.walk`` does, without recursion and not below :data:`DEPTH` folders.
 
     A folder that lies too deep is named among the files. Names may be removed from the list of
-    folders while it walks; links are never followed.
-
-    Args:
-        folder: where to begin.
-
-    Returns:
-        For each folder its path, the names of the folders in it and of everything else in it.
+    folders while it walks; links are never followed. For each folder its path, the names of the
+    folders in it and of everything else in it.
     """
     waiting = [(Path(folder), 0)]
     while waiting:
@@ -105,13 +100,10 @@ def module_files(imported: Import, name: str) -> Iterator[str]:
 
 
 def imported_packages(folder: str) -> list[str]:
-    """Return the top-level names that ``controller.py`` imports, directly or through its modules.
+    """Return the top-level names that ``controller.py`` of a folder imports, also by its modules.
 
     Words in comments, docstrings and text count for nothing, and neither do sources that the
     controller does not import. A source that is not Python imports nothing.
-
-    Args:
-        folder: the submission's folder.
     """
     waiting, seen, packages = [CONTROLLER], set(), set()
     while waiting:

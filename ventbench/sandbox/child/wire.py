@@ -75,15 +75,9 @@ def pack_reply(sequence: int, kind: int, value: float = 0.0, text: bytes = b"") 
 
 
 def unpack_reply(data: bytes, sequence: int, due: Sequence[int]) -> Reply | None:
-    """The one reply that is due.
+    """The one reply that is due of all data received since then; None while bytes are missing.
 
-    Args:
-        data: everything received since it became due.
-        sequence: number of the observation that is being answered.
-        due: what kinds may come; a failure may always.
-
-    Returns:
-        The reply, or None while bytes are missing.
+    It answers the observation of a number, and is of a kind that is due, or a failure.
 
     Raises:
         WireError: if the bytes cannot become that one reply and nothing else.

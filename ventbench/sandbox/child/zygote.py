@@ -76,10 +76,9 @@ class Zygote:
         signal.set_wakeup_fd(self._signalled, warn_on_full_buffer=False)
 
     def run(self) -> serve.Start | None:
-        """Serve until the scorer closes the socket.
+        """Serve until the scorer closes the socket: None then.
 
-        Returns:
-            None then; in a fork that is to be a cell, what it needs, with all else forgotten.
+        In a fork that is to be a cell, what it needs, with all else forgotten.
         """
         poll = select.poll()
         poll.register(self._wake, select.POLLIN)
@@ -176,11 +175,7 @@ def _configuration(control: socket.socket) -> dict[str, Any]:
 def _serve(
     descriptor: int, forks: isolation.Forks, layers: list[str]
 ) -> list[tuple[serve.Setup, Lockdown, serve.Start]]:
-    """Prepare, say so, serve.
-
-    Returns:
-        Nothing at the end; in each cell, once, the arguments of :func:`serve.run`.
-    """
+    """Prepare, say so, serve: nothing at the end; in each cell, once, for :func:`serve.run`."""
     control = socket.socket(fileno=descriptor)
     config = _configuration(control)
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
@@ -256,9 +251,7 @@ def _entries(folder: str) -> list[str]:
 def main(descriptor: int, apart: str) -> None:
     """Be the zygote, and in each fork a cell, which runs from here and not from the loop.
 
-    Args:
-        descriptor: the socket to the scorer.
-        apart: whether to make namespaces and a root of its own; empty where that is forbidden.
+    Over a socket to the scorer; ``apart``, with namespaces and a root of its own if not empty.
     """
     layers: list[str] = []
     if apart and isolation.enter_namespaces():

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ventbench.base.errors import InputError
-from ventbench.board import rerun, store
+from ventbench.board import official_runs, store
 from ventbench.board.verify import verify
 from ventbench.cli import app
 from ventbench.entries.runner import InProcessRunner
@@ -25,7 +25,7 @@ def sha_of(folder: Path, name: str) -> str:
     return next(score.sha256 for score in store.load(folder).scores if score.name == name)
 
 
-def states(outcomes: list[rerun.Outcome]) -> dict[str, str]:
+def states(outcomes: list[official_runs.Outcome]) -> dict[str, str]:
     return {outcome.name: outcome.state for outcome in outcomes}
 
 
@@ -33,9 +33,9 @@ def states(outcomes: list[rerun.Outcome]) -> dict[str, str]:
 def again(simulators: TextbookRigs):
     """Run records of a leaderboard again, in this process."""
 
-    def run(folder: Path, *sources: Path, **options) -> list[rerun.Outcome]:
+    def run(folder: Path, *sources: Path, **options) -> list[official_runs.Outcome]:
         options = {"runner": InProcessRunner, **options}
-        return rerun.rerun(folder, sources=sources, load=lambda: simulators, **options)
+        return official_runs.rerun(folder, sources=sources, load=lambda: simulators, **options)
 
     return run
 
@@ -66,9 +66,9 @@ def test_commands_of_somebody_else_are_seen(board: Path, code: Path, again, simu
     assert verify(board, lambda: simulators).problems == [], "control"
     outcomes = again(board, code)
     assert states(outcomes) == {
-        "honest": rerun.REPRODUCED,
-        "softer": rerun.DIFFERENT,
-        "absent": rerun.NOT_RERUN,
+        "honest": official_runs.REPRODUCED,
+        "softer": official_runs.DIFFERENT,
+        "absent": official_runs.NOT_RERUN,
     }
     by_name = {outcome.name: str(outcome) for outcome in outcomes}
     forged, absent = by_name["softer"], by_name["absent"]
@@ -81,16 +81,16 @@ def test_a_thousandth_of_a_percent_is_seen(board: Path, scores) -> None:
     score = next(x for x in store.load(board).scores if x.name == "honest")
     recorded = scores["pid_best"].requested
     changed = recorded.copy()
-    allowed = rerun.COMMAND_TOLERANCE * max(1.0, abs(recorded[2, 3, 4, 1, 5]) / 100.0)
+    allowed = official_runs.COMMAND_TOLERANCE * max(1.0, abs(recorded[2, 3, 4, 1, 5]) / 100.0)
     changed[2, 3, 4, 1, 5] += 0.9 * allowed  # a processor's rounding is far below
-    assert rerun.difference(score, recorded, recorded.copy()) == ""
-    assert rerun.difference(score, recorded, changed) == ""
+    assert official_runs.difference(score, recorded, recorded.copy()) == ""
+    assert official_runs.difference(score, recorded, changed) == ""
     changed[2, 3, 4, 1, 5] += 0.2 * allowed
-    text = rerun.difference(score, recorded, changed)
+    text = official_runs.difference(score, recorded, changed)
     assert "differ in 1 of 756 cells" in text
     assert f"first in {score.lungs[2]}, PIP 30, draw 3, breath 2, step 6" in text
     changed[2, 3, 4, 1, 5] = np.nan
-    assert "differ in 1 of 756 cells" in rerun.difference(score, recorded, changed)
+    assert "differ in 1 of 756 cells" in official_runs.difference(score, recorded, changed)
 
 
 def test_a_reproduced_record_says_how_close(board: Path, code: Path, again) -> None:
@@ -102,10 +102,10 @@ def test_a_reproduced_record_says_how_close(board: Path, code: Path, again) -> N
 def test_changed_code_is_not_the_code(board: Path, code: Path, again) -> None:
     path = code / "honest" / "controller.py"
     path.write_text(path.read_text() + "\n")
-    assert states(again(board, code))["honest"] == rerun.NOT_RERUN
+    assert states(again(board, code))["honest"] == official_runs.NOT_RERUN
     path.write_text(path.read_text()[:-1])
     (code / "honest" / "more.txt").write_text("x")
-    assert states(again(board, code))["honest"] == rerun.NOT_RERUN
+    assert states(again(board, code))["honest"] == official_runs.NOT_RERUN
 
 
 def test_nothing_of_an_earlier_run_is_believed(
@@ -118,7 +118,7 @@ def test_nothing_of_an_earlier_run_is_believed(
     runner = lambda: started.append(1) or InProcessRunner()  # noqa: E731
     for count in (1, 2):
         (outcome,) = again(board, code, records=[sha256[:8]], runner=runner)
-        assert outcome.state == rerun.REPRODUCED
+        assert outcome.state == official_runs.REPRODUCED
         assert len(started) == count, "it ran"
     assert set(tmp_path.rglob("*")) == files, "nothing is left for the next"
     with pytest.raises(InputError, match="no single record"):
@@ -127,10 +127,10 @@ def test_nothing_of_an_earlier_run_is_believed(
 
 def test_code_beside_the_leaderboard_and_the_folder_itself(board: Path, code: Path, again) -> None:
     (outcome,) = again(board, code / "honest", records=[sha_of(board, "honest")])
-    assert outcome.state == rerun.REPRODUCED
+    assert outcome.state == official_runs.REPRODUCED
     shutil.copytree(code / "honest", board.parent / "submissions" / "renamed")
     (outcome,) = again(board, records=[sha_of(board, "honest")])
-    assert outcome.state == rerun.REPRODUCED
+    assert outcome.state == official_runs.REPRODUCED
 
 
 def test_the_command_says_all_three(
@@ -138,9 +138,9 @@ def test_the_command_says_all_three(
 ) -> None:
     monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
     in_this_process = functools.partial(
-        rerun.rerun, load=lambda: simulators, runner=InProcessRunner
+        official_runs.rerun, load=lambda: simulators, runner=InProcessRunner
     )
-    monkeypatch.setattr(rerun, "rerun", in_this_process)
+    monkeypatch.setattr(official_runs, "rerun", in_this_process)
     arguments = ["board", "verify", "--folder", str(board)]
     said = CliRunner().invoke(app, [*arguments, "--rerun", "--source", str(code)])
     assert said.exit_code == 1
@@ -160,5 +160,5 @@ def test_published_records_are_reproduced_in_two_processes() -> None:
     scores = [score for score in store.load(folder).scores if score.track == "performance"]
     newest = {s.name: s.sha256 for s in scores if s.name in ("pid_best", "pid_robust")}
     assert len(newest) == 2
-    outcomes = rerun.rerun(folder, records=[*newest.values()], jobs=2)
-    assert [(x.state, x.detail) for x in outcomes if x.state != rerun.REPRODUCED] == []
+    outcomes = official_runs.rerun(folder, records=[*newest.values()], jobs=2)
+    assert [(x.state, x.detail) for x in outcomes if x.state != official_runs.REPRODUCED] == []

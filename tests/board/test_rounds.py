@@ -18,7 +18,7 @@ from ci import propose
 from ci.git import Git
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.board import canonical, gate, round_scoring, rounds, store
+from ventbench.board import canonical, gate, official_runs, rounds, store
 from ventbench.board.gate import PRACTICE
 from ventbench.board.rounds import Request
 from ventbench.board.verify import verify
@@ -204,7 +204,7 @@ def _pid_bounds(own, simulators, pool, folder, **options):
 
 def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -> None:
     """Two entries, one of which cannot be run; the second time nothing runs again."""
-    monkeypatch.setattr(round_scoring, "bounds_of", _pid_bounds)
+    monkeypatch.setattr(official_runs, "bounds_of", _pid_bounds)
     one = fresh.parent / "submissions/one/controller.py"
     one.write_text("raise ValueError('no')\n" + one.read_text())
     submissions = fresh.parent / "submissions"
@@ -213,17 +213,17 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
     )
     rounds.draw(fresh, "r2", referee.value(SECRET, own.number))
     checkout = shutil.copytree(fresh, fresh.parent / "checkout" / "leaderboard")
-    monkeypatch.setattr(round_scoring, "DRAWS", 0)  # stress has tests of its own
+    monkeypatch.setattr(official_runs, "DRAWS", 0)  # stress has tests of its own
     ran: list[str] = []
-    run = round_scoring.run_protocol
+    run = official_runs.run_protocol
     monkeypatch.setattr(
-        round_scoring, "run_protocol",
+        official_runs, "run_protocol",
         lambda entry, *a, **b: ran.append(entry.manifest.name) or run(entry, *a, **b),
     )  # fmt: skip
 
     def score():
         with executor() as pool:
-            return round_scoring.score(
+            return official_runs.score(
                 fresh, "r2", pool, fresh.parent / "work", places=[submissions],
                 load=lambda: simulators, runner=InProcessRunner,
             )  # fmt: skip
@@ -278,7 +278,7 @@ def test_code_that_changed_after_the_freeze_is_not_scored(fresh: Path, simulator
     rounds.draw(fresh, "r2", referee.value(SECRET, own.number))
     flip(fresh.parent / "submissions/one/controller.py", 5)
     with pytest.raises(InputError, match="the code of one, as it was frozen"):
-        round_scoring.code_of(rounds.load(fresh, "r2"), [fresh.parent / "submissions"])
+        official_runs.code_of(rounds.load(fresh, "r2"), [fresh.parent / "submissions"])
 
 
 @pytest.fixture
@@ -291,7 +291,7 @@ def thousand(fresh: Path) -> list[tuple[str, str]]:
     (own.folder / rounds.FROZEN).write_text(tomli_w.dumps(table))
     own = rounds.load(fresh, "r2")
     rounds.draw(fresh, "r2", referee.value(SECRET, own.number))
-    return round_scoring.plan(rounds.load(fresh, "r2"))
+    return official_runs.plan(rounds.load(fresh, "r2"))
 
 
 def test_a_thousand_entries_are_planned(thousand: list[tuple[str, str]], fresh: Path) -> None:

@@ -12,8 +12,8 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.base.text import number
-from ventbench.pages import graphics, report, scores, write_figure, write_report
-from ventbench.pages import scores as shared
+from ventbench.pages import panels, report, write_figure, write_report
+from ventbench.pages import panels as shared
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
 
@@ -157,7 +157,7 @@ def test_wrong_score_files(best: Trajectories, tmp_path: Path) -> None:
 
 
 def test_best_and_differences(best: Trajectories, robust: Trajectories) -> None:
-    numbers = scores.collect([best, robust])
+    numbers = panels.collect([best, robust])
     row = report.table(best.lungs, numbers)[0]
     ours, base = row["cells"]
     assert row["name"] == "All lungs"
@@ -167,9 +167,9 @@ def test_best_and_differences(best: Trajectories, robust: Trajectories) -> None:
     assert ours["difference"] == number(
         shared.errors(best).mean() - shared.errors(robust).mean(), sign=True
     )
-    same = report.table(best.lungs, scores.collect([best, best]))[0]["cells"][0]
+    same = report.table(best.lungs, panels.collect([best, best]))[0]["cells"][0]
     assert (same["difference"], same["class"]) == ("±0.00", "same")
-    alone = report.table(best.lungs, scores.collect([best]))[0]["cells"][0]
+    alone = report.table(best.lungs, panels.collect([best]))[0]["cells"][0]
     assert (alone["best"], alone["difference"]) == (False, "")
 
 
@@ -178,7 +178,7 @@ def test_path_does_not_drift() -> None:
     line = np.cumsum(rng.uniform(0.0, 3.0, (200, 2)), axis=0)
     x = y = 0.0
     points = []
-    for kind, body in re.findall(r"([Mlhv])([^Mlhv]*)", graphics.path(line)):
+    for kind, body in re.findall(r"([Mlhv])([^Mlhv]*)", panels.path(line)):
         numbers = [float(n) for n in re.findall(r"-?\d*\.?\d+", body)]
         if kind == "M":
             x, y = numbers
@@ -191,8 +191,8 @@ def test_path_does_not_drift() -> None:
 
 def test_path_breaks_at_gaps() -> None:
     line = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, np.nan], [3.0, 3.0], [4.0, 2.5]])
-    assert graphics.path(line) == "M0 0l1 1M3 3l1-.5"
-    assert graphics.area(line, line) == ""
+    assert panels.path(line) == "M0 0l1 1M3 3l1-.5"
+    assert panels.area(line, line) == ""
 
 
 def test_figure(
@@ -241,10 +241,8 @@ def test_the_valve_has_one_axis(best: Trajectories, robust: Trajectories) -> Non
         }
         assert len(figures) == 36
         assert len(marks) == 1
-    column = graphics.panels([quiet])[0][0]
-    top = graphics.VALVE_TOP + graphics.VALVE_HEIGHT * (
-        1.0 - quiet.u_in[0, 0].max() / protocol.U_MAX
-    )
+    column = panels.panels([quiet])[0][0]
+    top = panels.VALVE_TOP + panels.VALVE_HEIGHT * (1.0 - quiet.u_in[0, 0].max() / protocol.U_MAX)
     assert column.valves[0][:, 1].min() == pytest.approx(top, abs=2.0), "not stretched to its range"
 
 

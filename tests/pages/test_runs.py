@@ -12,7 +12,7 @@ import pytest
 
 from ventbench import pages
 from ventbench.base.errors import InputError
-from ventbench.pages import scores as shared
+from ventbench.pages import panels as shared
 from ventbench.trajectories import Trajectories
 
 WRITERS = (pages.write_rerun, pages.write_report, pages.write_figure)

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hardware_eval.results.evaluate import make_runner
-from ventbench.board import rerun
+from ventbench.board import official_runs
 from ventbench.cli import app
 from ventbench.entries import contract
 from ventbench.sandbox import runner as runner_module
@@ -83,7 +83,7 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
         lambda: contract.check("pid_best"),
         lambda: contract.assert_ready("pid_best"),
         lambda: make_runner(sandbox=True),
-        rerun.sandboxed,
+        official_runs.sandboxed,
         *(
             lambda words=words: CliRunner().invoke(app, words.split(), catch_exceptions=False)
             for words in (

@@ -9,5 +9,6 @@
 - :mod:`~ventbench.board.ranking`: which record of an entry counts, ranks, intervals, differences;
 - :mod:`~ventbench.board.frames`: the columns of the board, its CSV and pandas frames;
 - :mod:`~ventbench.board.build`: the site, with :mod:`~ventbench.board.pages`;
-- :mod:`~ventbench.board.verify`: everything again; :mod:`~ventbench.board.rerun`: code, too.
+- :mod:`~ventbench.board.official_runs`: rounds are scored, and code of records runs again;
+- :mod:`~ventbench.board.verify`: all that files can show, again.
 """

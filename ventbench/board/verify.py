@@ -1,7 +1,7 @@
 """Everything that files can show: hashes, signatures, rounds, ranks, the replay of all commands.
 
 Nothing stops at the first problem: each names its file, and the key or line in it. Replay proves
-that errors follow from commands; who computed the commands is for :mod:`ventbench.board.rerun`.
+that errors follow from commands; who computed them is for :mod:`ventbench.board.official_runs`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import attestation, canonical, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
+from ventbench.board.official_runs import STRESS_TOLERANCE, folders
 from ventbench.board.record import AnyRecord, Record
 from ventbench.board.replay import (
     BATCH,
@@ -27,7 +28,6 @@ from ventbench.board.replay import (
     draws_of,
     replay,
 )
-from ventbench.board.rerun import STRESS_TOLERANCE, folders
 from ventbench.board.rounds import Round
 from ventbench.board.store import Store
 from ventbench.entries import reference as references
@@ -55,7 +55,7 @@ class Report:
 
     records: int = 0  #: how many there are.
     replayed: int = 0  #: how many were replayed.
-    #: how many were run again and gave the same commands; see :func:`ventbench.board.rerun.rerun`.
+    #: how many were run again by :func:`official_runs.rerun` and gave the same commands.
     reproduced: int = 0
     #: what each second run showed, one sentence a record.
     second_runs: list[str] = field(default_factory=list)

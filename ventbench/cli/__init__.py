@@ -22,7 +22,6 @@ from ventbench.cli import (
     simulators,
     train,
     tune,
-    view,
 )
 
 app = typer.Typer(
@@ -52,7 +51,7 @@ def _root(
     options.be_quiet(quiet)
 
 
-for _module in (score, tune, simulators, view, diagnose):
+for _module in (score, tune, simulators, diagnose):
     for _command in _module.COMMANDS:
         app.command(_command.__name__.replace("_", "-"))(_command)
 app.command()(doctor.doctor)

@@ -235,22 +235,22 @@ def _rerun(
     scheduler: str | None,
 ) -> None:  # fmt: skip
     """Run code again; note in the report what came of it."""
-    from ventbench.board import rerun
+    from ventbench.board import official_runs
 
     with notes().status("running code again") as status:
 
-        def note(outcome: rerun.Outcome) -> None:
-            if outcome.state == rerun.REPRODUCED:
+        def note(outcome: official_runs.Outcome) -> None:
+            if outcome.state == official_runs.REPRODUCED:
                 report.reproduced += 1
             status.update(f"{report.reproduced} records reproduced")
 
-        outcomes = rerun.rerun(
+        outcomes = official_runs.rerun(
             folder, records=records, sources=sources, jobs=jobs, scheduler=scheduler,
             progress=note,
         )  # fmt: skip
     report.second_runs = [str(x) for x in outcomes]
-    report.problems += [str(x) for x in outcomes if x.state == rerun.DIFFERENT]
-    report.notes += [str(x) for x in outcomes if x.state == rerun.NOT_RERUN]
+    report.problems += [str(x) for x in outcomes if x.state == official_runs.DIFFERENT]
+    report.notes += [str(x) for x in outcomes if x.state == official_runs.NOT_RERUN]
 
 
 def _summary(console: Console, report: Report) -> None:

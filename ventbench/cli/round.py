@@ -162,12 +162,12 @@ def score(
     import os
 
     from ventbench.base.executor import executor
-    from ventbench.board import attestation, round_scoring, rounds
+    from ventbench.board import attestation, official_runs, rounds
 
     own = rounds.load(folder, name)
     if plan:
-        runs = round_scoring.plan(own)
-        seconds = sum(round_scoring.SECONDS[track] for _, track in runs)
+        runs = official_runs.plan(own)
+        seconds = sum(official_runs.SECONDS[track] for _, track in runs)
         emit({"runs": runs, "processor_s": seconds}, json)
         typer.echo(
             f"{len(runs)} runs of {len({x for x, _ in runs})} entries: about "
@@ -183,7 +183,7 @@ def score(
                 tasks[what] = shown.add_task(what, total=count)
             shown.update(tasks[what], completed=done, total=count)
 
-        made = round_scoring.score(
+        made = official_runs.score(
             folder,
             name,
             pool,

@@ -18,7 +18,7 @@ from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, require
 from ventbench.base.text import number
-from ventbench.pages import graphics, scores
+from ventbench.pages import panels
 from ventbench.task import protocol
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, stressor
 
@@ -247,9 +247,9 @@ def runs_png(runs: Sequence[Trajectories]) -> bytes:
             "left": 0.05, "right": 0.99, "top": 1.0 - HEAD / height, "bottom": FOOT / height,
         },
     )  # fmt: skip
-    numbers, names = scores.collect(runs), _drawn(scores.labels(runs))
+    numbers, names = panels.collect(runs), _drawn(panels.labels(runs))
     for j in range(len(pips)):
-        limits = graphics.pressure_limits(runs, j)
+        limits = panels.pressure_limits(runs, j)
         for i, lung in enumerate(lungs):
             upper, lower = axes[2 * i, j], axes[2 * i + 1, j]
             _panel(upper, lower, runs, (i, j), limits)
@@ -264,7 +264,7 @@ def runs_png(runs: Sequence[Trajectories]) -> bytes:
         axes[-1, j].tick_params(labelbottom=True)
     figure.text(0.012, 1.0 - 0.3 / height, names[0], fontsize=13, weight="bold", parse_math=False)
     read = (
-        f"{scores.shared_tracks(runs)}. Breath {graphics.BREATH + 1} on each lung at each PIP, "
+        f"{panels.shared_tracks(runs)}. Breath {panels.BREATH + 1} on each lung at each PIP, "
         "against time, s. Black: target. Band: scored. Numbers: mean absolute error, cmH2O."
     )
     (read,) = _drawn([read])
@@ -283,19 +283,19 @@ def _panel(
     limits: tuple[float, float],
 ) -> None:
     """Draw the runs of a lung and PIP, the first one above the others."""
-    time, scored = graphics.shown_times(), slice(protocol.INSPIRATION_STEPS)
-    target = runs[0].target[at][graphics.WINDOW]
+    time, scored = panels.shown_times(), slice(protocol.INSPIRATION_STEPS)
+    target = runs[0].target[at][panels.WINDOW]
     # Limits first, and apart from one another: to find common ones takes longest.
     upper.set(ylim=limits, yticks=(float(target.min()), runs[0].pips[at[1]]))
-    lower.set(ylim=(-3.0, protocol.U_MAX + 3.0), yticks=graphics.VALVE_MARKS)
+    lower.set(ylim=(-3.0, protocol.U_MAX + 3.0), yticks=panels.VALVE_MARKS)
     for axes in (upper, lower):
-        axes.set(xlim=(0.0, time[-1]), xticks=graphics.TIMES)
+        axes.set(xlim=(0.0, time[-1]), xticks=panels.TIMES)
         axes.tick_params(length=0.0, labelsize=7, labelcolor=palette.QUIET, labelbottom=False)
         axes.spines[:].set_visible(False)
         axes.grid(axis="y", color=palette.LINE, linewidth=0.7)
         axes.axvspan(0.0, protocol.INSPIRATION_STEPS * protocol.DT, color=palette.BAND, zorder=0)
     for k in reversed(range(len(runs))):
-        pressure, u_in = (x[at][graphics.WINDOW] for x in (runs[k].pressure, runs[k].u_in))
+        pressure, u_in = (x[at][panels.WINDOW] for x in (runs[k].pressure, runs[k].u_in))
         pressure = np.where(np.isfinite(pressure), pressure, np.nan)
         upper.plot(time, pressure, color=_color(k), linewidth=0.9, alpha=0.5)
         upper.plot(time[scored], pressure[scored], color=_color(k), linewidth=1.9 - 0.5 * (k > 0))

@@ -16,8 +16,8 @@ from ventbench import palette
 from ventbench.base import errors, files
 from ventbench.base.arrays import Floats
 from ventbench.base.text import number, page_templates
-from ventbench.pages import graphics, scores
-from ventbench.pages.scores import check, labels, shared_tracks
+from ventbench.pages import panels
+from ventbench.pages.panels import check, labels, shared_tracks
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.task.metrics import bootstrap
@@ -120,7 +120,7 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
         InputError: if the score files do not belong to the runs.
     """
     names = labels(runs)
-    numbers = scores.collect(runs, given)
+    numbers = panels.collect(runs, given)
     page = page_templates("ventbench.pages").get_template("report.html.j2")
     return page.render(
         title=names[0],
@@ -134,16 +134,16 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
         heading=shared_tracks(runs),
         tracks=[run.track for run in runs],
         table=table(runs[0].lungs, numbers),
-        draws=[scores.draws(score) for score in given or ()],
+        draws=[panels.draws(score) for score in given or ()],
         lungs=sections(runs, names, numbers),
         pips=runs[0].pips,
         frame=frame(),
         protocol=protocol,
         scored=[breath + 1 for breath in protocol.SCORED_BREATHS],
-        shown_breath=graphics.BREATH + 1,
+        shown_breath=panels.BREATH + 1,
         official=given is not None,
-        provenance=[scores.provenance(score) for score in given or ()],
-        failures=[scores.failures(score) for score in given or ()],
+        provenance=[panels.provenance(score) for score in given or ()],
+        failures=[panels.failures(score) for score in given or ()],
         version=ventbench.__version__,
     )
 
@@ -151,7 +151,7 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
 def comparison(
     runs: Sequence[Trajectories],
     names: Sequence[str],
-    numbers: scores.Scores,
+    numbers: panels.Scores,
     other: int,
     given: Sequence[Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def comparison(
             i, j = np.unravel_index(at(difference), difference.shape)
             where = f"{runs[0].lungs[i]} at PIP {runs[0].pips[j]:g}"
             texts[key] = f"{number(abs(value))} cmH2O, {where}"
-    drawn = scores.paired_draws(given[0], given[other]) if given is not None else None
+    drawn = panels.paired_draws(given[0], given[other]) if given is not None else None
     return {
         "name": names[other],
         "lungs": int(np.sum(lungs < 0.0)),
@@ -204,14 +204,14 @@ def _shade(difference: float) -> str:
     return f"{'b' if difference < 0.0 else 'w'}{step}" if step and np.isfinite(difference) else ""
 
 
-def table(lungs: Sequence[str], numbers: scores.Scores) -> list[dict[str, Any]]:
+def table(lungs: Sequence[str], numbers: panels.Scores) -> list[dict[str, Any]]:
     """Rows of the score table: the mean, then each lung; for each run text, difference, best."""
     rows = [("All lungs", numbers.overall), *zip(lungs, numbers.lungs.T, strict=True)]
     return [{"name": name, "cells": _cells(values)} for name, values in rows]
 
 
 def sections(
-    runs: Sequence[Trajectories], names: Sequence[str], numbers: scores.Scores
+    runs: Sequence[Trajectories], names: Sequence[str], numbers: panels.Scores
 ) -> list[dict[str, Any]]:
     """A lung each: its numbers and its panels."""
     return [
@@ -222,48 +222,46 @@ def sections(
             "scores": [number(value) for value in numbers.lungs[:, i]],
             "panels": [_panel(panel, names, numbers.cells[:, i, j]) for j, panel in enumerate(row)],
         }
-        for i, row in enumerate(graphics.panels(runs))
+        for i, row in enumerate(panels.panels(runs))
     ]
 
 
 def frame() -> dict[str, Any]:
     """Elements that all panels share: sizes, time ticks, the scored part."""
-    end = float(graphics.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
+    end = float(panels.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
     return {
-        "width": graphics.WIDTH,
-        "height": graphics.HEIGHT,
-        "left": graphics.LEFT,
-        "right": graphics.LEFT + graphics.PLOT_WIDTH,
-        "top": graphics.TOP,
-        "bottom": graphics.TOP + graphics.PRESSURE_HEIGHT,
-        "scored_width": round(end - graphics.LEFT, 1),
+        "width": panels.WIDTH,
+        "height": panels.HEIGHT,
+        "left": panels.LEFT,
+        "right": panels.LEFT + panels.PLOT_WIDTH,
+        "top": panels.TOP,
+        "bottom": panels.TOP + panels.PRESSURE_HEIGHT,
+        "scored_width": round(end - panels.LEFT, 1),
         "scored_end": round(end, 1),
-        "valve_top": graphics.VALVE_TOP,
-        "valve_bottom": graphics.VALVE_TOP + graphics.VALVE_HEIGHT,
-        "commands": [
-            (f"{u:g}", round(float(graphics.valve_y(u)), 1)) for u in graphics.VALVE_MARKS
-        ],
-        "times": [(f"{t:g}", round(float(graphics.time_x(t)), 1)) for t in graphics.TIMES],
+        "valve_top": panels.VALVE_TOP,
+        "valve_bottom": panels.VALVE_TOP + panels.VALVE_HEIGHT,
+        "commands": [(f"{u:g}", round(float(panels.valve_y(u)), 1)) for u in panels.VALVE_MARKS],
+        "times": [(f"{t:g}", round(float(panels.time_x(t)), 1)) for t in panels.TIMES],
     }
 
 
-def _panel(panel: graphics.RunPanel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
+def _panel(panel: panels.RunPanel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
     errors_text = "; ".join(
         f"{name} {number(e)}{' cmH2O' if np.isfinite(e) else ''}"
         for name, e in zip(names, errors, strict=True)
     )
-    first = graphics.inspiration(panel.pressures[0])
+    first = panels.inspiration(panel.pressures[0])
     return {
         "pip": f"{panel.pip:g}",
         "alt": f"{panel.lung} at PIP {panel.pip:g} cmH2O: pressure and u_in over one breath. "
         f"Mean absolute error: {errors_text}.",
         "errors": [number(error) for error in errors],
         "ticks": [(f"{value:g}", round(y, 1)) for value, y in panel.ticks],
-        "target": graphics.path(panel.target),
-        "area": graphics.area(first, graphics.inspiration(panel.target)),
-        "pressures": [graphics.path(line) for line in panel.pressures],
-        "scored": [graphics.path(graphics.inspiration(line)) for line in panel.pressures],
-        "valves": [graphics.path(line) for line in panel.valves],
+        "target": panels.path(panel.target),
+        "area": panels.area(first, panels.inspiration(panel.target)),
+        "pressures": [panels.path(line) for line in panel.pressures],
+        "scored": [panels.path(panels.inspiration(line)) for line in panel.pressures],
+        "valves": [panels.path(line) for line in panel.valves],
         "above": None if panel.above is None else f"{panel.above:.0f}",
     }
 

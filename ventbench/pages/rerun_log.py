@@ -22,7 +22,7 @@ from ventbench import palette
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.text import escape_markdown, number
-from ventbench.pages.scores import STEPS, distinct, errors, labels, scored, shared_tracks
+from ventbench.pages.panels import STEPS, distinct, errors, labels, scored, shared_tracks
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.trajectories import Trajectories

@@ -15,7 +15,7 @@ from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Trace
 from ventbench.diagnosis.residual_analysis import Profile, profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.pages import graphics
+from ventbench.pages.panels import area, path
 from ventbench.physics.characteristics import Characteristic
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class Chart:
 
     def line(self, look: str, x: ArrayLike, y: ArrayLike) -> None:
         """Add a line, which breaks where a point is NaN."""
-        self.paths.append((look, graphics.path(self._points(x, y))))
+        self.paths.append((look, path(self._points(x, y))))
 
     def stairs(self, look: str, edges: ArrayLike, y: ArrayLike) -> None:
         """Add one level for each of k ranges with ``k + 1`` edges."""
@@ -127,7 +127,7 @@ class Chart:
             if np.isfinite(bottom) and np.isfinite(top):
                 ends = edges[[k, k + 1]]
                 upper, lower = self._points(ends, [top, top]), self._points(ends, [bottom, bottom])
-                parts.append(graphics.area(upper, lower))
+                parts.append(area(upper, lower))
         if parts:
             self.areas.append((look, "".join(parts)))
 

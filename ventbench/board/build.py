@@ -263,7 +263,7 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
         "failures": header.failures[:MAX_FAILURES],
         "frames": [pages.trusted(pages.frame(pip)) for pip in record.pips],
         "pips": [f"{pip:g}" for pip in record.pips],
-        "lungs": [(name, *_setting(name)) for name in record.lungs],
+        "lungs": [(x.id, f"{x.R:g}", f"{x.C:g}") for x in map(parse_lung, record.lungs)],
         "breath": record.breath,
         "provenance": _provenance(header),
         "history": _history(row, evidence),
@@ -284,11 +284,6 @@ def _safety(record: Record) -> list[dict[str, Any]]:
         }
         for i, name in enumerate(record.lungs)
     ]
-
-
-def _setting(name: str) -> tuple[str, str]:
-    lung = parse_lung(name)
-    return f"{lung.R:g}", f"{lung.C:g}"
 
 
 def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:

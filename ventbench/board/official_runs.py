@@ -352,7 +352,8 @@ def score(
         InputError: if the round cannot be scored, code is missing, or a record is refused.
         OSError: if a file cannot be read or written.
     """
-    own, simulators, tell = rounds.load(leaderboard, name), load(), progress or _silent
+    own, simulators = rounds.load(leaderboard, name), load()
+    tell = progress or (lambda what, done, count: None)
     runs, places = plan(own), list(places)
     if different := rounds.protocol_differences(own, simulators.about()):
         raise InputError(f"round {name} has another protocol: {', '.join(different)}")
@@ -415,7 +416,3 @@ def _score_entry(
     except (InputError, FloatingPointError) as error:
         return {"failed": str(error)}
     return {"record": str(path)}
-
-
-def _silent(what: str, done: int, count: int) -> None:
-    pass

@@ -220,7 +220,11 @@ def stress_chart(made: Sequence[StressRow]) -> list[dict[str, Any]]:
         ]
         groups.append({"title": CATEGORIES[category].capitalize(), "rows": lines})
     pairs = [c for c in index if len(c.stressors) > 1]
-    lines = [_chart_line(_pair(c), [(c, "mild"), (None, "")], made, index) for c in pairs]
+    titles = [" + ".join(stressor(name).title for name in c.stressors) for c in pairs]
+    lines = [
+        _chart_line(title, [(c, "mild"), (None, "")], made, index)
+        for title, c in zip(titles, pairs, strict=True)
+    ]
     groups.append({"title": "Two at once, both mild", "rows": lines})
     return [group for group in groups if group["rows"]]
 
@@ -232,10 +236,6 @@ def title_of(condition: str) -> str:
             titles = " + ".join(stressor(name).title for name in known.stressors)
             return f"{titles}, {known.severity}" if titles else "without stressor"
     return condition
-
-
-def _pair(condition: Condition) -> str:
-    return " + ".join(stressor(name).title for name in condition.stressors)
 
 
 def _chart_line(
@@ -386,14 +386,9 @@ def _difference_shade(value: float) -> str:
     return f"{'b' if value < 0 else 'w'}{level}" if level else "h0"
 
 
-def _limits(pip: float) -> tuple[float, float]:
-    """Pressure axis of a PIP, cmH2O: a little below PEEP, and room for an overshoot of 60 %."""
-    height = pip - protocol.PEEP
-    return protocol.PEEP - 0.12 * height, pip + 0.6 * height
-
-
 def _y(pressure: Floats | float, pip: float) -> Floats:
-    low, high = _limits(pip)
+    height = pip - protocol.PEEP  # the axis: a little below PEEP, and room for an overshoot of 60 %
+    low, high = protocol.PEEP - 0.12 * height, pip + 0.6 * height
     share = (high - np.asarray(pressure)) / (high - low)
     return TOP + PRESSURE_HEIGHT * np.clip(share, 0.0, 1.0)
 
@@ -445,13 +440,13 @@ def paths(record: Record) -> list[list[tuple[str, str]]]:
         heights = np.rint(_y(record.pressure[:, j], pip)).astype(int)
         moves = np.diff(heights, axis=-1)
         rows = zip(heights[:, 0].tolist(), moves.tolist(), valves[:, j].tolist(), strict=True)
-        columns.append([(_line(first, rest), _stairs(valve)) for first, rest, valve in rows])
+        columns.append(
+            [  # a path through points one step apart, relative to each other
+                (f"m{LEFT} {first}" + "".join([f" {STEP} {move}" for move in rest]), _stairs(valve))
+                for first, rest, valve in rows
+            ]
+        )
     return [list(row) for row in zip(*columns, strict=True)]
-
-
-def _line(first: int, moves: list[int]) -> str:
-    """Path through points one step apart, relative to each other."""
-    return f"m{LEFT} {first}" + "".join([f" {STEP} {move}" for move in moves])
 
 
 def _stairs(heights: list[int]) -> str:

@@ -270,7 +270,8 @@ def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Ro
 
     Best first, those of equal score by name; without ``ranks`` the order is only practice.
     """
-    ordered = sorted(entries, key=lambda e: (_rounded(e.record.ranked_values), e.record.name))
+    ordered = sorted(entries, key=lambda e: e.record.name)
+    ordered.sort(key=lambda e: round(float(np.mean(e.record.ranked_values)), DECIMALS))
     if not ordered:
         return []
     records = [entry.record for entry in ordered]
@@ -349,10 +350,6 @@ def worst(record: Record) -> tuple[float, str, float]:
         return np.nan, "", np.nan
     i, j = np.unravel_index(np.argmax(cells), cells.shape)
     return float(cells[i, j]), record.lungs[i], record.pips[j]
-
-
-def _rounded(values: Floats) -> float:
-    return round(float(np.mean(values)), DECIMALS)
 
 
 def _resampled(record: Record, values: Floats) -> Floats:

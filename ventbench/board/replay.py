@@ -275,7 +275,7 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("headroom.error", record.headroom.error, replayed.controllable),
     ):
         if np.all(_off(recorded, given) <= TOLERANCE):
-            means = _means(recorded, given)
+            means = (x.mean(axis=(-2, -1)) for x in (recorded, given))  # NaN where a cell failed
             text = _difference(f"{key}, mean over cells", *means, MEAN_TOLERANCE)
             texts += [] if text is None else [text]
     return texts + lung_leaks(record, replayed)
@@ -306,11 +306,6 @@ def lung_leaks(record: Record, replayed: Replayed) -> list[str]:
         f"{lowest[pip]:g} % on one lung and {highest[pip]:g} % on another, though the first "
         "observation is the same: the lung was known"
     ]
-
-
-def _means(recorded: Floats, replayed: Floats) -> tuple[Floats, Floats]:
-    """Means over lungs and PIPs; NaN where a cell failed."""
-    return recorded.mean(axis=(-2, -1)), replayed.mean(axis=(-2, -1))
 
 
 def _difference(key: str, recorded: ArrayLike, replayed: ArrayLike, tolerance: float) -> str | None:

@@ -264,7 +264,8 @@ def freeze(
         raise InputError(f"round {name} is {own.state} already")
     if at < own.opened.closes:
         raise InputError(f"round {name} closes at {own.opened.closes:%Y-%m-%d %H:%M:%S} UTC")
-    owners = _owners(leaderboard)
+    before = [r.frozen for r in load_all(leaderboard) if r.frozen]  # the earliest one last
+    owners = {x.name: x.account for frozen in before for x in frozen.entries}
     asked: dict[str, Request] = {}
     for request in sorted(requests, key=lambda x: (x.asked, x.name)):
         asked.setdefault(request.name, request)
@@ -314,12 +315,6 @@ def _named(folder: Path, name: str) -> Submission:
         if why := deceptive(author):
             raise InputError(f"submission.toml, key authors: {why}")
     return submission
-
-
-def _owners(leaderboard: Path) -> dict[str, str]:
-    """Account of each name in the earliest round that has it."""
-    entries = (x for r in load_all(leaderboard) if r.frozen for x in r.frozen.entries)
-    return {entry.name: entry.account for entry in entries}
 
 
 def draw(leaderboard: Path, name: str, content: bytes, *, now: datetime | None = None) -> Round:

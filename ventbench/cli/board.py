@@ -10,6 +10,7 @@ import typer
 from ventbench.cli.options import (
     JsonFile,
     Scheduler,
+    Sources,
     bars,
     counted,
     emit,
@@ -185,14 +186,7 @@ def verify(
         bool,
         typer.Option("--rerun", help="Also run the code of records again, in the sandbox."),
     ] = False,
-    source: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="DIR",
-            help="Code for --rerun: a submission or a folder of them; may be repeated. "
-            "submissions/ beside the leaderboard is looked through anyway.",
-        ),
-    ] = None,
+    source: Sources = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes of --rerun.")] = 1,
     scheduler: Scheduler = None,
     json: JsonFile = None,

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn, TypeVar
 
 import typer
 
@@ -76,6 +76,27 @@ def known_plants(incomplete: str) -> list[str]:
     return [name for name in names() if name.startswith(incomplete)] + files
 
 
+Entries = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="SUBMISSION...",
+        help="Folders or names of bundled submissions.",
+        autocompletion=known_entries,
+    ),
+]
+OneTrack = Annotated[
+    Literal["performance", "robustness"] | None,
+    typer.Option(help="What the controller is told; default: the first of the submission."),
+]
+Sources = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--source",
+        metavar="DIR",
+        help="Code of entries: a submission or a folder of them; may be repeated. submissions/ "
+        "beside the leaderboard is looked through anyway.",
+    ),
+]
 JsonFile = Annotated[
     Path | None,
     typer.Option(

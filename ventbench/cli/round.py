@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ventbench.cli.board import FOLDER, Folder, tables_of
-from ventbench.cli.options import JsonFile, Scheduler, Workers, bars, emit
+from ventbench.cli.options import JsonFile, Scheduler, Sources, Workers, bars, emit
 
 if TYPE_CHECKING:
     from ventbench.board.rounds import Round
@@ -134,14 +134,7 @@ def draw(
 @app.command()
 def score(
     name: Name,
-    source: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="DIR",
-            help="Code of the entries: a submission or a folder of them; may be repeated. "
-            "submissions/ beside the leaderboard is looked through anyway.",
-        ),
-    ] = None,
+    source: Sources = None,
     plan: Annotated[
         bool, typer.Option("--plan", help="Only say what there is to run, and how long it takes.")
     ] = False,

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ventbench.cli.options import (
+    Entries,
     InProcess,
     JsonFile,
+    OneTrack,
     PlantName,
     Scheduler,
     Workers,
@@ -37,14 +39,7 @@ Track = Literal["performance", "robustness", "all"]
 
 
 def score(
-    names: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SUBMISSION...",
-            help="Folders or names of bundled submissions.",
-            autocompletion=known_entries,
-        ),
-    ],
+    names: Entries,
     track: Annotated[
         Track | None,
         typer.Option(
@@ -370,20 +365,7 @@ def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
 
 
 def transfer(
-    names: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SUBMISSION...",
-            help="Folders or names of bundled submissions.",
-            autocompletion=known_entries,
-        ),
-    ],
-    track: Annotated[
-        Literal["performance", "robustness"] | None,
-        typer.Option(help="Track to score; default: the first of the submission."),
-    ] = None,
-    in_process: InProcess = False,
-    json: JsonFile = None,
+    names: Entries, track: OneTrack = None, in_process: InProcess = False, json: JsonFile = None
 ) -> None:
     """Score controllers on every rig and every member of the ensemble, without noise.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -214,65 +215,44 @@ def _residual_table(result: dict[str, Any]) -> Any:
     return table_of("Nominal mean |pressure - target|, cmH2O", columns, rows, left=["lung"])
 
 
-@app.command()
-def ppo(
-    lung: Lung = None,
-    all_lungs: All = False,
-    seed: Seed = 0,
-    seeds: Seeds = 2,
-    steps: Steps = None,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
-    ] = Path("runs/ppo"),
-    plant: PlantName = "frozen",
-    json: JsonFile = None,
-) -> None:
-    """Train networks that correct the PID, by proximal policy optimisation (PPO).
+def _policies(method: str, what: str) -> Callable[..., None]:
+    """The command that trains networks by a method of reinforcement learning."""
 
-    Writes training.json and weights.npz, which `submissions/ppo` can read. Without `--lung` and
-    `--all` it trains seven networks: one for each lung, and one for all six. Ctrl-C keeps the
+    def command(
+        lung: Lung = None,
+        all_lungs: All = False,
+        seed: Seed = 0,
+        seeds: Seeds = 2,
+        steps: Steps = None,
+        out: Annotated[
+            Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+        ] = Path("runs", method),
+        plant: PlantName = "frozen",
+        json: JsonFile = None,
+    ) -> None:
+        _train_policies(method, lung, all_lungs, range(seed, seed + seeds), steps, out, plant, json)
+
+    command.__doc__ = f"""Train networks that {what}.
+
+    Writes training.json and weights.npz, which `submissions/{method}` can read. Without `--lung`
+    and `--all` it trains seven networks: one for each lung, and one for all six. Ctrl-C keeps the
     finished work; the same command continues.
 
-    Example: `ventbench train ppo --lung R20C50 --out runs/ppo-R20C50`
+    Example: `ventbench train {method} --lung R20C50 --out runs/{method}-R20C50`
     """
-    _train_policies("ppo", lung, all_lungs, seed, seeds, steps, out, plant, json)
+    return command
 
 
-@app.command()
-def dqn(
-    lung: Lung = None,
-    all_lungs: All = False,
-    seed: Seed = 0,
-    seeds: Seeds = 2,
-    steps: Steps = None,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
-    ] = Path("runs/dqn"),
-    plant: PlantName = "frozen",
-    json: JsonFile = None,
-) -> None:
-    """Train networks that choose among 19 corrections of the PID, by deep Q-learning (DQN).
-
-    Writes training.json and weights.npz, which `submissions/dqn` can read. Without `--lung` and
-    `--all` it trains seven networks: one for each lung, and one for all six. Ctrl-C keeps the
-    finished work; the same command continues.
-
-    Example: `ventbench train dqn --lung R20C50 --out runs/dqn-R20C50`
-    """
-    _train_policies("dqn", lung, all_lungs, seed, seeds, steps, out, plant, json)
+app.command("ppo")(_policies("ppo", "correct the PID, by proximal policy optimisation (PPO)"))
+app.command("dqn")(
+    _policies("dqn", "choose among 19 corrections of the PID, by deep Q-learning (DQN)")
+)
 
 
 def _train_policies(
-    method: str,
-    lung: str | None,
-    all_lungs: bool,
-    seed: int,
-    seeds: int,
-    steps: int | None,
-    out: Path,
-    plant: str,
-    json: Path | None,
-) -> None:
+    method: str, lung: str | None, all_lungs: bool, seeds: range, steps: int | None, out: Path,
+    plant: str, json: Path | None,
+) -> None:  # fmt: skip
     from ventbench.base.errors import InputError
     from ventbench.train.plants import ALL
     from ventbench.train.rl.train import train_dqn, train_ppo
@@ -290,14 +270,7 @@ def _train_policies(
             description = f"{method}, {label}: {best:.3f} cmH2O"
             shown.update(tasks[label], completed=share, description=description)
 
-        trained = work(
-            networks,
-            out,
-            seeds=range(seed, seed + seeds),
-            steps=steps,
-            simulator=plant,
-            progress=progress,
-        )
+        trained = work(networks, out, seeds=seeds, steps=steps, simulator=plant, progress=progress)
     console = told(trained.report, json)
     console.print(_trained(trained.report))
     console.print(f"wrote {out}", markup=False, highlight=False)

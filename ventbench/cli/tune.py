@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 from ventbench.cli.options import (
     InProcess,
     JsonFile,
+    OneTrack,
     PlantName,
     Scheduler,
     Workers,
@@ -264,10 +265,7 @@ def adversary(
         list[str] | None,
         typer.Option(help="Stressor that may act; may be repeated. Default: all, and the rig."),
     ] = None,
-    track: Annotated[
-        Literal["performance", "robustness"] | None,
-        typer.Option(help="What the controller is told; default: the first of the submission."),
-    ] = None,
+    track: OneTrack = None,
     plant: PlantName = "frozen",
     in_process: InProcess = False,
     out: Annotated[

@@ -447,13 +447,11 @@ def weights_problems(path: Path) -> list[str]:
     try:
         if path.suffix.lower() == ".safetensors":
             return _safetensors(path)
-        return _npz(path) if path.suffix.lower() == ".npz" else _npy(path)
+        if path.suffix.lower() == ".npz":
+            return _npz(path)
+        return _numbers({"it": np.load(path, mmap_mode="r", allow_pickle=False)})
     except Exception as error:  # whatever a hostile file brings numpy and zipfile to raise
         return [f"cannot be read without pickle: {type(error).__name__}: {error}"]
-
-
-def _npy(path: Path) -> list[str]:
-    return _numbers({"it": np.load(path, mmap_mode="r", allow_pickle=False)})
 
 
 def _npz(path: Path) -> list[str]:

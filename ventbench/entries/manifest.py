@@ -172,18 +172,22 @@ def _hint(value: Any, choices: tuple[str, ...]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
+#: What is wrong with a key that is none of the manifest's begins so.
+_UNKNOWN = "is not known"
+
+
 def _checked(
-    table: dict[str, Any], checks: dict[str, ValueCheck], where: str, problems: list[str]
+    table: dict[str, Any], checks: dict[str, ValueCheck], where: str, problems: list[_Problem]
 ) -> dict[str, Any]:
     kept = {}
     for key, value in table.items():
         if key not in checks:
-            problems.append(f"{where}{_shown(key)} is not known{_hint(key, tuple(checks))}")
+            problems.append((f"{where}{_shown(key)}", f"{_UNKNOWN}{_hint(key, tuple(checks))}"))
             continue
         try:
             kept[key] = checks[key](value)
         except ValueError as error:
-            problems.append(f"{where}{key}: {error}")
+            problems.append((f"{where}{key}", str(error)))
     return kept
 
 
@@ -193,28 +197,40 @@ def read_manifest(path: Path, label: str | None = None) -> Manifest:
     Raises:
         SubmissionError: naming every problem with file and key.
     """
-    label, problems = label or str(path), []
+    label, read = label or str(path), _read(path)
+    if isinstance(read, Manifest):
+        return read
+    texts = []
+    for key, what in read:
+        between = " " if what.startswith(_UNKNOWN) else ": "
+        texts.append(f"{label}, key {key}{between}{what}" if key else f"{label}: {what}")
+    raise SubmissionError(*texts)
+
+
+#: A key, empty where the file as a whole is wrong, and what is wrong with it.
+_Problem = tuple[str, str]
+
+
+def _read(path: Path) -> Manifest | list[_Problem]:
+    problems: list[_Problem] = []
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise SubmissionError(f"{label}: larger than {_MAX_BYTES // 1000} kB")
+            return [("", f"larger than {_MAX_BYTES // 1000} kB")]
         content = tomllib.loads(path.read_bytes().decode())
     except UnicodeDecodeError as error:
-        raise SubmissionError(f"{label}: not UTF-8 text (byte {error.start})") from None
+        return [("", f"not UTF-8 text (byte {error.start})")]
     except (ValueError, RecursionError) as error:  # ValueError: an integer of 5,000 digits too
-        raise SubmissionError(f"{label}: not TOML: {error}") from None
+        return [("", f"not TOML: {error}")]
     except OSError as error:
-        raise SubmissionError(f"{label}: cannot be read: {error.strerror}") from None
-
+        return [("", f"cannot be read: {error.strerror}")]
     training = content.pop("training", {})
     if not isinstance(training, dict):
-        problems.append(f"{label}, key training: must be a table, [training]")
+        problems.append(("training", "must be a table, [training]"))
         training = {}
-    kept = _checked(content, _REQUIRED, f"{label}, key ", problems)
-    problems += [f"{label}, key {key}: is missing" for key in _REQUIRED if key not in content]
-    trained = _checked(training, _TRAINING, f"{label}, key training.", problems)
-    if problems:
-        raise SubmissionError(*problems)
-    return Manifest(**kept, training=Training(**trained))
+    kept = _checked(content, _REQUIRED, "", problems)
+    problems += [(key, "is missing") for key in _REQUIRED if key not in content]
+    trained = _checked(training, _TRAINING, "training.", problems)
+    return problems or Manifest(**kept, training=Training(**trained))
 
 
 def read_as_json(folder: str, label: str) -> dict[str, Any]:
@@ -256,12 +272,7 @@ _EXAMPLES = {
 }
 _OTHER_ADVICE = "see submission.toml in submissions/README.md for the keys and their values"
 
-# How read_manifest names a key, and tomllib a place.
-_KEY = re.compile(
-    rf"{re.escape(MANIFEST)}, key (?P<table>training\.)?(?P<key>\w+|(['\"]).*?\3)"
-    r"(: (?P<what>.*)| (?P<unknown>is not .*))",
-    re.DOTALL,
-)
+# How tomllib names a place.
 _TOML_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)")
 
 
@@ -270,27 +281,22 @@ def check_manifest(folder: Path) -> tuple[list[Finding], Manifest | None]:
     path = folder / MANIFEST
     if not path.is_file():
         return [], None  # reported by check_files
-    try:
-        manifest = read_manifest(path, MANIFEST)
-    except SubmissionError as error:
-        lines = _lines(path)
-        return [_explained(problem, lines) for problem in error.problems], None
-    return list(_consistency(manifest, folder, _lines(path))), manifest
+    read, lines = _read(path), _lines(path)
+    if isinstance(read, Manifest):
+        return list(_consistency(read, folder, lines)), read
+    return [_explained(*problem, lines) for problem in read], None
 
 
-def _explained(problem: str, lines: list[str]) -> Finding:
-    """A finding of one of the manifest's problems, whose text names the key."""
-    known = _KEY.fullmatch(problem)
-    if known is None:
-        text = problem.removeprefix(f"{MANIFEST}: ")
-        at = _TOML_PLACE.search(text)
-        line, column = (int(at[1]), int(at[2])) if at else (None, None)
-        what = _TOML_PLACE.sub("", text)
-        return Finding("manifest", MANIFEST, what, _OTHER_ADVICE, line, column)
-    key = (known["table"] or "") + known["key"].strip("'\"")
-    advice = "remove or rename it" if known["unknown"] else _EXAMPLES.get(key, _OTHER_ADVICE)
-    what = f"key {key} {known['unknown'] or known['what']}"
-    return Finding("manifest", MANIFEST, what, advice, _line(lines, key))
+def _explained(key: str, what: str, lines: list[str]) -> Finding:
+    """A finding of one of the manifest's problems."""
+    if not key:
+        at = _TOML_PLACE.search(what)
+        place = (int(at[1]), int(at[2])) if at else (None, None)
+        return Finding("manifest", MANIFEST, _TOML_PLACE.sub("", what), _OTHER_ADVICE, *place)
+    unknown, table = what.startswith(_UNKNOWN), "training." * key.startswith("training.")
+    key = table + key.removeprefix(table).strip("'\"")
+    advice = "remove or rename it" if unknown else _EXAMPLES.get(key, _OTHER_ADVICE)
+    return Finding("manifest", MANIFEST, f"key {key} {what}", advice, _line(lines, key))
 
 
 def _line(lines: list[str], key: str) -> int | None:

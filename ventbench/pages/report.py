@@ -20,7 +20,6 @@ from ventbench.pages import panels
 from ventbench.pages.panels import check, labels, shared_tracks
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
-from ventbench.task.metrics import bootstrap
 from ventbench.trajectories import Trajectories
 
 
@@ -171,13 +170,17 @@ def comparison(
             where = f"{runs[0].lungs[i]} at PIP {runs[0].pips[j]:g}"
             texts[key] = f"{number(abs(value))} cmH2O, {where}"
     drawn = panels.paired_draws(given[0], given[other]) if given is not None else None
+    mean, low, high = (
+        ("", "", "") if drawn is None
+        else (number(x, sign=True) for x in (drawn.mean, *drawn.ci95))
+    )  # fmt: skip
     return {
         "name": names[other],
         "lungs": int(np.sum(lungs < 0.0)),
         "cells": int(np.sum(difference < 0.0)),
         "best": texts.get("best", ""),
         "worst": texts.get("worst", ""),
-        "draws": "" if drawn is None else _interval(drawn),
+        "draws": f"{mean} [{low}, {high}]" if mean else "",
         "count": 0 if drawn is None else drawn.count,
         "rows": [
             {
@@ -190,13 +193,6 @@ def comparison(
             for lung, row, mean in zip(runs[0].lungs, difference, lungs, strict=True)
         ],
     }
-
-
-def _interval(summary: bootstrap.Summary) -> str:
-    low, high = summary.ci95
-    return (
-        f"{number(summary.mean, sign=True)} [{number(low, sign=True)}, {number(high, sign=True)}]"
-    )
 
 
 def _shade(difference: float) -> str:

@@ -176,7 +176,8 @@ def _plots(runs: Sequence[Trajectories]) -> tuple[Plot, ...]:
     The expiratory valve is logged but not shown: no controller moves it. Its room goes to u_in,
     whose axis else has one mark.
     """
-    highest = _top([x for run in runs for x in (run.pressure, run.target)])
+    arrays = [x for run in runs for x in (run.pressure, run.target)]
+    highest = max(float(np.max(x, initial=0.0, where=np.isfinite(x))) for x in arrays)
     pressure = min(1.06 * highest, 2.0 * protocol.SAFETY_PRESSURE)
     u_in = 1.06 * protocol.U_MAX
     return (
@@ -268,11 +269,6 @@ def _last_scored_breath() -> rrb.TimeAxis:
             start=at(seconds=start - 0.15), end=at(seconds=start + breath - 0.1)
         )
     )
-
-
-def _top(arrays: Sequence[np.ndarray]) -> float:
-    """Highest finite value, 0 at least."""
-    return max(float(np.max(array, initial=0.0, where=np.isfinite(array))) for array in arrays)
 
 
 def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:

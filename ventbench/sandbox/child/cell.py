@@ -233,15 +233,12 @@ def _checked(controller: Any, label: str) -> Callable[[], Any]:
         raise SubmissionError(
             f"{label}: {CLASS} in {FILE} is a {type(controller).__name__}, no class"
         )
-    missing = [m for m in ("reset(task)", "act(observation)") if not _has(controller, m)]
+    methods = {"reset": "reset(task)", "act": "act(observation)"}
+    missing = [m for k, m in methods.items() if not callable(getattr(controller, k, None))]
     if missing:
         problems = (f"{label}: class {CLASS} in {FILE} has no method {m}" for m in missing)
         raise SubmissionError(*problems)
     return controller
-
-
-def _has(controller: Any, method: str) -> bool:
-    return callable(getattr(controller, method.partition("(")[0], None))
 
 
 @contextlib.contextmanager

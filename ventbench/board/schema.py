@@ -309,7 +309,10 @@ def read(
                 f"{label}, key {key}: is {found}; this ventbench reads records of {key} {known} "
                 "and no other"
             )
-    _check_time(record.created, f"{label}, key created")
+    try:
+        datetime.strptime(record.created, TIME_FORMAT)
+    except ValueError:  # a time that no calendar has
+        raise InputError(f"{label}, key created: {record.created} is no date and time") from None
     if isinstance(record, WithdrawalContent):
         return record
     for key in record.__struct_fields__:
@@ -475,14 +478,6 @@ def _check_claims(record: ScoreContent, label: str) -> None:
         raise InputError(f"{label}, key track: the submission does not enter it")
     if record.official and not (record.sandbox and record.sandbox.get("official") is True):
         raise InputError(f"{label}, key official: its sandbox was not official")
-
-
-def _check_time(created: str, where: str) -> None:
-    """Refuse a time that no calendar has."""
-    try:
-        datetime.strptime(created, TIME_FORMAT)
-    except ValueError:
-        raise InputError(f"{where}: {created} is no date and time") from None
 
 
 def _check_submission(submission: RecordedSubmission, where: str) -> None:

@@ -14,6 +14,7 @@ imports must be there too.
 from __future__ import annotations
 
 import ast
+import contextlib
 import dataclasses
 import difflib
 import io
@@ -22,7 +23,7 @@ import sys
 import tokenize
 import unicodedata
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -367,25 +368,21 @@ def _module(name: str) -> Iterator[tuple[str, str]]:
 #: Most findings of one kind that are listed.
 LISTED = 200
 
-_CHECKS = ("manifest", "files", "sources", "review")
+_CHECKS: Mapping[str, Callable[[Path], list[Finding]]] = {
+    "manifest": lambda folder: check_manifest(folder)[0], "files": check_files,
+    "sources": check_sources, "review": review,
+}  # fmt: skip
 
 
-def findings_as_json(folder: str, check: str) -> list[dict[str, Any]]:
-    """Make one of :data:`_CHECKS` on a folder, for a process that answers in JSON."""
-    path = Path(folder)
-    if check == "manifest":
-        findings = check_manifest(path)[0]
-    else:
-        checks = {"files": check_files, "sources": check_sources, "review": review}
-        findings = checks[check](path)
-    # Problems first: what is cut off must not be what stops the submission.
-    kept = sorted(findings, key=lambda finding: not finding.problem)[:LISTED]
-    return [dataclasses.asdict(finding) for finding in findings if finding in kept]
-
-
-def all_findings_as_json(folder: str) -> list[dict[str, Any]]:
-    """Make every check on a folder, for a process that answers in JSON."""
-    return [finding for check in _CHECKS for finding in findings_as_json(folder, check)]
+def findings_as_json(folder: str, *checks: str) -> list[dict[str, Any]]:
+    """Make some of :data:`_CHECKS` on a folder, for a process that answers in JSON."""
+    listed = []
+    for check in checks:
+        findings = _CHECKS[check](Path(folder))
+        # Problems first: what is cut off must not be what stops the submission.
+        kept = sorted(findings, key=lambda finding: not finding.problem)[:LISTED]
+        listed += [dataclasses.asdict(finding) for finding in findings if finding in kept]
+    return listed
 
 
 def inspect_folder(folder: Path) -> tuple[Finding, ...]:
@@ -395,18 +392,11 @@ def inspect_folder(folder: Path) -> tuple[Finding, ...]:
     the answer says which files cannot be read and still has what the other checks find. Nothing
     in the folder is run or imported.
     """
-    try:
-        together = read_apart("ventbench.entries.review:all_findings_as_json", folder)
-        return tuple(Finding(**finding) for finding in together)
-    except UnreadableError:
-        return _each_apart(folder)
-
-
-def _each_apart(folder: Path) -> tuple[Finding, ...]:
-    findings: list[Finding] = []
+    function, findings = "ventbench.entries.review:findings_as_json", list[Finding]()
+    with contextlib.suppress(UnreadableError):
+        return tuple(Finding(**each) for each in read_apart(function, folder, [*_CHECKS]))
     for check in _CHECKS:
         try:
-            function = "ventbench.entries.review:findings_as_json"
             answer = read_apart(function, folder, [check])
         except UnreadableError as error:
             group = check if check in ("manifest", "files") else "source"

@@ -29,68 +29,29 @@ class CallNumber(NamedTuple):
     aarch64: int | None
 
 
+def _table(text: str) -> dict[str, CallNumber]:
+    """Calls by name, of ``name x86-64 aarch64`` with commas between; ``-`` where there is none."""
+    calls = {}
+    for name, *numbers in (call.split() for call in text.split(",")):
+        calls[name] = CallNumber(*(None if x == "-" else int(x) for x in numbers))
+    return calls
+
+
 #: Allowed with any argument.
-PLAIN = {
-    "read": CallNumber(0, 63),
-    "write": CallNumber(1, 64),
-    "readv": CallNumber(19, 65),
-    "writev": CallNumber(20, 66),
-    "pread64": CallNumber(17, 67),
-    "lseek": CallNumber(8, 62),
-    "close": CallNumber(3, 57),
-    "close_range": CallNumber(436, 436),
-    "dup": CallNumber(32, 23),
-    "dup2": CallNumber(33, None),
-    "dup3": CallNumber(292, 24),
-    "fstat": CallNumber(5, 80),
-    "mprotect": CallNumber(10, 226),
-    "munmap": CallNumber(11, 215),
-    "mremap": CallNumber(25, 216),
-    "brk": CallNumber(12, 214),
-    "rt_sigaction": CallNumber(13, 134),
-    "rt_sigprocmask": CallNumber(14, 135),
-    "rt_sigreturn": CallNumber(15, 139),
-    "sigaltstack": CallNumber(131, 132),
-    "getpid": CallNumber(39, 172),
-    "gettid": CallNumber(186, 178),
-    "getppid": CallNumber(110, 173),
-    "getuid": CallNumber(102, 174),
-    "geteuid": CallNumber(107, 175),
-    "getgid": CallNumber(104, 176),
-    "getegid": CallNumber(108, 177),
-    "getrusage": CallNumber(98, 165),
-    "getrlimit": CallNumber(97, 163),
-    "uname": CallNumber(63, 160),
-    "times": CallNumber(100, 153),
-    "time": CallNumber(201, None),
-    "gettimeofday": CallNumber(96, 169),
-    "nanosleep": CallNumber(35, 101),
-    "restart_syscall": CallNumber(219, 128),
-    "sched_yield": CallNumber(24, 124),
-    "getcpu": CallNumber(309, 168),
-    "getrandom": CallNumber(318, 278),
-    "poll": CallNumber(7, None),
-    "ppoll": CallNumber(271, 73),
-    "select": CallNumber(23, None),
-    "pselect6": CallNumber(270, 72),
-    "arch_prctl": CallNumber(158, None),
-    "set_robust_list": CallNumber(273, 99),
-    "set_tid_address": CallNumber(218, 96),
-    "rseq": CallNumber(334, 293),
-    "exit": CallNumber(60, 93),
-    "exit_group": CallNumber(231, 94),
-    "stat": CallNumber(4, None),
-    "lstat": CallNumber(6, None),
-    "newfstatat": CallNumber(262, 79),
-    "statx": CallNumber(332, 291),
-    "access": CallNumber(21, None),
-    "faccessat": CallNumber(269, 48),
-    "faccessat2": CallNumber(439, 439),
-    "readlink": CallNumber(89, None),
-    "readlinkat": CallNumber(267, 78),
-    "getdents64": CallNumber(217, 61),
-    "getcwd": CallNumber(79, 17),
-}
+PLAIN = _table("""
+    read 0 63, write 1 64, readv 19 65, writev 20 66, pread64 17 67, lseek 8 62, close 3 57,
+    close_range 436 436, dup 32 23, dup2 33 -, dup3 292 24, fstat 5 80, mprotect 10 226,
+    munmap 11 215, mremap 25 216, brk 12 214, rt_sigaction 13 134, rt_sigprocmask 14 135,
+    rt_sigreturn 15 139, sigaltstack 131 132, getpid 39 172, gettid 186 178, getppid 110 173,
+    getuid 102 174, geteuid 107 175, getgid 104 176, getegid 108 177, getrusage 98 165,
+    getrlimit 97 163, uname 63 160, times 100 153, time 201 -, gettimeofday 96 169,
+    nanosleep 35 101, restart_syscall 219 128, sched_yield 24 124, getcpu 309 168,
+    getrandom 318 278, poll 7 -, ppoll 271 73, select 23 -, pselect6 270 72, arch_prctl 158 -,
+    set_robust_list 273 99, set_tid_address 218 96, rseq 334 293, exit 60 93,
+    exit_group 231 94, stat 4 -, lstat 6 -, newfstatat 262 79, statx 332 291, access 21 -,
+    faccessat 269 48, faccessat2 439 439, readlink 89 -, readlinkat 267 78, getdents64 217 61,
+    getcwd 79 17
+""")
 
 #: Opening files, for reading only.
 OPENAT, OPEN = CallNumber(257, 56), CallNumber(2, None)
@@ -99,20 +60,11 @@ OPENAT, OPEN = CallNumber(257, 56), CallNumber(2, None)
 SECCOMP = CallNumber(317, 277)
 
 #: Allowed with the arguments that :func:`_checked` names.
-CHECKED = {
-    "mmap": CallNumber(9, 222),
-    "ioctl": CallNumber(16, 29),
-    "fcntl": CallNumber(72, 25),
-    "futex": CallNumber(202, 98),
-    "madvise": CallNumber(28, 233),
-    "prlimit64": CallNumber(302, 261),
-    "clock_gettime": CallNumber(228, 113),
-    "clock_getres": CallNumber(229, 114),
-    "clock_nanosleep": CallNumber(230, 115),
-    "sched_getaffinity": CallNumber(204, 123),
-    "tgkill": CallNumber(234, 131),
-    "clone": CallNumber(56, 220),
-}
+CHECKED = _table("""
+    mmap 9 222, ioctl 16 29, fcntl 72 25, futex 202 98, madvise 28 233, prlimit64 302 261,
+    clock_gettime 228 113, clock_getres 229 114, clock_nanosleep 230 115,
+    sched_getaffinity 204 123, tgkill 234 131, clone 56 220
+""")
 
 #: Answered with "no such call", so that the C library falls back to one that is looked into.
 MISSING = {"clone3": CallNumber(435, 435), "openat2": CallNumber(437, 437)}

@@ -229,15 +229,12 @@ def _track(
     records = [row.record for row in ranked]
     base = _baseline(records, name)
     return Track(
-        name=name,
-        draws=draws,
-        round=own,
-        ranked=tuple(ranked),
+        name=name, draws=draws, round=own, ranked=tuple(ranked),
         unranked=tuple(_unranked_rows(placed["unranked"])),
         unofficial=tuple(_unranked_rows(placed["unofficial"])),
         baseline=None if base is None else records[base],
         stress=tuple(_stress_rows(ranked, evidence)),
-    )
+    )  # fmt: skip
 
 
 def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:

@@ -353,13 +353,9 @@ def _plain_table(title: str) -> Table:
     from rich.table import Table
 
     return Table(
-        title=title or None,
-        box=box.SIMPLE_HEAD,
-        padding=(0, 0, 0, 1),
-        pad_edge=False,
-        title_justify="left",
-        caption_justify="left",
-    )
+        title=title or None, box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False,
+        title_justify="left", caption_justify="left",
+    )  # fmt: skip
 
 
 def _lung_table(track: Track, lung: str) -> Table:
@@ -408,13 +404,9 @@ def _stress_table(track: Track) -> Table:
     for row in rows:
         score, ranks = row["score"], row["ranks"]
         table.add_row(
-            "" if row["rank"] is None else str(row["rank"]),
-            row["name"],
-            "failed" if score is None else score["text"],
-            "" if score is None else score["small"],
-            "" if ranks is None else f"{ranks[0]} to {ranks[1]}",
-            row["unstressed"],
-            f"{row['survived']} %",
-            str(row["unsafe"]),
-        )
+            "" if row["rank"] is None else str(row["rank"]), row["name"],
+            "failed" if score is None else score["text"], "" if score is None else score["small"],
+            "" if ranks is None else f"{ranks[0]} to {ranks[1]}", row["unstressed"],
+            f"{row['survived']} %", str(row["unsafe"]),
+        )  # fmt: skip
     return table

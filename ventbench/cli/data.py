@@ -134,20 +134,12 @@ def import_(
     }  # fmt: skip
     with waiting(f"reading {file}"):
         imported = import_recording(
-            file,
-            columns=_pairs(columns, "--map"),
-            units={role: unit for role, unit in units.items() if unit is not None},
-            layout=layout,
-            lung=lung,
-            rate=rate,
-            split_breaths=split_breaths,
-            invert=invert or (),
-            offsets=_offsets(offset),
-            select=_pairs(select, "--select"),
-            skip_bad_breaths=skip_bad_breaths,
-            separator=separator,
-            decimal=decimal,
-        )
+            file, columns=_pairs(columns, "--map"),
+            units={role: unit for role, unit in units.items() if unit is not None}, layout=layout,
+            lung=lung, rate=rate, split_breaths=split_breaths, invert=invert or (),
+            offsets=_offsets(offset), select=_pairs(select, "--select"),
+            skip_bad_breaths=skip_bad_breaths, separator=separator, decimal=decimal,
+        )  # fmt: skip
     emit(imported.as_dict(), json)
     to_stderr = str(json) == "-"
     for name, role in imported.columns.items():

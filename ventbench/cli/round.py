@@ -64,14 +64,9 @@ def open_(
     from ventbench.entries.folder import bundled
 
     made = rounds.open_round(
-        folder,
-        name,
-        closes.replace(tzinfo=datetime.UTC),
-        project or bundled(),
-        delay_s=delay,
-        limit=limit,
-        chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
-    )
+        folder, name, closes.replace(tzinfo=datetime.UTC), project or bundled(), delay_s=delay,
+        limit=limit, chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
+    )  # fmt: skip
     _told(made, json)
 
 
@@ -177,14 +172,9 @@ def score(
             shown.update(tasks[what], completed=done, total=count)
 
         made = official_runs.score(
-            folder,
-            name,
-            pool,
-            out / name,
-            places=[folder.parent / "submissions", *(source or [])],
-            secret=os.environ.get(attestation.SECRET) or None,
-            progress=tell,
-        )
+            folder, name, pool, out / name, places=[folder.parent / "submissions", *(source or [])],
+            secret=os.environ.get(attestation.SECRET) or None, progress=tell,
+        )  # fmt: skip
     _told(made, json)
 
 

@@ -124,13 +124,9 @@ def protocol_of(
         about = None if drawn is None else drawn.about()
         reference = reference_of(rigs.about, about, reference)
     return Protocol(
-        rigs,
-        pips,
-        drawn,
-        _nominal_and_drawn(rigs, drawn, pips),
-        _under_stress(rigs, whole, chosen_conditions(stressors)) if stress else None,
-        reference,
-    )
+        rigs, pips, drawn, _nominal_and_drawn(rigs, drawn, pips),
+        _under_stress(rigs, whole, chosen_conditions(stressors)) if stress else None, reference,
+    )  # fmt: skip
 
 
 def _nominal_and_drawn(rigs: Rigs, drawn: Draws | None, pips: tuple[float, ...]) -> Cells:

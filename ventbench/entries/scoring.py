@@ -91,15 +91,9 @@ def score(
     """
     entry = as_submission(submission)
     result = run_protocol(
-        entry,
-        load_rigs(simulator),
-        track=track,
-        draws=draws,
-        stress=stress,
-        stressors=stressors,
-        runner=runner_of(entry, sandbox=sandbox),
-        progress=progress,
-    )
+        entry, load_rigs(simulator), track=track, draws=draws, stress=stress, stressors=stressors,
+        runner=runner_of(entry, sandbox=sandbox), progress=progress,
+    )  # fmt: skip
     if len(result.failures) == result.requested[..., 0, 0].size and entry.sha256 is None:
         raise SubmissionError(result.failures[0].message)  # a class or function that never works
     return result
@@ -178,13 +172,9 @@ def run_protocol(
         for x in (scenario.peep, pip, scenario.dt)
     )
     return Score(
-        submission=submission,
-        track=track,
-        protocol=what,
-        runs=runs_of(run, what.cells, submission, tasks),
-        stressed=under_stress,
-        controllable=controllable,
-        figures=figures(InspirationSignals(*signals, *levels)),
+        submission=submission, track=track, protocol=what,
+        runs=runs_of(run, what.cells, submission, tasks), stressed=under_stress,
+        controllable=controllable, figures=figures(InspirationSignals(*signals, *levels)),
         below=np.sum(requested < 0.0, axis=(1, 2, 3)),
         above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3)),
         trajectories=end_to_end(submission.manifest.name, track, names, what.pips, *joined),
@@ -194,7 +184,7 @@ def run_protocol(
             "act_median_us": 1e6 * float(np.median(run.act_seconds)),
             "act_max_us": 1e6 * float(np.max(run.act_seconds)),
         },
-    )
+    )  # fmt: skip
 
 
 def _counted(progress: Progress | None, sessions: int) -> Callable[[], object]:
@@ -256,19 +246,12 @@ def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Seque
         return values.reshape(len(cells.conditions), count, draws * pips, *values.shape[4:])
 
     return Runs(
-        conditions=cells.conditions,
-        lungs=lungs,
-        pips=cells.pips.reshape(count, -1),
-        rig=np.repeat(cells.rig, pips, axis=1),
-        member=np.repeat(cells.member, pips, axis=1),
-        error=flat(error),
-        safe=flat(safe),
-        survived=flat(survived),
+        conditions=cells.conditions, lungs=lungs, pips=cells.pips.reshape(count, -1),
+        rig=np.repeat(cells.rig, pips, axis=1), member=np.repeat(cells.member, pips, axis=1),
+        error=flat(error), safe=flat(safe), survived=flat(survived),
         alarm_s=flat(time_above_alarm(*by_breath).max(axis=-1)),
-        peak=flat(run.pressure.max(axis=(-2, -1))),
-        volume=flat(volume),
-        draw=np.repeat(cells.draw, pips),
-        plateau_error=flat(plateau),
+        peak=flat(run.pressure.max(axis=(-2, -1))), volume=flat(volume),
+        draw=np.repeat(cells.draw, pips), plateau_error=flat(plateau),
         requested=flat(run.requested),
         failures=[
             CellFailure(
@@ -281,7 +264,7 @@ def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Seque
             )
             for (s, lung, draw, at), failure in sorted(run.failures.items())
         ],
-    )
+    )  # fmt: skip
 
 
 #: Where an entry is tried, in the order of the table.

@@ -249,15 +249,9 @@ class ZygoteClient:
         command = [sys.executable, *OPTIONS, "-c", _BOOT, *told]
         try:
             self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=self._stderr,
-                cwd="/",
-                env=ENVIRONMENT,
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,
-            )
+                command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._stderr,
+                cwd="/", env=ENVIRONMENT, pass_fds=[theirs.fileno()], start_new_session=True,
+            )  # fmt: skip
         except OSError as error:
             self._control.close()
             self._stderr.close()

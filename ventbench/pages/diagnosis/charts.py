@@ -318,13 +318,11 @@ def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
     where = "; ".join(f"{p.low:.6g} to {p.high:.6g}" for p in places) or "none"
     chart = Chart(
         (float(edges[0]), float(edges[-1])),
-        y if y[1] - y[0] > 0.2 else limits(y, least=0.2, around=0.0),
-        f"{axis.name}{unit}",
+        y if y[1] - y[0] > 0.2 else limits(y, least=0.2, around=0.0), f"{axis.name}{unit}",
         "recorded − simulated, cmH2O",
-        f"Mean error along {axis.name}{unit}; significant ranges: {where}.",
-        width=330.0,
+        f"Mean error along {axis.name}{unit}; significant ranges: {where}.", width=330.0,
         height=190.0,
-    )
+    )  # fmt: skip
     if axis.name == EDGE:
         # Half of what matters happens in the first two samples after an edge.
         chart.log, chart.x = True, (_FIRST_EDGE_TIME, max(float(edges[-1]), 2 * _FIRST_EDGE_TIME))
@@ -347,14 +345,11 @@ def _near(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
 def own_signal(name: str, shown: Characteristic) -> Chart:
     """What a mechanism does to its own quantity, without it and with it."""
     chart = Chart(
-        (float(shown.x.min()), float(shown.x.max())),
-        limits(shown.without, shown.acting),
-        shown.x_label,
-        shown.y_label,
-        f"{shown.y_label} over {shown.x_label}, without and with {name}.",
-        width=360.0,
+        (float(shown.x.min()), float(shown.x.max())), limits(shown.without, shown.acting),
+        shown.x_label, shown.y_label,
+        f"{shown.y_label} over {shown.x_label}, without and with {name}.", width=360.0,
         height=200.0,
-    )
+    )  # fmt: skip
     chart.line(_WITHOUT, shown.x, shown.without)
     chart.line(_WITH, shown.x, shown.acting)
     return chart
@@ -363,14 +358,10 @@ def own_signal(name: str, shown: Characteristic) -> Chart:
 def nonparametric_term(shape: NonparametricTerm) -> Chart:
     """The curve of a nonparametric term."""
     chart = Chart(
-        (float(shape.x.min()), float(shape.x.max())),
-        limits(shape.y, [0.0]),
-        shape.x_unit,
-        shape.y_unit,
-        f"Shape of {shape.name}: {shape.y_unit} over {shape.x_unit}.",
-        width=420.0,
+        (float(shape.x.min()), float(shape.x.max())), limits(shape.y, [0.0]), shape.x_unit,
+        shape.y_unit, f"Shape of {shape.name}: {shape.y_unit} over {shape.x_unit}.", width=420.0,
         height=220.0,
-    )
+    )  # fmt: skip
     chart.line("after", shape.x, shape.y)
     return chart
 

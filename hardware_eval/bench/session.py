@@ -133,14 +133,8 @@ def _runs(
             return SessionEnd(False, "the operator did not confirm the next PIP", made)
         prepare_run(run)
         try:
-            result = _one(
-                bench,
-                run,
-                attempts,
-                make_controller,
-                log,
-                (len(plan.runs) - len(queue), len(plan.runs)),
-            )
+            place = len(plan.runs) - len(queue), len(plan.runs)
+            result = _one(bench, run, attempts, make_controller, log, place)
         except LinkError as error:
             # The device has vented or will: by the vent that follows, or by its watchdog.
             log.append({"type": "event", "what": "link", "message": str(error)})
@@ -226,6 +220,10 @@ def _one(
             controller.close()
     for each in written:
         each.result()
+    for trip in result.trips:
+        bench.operator.tell(trip.alarm)
+    if not result.trips and math.isfinite(result.vented_after):
+        bench.operator.tell(f"high priority alarm: {result.reason}")
     line = _run_line(run, attempt, result.status, result.reason)
     log.append(
         {

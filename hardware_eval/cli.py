@@ -19,7 +19,6 @@ from hardware_eval.commands import (
     Yes,
     bench_on,
     calibration_of,
-    keys,
     known_by,
     numbers,
     register,
@@ -152,7 +151,7 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval.bench.console import Blind, ConsoleOperator, RerunView, TerminalView, Views
+    from hardware_eval.bench.console import Blind, RerunView, TerminalView, Views
     from hardware_eval.bench.fallback import DEFAULT as FALLBACK
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.plan import make_plan
@@ -185,21 +184,15 @@ def run(
         print(sheet, flush=True)
         return sheet
 
-    line = ev.connect(port)
-    calibrated = calibration_of(line, calibration)
-    person = ConsoleOperator(yes=yes, control=control, device=line.device)
-    masked = Blind(person, views, plan)
-    try:
-        with keys(person):
-            done = ev.evaluate(
-                entries, line, out, masked if blind else person, plan=plan,
-                view=masked if blind else views, sandbox=not in_process,
-                dry=dry_run, before_lung=before_lung, settings=settings, operator_name=operator,
-                notes=notes, rest=rest, calibration=calibrated,
-                fallback=FALLBACK if fallback else None,
-            )  # fmt: skip
-    finally:
-        line.client.close()
+    with bench_on(port, yes=yes, control=control) as (line, _, person):
+        calibrated = calibration_of(line, calibration)
+        masked = Blind(person, views, plan)
+        done = ev.evaluate(
+            entries, line, out, masked if blind else person, plan=plan,
+            view=masked if blind else views, sandbox=not in_process, dry=dry_run,
+            before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
+            rest=rest, calibration=calibrated, fallback=FALLBACK if fallback else None,
+        )  # fmt: skip
     reason = masked.hidden(done.reason) if blind else done.reason
     emit(
         {

@@ -182,12 +182,8 @@ class SafetySample(NamedTuple):
 
 
 #: Checks with an alarm of medium priority, in the words of IEC 60601-1-8; the others have high.
-MEDIUM = frozenset(
-    {
-        "disconnected", "low_pressure", "no_answer", "software_delay", "missed_deadlines",
-        "applied_command",
-    }
-)  # fmt: skip
+MEDIUM = ("disconnected", "low_pressure", "no_answer", "software_delay", "missed_deadlines",
+          "applied_command")  # fmt: skip
 
 #: Checks that blame the host or the line, not the lung, its tubes or its sensor.
 TIMING_CHECKS = frozenset({"no_answer", "software_delay", "missed_deadlines"})

@@ -328,15 +328,10 @@ def selftest(
     sheet = judge(lung, driven, simulator=simulator, valve=valve, known=known, skipped=left_out)
     findings = list(sheet.findings)
     busy = any(x.held_up for x in everything)
-    findings.append(
-        Finding(
-            "interruptions", float(repeated), not busy,
-            f"{repeated} part{'s' * (repeated != 1)} repeated: host or line was held up"
-            + ("; close other programs, or run with real-time priority" if busy else ""),
-        )
-        if repeated
-        else _finding("interruptions", 0.0, "neither host nor line was held up")
-    )  # fmt: skip
+    told = f"{repeated} part{'s' * (repeated != 1)} repeated: host or line was held up"
+    told += "; close other programs, or run with real-time priority" * busy
+    told = told if repeated else "neither host nor line was held up"
+    findings.append(Finding("interruptions", float(repeated), not (busy and repeated), told))
     trips = [text for x in everything if not x.held_up for text in x.trips]
     findings.append(
         Finding("safety", float(len(trips)), not trips, "; ".join(trips) or "nothing tripped")

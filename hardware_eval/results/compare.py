@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -177,7 +176,10 @@ Floats = NDArray[np.float64]
 _PLATEAUS = (0.0, 12.5, 17.5, 22.5, 27.5, 32.5, float("inf"))
 _NAMES = (
     "up to 12.5",
-    *(f"{low:g} to {high:g}" for low, high in pairwise(_PLATEAUS[1:-1])),
+    "12.5 to 17.5",
+    "17.5 to 22.5",
+    "22.5 to 27.5",
+    "27.5 to 32.5",
     "above 32.5",
 )
 

@@ -9,7 +9,10 @@ from the death to the valves' movement in the log of the electronics is exact, a
 
 Usage:
 
-    python benchmarks/hardware_deaths.py [--death device ...] [--kills 20] [--valve open] [--strict]
+    python benchmarks/hardware_deaths.py [--death device ...] [--kills 100] [--realtime] [--out DIR]
+
+Prints the table of ``hardware_eval/README.md``, valves of both kinds together. The folder keeps
+what is finished; the same command continues.
 """
 
 from __future__ import annotations
@@ -37,6 +40,7 @@ from hardware_eval.wire.client import Client
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Mode
 from hardware_eval.wire.parser import LinkError
+from ventbench.base import files
 
 #: The lung must be vented within this time of a death, s: watchdog, deadman, monostable, age of the
 #: readings, each with what their processes need to wake up.
@@ -264,42 +268,42 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--death", choices=LIMITS, action="append", help="what dies; repeatable")
     parser.add_argument("--valve", choices=("open", "closed"), help="without current; both if not")
-    parser.add_argument("--kills", type=int, default=20, help="of each row")
+    parser.add_argument("--kills", type=int, default=100, help="of each death and valve")
     parser.add_argument("--emulators", type=int, default=2)
     parser.add_argument("--realtime", action="store_true", help="real-time scheduling of all")
     parser.add_argument("--strict", action="store_true", help="exit 1 if any delay is too long")
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    extra = ["--realtime"] * arguments.realtime
+    parser.add_argument("--out", type=Path, default=Path("runs/deaths"), help="kept here")
+    given = parser.parse_args()
+    extra = ["--realtime"] * given.realtime
     # Not what it starts: an emulator that compiles would hold up everything else.
-    if arguments.realtime and not realtime.take_priority():
+    if given.realtime and not realtime.take_priority():
         raise SystemExit("no real-time scheduling: it wants root, or a limit rtprio")
     # In memory: a disk that others write to holds up whoever writes a line.
     memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    rows = []
-    print(
-        "| death | valve without current | within its bound | ms: bound, median, longest | late |"
-    )
-    print("|---|---|---|---|---|")
-    with tempfile.TemporaryDirectory(dir=memory) as folder:
-        for death in arguments.death or LIMITS:
-            for valve in [arguments.valve] if arguments.valve else ["open", "closed"]:
-                row = deaths(
-                    death, valve == "open", arguments.kills, arguments.emulators, Path(folder),
-                    extra,
-                )  # fmt: skip
-                rows.append(row)
-                did = f"{row['within']} of {row['kills']}"
-                did += "" if row["vents"] else " closed, none vented"
-                times = f"{row['bound_ms']:.0f}, {row['median_ms']:.0f}, {row['worst_ms']:.0f}"
-                print(f"| {death} | {valve} | {did} | {times} | {row['held_up']} |", flush=True)
-    print(f"load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors")
-    print("late: the machine held the device's process up for more than 40 ms")
+    rows: list[dict[str, Any]] = []
+    for death in given.death or LIMITS:
+        for valve in [given.valve] if given.valve else ["open", "closed"]:
+            kept = given.out / f"{death}-{valve}-{given.kills}.json"
+            if not kept.exists():
+                with tempfile.TemporaryDirectory(dir=memory) as folder:
+                    row = deaths(
+                        death, valve == "open", given.kills, given.emulators, Path(folder), extra
+                    )
+                files.write_json(kept, {**row, "load": round(os.getloadavg()[0], 1)})
+            rows.append(json.loads(kept.read_text()))
+    print("| death | within bound | ms: bound, larger median, longest |\n|---|---|---|")
+    for death, vents in dict.fromkeys((row["death"], row["vents"]) for row in rows):
+        own = [row for row in rows if (row["death"], row["vents"]) == (death, vents)]
+        kills, within = (sum(row[name] for row in own) for name in ("kills", "within"))
+        longest = [max(row[name] for row in own) for name in ("bound_ms", "median_ms", "worst_ms")]
+        name = death if vents else f"{death}, closed without current: nothing flows"
+        print(f"| {name} | {within}/{kills} | {', '.join(f'{ms:.0f}' for ms in longest)} |")
+    loads = [row["load"] for row in rows]
+    print(f"load {min(loads)} to {max(loads)} on {os.cpu_count()} processors")
+    print(f"held up by the machine for over 40 ms: {sum(row['held_up'] for row in rows)}")
     missed = sum(row["not_counted"] for row in rows)
     print(f"not counted, as the lung was vented before the death by a late host: {missed}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(rows))
-    if arguments.strict and any(row["within"] < row["kills"] for row in rows):
+    if given.strict and any(row["within"] < row["kills"] for row in rows):
         raise SystemExit(1)
 
 

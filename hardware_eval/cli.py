@@ -6,10 +6,8 @@ without a score, a no-go); 2 bad input or no device.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import secrets
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -19,11 +17,12 @@ from hardware_eval.commands import (
     Calibrated,
     Port,
     Yes,
+    bench_on,
     calibration_of,
-    keys,
     known_by,
     numbers,
     register,
+    told,
 )
 from ventbench import __version__
 from ventbench.base.errors import InputError
@@ -152,7 +151,7 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval.bench.console import Blind, ConsoleOperator, RerunView, TerminalView, Views
+    from hardware_eval.bench.console import Blind, RerunView, TerminalView, Views
     from hardware_eval.bench.fallback import DEFAULT as FALLBACK
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.plan import make_plan
@@ -185,21 +184,15 @@ def run(
         print(sheet, flush=True)
         return sheet
 
-    line = ev.connect(port)
-    calibrated = calibration_of(line, calibration)
-    person = ConsoleOperator(yes=yes, control=control, device=line.device)
-    masked = Blind(person, views, plan)
-    try:
-        with keys(person):
-            done = ev.evaluate(
-                entries, line, out, masked if blind else person, plan=plan,
-                view=masked if blind else views, sandbox=not in_process,
-                dry=dry_run, before_lung=before_lung, settings=settings, operator_name=operator,
-                notes=notes, rest=rest, calibration=calibrated,
-                fallback=FALLBACK if fallback else None,
-            )  # fmt: skip
-    finally:
-        line.client.close()
+    with bench_on(port, yes=yes, control=control) as (line, _, person):
+        calibrated = calibration_of(line, calibration)
+        masked = Blind(person, views, plan)
+        done = ev.evaluate(
+            entries, line, out, masked if blind else person, plan=plan,
+            view=masked if blind else views, sandbox=not in_process, dry=dry_run,
+            before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
+            rest=rest, calibration=calibrated, fallback=FALLBACK if fallback else None,
+        )  # fmt: skip
     reason = masked.hidden(done.reason) if blind else done.reason
     emit(
         {
@@ -212,7 +205,7 @@ def run(
         },
         json,
     )
-    shown = sys.stderr if str(json) == "-" else sys.stdout
+    shown = told(json)
     if not done.complete:
         print(f"stopped: {plain(reason)}", file=shown)
         print(f"what is done is in {done.log}; the same command continues", file=shown)
@@ -268,27 +261,15 @@ def selftest(
 
     Example: `ventbench-hardware selftest --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval.bench.console import ConsoleOperator
-    from hardware_eval.bench.loop import Bench
-    from hardware_eval.bench.safety import DEFAULT
     from hardware_eval.bench.selftest import selftest as run_selftest
-    from hardware_eval.results import evaluate as ev
     from ventbench.task.lungs import scored_lung
 
     label = scored_lung(lung).id
-    person = ConsoleOperator(yes=True)
-    line = ev.connect(port)
-    calibrated = calibration_of(line, calibration)
-    try:
-        with keys(person):
-            sheet = run_selftest(
-                Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant,
-                **known_by(calibrated), skip=skip or (),
-            )  # fmt: skip
-    finally:
-        line.client.close()
+    with bench_on(port, yes=True) as (line, bench, _):
+        known = known_by(calibration_of(line, calibration))
+        sheet = run_selftest(bench, label, simulator=plant, skip=skip or (), **known)
     emit(sheet.as_dict(), json)
-    print(sheet, file=sys.stderr if str(json) == "-" else sys.stdout)
+    print(sheet, file=told(json))
     if not sheet.go:
         raise typer.Exit(1)
 
@@ -315,7 +296,7 @@ def conformance(
         return
     if port is None:
         raise InputError("--port: give the device's serial port, such as /dev/ttyACM0")
-    shown = sys.stderr if str(json) == "-" else sys.stdout
+    shown = told(json)
     transport, clock = ev.carrier(port)
     try:
         clauses = judge.conformance(
@@ -369,7 +350,7 @@ def compare(
         for lung, diagnosis in done.diagnoses.items():
             diagnosis.save(out / lung)
     emit(done.as_dict(), json)
-    print(done, file=sys.stderr if str(json) == "-" else sys.stdout)
+    print(done, file=told(json))
 
 
 @app.command()
@@ -394,9 +375,6 @@ def collect(
     Example: `ventbench-hardware collect --port /dev/ttyACM0 --lung R20C50 --breaths 600`
     """
     from hardware_eval.bench import collect as collection
-    from hardware_eval.bench.console import ConsoleOperator
-    from hardware_eval.bench.loop import Bench
-    from hardware_eval.bench.safety import DEFAULT
     from hardware_eval.results import evaluate as ev
     from ventbench.cli.options import bars
     from ventbench.task import protocol
@@ -409,25 +387,19 @@ def collect(
         raise InputError(
             f"--ease {ease:g} cmH2O: give more than {protocol.PEEP:g} and at most {highest:g}"
         )
-    person = ConsoleOperator(yes=yes)
-    line = ev.connect(port)
-    try:
-        about = {"device": ev.device_about(line)}
-        with keys(person), contextlib.ExitStack() as stack:
-            if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
-                raise typer.Exit(1)
-            shown = stack.enter_context(bars())
+    with bench_on(port, yes=yes) as (line, bench, person):
+        if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
+            raise typer.Exit(1)
+        with bars() as shown:
             bar = shown.add_task("exploring", total=breaths)
             done = collection.collect(
-                Bench(line.client, line.clock, DEFAULT, person), label, breaths, out, seed=seed,
-                limits=Limits(ease=ease), about=about,
+                bench, label, breaths, out, seed=seed, limits=Limits(ease=ease),
+                about={"device": ev.device_about(line)},
                 progress=lambda number: shown.update(bar, completed=number),
             )  # fmt: skip
-    finally:
-        line.client.close()
     count = len(done.breaths)
     emit({"breaths": count, "recording": str(done.recording), "stopped": done.stopped}, json)
-    to = sys.stderr if str(json) == "-" else sys.stdout
+    to = told(json)
     print(f"{count} whole breaths: {done.recording}", file=to)
     if done.stopped:
         print(f"stopped: {plain(done.stopped)}; the same command continues", file=to)
@@ -463,7 +435,7 @@ def demo(
     """
     from hardware_eval.demo import demo as run_demo
 
-    to = sys.stderr if str(json) == "-" else sys.stdout
+    to = told(json)
     done = run_demo(
         conceal, out, breaths=breaths, simulator=plant, real_time=not fast,
         sandbox=not in_process, tell=lambda text: print(text, file=to, flush=True),
@@ -496,7 +468,7 @@ def replay(
 
     report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
     emit(report.as_dict(), json)
-    print(report, file=sys.stderr if str(json) == "-" else sys.stdout)
+    print(report, file=told(json))
     if report.problems:
         raise typer.Exit(1)
 

@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
@@ -16,6 +16,7 @@ from ventbench.cli.options import JsonFile, emit, known_lungs
 if TYPE_CHECKING:
     from hardware_eval.bench.calibrate import Calibration
     from hardware_eval.bench.console import ConsoleOperator
+    from hardware_eval.bench.loop import Bench
     from hardware_eval.results.evaluate import Line
 
 Port = Annotated[
@@ -29,6 +30,30 @@ Port = Annotated[
 Yes = Annotated[
     bool, typer.Option("--yes", help="Confirm every question; for an emulator, not for a bench.")
 ]
+
+
+def told(json: Path | None) -> TextIO:
+    """Where a command speaks to people: not where its JSON goes."""
+    return sys.stderr if str(json) == "-" else sys.stdout
+
+
+@contextlib.contextmanager
+def bench_on(
+    port: str, *, yes: bool, control: Path | None = None
+) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
+    """A bench with a person at it, whose keys are stops; the line is released at the end."""
+    from hardware_eval.bench.console import ConsoleOperator
+    from hardware_eval.bench.loop import Bench
+    from hardware_eval.bench.safety import DEFAULT
+    from hardware_eval.results import evaluate as ev
+
+    line = ev.connect(port)
+    try:
+        person = ConsoleOperator(yes=yes, control=control, device=line.device)
+        with keys(person):
+            yield line, Bench(line.client, line.clock, DEFAULT, person), person
+    finally:
+        line.client.close()
 
 
 @contextlib.contextmanager
@@ -67,7 +92,7 @@ def trial(
 
     done = analyse(sessions)
     emit(done.as_dict(), json)
-    print(done, file=sys.stderr if str(json) == "-" else sys.stdout)
+    print(done, file=told(json))
 
 
 def calibrate(
@@ -100,32 +125,22 @@ def calibrate(
     Example: `ventbench-hardware calibrate span --port /dev/ttyACM0 --reference 0,20,40,20,0`
     """
     from hardware_eval.bench import calibrate as calibration
-    from hardware_eval.bench.console import ConsoleOperator
-    from hardware_eval.bench.loop import Bench
-    from hardware_eval.bench.safety import DEFAULT
-    from hardware_eval.results import evaluate as ev
     from ventbench.base import files
     from ventbench.task.lungs import scored_lung
 
     values = numbers("--reference", reference)
     label = scored_lung(lung).id
-    line = ev.connect(port)
-    person = ConsoleOperator(yes=yes)
-    bench = Bench(line.client, line.clock, DEFAULT, person)
-    try:
+    with bench_on(port, yes=yes) as (line, bench, person):
         device = calibration.device_of(line.client)
         kept = calibration.load(out, device, stale=True).parts if out.exists() else {}
-        with keys(person):
-            made = calibration.measure(
-                bench, part, lung=label, reference=values, ask=None if yes else person.number
-            )
-    finally:
-        line.client.close()
+        made = calibration.measure(
+            bench, part, lung=label, reference=values, ask=None if yes else person.number
+        )
     saved = calibration.Calibration(device, {**kept, part: made}).save(out)
     emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
     if plot is not None:
         files.write_atomically(plot, lambda file: file.write(saved.plot_png()))
-    to = sys.stderr if str(json) == "-" else sys.stdout
+    to = told(json)
     print(made, file=to)
     if part == "leak":
         print(f"leak: {calibration.lost_flow(made, label)} mL/s of {label}", file=to)

@@ -376,15 +376,13 @@ body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:60rem;padding
 color:#1b1f24;background:#fff}h1{font-size:1.6rem}ol{padding-left:1.4rem}li{margin:.4rem 0}
 table{border-collapse:collapse;margin:1rem 0}
 th,td{padding:.3rem .8rem;text-align:right;border-bottom:1px solid #d7dce2}
-th:first-child,td:first-child{text-align:left}svg{display:block}.note{color:#57606a}
+th:first-child,td:first-child{text-align:left}.note{color:#57606a}
 @media(prefers-color-scheme:dark){body{background:#14181d;color:#e6e9ed}td,th{border-color:#39414b}}
 """
 
-_COLOURS = {"in simulation": "#6b7785", "on the lung": "#c4462d", "replanned": "#1f7a5c"}
-
 
 def _report(done: Demo) -> str:
-    """One page: the steps, the errors by PIP as bars, the distance, and what was named."""
+    """One page: the steps, the errors by PIP, the distance, and what was named."""
     steps = "".join(
         f"<li><b>{html.escape(title)}.</b> {html.escape(text)}</li>" for title, text in done.steps()
     )
@@ -397,7 +395,7 @@ def _report(done: Demo) -> str:
         + "</tr>"
         for pip in done.simulated
     )
-    heads = "".join(f"<th>{name}</th>" for name in _COLOURS)
+    heads = "".join(f"<th>{name}</th>" for name in ("in simulation", "on the lung", "replanned"))
     waves = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{x.breaths}</td><td>{x.mae:.2f}</td>"
         f"<td>{x.bias:+.2f}</td></tr>"
@@ -413,45 +411,11 @@ def _report(done: Demo) -> str:
         f"<style>{_STYLE}</style><h1>The loop closed on an emulated {html.escape(done.lung)}</h1>"
         "<p class=note>Mean |pressure - target| over the scored inspirations, cmH2O: lower is "
         "better. The lung is emulated in software behind the real wire protocol.</p>"
-        f"<ol>{steps}</ol>{_bars(done)}"
-        f"<table><tr><th>PIP, cmH2O</th>{heads}</tr>{rows}</table>"
+        f"<ol>{steps}</ol><table><tr><th>PIP, cmH2O</th>{heads}</tr>{rows}</table>"
         "<h2>Open-loop distance by waveform</h2><table><tr><th>plateau, "
         f"cmH2O</th><th>breaths</th><th>error a step</th><th>bias</th></tr>{waves}</table>"
         f"<h2>The diagnosis in its own words</h2>{sentences}"
         '<p><a href="diagnosis/report.html">its report</a>, <a href="demo.json">all figures</a>, '
         f'<a href="seal.json">the seal</a>; the words were "{html.escape(done.words)}".</p>'
         "</html>\n"
-    )
-
-
-def _bars(done: Demo) -> str:
-    """Errors by PIP as grouped bars, each with its value."""
-    groups = dict(zip(_COLOURS, (done.simulated, done.measured, done.retuned), strict=True))
-    finite = [x for errors in groups.values() for x in errors.values() if np.isfinite(x)]
-    scale = 150.0 / max([*finite, 1e-9])
-    parts = []
-    for place, pip in enumerate(done.simulated):
-        left = 6 + 112 * place
-        for k, (name, errors) in enumerate(groups.items()):
-            ended = not np.isfinite(errors[pip])
-            height, value = (150.0, "stopped") if ended else (scale * errors[pip], errors[pip])
-            value = value if isinstance(value, str) else f"{value:.2f}"
-            x, top = left + 33 * k, 175.0 - height
-            parts.append(
-                f'<rect x="{x}" y="{top:.1f}" width="30" height="{height:.1f}" '
-                f'fill="{_COLOURS[name]}"><title>{name}, PIP {pip:g}: {value}</title></rect>'
-                f'<text x="{x + 15}" y="{top - 4:.1f}" font-size="11" text-anchor="middle">'
-                f"{value}</text>"
-            )
-        parts.append(f'<text x="{left + 48}" y="193" text-anchor="middle">PIP {pip:g}</text>')
-    width = max(112 * len(done.simulated), 336)
-    legend = "".join(
-        f'<rect x="{6 + 112 * k}" y="206" width="10" height="10" fill="{colour}"/>'
-        f'<text x="{21 + 112 * k}" y="216">{name}</text>'
-        for k, (name, colour) in enumerate(_COLOURS.items())
-    )
-    return (
-        f'<svg viewBox="0 0 {width} 222" style="width:min(100%,{1.5 * width:g}px)" role="img" '
-        f'font-size="13" fill="currentColor" aria-label="Errors by PIP">{"".join(parts)}{legend}'
-        "</svg>"
     )

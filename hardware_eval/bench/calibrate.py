@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hardware_eval.bench.drive import Commands, Driven, drive
-from hardware_eval.bench.identity import KnownLung, measured_lung
+from hardware_eval.bench.identity import KnownLung, measured_lung, white_noise
 from hardware_eval.bench.loop import Bench
-from hardware_eval.bench.selftest import closed_lung, programs
+from hardware_eval.bench.selftest import hold, programs
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Reading
 from ventbench.base import files
@@ -275,21 +275,23 @@ def measure(
         done = {
             part: [
                 _watched(drive(bench, lung, make(), steps, pip=pip), kind)
-                for make, steps, pip in programs()[part]
+                for make, steps, pip in programs(lung)[part]
             ]
             for part in ("sensor", "lung")
         }
-        noise = max(float(np.std(np.diff(done["sensor"][0].pressure))) / math.sqrt(2.0), 1e-3)
-        own = measured_lung(done["lung"], lung, noise)[0]
+        noise = white_noise(done["sensor"][0].pressure)
+        own = measured_lung(done["lung"], lung, max(noise, 1e-3))[0]
         points = [(float(k), own.logarithms[k], own.errors[k]) for k in range(2)]
         if not np.isfinite(points).all():
             raise InputError("lung: neither R nor C can be measured here; see the self-test")
     else:
         confirmed(f"set the lung to {lung} and connect it. Is it set?")
-        commands, fill, steps = closed_lung()
-        closed = _watched(drive(bench, lung, commands, steps, pip=30.0), kind)
-        time, pressure = closed.time[fill:], closed.pressure[fill:]
-        noise = max(float(np.std(np.diff(pressure))) / math.sqrt(2.0), _PRESSURE_ERROR)
+        noise = white_noise(_vented(bench, _READINGS)[0])
+        ((make, steps, pip),) = programs(lung, noise)[kind]
+        still = hold(lung, noise)[0]
+        closed = _watched(drive(bench, lung, make(), steps, pip=pip), kind)
+        time, pressure = closed.time[still:], closed.pressure[still:]
+        noise = max(white_noise(pressure), _PRESSURE_ERROR)
         points = [(t - time[0], p, noise) for t, p in zip(time, pressure, strict=True)]
     columns = zip(*points, strict=True)
     xs, ys, errors = (tuple(round(float(x), 6) for x in column) for column in columns)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from hardware_eval import realtime
 from hardware_eval.bench import safety
-from hardware_eval.bench.loop import Bench, BreathLog, EmergencyStop, answer_by
-from hardware_eval.bench.raw_log import RawLog, lines, recording
-from hardware_eval.bench.safety import SafetySample
+from hardware_eval.bench.loop import Bench, BreathLog, EmergencyStop, answer_by, sample_of
+from hardware_eval.bench.plan import PlannedRun
+from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
@@ -31,9 +31,6 @@ from ventbench.task.lungs import lung as parse_lung
 from ventbench.train.exploration import RANGES, ExplorationRanges, Limits, explore
 
 Floats = NDArray[np.float64]
-
-#: Files of a collection in its folder.
-LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
 
 #: Rest before a breath in time constants of the labelled lung with its expiratory valve, and its
 #: limits, s.
@@ -127,24 +124,20 @@ class BenchVentilator:
         if self.stopped:
             return np.full(1, np.nan)
         began = bench.clock.now()
-        pressure = flow = applied = float("nan")
-        answered = False
+        reading = None
         with contextlib.suppress(NoAnswerError):
             reading = bench.client.heartbeat()
-            pressure, flow, applied = reading.pressure, reading.flow, reading.u_in
-            answered = True
-        late = max(began - self._deadline, 0.0)
+        sample = sample_of(reading, began, self._last, self.pip, max(began - self._deadline, 0.0))
         log.time.append(began - self._start)
-        log.pressure.append(pressure)
-        log.flow.append(flow)
+        log.pressure.append(sample.pressure)
+        log.flow.append(sample.flow)
         log.target.append(self.pip)
-        log.late.append(late)
-        sample = SafetySample(began, pressure, flow, *self._last, self.pip, late, applied, answered)
+        log.late.append(sample.late)
         self._safety = safety.step(bench.settings, self._safety, sample)
         if self._safety.trips:
             bench.client.vent()
             self.stopped = self._safety.trips[0].message
-        return np.full(1, pressure)
+        return np.full(1, sample.pressure)
 
 
 def collect(
@@ -205,7 +198,9 @@ def collect(
                     explore(
                         ventilator, lung, 1, seed=own, ranges=ranges, limits=limits, pips=(pip,)
                     )
-                log.append(_line(ventilator.log, lung, pip, number, not ventilator.stopped))
+                run = PlannedRun(number, "explore", "exploration", lung, pip, number)
+                line = ventilator.log.line(run, 0, 0)
+                log.append({**line, "whole": not ventilator.stopped})
                 spoilt = spoilt + 1 if ventilator.stopped else 0
                 progress(number)
                 if ventilator.stopped:
@@ -222,18 +217,3 @@ def collect(
     breaths = recording(out / LOG, kinds=("explore",))
     write(breaths, out / RECORDING)
     return Collection(breaths, out / RECORDING, stopped)
-
-
-def _line(log: BreathLog, lung: str, pip: float, number: int, whole: bool) -> dict[str, Any]:
-    """A breath as a line of the log; the pressure after the last command is no sample of it."""
-    steps = len(log.u_in)
-    columns = {
-        name: [
-            None if not np.isfinite(value) else round(float(value), 6)
-            for value in getattr(log, name)[:steps]
-        ]
-        for name in ("time", "pressure", "flow", "requested", "u_in", "late", "busy")
-    }
-    about = {"run": number, "attempt": 0, "breath": 0, "entry": "exploration", "kind": "explore"}
-    label = {"lung": lung, "pip": pip, "repeat": number, "whole": whole}
-    return {"type": "breath", **about, **label, **columns, "u_out": log.u_out[:steps]}

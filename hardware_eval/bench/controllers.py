@@ -118,37 +118,29 @@ class SubmissionController:
 
 
 class PIDController:
-    """The PID of the protocol in this process: control runs, exploring and self-tests.
+    """The PID of the protocol in this process, for control runs.
 
     Args:
         gains: P, I and D, %/cmH2O.
-        added: what is added to its command at a time of the breath, %; nothing if not given.
     """
 
     longest_answer = 0.0
 
-    def __init__(
-        self,
-        gains: tuple[float, float, float],
-        added: Callable[[int, float], float] | None = None,
-    ) -> None:
-        self._gains, self._added = gains, added or (lambda breath, time: 0.0)
+    def __init__(self, gains: tuple[float, float, float]) -> None:
+        self._gains = gains
         self._error = self._integral = self._derivative = 0.0
-        self._breath = -1
 
     def act(self, row: Floats, budget: float) -> float | None:
         """Next command; the averages restart at each breath."""
         now, dt, pressure, target = (float(value) for value in row[0, :4])
         if now == 0.0:
             self._error = self._integral = self._derivative = 0.0
-            self._breath += 1
         error, a = target - pressure, dt / (dt + 0.5)
         self._integral += a * (error - self._integral)
         self._derivative += a * (error - self._error - self._derivative)
         self._error = error
         P, I, D = self._gains  # noqa: E741 - the field's names
-        u_in = P * error + I * self._integral + D * self._derivative
-        return u_in + self._added(self._breath, now)
+        return P * error + I * self._integral + D * self._derivative
 
     def close(self) -> None:
         """Nothing to end."""

@@ -18,8 +18,8 @@ from hardware_eval.bench.loop import (
     answer_by,
     is_held_up,
     no_collection,
+    sample_of,
 )
-from hardware_eval.bench.safety import SafetySample
 from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
@@ -93,15 +93,12 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
             began = clock.now()
             if bench.operator.stop():
                 raise EmergencyStop
-            pressure = flow = applied = math.nan
-            answered = False
+            reading, late = None, began - deadline
             with contextlib.suppress(NoAnswerError):
                 reading = client.heartbeat()
-                pressure, flow, applied = reading.pressure, reading.flow, reading.u_in
-                answered = True
-            missed += not answered
-            late = began - deadline
-            sample = SafetySample(began, pressure, flow, *last, pip, late, applied, answered)
+            missed += reading is None
+            sample = sample_of(reading, began, last, pip, late)
+            pressure = sample.pressure
             watched = safety.step(bench.settings, watched, sample)
             if watched.trips:
                 trips = tuple(trip.message for trip in watched.trips)
@@ -117,7 +114,9 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
             except NoAnswerError:
                 missed += 1
             last = (u_in, u_out)
-            rows.append((began - start, pressure, flow, *last, late, clock.now() - began, answered))
+            busy = clock.now() - began
+            flow, answered = sample.flow, sample.answered
+            rows.append((began - start, pressure, flow, *last, late, busy, answered))
     columns = np.array(rows, float).reshape(-1, 8).T
     time, heard = columns[0], columns[7] > 0.0
     if heard.any():

@@ -1,4 +1,4 @@
-"""Which lung is mounted: R and C with intervals, from pressure and flow, without any simulator."""
+"""What is mounted: R and C with intervals, and leaks, by pressure and flow, without simulators."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+from scipy.signal import lfilter
 
 from hardware_eval.bench.drive import Driven
 from hardware_eval.bench.safety import VALVE_GAIN
@@ -93,6 +95,11 @@ def identified(
     return holds, holds and settings == [lung], told
 
 
+def white_noise(pressure: Floats) -> float:
+    """Standard deviation of the noise of pressures that change slowly, cmH2O."""
+    return float(np.std(np.diff(pressure))) / math.sqrt(2.0)
+
+
 @dataclass(frozen=True)
 class KnownLung:
     """A lung by the probes of the self-test, to be compared with itself.
@@ -145,3 +152,60 @@ def measured_lung(
         if value > 0.0:
             logs[k], relative[k] = math.log(value), float(errors[k]) / value
     return KnownLung(lung, (logs[0], logs[1]), (relative[0], relative[1])), R, C, gain
+
+
+#: What a tight lung may creep: this share of its recoil relaxes, with one of these times, s. Rubber
+#: bellows do 0.04, human lungs 0.05 to 0.7 (Bates, Lung Mechanics, Cambridge 2009).
+CREEP, CREEP_TIMES = 0.08, (0.3, 0.8, 2.0)
+
+#: Steps whose mean is the pressure of the filled lung; least scatter of the wire's numbers, cmH2O.
+_FILLED, _ROUNDED = 10, 0.003
+
+
+@dataclass(frozen=True)
+class Leak:
+    """What a closed lung loses.
+
+    Attributes:
+        flow: mL/s; below 0 where gas comes in.
+        pressure: mean while it was closed, cmH2O.
+        sigmas: standard errors by which the pressures contradict all that is allowed.
+    """
+
+    flow: float
+    pressure: float
+    sigmas: float
+
+
+def leak(held: Driven, closed: int, C: float, allowed: float) -> Leak:
+    """Tell a leak from the creep of a tight lung, by the pressures of one that is held closed.
+
+    ``p(t) = p0 - flow / C t + creep S(t)``, where ``S' = P' - S / time`` is the stress of a Maxwell
+    element beside the recoil P, which rises with the volume that the valve gives. Two fits by least
+    squares, the flow within what is allowed or any, are compared by their likelihood ratio, with
+    the scatter about the second one as noise.
+
+    Args:
+        held: a lung that is filled, then closed.
+        closed: step from which the pressure has settled.
+        C: compliance, mL/cmH2O.
+        allowed: flow that is no leak yet, mL/s.
+    """
+    time, pressure = held.time[closed:], held.pressure[closed:]
+    volume = np.cumsum(held.u_in) / max(float(np.sum(held.u_in)), 1e-9)
+    recoil = volume * (float(pressure[:_FILLED].mean()) - held.pressure[0])
+    within, of_any = (math.inf, 0.0), (math.inf, 0.0)
+    for relaxation in CREEP_TIMES:
+        kept = math.exp(-protocol.DT / relaxation)
+        stress = lfilter([kept], [1.0, -kept], np.diff(recoil, prepend=0.0))[closed:]
+        design = np.column_stack([np.ones_like(time), time.mean() - time, stress])
+
+        def fitted(most: float, design: Floats = design) -> tuple[float, float]:
+            bounds = [-np.inf, -most, 0.0], [np.inf, most, CREEP]
+            found = lsq_linear(design, pressure, bounds, method="bvls")
+            return 2.0 * float(found.cost), float(found.x[1])
+
+        within, of_any = min(within, fitted(allowed / C)), min(of_any, fitted(np.inf))
+    variance = max(of_any[0] / (len(pressure) - 3), _ROUNDED**2)
+    sigmas = math.sqrt(max(within[0] - of_any[0], 0.0) / variance)
+    return Leak(C * of_any[1], float(pressure.mean()), sigmas)

@@ -132,10 +132,11 @@ class BreathLog:
     busy: list[float] = field(default_factory=list)
 
     def line(self, run: PlannedRun, attempt: int, breath: int) -> dict[str, Any]:
-        """The breath as a line of the log."""
+        """The breath as a line of the log; the pressure after the last command is none of it."""
+        steps = len(self.u_in)
         rounded = {
-            name: [None if math.isnan(value) else round(value, 6) for value in getattr(self, name)]
-            for name in vars(self)
+            name: [None if math.isnan(value) else round(value, 6) for value in each[:steps]]
+            for name, each in vars(self).items()
             if name not in ("target", "u_out")
         }
         about = {"run": run.number, "attempt": attempt, "breath": breath, "entry": run.entry}
@@ -358,17 +359,7 @@ class _Loop:
         bench, run = self._bench, self._run
         if reading is not None and reading.flags & _CAUSES:
             return self._vented_by_device(reading.flags)
-        sample = SafetySample(
-            began,
-            math.nan if reading is None else reading.pressure,
-            math.nan if reading is None else reading.flow,
-            self._command[0],
-            self._command[1],
-            run.pip,
-            late,
-            math.nan if reading is None else reading.u_in,
-            reading is not None,
-        )
+        sample = sample_of(reading, began, self._command, run.pip, late)
         self._safety = safety.step(bench.settings, self._safety, sample)
         if not self._safety.trips:
             return None
@@ -468,6 +459,15 @@ _CAUSES = CAUSES & ~Flag.HOST_VENTED
 
 
 _HELD_UP = Flag.COMMANDS_STOPPED | Flag.DEVICE_LATE
+
+
+def sample_of(
+    reading: Reading | None, began: float, command: tuple[float, int], pip: float, late: float
+) -> SafetySample:
+    """What the checks see of a reading, or of its absence, under a command."""
+    if reading is None:
+        return SafetySample(began, math.nan, math.nan, *command, pip, late, answered=False)
+    return SafetySample(began, reading.pressure, reading.flow, *command, pip, late, reading.u_in)
 
 
 def is_held_up(flags: Flag) -> bool:

@@ -20,6 +20,9 @@ from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, make_breaths
 from ventbench.task.lungs import lung as parse_lung
 
+#: Files of a session or a collection in its folder.
+LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
+
 #: First line of every log.
 FORMAT = "ventbench-hardware-log-1"
 

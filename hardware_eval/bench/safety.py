@@ -181,6 +181,10 @@ class SafetySample(NamedTuple):
     answered: bool = True
 
 
+#: Checks with an alarm of medium priority, in the words of IEC 60601-1-8; the others have high.
+MEDIUM = ("disconnected", "low_pressure", "no_answer", "software_delay", "missed_deadlines",
+          "applied_command")  # fmt: skip
+
 #: Checks that blame the host or the line, not the lung, its tubes or its sensor.
 TIMING_CHECKS = frozenset({"no_answer", "software_delay", "missed_deadlines"})
 
@@ -204,6 +208,11 @@ class Trip:
     value: float
     message: str
     bench: bool
+
+    @property
+    def alarm(self) -> str:
+        """What the operator is told."""
+        return f"{'medium' if self.check in MEDIUM else 'high'} priority alarm: {self.message}"
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,9 @@ MAX_ATTEMPTS = 3
 #: Runs that a busy host or a slow line ends in a row before the session gives up.
 MAX_HELD_UP = 10
 
+#: What a run's line in the log takes from its result as it is.
+_COUNTED = ("asked", "late_answers", "limited", "outside", "fallback", "longest_fallback")
+
 
 @dataclass(frozen=True)
 class SessionEnd:
@@ -109,15 +112,10 @@ def _safety(bench: Bench) -> dict[str, Any]:
 
 
 def _runs(
-    bench: Bench,
-    plan: Plan,
-    remaining: Sequence[PlannedRun],
-    attempts: dict[int, int],
-    make_controller: MakeController,
-    log: RawLog,
-    before_lung: Callable[[str], Sheet | None],
+    bench: Bench, plan: Plan, remaining: Sequence[PlannedRun], attempts: dict[int, int],
+    make_controller: MakeController, log: RawLog, before_lung: Callable[[str], Sheet | None],
     prepare_run: Callable[[PlannedRun], None],
-) -> SessionEnd:
+) -> SessionEnd:  # fmt: skip
     mounted, spoilt, held_up, made = "", 0, 0, 0
     queue = list(remaining)
     while queue:
@@ -133,14 +131,8 @@ def _runs(
             return SessionEnd(False, "the operator did not confirm the next PIP", made)
         prepare_run(run)
         try:
-            result = _one(
-                bench,
-                run,
-                attempts,
-                make_controller,
-                log,
-                (len(plan.runs) - len(queue), len(plan.runs)),
-            )
+            place = len(plan.runs) - len(queue), len(plan.runs)
+            result = _one(bench, run, attempts, make_controller, log, place)
         except LinkError as error:
             # The device has vented or will: by the vent that follows, or by its watchdog.
             log.append({"type": "event", "what": "link", "message": str(error)})
@@ -191,13 +183,9 @@ def _mount(bench: Bench, lung: str, log: RawLog, before_lung: Callable[[str], Sh
 
 
 def _one(
-    bench: Bench,
-    run: PlannedRun,
-    attempts: dict[int, int],
-    make_controller: MakeController,
-    log: RawLog,
-    place: tuple[int, int],
-) -> RunResult:
+    bench: Bench, run: PlannedRun, attempts: dict[int, int], make_controller: MakeController,
+    log: RawLog, place: tuple[int, int],
+) -> RunResult:  # fmt: skip
     done, total = place
     attempt = attempts.get(run.number, 0)
     attempts[run.number] = attempt + 1
@@ -226,18 +214,17 @@ def _one(
             controller.close()
     for each in written:
         each.result()
+    for trip in result.trips:
+        bench.operator.tell(trip.alarm)
+    if not result.trips and math.isfinite(result.vented_after):
+        bench.operator.tell(f"high priority alarm: {result.reason}")
     line = _run_line(run, attempt, result.status, result.reason)
     log.append(
         {
             **line,
+            **{name: getattr(result, name) for name in _COUNTED},
             "error": None if math.isnan(result.error) else result.error,
-            "asked": result.asked,
-            "late_answers": result.late_answers,
             "longest_answer": round(result.longest_answer, 6),
-            "limited": result.limited,
-            "outside": result.outside,
-            "fallback": result.fallback,
-            "longest_fallback": result.longest_fallback,
             "trips": [vars(trip) for trip in result.trips],
         }
     )

@@ -23,7 +23,7 @@ from hardware_eval.bench.controllers import (
 from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import REST_S, Bench, Operator, View
 from hardware_eval.bench.plan import Plan, PlannedRun
-from hardware_eval.bench.raw_log import RawLog, lines, recording
+from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.bench.selftest import Sheet
 from hardware_eval.realtime import Clock, RealClock
@@ -42,9 +42,6 @@ from ventbench.task.interfaces import Task
 if TYPE_CHECKING:
     from hardware_eval.emulation.loopback import LoopbackDevice
     from hardware_eval.wire.link import Link
-
-#: Files of an evaluation in its folder.
-LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
 
 #: Kinds of runs whose lung is as its label says.
 UNDISTURBED = ("ramp", "scored", "control")

@@ -83,7 +83,8 @@ def import_(
         ),
     ] = None,
     layout: Annotated[
-        str | None, typer.Option(help="kaggle, respiraworks or pvp; recognised if not given.")
+        str | None,
+        typer.Option(help="kaggle, respiraworks, pvp or servo; recognised if not given."),
     ] = None,
     lung: Annotated[
         str | None, typer.Option(metavar="R20C50", help="Label where no columns hold R and C.")
@@ -139,20 +140,12 @@ def import_(
     }  # fmt: skip
     with waiting(f"reading {file}"):
         imported = import_recording(
-            file,
-            columns=_pairs(columns, "--map"),
-            units={role: unit for role, unit in units.items() if unit is not None},
-            layout=layout,
-            lung=lung,
-            rate=rate,
-            split_breaths=split_breaths,
-            invert=invert or (),
-            offsets=_offsets(offset),
-            select=_pairs(select, "--select"),
-            skip_bad_breaths=skip_bad_breaths,
-            separator=separator,
-            decimal=decimal,
-        )
+            file, columns=_pairs(columns, "--map"),
+            units={role: unit for role, unit in units.items() if unit is not None}, layout=layout,
+            lung=lung, rate=rate, split_breaths=split_breaths, invert=invert or (),
+            offsets=_offsets(offset), select=_pairs(select, "--select"),
+            skip_bad_breaths=skip_bad_breaths, separator=separator, decimal=decimal,
+        )  # fmt: skip
     emit(imported.as_dict(), json)
     to_stderr = str(json) == "-"
     for name, role in imported.columns.items():

@@ -107,15 +107,12 @@ def decimate(breaths: Breaths) -> Decimation:
         [np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes, _ in kept]
     )
     fewer = replace(
-        breaths,
-        time=time,
-        dt=dt,
+        breaths, time=time, dt=dt,
         u_in=_wide(stack(flat["u_in"], counts, FILL["u_in"]), width, FILL["u_in"]),
         u_out=_wide(stack(flat["u_out"], counts, FILL["u_out"]), width, FILL["u_out"]),
         pressure=_wide(stack(flat["pressure"], counts, np.nan), width, np.nan),
-        valid=_wide(valid_mask(counts), width, False),
-        **optional,
-    )
+        valid=_wide(valid_mask(counts), width, False), **optional,
+    )  # fmt: skip
     return Decimation(fewer, index)
 
 

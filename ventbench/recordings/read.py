@@ -220,13 +220,9 @@ def check(
         kind = source.kind if source else None
         warnings = source.warnings if source else ()
         return RecordingReport(
-            str(path),
-            kind,
-            problems=error.problems,
-            problem_count=error.total,
-            warnings=warnings,
+            str(path), kind, problems=error.problems, problem_count=error.total, warnings=warnings,
             warning_count=len(warnings),
-        )
+        )  # fmt: skip
     report = _report(source, log, tally)
     if not report.ok:
         return report
@@ -306,16 +302,10 @@ def _report(source: Source, log: ProblemLog, tally: Tally) -> RecordingReport:
     roles = role_problems(source.file, tally) if sound else {}
     warnings = source.warnings + log.listed("warning", find, source.place)
     return RecordingReport(
-        source.file,
-        source.kind,
-        source.sha256,
-        log.listed("problem", find, source.place),
-        log.counts["problem"],
-        warnings,
-        len(source.warnings) + log.counts["warning"],
-        roles.get("refused", ()) + roles.get("suspicious", ()),
-        **describe(tally),
-    )
+        source.file, source.kind, source.sha256, log.listed("problem", find, source.place),
+        log.counts["problem"], warnings, len(source.warnings) + log.counts["warning"],
+        roles.get("refused", ()) + roles.get("suspicious", ()), **describe(tally),
+    )  # fmt: skip
 
 
 def _assemble(block: Block, table: IntervalTable, file: str) -> Breaths:
@@ -335,20 +325,11 @@ def _assemble(block: Block, table: IntervalTable, file: str) -> Breaths:
         name: stack(values, block.lengths, FILL[name]) for name, values in block.samples.items()
     }
     return Breaths(
-        breath_id=block.breath_id,
-        R=block.R,
-        C=block.C,
-        time=times,
-        dt=dts,
-        valid=valid_mask(block.lengths),
-        time_inferred=block.times.blank,
-        source=file,
-        u_in=samples["u_in"],
-        u_out=samples["u_out"],
-        pressure=samples["pressure"],
-        flow=samples.get("flow"),
-        volume=samples.get("volume"),
-    )
+        breath_id=block.breath_id, R=block.R, C=block.C, time=times, dt=dts,
+        valid=valid_mask(block.lengths), time_inferred=block.times.blank, source=file,
+        u_in=samples["u_in"], u_out=samples["u_out"], pressure=samples["pressure"],
+        flow=samples.get("flow"), volume=samples.get("volume"),
+    )  # fmt: skip
 
 
 def recordings_dir() -> Path | None:

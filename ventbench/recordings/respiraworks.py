@@ -15,16 +15,10 @@ from ventbench.recordings.problems import fail
 from ventbench.recordings.scan import kind_of
 
 SIGNALS = {
-    "pressure": "cmH2O",
-    "flow": "mL/s",
-    "volume": "mL",
-    "target": "cmH2O",
-    "cmd_inh_valve": "as logged",
-    "cmd_exh_valve": "as logged",
-    "cmd_psol": "as logged",
-    "dp_inhale": "as logged",
-    "dp_exhale": "as logged",
-}
+    "pressure": "cmH2O", "flow": "mL/s", "volume": "mL", "target": "cmH2O",
+    "cmd_inh_valve": "as logged", "cmd_exh_valve": "as logged", "cmd_psol": "as logged",
+    "dp_inhale": "as logged", "dp_exhale": "as logged",
+}  # fmt: skip
 """Signals of a run and their units."""
 _LABELS = ("run", "test", "breath", "time_step", "R", "C", "drive")
 

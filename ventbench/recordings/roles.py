@@ -120,13 +120,10 @@ def breath_figures(
 
     out = {
         "inspiration": np.add.reduceat(inside.astype(float), starts) / lengths,
-        "end": mean(pressure, left <= _END * lengths[breath]),
-        "inside": mean(pressure, inside),
-        "outside": mean(pressure, ~inside),
-        "u_in_inside": mean(u_in, inside),
-        "u_in_outside": mean(u_in, ~inside),
-        "u_in": np.maximum.reduceat(u_in, starts),
-    }
+        "end": mean(pressure, left <= _END * lengths[breath]), "inside": mean(pressure, inside),
+        "outside": mean(pressure, ~inside), "u_in_inside": mean(u_in, inside),
+        "u_in_outside": mean(u_in, ~inside), "u_in": np.maximum.reduceat(u_in, starts),
+    }  # fmt: skip
     for name in ("pressure", "flow"):
         if name in samples:
             for side, sign in (("high", 1.0), ("low", -1.0)):

@@ -320,12 +320,9 @@ def check_single(rows: Rows, log: ProblemLog) -> None:
     """Check that each breath has at least two samples."""
     at = rows.starts[rows.lengths == 1]
     log.add(
-        rows.row0 + at,
-        "breath_id",
-        "breath {value} has one sample, at least two are needed",
-        "Remove it, or keep the rows of a breath together.",
-        values=rows.columns["breath_id"][at],
-    )
+        rows.row0 + at, "breath_id", "breath {value} has one sample, at least two are needed",
+        "Remove it, or keep the rows of a breath together.", values=rows.columns["breath_id"][at],
+    )  # fmt: skip
 
 
 def check_row_ids(rows: Rows, log: ProblemLog, last: int | None) -> int:
@@ -398,13 +395,9 @@ def _add_repeat(
     values: np.ndarray,
 ) -> None:
     log.add(
-        rows.row0 + here,
-        column,
-        "the row repeats {other}",
-        "Remove one of the two.",
-        values=values[here],
-        others=rows.row0 + previous,
-    )
+        rows.row0 + here, column, "the row repeats {other}", "Remove one of the two.",
+        values=values[here], others=rows.row0 + previous,
+    )  # fmt: skip
 
 
 def _same(rows: Rows, first: np.ndarray, other: np.ndarray, names: object) -> np.ndarray:

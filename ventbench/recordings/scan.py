@@ -285,16 +285,12 @@ def _block(rows: Rows, columns: dict[str, np.ndarray]) -> Block:
     samples = {name: columns[name] for name in keep if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
     return Block(
-        breath_id=columns["breath_id"][starts],
-        R=columns["R"][starts],
-        C=columns["C"][starts],
-        first_row=rows.row0 + starts,
-        lengths=lengths,
+        breath_id=columns["breath_id"][starts], R=columns["R"][starts], C=columns["C"][starts],
+        first_row=rows.row0 + starts, lengths=lengths,
         n_inspiratory=leading_zeros(samples["u_out"], starts, lengths),
-        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
-        times=times,
+        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1), times=times,
         samples=samples,
-    )
+    )  # fmt: skip
 
 
 def join_blocks(blocks: Sequence[Block]) -> Block:

@@ -25,11 +25,8 @@ from ventbench.recordings.foreign.units import spelled, stem, unit_of
 #: Roles of PIRDS types, and what their integers are divided by to be cmH2O, L/min and mL; relative
 #: pressure before absolute.
 _PIRDS = (
-    ("pressure", "D", 10.0),
-    ("pressure", "P", 10.0),
-    ("flow", "F", 1000.0),
-    ("volume", "V", 1.0),
-)
+    ("pressure", "D", 10.0), ("pressure", "P", 10.0), ("flow", "F", 1000.0), ("volume", "V", 1.0),
+)  # fmt: skip
 
 #: Places of PIRDS sensors, the nearer to the patient first.
 _PLACES = "AIDE"

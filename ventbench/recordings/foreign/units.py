@@ -13,15 +13,10 @@ from ventbench.base.errors import InputError
 
 #: Pascal in a centimetre of water (conventional, at 4 degrees Celsius) and of other units.
 _PASCAL = {
-    "cmH2O": Fraction("98.0665"),
-    "mbar": Fraction(100),
-    "hPa": Fraction(100),
-    "kPa": Fraction(1000),
-    "Pa": Fraction(1),
-    "mmHg": Fraction("133.322387415"),
-    "mmH2O": Fraction("9.80665"),
-    "psi": Fraction("6894.757293168"),
-}
+    "cmH2O": Fraction("98.0665"), "mbar": Fraction(100), "hPa": Fraction(100),
+    "kPa": Fraction(1000), "Pa": Fraction(1), "mmHg": Fraction("133.322387415"),
+    "mmH2O": Fraction("9.80665"), "psi": Fraction("6894.757293168"),
+}  # fmt: skip
 
 #: Factors to the schema's unit, which is the first of each role.
 UNITS: dict[str, dict[str, Fraction]] = {

@@ -144,19 +144,15 @@ def _round(own: Round) -> dict[str, Any]:
     """A round for the templates."""
     frozen, result = own.frozen, own.result
     return {
-        "name": own.name,
-        "path": f"{canonical.ROUNDS}/{own.name}.html",
-        "state": own.state,
-        "rehearsal": own.opened.rehearsal,
-        "closes": f"{own.opened.closes:%Y-%m-%d %H:%M} UTC",
+        "name": own.name, "path": f"{canonical.ROUNDS}/{own.name}.html", "state": own.state,
+        "rehearsal": own.opened.rehearsal, "closes": f"{own.opened.closes:%Y-%m-%d %H:%M} UTC",
         "frozen": f"{frozen.frozen:%Y-%m-%d %H:%M:%S} UTC" if frozen else "",
-        "frozen_sha256": own.frozen_sha256,
-        "number": own.number if frozen else None,
+        "frozen_sha256": own.frozen_sha256, "number": own.number if frozen else None,
         "randomness": own.value.randomness if own.value else "",
         "entries": frozen.entries if frozen else [],
         "left_out": sorted(frozen.left_out.items()) if frozen else [],
         "failed": sorted(result.failed.items()) if result else [],
-    }
+    }  # fmt: skip
 
 
 def _track(track: Track) -> dict[str, Any]:
@@ -178,14 +174,11 @@ def _track(track: Track) -> dict[str, Any]:
             }
         )
     return {
-        "id": track.name if track.round else f"practice-{track.name}",
-        "name": track.name,
+        "id": track.name if track.round else f"practice-{track.name}", "name": track.name,
         "title": f"{'' if track.round else 'Practice: '}{track.name}".capitalize(),
-        "about": track.title,
-        "practice": track.round is None,
-        "rows": rows,
+        "about": track.title, "practice": track.round is None, "rows": rows,
         "stability": _stability(track),
-    }
+    }  # fmt: skip
 
 
 def _stability(track: Track) -> list[dict[str, str]]:
@@ -315,14 +308,11 @@ def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
     groups = (
         ("Training, as the authors state it", submission.manifest.training),
         ("Where it came from", header.provenance),
-        ("Files of the submission, SHA-256", submission.files),
-        ("Simulators", header.simulators),
+        ("Files of the submission, SHA-256", submission.files), ("Simulators", header.simulators),
         ("Draws", header.draws.about()),
         ("Sandbox", header.sandbox or {"layers": "none: scored in the scorer's process"}),
-        ("Machine", header.machine),
-        ("Versions", header.versions),
-        ("Timing", header.timing),
-    )
+        ("Machine", header.machine), ("Versions", header.versions), ("Timing", header.timing),
+    )  # fmt: skip
     flat = [(title, flatten(values)) for title, values in groups]
     return [(title, rows) for title, rows in flat if rows]
 

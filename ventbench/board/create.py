@@ -297,14 +297,11 @@ def machine() -> dict[str, Any]:
     flags = set(info.get("flags", info.get("Features", "")).split())
     limit = re.search(r"--xla_cpu_max_isa=(\w+)", os.environ.get("XLA_FLAGS", ""))
     return {
-        "system": _system(),
-        "kernel": f"{platform.system()} {platform.release()}",
-        "architecture": platform.machine(),
-        "cpu": info.get("model name", platform.processor()),
-        "isa": [name for name in _ISA if name in flags],
-        "isa_limit": limit[1] if limit else None,
+        "system": _system(), "kernel": f"{platform.system()} {platform.release()}",
+        "architecture": platform.machine(), "cpu": info.get("model name", platform.processor()),
+        "isa": [name for name in _ISA if name in flags], "isa_limit": limit[1] if limit else None,
         "cores": os.cpu_count() or 0,
-    }
+    }  # fmt: skip
 
 
 def _system() -> str:

@@ -28,6 +28,18 @@ Folder = Annotated[
 ]
 FOLDER = Path("leaderboard")
 
+
+def at_hand(folder: Path) -> Path:
+    """The folder that is shown: for want of the usual one, that of the package, which is said."""
+    from ventbench.board import frames
+
+    path = frames.folder_of(folder)
+    if path != folder:
+        said = f"no folder {folder} here; the board of the last round, which came with ventbench:"
+        typer.echo(said, err=True)
+    return path
+
+
 #: Characters of a hash that tables show, as `--supersedes` and `verify --rerun` take them.
 SHOWN = 8
 
@@ -283,6 +295,7 @@ def show(
 
     from ventbench.board import frames, ranking
 
+    folder = at_hand(folder)
     tracks = ranking.newest(frames.load_tracks(folder))
     rows = [
         frames.csv_row(line)
@@ -337,6 +350,7 @@ def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
     from ventbench.base.text import plain
     from ventbench.board import frames
 
+    folder = at_hand(folder)
     rows = frames.record_index(folder)
     emit({"records": rows}, json)
     table = _plain_table("")
@@ -344,13 +358,9 @@ def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
         table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(
-            row["record"][:SHOWN],
-            plain(row["name"]),
-            row["track"],
-            row["kind"],
-            row["created"][:10],
-            row["state"],
-        )
+            row["record"][:SHOWN], plain(row["name"]), row["track"], row["kind"],
+            row["created"][:10], row["state"],
+        )  # fmt: skip
     console = Console(stderr=str(json) == "-")
     console.print(table)
     console.print(
@@ -364,13 +374,9 @@ def _plain_table(title: str) -> Table:
     from rich.table import Table
 
     return Table(
-        title=title or None,
-        box=box.SIMPLE_HEAD,
-        padding=(0, 0, 0, 1),
-        pad_edge=False,
-        title_justify="left",
-        caption_justify="left",
-    )
+        title=title or None, box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False,
+        title_justify="left", caption_justify="left",
+    )  # fmt: skip
 
 
 def _lung_table(track: Track, lung: str) -> Table:
@@ -425,15 +431,11 @@ def _stress_table(track: Track) -> Table:
     for row in rows:
         score, ranks = row["score"], row["ranks"]
         table.add_row(
-            "" if row["rank"] is None else str(row["rank"]),
-            row["name"],
-            "failed" if score is None else score["text"],
-            "" if score is None else score["small"],
-            "" if ranks is None else f"{ranks[0]} to {ranks[1]}",
-            row["unstressed"],
-            f"{row['survived']} %",
-            str(row["unsafe"]),
-        )
+            "" if row["rank"] is None else str(row["rank"]), row["name"],
+            "failed" if score is None else score["text"], "" if score is None else score["small"],
+            "" if ranks is None else f"{ranks[0]} to {ranks[1]}", row["unstressed"],
+            f"{row['survived']} %", str(row["unsafe"]),
+        )  # fmt: skip
     return table
 
 

@@ -196,12 +196,9 @@ def bars() -> Progress:
     from rich.progress import TimeRemainingColumn as Remaining
 
     columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        Remaining(),
-    )
+        TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn(),
+        TextColumn("left"), Remaining(),
+    )  # fmt: skip
     return _progress(*columns)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.board import FOLDER, Folder, tables_of
+from ventbench.cli.board import FOLDER, Folder, at_hand, tables_of
 from ventbench.cli.options import JsonFile, Scheduler, Workers, bars, emit
 
 if TYPE_CHECKING:
@@ -64,14 +64,9 @@ def open_(
     from ventbench.entries.folder import bundled
 
     made = rounds.open_round(
-        folder,
-        name,
-        closes.replace(tzinfo=datetime.UTC),
-        project or bundled(),
-        delay_s=delay,
-        limit=limit,
-        chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
-    )
+        folder, name, closes.replace(tzinfo=datetime.UTC), project or bundled(), delay_s=delay,
+        limit=limit, chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
+    )  # fmt: skip
     _told(made, json)
 
 
@@ -184,14 +179,9 @@ def score(
             shown.update(tasks[what], completed=done, total=count)
 
         made = round_scoring.score(
-            folder,
-            name,
-            pool,
-            out / name,
-            places=[folder.parent / "submissions", *(source or [])],
-            secret=os.environ.get(attestation.SECRET) or None,
-            progress=tell,
-        )
+            folder, name, pool, out / name, places=[folder.parent / "submissions", *(source or [])],
+            secret=os.environ.get(attestation.SECRET) or None, progress=tell,
+        )  # fmt: skip
     _told(made, json)
 
 
@@ -209,6 +199,7 @@ def show(
     """
     from ventbench.board import rounds
 
+    folder = at_hand(folder)
     if name is None:
         made = rounds.load_all(folder)
         emit({"rounds": [_about(own) for own in made]}, json)
@@ -225,17 +216,14 @@ def _about(own: Round) -> dict[str, object]:
     """What is known of a round, as JSON values."""
     frozen = own.frozen
     return {
-        "name": own.name,
-        "state": own.state,
-        "rehearsal": own.opened.rehearsal,
-        "closes": own.opened.closes.isoformat(),
-        "beacon_round": own.number if frozen else None,
+        "name": own.name, "state": own.state, "rehearsal": own.opened.rehearsal,
+        "closes": own.opened.closes.isoformat(), "beacon_round": own.number if frozen else None,
         "beacon_time": own.opened.chain.time_of(own.number).isoformat() if frozen else None,
         "entries": [entry.name for entry in frozen.entries] if frozen else [],
         "left_out": frozen.left_out if frozen else {},
         "failed": own.result.failed if own.result else {},
         "draws": own.commitment if own.value else None,
-    }
+    }  # fmt: skip
 
 
 def _told(own: Round, json: Path | None) -> None:

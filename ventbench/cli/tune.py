@@ -77,29 +77,20 @@ def headroom(
         pids = best_pids(rigs, progress=counted(progress, "best PID of each lung"))
         with executor(workers, scheduler) as pool:
             computed = references.compute(
-                plants,
-                cells,
-                pids.gains,
-                about,
-                folder=parts,
-                pool=pool,
+                plants, cells, pids.gains, about, folder=parts, pool=pool,
                 progress=counted(progress, "best attainable"),
-            )
+            )  # fmt: skip
     sha256 = computed.save(out)
     shutil.rmtree(parts)  # they are in the file now
     summary = {
-        "file": str(out),
-        "sha256": sha256,
-        "gains": computed.gains.tolist(),
-        "searches": pids.search_gains.tolist(),
-        "search_errors": pids.search_errors.tolist(),
+        "file": str(out), "sha256": sha256, "gains": computed.gains.tolist(),
+        "searches": pids.search_gains.tolist(), "search_errors": pids.search_errors.tolist(),
         "searches_agree": pids.agree.tolist(),
         "distance": np.round(computed.attainable - computed.lower, 6).tolist(),
-        "attainable": float(computed.attainable.mean()),
-        "lower": float(computed.lower.mean()),
+        "attainable": float(computed.attainable.mean()), "lower": float(computed.lower.mean()),
         "pid": float(computed.pid.mean()),
         "largest_gap": float(np.max(computed.attainable - computed.lower)),
-    }
+    }  # fmt: skip
     emit(summary, json)
     console.print(
         f"wrote {out}\nmean over cells, first step left out: best attainable "

@@ -99,12 +99,7 @@ def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | Non
     if position is None:
         position = np.linspace(0.0, 1.0, len(breaths)) if len(breaths) > 1 else np.zeros(1)
     return Data(
-        u_in=breaths.u_in.astype(float),
-        u_out=breaths.u_out.astype(float),
-        dt=breaths.dt.astype(float),
-        measured=np.where(weight > 0, measured, 0.0),
-        weight=weight,
-        R=breaths.R.astype(float),
-        C=breaths.C.astype(float),
-        position=np.asarray(position, float),
-    )
+        u_in=breaths.u_in.astype(float), u_out=breaths.u_out.astype(float),
+        dt=breaths.dt.astype(float), measured=np.where(weight > 0, measured, 0.0), weight=weight,
+        R=breaths.R.astype(float), C=breaths.C.astype(float), position=np.asarray(position, float),
+    )  # fmt: skip

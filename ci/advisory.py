@@ -1,4 +1,4 @@
-"""What the author of a pull request is told: every problem, and the nominal score.
+"""What the author of a pull request is told: every problem, and the score on the practice draws.
 
 Not official, whatever it says: it runs beside the pull request, which might change this file.
 """
@@ -10,19 +10,23 @@ import tempfile
 from pathlib import Path
 
 from ci import workflow
-from ci.take import TakeError, changed_submissions, take
+from ci.take import PARENT, TakeError, changed_submissions, take
+from ventbench.base.text import number
 from ventbench.entries import contract
 from ventbench.entries.folder import open_submission
+from ventbench.entries.manifest import MANIFEST
+from ventbench.entries.result import Score
 from ventbench.entries.runner import Runner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
+from ventbench.task.draws import COUNT
 
 TITLE = "Advisory score (not official)"
 #: Most submissions checked in one pull request.
 MAX_SUBMISSIONS = 3
 #: Time for all of their sessions, s, which leaves some of the job's for setting up; and sessions of
 #: one: three of the check and a score on each of two tracks.
-JOB_S, SESSIONS = 900.0, 5
+JOB_S, SESSIONS = 3000.0, 5
 
 
 def advise(
@@ -32,6 +36,7 @@ def advise(
     name: str,
     rigs: Rigs,
     runner: Runner,
+    draws: int,
 ) -> tuple[bool, list[str]]:
     """Say what is wrong with a submission, and its score if nothing is.
 
@@ -42,6 +47,7 @@ def advise(
         name: of the submission.
         rigs: that are scored.
         runner: of the controller.
+        draws: how many of the development draws to score on.
 
     Returns:
         Whether it is ready, and lines for its author.
@@ -59,13 +65,26 @@ def advise(
         if submission.manifest.name != name:
             return False, [*lines, f"{name}: submission.toml calls it {submission.manifest.name}"]
         for track in submission.manifest.tracks:
-            result = run_protocol(submission, rigs, track=track, runner=runner)
-            by_lung = zip(result.lungs, result.by_lung, strict=True)
-            each = ", ".join(f"{lung} {value:.3f}" for lung, value in by_lung)
-            lines.append(f"{name}: {track}: {result.score:.3f} cmH2O nominal ({each})")
+            result = run_protocol(submission, rigs, track=track, draws=draws, runner=runner)
+            lines.append(f"{name}: {track}: {figures(result)}")
             failed = [failure.message for failure in result.failures[:3]]
             lines += [message.replace(str(taken.folder), name) for message in failed]
     return True, lines
+
+
+def figures(result: Score) -> str:
+    """The score that ranks, on practice draws; then the errors of the draws and the nominal one."""
+    own = result.to_json()
+    each = zip(result.lungs, result.by_lung, strict=True)
+    by_lung = ", ".join(f"{lung} {number(value, 3)}" for lung, value in each)
+    ranked = (own["normalised"] or {}).get("draws")
+    parts = []
+    if ranked:
+        low, high = (number(end, 1) for end in ranked["ci95"])
+        parts = [f"normalised {number(ranked['score'], 1)} [{low}, {high}]"]
+    if own["draws"]:
+        parts += [f"{number(own['draws']['score'], 3)} cmH2O over {len(result.drawn)} draws"]
+    return "; ".join([*parts, f"{number(result.score, 3)} cmH2O nominal ({by_lung})"])
 
 
 def main() -> int:
@@ -80,7 +99,7 @@ def main() -> int:
         workflow.summary(TITLE, ["this pull request changes no submission"])
         return 0
     # Each of the submissions gets its share of the job's time, however slow another one is.
-    share = JOB_S / (MAX_SUBMISSIONS * SESSIONS)
+    share = JOB_S / (len(names[:MAX_SUBMISSIONS]) * SESSIONS)
     allowance = Allowance(total_s=share)
     rigs, runner = load_rigs(), SandboxRunner(require_official=True, allowance=allowance)
     ready = len(names) <= MAX_SUBMISSIONS
@@ -88,9 +107,11 @@ def main() -> int:
         text = f"{len(names)} submissions are changed; one pull request, one submission"
         workflow.summary(TITLE, [text])
     for name in names[:MAX_SUBMISSIONS]:
-        good, lines = advise(*pull, name, rigs, runner)
+        good, lines = advise(*pull, name, rigs, runner, COUNT)
         ready = ready and good
         workflow.summary(TITLE, lines)
+        place = f"{PARENT}/{name}/{MANIFEST}"
+        workflow.annotate(TITLE, lines, place, wrong=not good)
     return 0 if ready else 1
 
 

@@ -39,6 +39,21 @@ def summary(title: str, lines: Iterable[str]) -> None:
             file.write(f"## {title}\n\n{fenced(shown)}\n")
 
 
+def annotate(title: str, lines: Iterable[str], file: str, *, wrong: bool) -> None:
+    """Show lines on the pull request, at the first line of a file, which takes no right to write.
+
+    Args:
+        title: of ours.
+        lines: may quote a submission; none can end the command that shows them.
+        file: path in the repository, of anybody.
+        wrong: whether they are objections.
+    """
+    if os.environ.get("GITHUB_ACTIONS"):
+        said = "%0A".join(plain(x).replace("%", "%25") for text in lines for x in text.splitlines())
+        place = "".join(f"%{ord(x):02X}" if x in "%:,\r\n" else x for x in file)
+        print(f"::{'error' if wrong else 'notice'} file={place},line=1,title={title}::{said}")
+
+
 def fenced(lines: Iterable[str]) -> str:
     """Markdown that shows lines as they are: each indented, none able to end the block."""
     return "".join(f"    {line}\n" for text in lines for line in text.splitlines() or [""])

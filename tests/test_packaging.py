@@ -198,8 +198,10 @@ def test_wheel_content(wheel: Path) -> None:
         ("ventbench", "ventbench"),
         ("data", "ventbench/_data"),
         ("submissions", "ventbench/_submissions"),
+        ("leaderboard", "ventbench/_leaderboard"),
     ]:
-        tracked = {name.replace(folder, inside, 1) for name in _git_files("--", folder)}
+        listed = [name for name in _git_files("--", folder) if not name.endswith(".actions")]
+        tracked = {name.replace(folder, inside, 1) for name in listed}
         assert tracked <= names, f"missing in the wheel: {sorted(tracked - names)}"
     assert any(name.startswith("ventbench/_data/") for name in names)
     assert "ventbench/_submissions/pid_best/controller.py" in names
@@ -249,6 +251,7 @@ def test_wheel_works_outside_the_repository(wheel: Path, tmp_path: Path) -> None
     assert ventbench.__version__ in ventbench_command("--version")
     assert "score" in ventbench_command("--help")
     assert "R20C50" in ventbench_command("lungs")
+    assert "identify_plan" in ventbench_command("board", "show")
     for extra, _, command in NEEDS_EXTRA.values():
         program, *words = shlex.split(command.format(root=ROOT))
         start = [python, program] if program.startswith("-") else [home / "bin" / program]

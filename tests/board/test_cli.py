@@ -109,6 +109,21 @@ def test_bad_input_is_explained(tmp_path: Path, full: Path) -> None:
     assert "field `kind`" in run("add", tmp_path / "x.json", "--folder", tmp_path, code=2)
 
 
+def test_outside_a_checkout_the_last_rounds_board_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which is said; a folder that is here and holds nothing is another thing."""
+    monkeypatch.chdir(tmp_path)
+    for command in ("records", "show"):
+        found = RUN.invoke(app, ["board", command])
+        assert "no folder leaderboard here; the board of the last round, which came" in found.stderr
+        assert "identify_plan" in found.stdout
+    assert "rehearsal-2: scored" in RUN.invoke(app, ["round", "show"]).stdout
+    assert "there is no such folder; the published leaderboard" in run("verify", code=2)
+    (tmp_path / "leaderboard").mkdir()
+    assert "leaderboard holds no record" in run("show", code=2)
+
+
 def test_whose_each_record_is(leaderboard: Path, tmp_path: Path) -> None:
     """File names are hashes: `board records` says whose, and whether they count."""
     scores = store.load(leaderboard).scores

@@ -34,6 +34,17 @@ def test_without_a_page_it_only_prints(monkeypatch, capsys):
     assert capsys.readouterr().out == "| x\n"
 
 
+def test_what_is_shown_on_a_pull_request_is_one_command_each(monkeypatch, capsys):
+    workflow.annotate("Title", HOSTILE, "a", wrong=False)
+    assert capsys.readouterr().out == "", "only where there is one"
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    workflow.annotate("Title", [*HOSTILE, "100 %"], "a,line=7::\n::error::b", wrong=True)
+    (line,) = capsys.readouterr().out.splitlines()
+    place, _, said = line.removeprefix("::error ").partition("::")
+    assert place == "file=a%2Cline=7%3A%3A%0A%3A%3Aerror%3A%3Ab,line=1,title=Title"
+    assert said.split("%0A") == [*HOSTILE[:-1], "a", "::error::b", "100 %25"]
+
+
 def test_outputs_are_single_lines(monkeypatch, tmp_path):
     monkeypatch.setenv("GITHUB_OUTPUT", str(tmp_path / "output"))
     workflow.output(branch="record/demo", commit="")

@@ -139,6 +139,9 @@ def test_slow_tests_run_on_schedule_and_branches_may_be_main_or_master():
     assert branches == [["main", "master"]] * 2, "tests and pages"
     slow = read(FOLDER / "test.yml")["jobs"]["slow"]
     assert any("make test-slow" in step.get("run", "") for step in slow["steps"])
+    assert any("stable-baselines3" in step.get("run", "") for step in slow["steps"]), (
+        "its page runs"
+    )
 
 
 def test_actions_are_kept_up_to_date():

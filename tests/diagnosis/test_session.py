@@ -14,6 +14,7 @@ from tests.physics import cases
 from ventbench.diagnosis.diagnose import diagnose
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
+from ventbench.diagnosis.identification import place_of_change
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.selection.forward import forward_selection
 from ventbench.diagnosis.selection.screening import screen_mechanisms
@@ -44,10 +45,10 @@ def changing(factors: np.ndarray, name: str) -> Breaths:
     return join(tuple(small.numbered(one, k + 1) for k, one in enumerate(each)))
 
 
-def stepped(name: str) -> Breaths:
-    """Breaths of a rig that changes after the seventh."""
+def stepped(name: str, before: int = BEFORE) -> Breaths:
+    """Breaths of a rig that changes after the seventh, or another one."""
     factors, change = STEPS[name]
-    late = np.arange(small.BREATHS) >= BEFORE
+    late = np.arange(small.BREATHS) >= before
     for base, factor in factors.items():
         return changing(np.where(late, factor, 1.0), base)
     usual = small.made()
@@ -86,6 +87,18 @@ def test_a_step_is_promising_and_is_found_at_its_breath(name):
         assert BEFORE - 1 <= place <= BEFORE + 1
         change = STEPS[name][1]
         assert fitted.column(f"{name}.change")[0] == pytest.approx(change, rel=0.1, abs=0.02)
+
+
+@pytest.mark.parametrize(("before", "gain_sd"), [(BEFORE, 0.0), (BEFORE + 1, 0.1)])
+def test_the_first_breath_after_a_change_is_found_where_no_fit_has_it(before, gain_sd):
+    """The eighth breath trains nothing; that gains scatter makes up for no wrong place."""
+    breaths = stepped("gain_step", before)
+    evaluator = dataclasses.replace(small.split(breaths), gain_sd=gain_sd)
+    noise = Noise((0.2,), (0.0,))
+    fitted = evaluator.fit(Hypothesis(("gain_step",)), noise, start={"gain_step.at": 0.5})
+    at = place_of_change(evaluator, fitted, make_data(breaths), "gain_step.at")
+    assert before - 1 < at.value * (small.BREATHS - 1) < before
+    assert at.low <= at.value <= at.high
 
 
 def test_two_simulations_give_the_cost_of_every_place():

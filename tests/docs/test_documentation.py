@@ -43,7 +43,7 @@ SLOW = re.compile(r"diagnose\(|train_|\bfit\(|ventbench\.score\(")
 #: with those before them, and with the page's own controller or diagnoser.
 QUICK = {"docs/mechanics.md": (1,), "docs/missing_physics.md": (2,)}
 WHOLE = {
-    "README.md": (2,), "docs/submitting.md": (1,),
+    "README.md": (2,), "docs/submitting.md": (1, 2, 3), "docs/reinforcement.md": (2,),
     "docs/diagnosers.md": (1,), "docs/mechanics.md": (2,),
 }  # fmt: skip
 
@@ -118,7 +118,7 @@ def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
 
 def furnish(folder: Path) -> Path:
     """Put what the pages speak of into a folder: recordings, tables, plans, a record."""
-    for name in ("data", "submissions", "leaderboard", "proofs", "ci"):
+    for name in ("data", "submissions", "leaderboard", "proofs", "ci", "tests", "examples"):
         (folder / name).symlink_to(ROOT / name)
     recorded = load(example("concealed"))
     (folder / "recording.csv").write_bytes(example("concealed").read_bytes())
@@ -192,6 +192,9 @@ def test_blocks_of_commands_run(page: str, tmp_path: Path, public_recordings: Pa
     script = re.sub(r"^pip install .*", "", "\n".join(lines), flags=re.M).replace(
         "&\n", "& sleep 8\n"
     )
+    if "stable" in script:
+        pytest.importorskip("stable_baselines3", reason="stable_baselines3 is no dependency")
+        script = script.replace("train_stable_baselines3.py", "train_stable_baselines3.py 5")
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", f"trap 'kill $(jobs -p) 2>&- || true' EXIT\n{script}"],

@@ -1,7 +1,7 @@
 """Files of the kinds that laboratories have, as they are: read as meant, or the way out is said.
 
 All but those of the schema are of pressure control, 15 above 5 cmH2O, of a lung of R 12 and C 40 at
-100 Hz. One more file, whose valve gain changes, is for the diagnosis.
+100 Hz.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import ventbench
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.recordings import check
@@ -57,6 +58,9 @@ CHECKED = {
     "twobreaths": (0, "2 breaths: enough for `ventbench open-loop`"),
 }
 
+#: Files whose diagnosis says it; the rig is R20C20.
+DIAGNOSED = {"gain_step": "the valve's gain rises by 25 % from breath 15 on"}
+
 
 def file(name: str) -> Path:
     return CASES / f"{name}.csv.gz"
@@ -68,7 +72,7 @@ def read(name: str, **options) -> Imported:
 
 def test_every_file_is_tried():
     names = {path.name.removesuffix(".csv.gz") for path in CASES.iterdir()}
-    assert names == {*READ, *SAID, *CHECKED}
+    assert names == {*READ, *SAID, *CHECKED, *DIAGNOSED}
 
 
 def mechanics(imported: Imported) -> np.ndarray:
@@ -122,3 +126,10 @@ def test_the_check_says_it(name):
     assert ended.exit_code == code
     report = check(file(name))
     assert (report.ok, bool(report.suspicious)) == (code != 2, code == 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DIAGNOSED)
+def test_the_diagnosis_says_it(name):
+    found = ventbench.diagnose(file(name), lung="R20C20")
+    assert DIAGNOSED[name] in str(found)

@@ -216,21 +216,50 @@ def test_breaths_between_marks(tmp_path):
     np.testing.assert_allclose(imported.breaths.dt, 0.02, atol=1e-9)
 
 
-def test_a_servo_export(tmp_path):
+SERVO = {
+    "Italian": ("Tempo", "Fase del respiro", "Paw", "FLUSSO", "V", "insp.", "insp. pausa", "esp."),
+    "German": ("Zeit", "Atemphase", "Paw", "Flow", "V", "Insp.", "Insp.-Pause", "Exsp."),
+    "Polish": ("Czas", "Faza", "Pdo", "Przepływ", "Obj.", "wdech", "wdech (pauza)", "wydech"),
+}
+
+
+@pytest.mark.parametrize("language", SERVO)
+def test_a_servo_export(tmp_path, language):
     """Sections, text cells, decimal commas and clocks with a colon before milliseconds."""
-    made = lung()
-    swap = str.maketrans(".", ",")
-    columns = [clocks(made, "{h:02}:{m:02}:{s:02}:{f:03}"),
-               ["insp." if t % PERIOD < 1 else "esp." for t in made["time"]],
-               *([x.translate(swap) for x in texts(v)] for v in (made["pressure"],
-                 0.06 * made["flow"])), [""] * len(made["time"])]  # fmt: skip
+    made, swap = lung(), str.maketrans(".", ",")
+    *names, inward, pause, outward = SERVO[language]
+    phase = made["time"] % PERIOD
+    told = np.where(phase < 0.8, inward, np.where(phase < 0.995, pause, outward))
+    numbers = (made["pressure"], 0.06 * made["flow"], np.cumsum(made["flow"]) / RATE)
+    columns = [
+        clocks(made, "{h:02}:{m:02}:{s:02}:{f:03}"),
+        list(told),
+        *([x.translate(swap) for x in texts(values)] for values in numbers),
+        ["Patient" if k == 40 else "" for k in range(len(told))],
+    ]
     above = "[REC]\nData\t18/06/25 00:10:39\nFile\t17502.txt\nDecimal separator\tCOMMA\n"
     above += "=====\nPEEP\t5,0\tcmH2O\nConc. O2\t30\t%\nI:E\t1:2\t\n[DATA]"
-    names = ["Tempo", "Fase del respiro", "Paw (cmH2O)", "FLUSSO (l/min)", "Trigger"]
+    units = ("", "", " (cmH2O)", " (l/min)", " (ml)")
+    names = [*(name + unit for name, unit in zip(names, units, strict=True)), "Trigger"]
     path = table(tmp_path / "a.txt", names, columns, separator="\t", above=above, encoding="utf-16")
     imported = import_recording(path, lung=LABEL)
     same_breaths(imported, made)
     assert "UTF-16" in imported.understood[0]
+    assert "Layout servo" in " ".join(imported.understood)
+    assert "not used" in " ".join(imported.understood)
+    assert imported.breaths.volume is not None
+    for u_out in imported.breaths.u_out[:, :300]:
+        np.testing.assert_array_equal(u_out, np.arange(300) >= 100)
+
+
+def test_what_else_a_servo_exports_is_named(tmp_path):
+    for first, said in (
+        ("[TRE]", "holds trends"),
+        ("[REC]\nPEEP\t5", r"no line \[DATA\]; export a recording"),
+    ):
+        path = table(tmp_path / "a.txt", ["Time", "Ppeak"], [["1", "2"], ["3", "4"]], above=first)
+        with pytest.raises(InputError, match=said):
+            import_recording(path, lung=LABEL)
 
 
 def test_absolute_pressure(tmp_path):

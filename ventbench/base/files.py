@@ -178,6 +178,11 @@ def submissions_folder() -> Path:
     return _folder("submissions")
 
 
+def leaderboard_folder() -> Path:
+    """Folder of the leaderboard that travels with ventbench, without commands in a wheel."""
+    return _folder("leaderboard")
+
+
 def example(name: str) -> Path:
     """Path of an example recording: synthetic breaths, described in ``manifest.toml`` beside them.
 

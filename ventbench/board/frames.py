@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.board import pages, ranking, store
@@ -176,7 +177,7 @@ COLUMNS = (
            "SHA-256 of the submission's files"),
 )  # fmt: skip
 
-#: Where commands look for a leaderboard.
+#: Where commands look for a leaderboard first.
 FOLDER = Path("leaderboard")
 
 #: Whole numbers that an entry may lack.
@@ -195,7 +196,8 @@ def load_board(folder: Path | str | None = None, *, track: str | None = None) ->
     ``score_R5C10_cmH2O`` and ``nominal_R5C10_cmH2O``.
 
     Args:
-        folder: of the leaderboard; ``leaderboard`` in the working directory by default.
+        folder: of the leaderboard; by default ``leaderboard`` in the working directory, or else
+            the board of the last round, which came with ventbench.
         track: ``"performance"`` or ``"robustness"``; both by default.
 
     Returns:
@@ -248,7 +250,7 @@ def load_cells(folder: Path | str | None = None, *, track: str | None = None) ->
                         "peak_cmH2O": record.peak.ravel(),
                         "steps_above": record.steps_above.ravel(),
                     }
-                )
+                ),
             )
     return pd.concat(parts, ignore_index=True)
 
@@ -261,9 +263,14 @@ def load_tracks(folder: Path | str | None = None, *, track: str | None = None) -
     return [tracks for tracks in board if track in (None, tracks.name)]
 
 
+def folder_of(given: Path | str | None) -> Path:
+    """Folder of a leaderboard; for want of the usual one, that of the last round in the package."""
+    path = Path(given or FOLDER)
+    return files.leaderboard_folder() if path == FOLDER and not path.is_dir() else path
+
+
 def _loaded(folder: Path | str | None) -> store.Store:
-    path = FOLDER if folder is None else Path(folder)
-    leaderboard = store.load(path)
+    leaderboard = store.load(path := folder_of(folder))
     if not leaderboard.records:
         raise InputError(f"{path} holds no record; add one with `ventbench board add`")
     return leaderboard
@@ -305,7 +312,7 @@ def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
                 "name": about.name,
                 "created": created_of(entry),
                 "state": "withdrawn" if entry.sha256 in taken_back else state,
-            }
+            },
         )
     return rows
 

@@ -60,9 +60,9 @@ def record_paths(folder: Path) -> list[Path]:
     """Paths of the records of a leaderboard; InputError if there is no such folder."""
     if not folder.is_dir():
         raise InputError(
-            f"{folder}: there is no such folder; the published leaderboard is a folder of the "
-            "source repository, which no installed package holds. Give the folder of a checkout, "
-            "or begin one with `ventbench board add RECORD`"
+            f"{folder}: there is no such folder; the published leaderboard is what `ventbench "
+            "board show` shows without --folder. Give the folder of a checkout, or begin one of "
+            "your own with `ventbench board add RECORD`"
         )
     paths = sorted((folder / RECORDS).glob(f"*{record.SUFFIX}"))
     return [path for path in paths if canonical.named(f"{RECORDS}/{path.name}")]

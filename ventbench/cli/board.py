@@ -39,6 +39,18 @@ Folder = Annotated[
 ]
 FOLDER = Path("leaderboard")
 
+
+def at_hand(folder: Path) -> Path:
+    """The folder that is shown: for want of the usual one, that of the package, which is said."""
+    from ventbench.board import frames
+
+    path = frames.folder_of(folder)
+    if path != folder:
+        said = f"no folder {folder} here; the board of the last round, which came with ventbench:"
+        typer.echo(said, err=True)
+    return path
+
+
 #: Characters of a hash that tables show, as `--supersedes` and `verify --rerun` take them.
 SHOWN = 8
 
@@ -282,6 +294,7 @@ def show(
     """
     from ventbench.board import frames, ranking
 
+    folder = at_hand(folder)
     tracks = ranking.newest(frames.load_tracks(folder))
     rows = [
         frames.csv_row(line)
@@ -333,6 +346,7 @@ def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
     from ventbench.base.text import plain
     from ventbench.board import frames
 
+    folder = at_hand(folder)
     rows = frames.record_index(folder)
     table = _plain_table("")
     for name in ("record", "entry", "track", "kind", "made", "state"):

@@ -78,7 +78,8 @@ def import_(
         ),
     ] = None,
     layout: Annotated[
-        str | None, typer.Option(help="kaggle, respiraworks or pvp; recognised if not given.")
+        str | None,
+        typer.Option(help="kaggle, respiraworks, pvp or servo; recognised if not given."),
     ] = None,
     lung: Annotated[
         str | None, typer.Option(metavar="R20C50", help="Label where no columns hold R and C.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.board import FOLDER, Folder, tables_of
+from ventbench.cli.board import FOLDER, Folder, at_hand, tables_of
 from ventbench.cli.options import JsonFile, Scheduler, Sources, Workers, bars, emit
 
 if TYPE_CHECKING:
@@ -192,6 +192,7 @@ def show(
     """
     from ventbench.board import rounds
 
+    folder = at_hand(folder)
     if name is None:
         made = rounds.load_all(folder)
         emit({"rounds": [_about(own) for own in made]}, json)

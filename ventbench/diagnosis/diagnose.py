@@ -30,6 +30,7 @@ from ventbench.diagnosis.identification import (
     Split,
     identify,
     never_fitted,
+    place_of_change,
     split,
     usable,
     without_saturated,
@@ -319,7 +320,7 @@ def _diagnose(
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(
-            _missing_mechanism(name, changed, recording_model, simulator_model, breaths)
+            _missing_mechanism(name, changed, recording_model, simulator_model, breaths, data)
             for name, changed in missing.items()
         ) + ((swings,) if swings else ()),
         nonparametric=term,
@@ -499,6 +500,7 @@ def _missing_mechanism(
     recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None,
     breaths: Breaths,
+    data: Data,
 ) -> MissingMechanism:
     conclusion = recording_model.conclusion
     alternatives = conclusion.alternatives.get(name, Alternatives((), 1.0, ()))
@@ -514,9 +516,10 @@ def _missing_mechanism(
     changes = [p.name for p in mechanism(name).description.parameters if p.change_point]
     affected = None
     if changes:
-        at, last = values[changes[0]], len(breaths) - 1
-        places = np.linspace(0.0, 1.0, len(breaths))  # as in the data of the fits
-        first = np.searchsorted(places, (at.value, *at.ci95)).clip(max=last)
+        model, path = recording_model, f"{name}.{changes[0]}"
+        at = place_of_change(model.evaluator, model.final_model, data, path)
+        values[changes[0]] = replace(values[changes[0]], value=at.value, ci95=(at.low, at.high))
+        first = np.searchsorted(data.position, at).clip(max=len(breaths) - 1)
         now, low, high = (int(i) for i in breaths.breath_id[first])
         affected = (now, low, high)
     return MissingMechanism(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name, without_term
-from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
+from ventbench.diagnosis.evaluator import Evaluator, make_evaluator, make_problem
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
     Partition,
@@ -29,8 +29,9 @@ from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id import Fit
+from ventbench.system_id import START, ConfidenceInterval, Fit, likely_places
 from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.problem import parameter_of
 from ventbench.task.interfaces import Plant
 
@@ -285,6 +286,29 @@ def _with_changes_of(conclusion: Conclusion, fit: Fit) -> Conclusion:
         return conclusion
     moved = replace(full, minimum=replace(full.minimum, x=x))
     return replace(conclusion, full=moved, named=moved if named is full else named)
+
+
+def place_of_change(
+    evaluator: Evaluator, fitted: FittedModel, data: Data, path: str
+) -> ConfidenceInterval:
+    """Where a change is by all breaths of a recording, 0..1, with the rest as fitted.
+
+    A fit leaves some breaths out, and the first affected one may be among them: a judging breath
+    or, beside a nonparametric term, a testing one. Starts are fitted on either side of the change;
+    gains of single breaths are as usual, since they would make up for a wrong place.
+    """
+    names = evaluator.training.predictor.names
+    partition = make_partition(data, names, evaluator.settings)
+    values = evaluator.transferred_values(fitted, partition)
+    fixed = {name: values[:, k] for k, name in enumerate(names) if name != "position"}
+    starts, about = [], parameter_of(path)
+    for place in (about.high, about.low):  # all breaths before, and after
+        fixed[path] = np.full(len(data), place)
+        side = make_problem(partition, (START,), fitted.noise, fixed, 0.0)
+        first = side.unknowns.pack({START: values[:, -1]})
+        starts.append(minimise(side.cost, side.normal, first, *side.unknowns.bounds()).x)
+    places, costs = side.change_costs(starts[0], path, after=starts[1])
+    return likely_places(places, costs, float(places[np.argmin(costs)]))
 
 
 def _is_idle_form(conclusion: Conclusion, name: str, settings: SelectionConfig) -> bool:

@@ -6,6 +6,7 @@ from ventbench.system_id.fit import ConfidenceInterval as ConfidenceInterval
 from ventbench.system_id.fit import Fit as Fit
 from ventbench.system_id.fit import fit as fit
 from ventbench.system_id.fit import interval as interval
+from ventbench.system_id.fit import likely_places as likely_places
 from ventbench.system_id.fit import profile_interval as profile_interval
 from ventbench.system_id.fit import refit_breath_parameters as refit_breath_parameters
 from ventbench.system_id.noise import Noise as Noise

@@ -368,6 +368,12 @@ class ConfidenceInterval(NamedTuple):
     high: float
 
 
+def likely_places(places: Floats, costs: Floats, value: float) -> ConfidenceInterval:
+    """A change at ``value``, and the places that are at most 20 times less likely than the best."""
+    likely = [value, *places[costs < costs.min(initial=np.inf) + _UNLIKELY]]
+    return ConfidenceInterval(value, min(likely), max(likely))
+
+
 def interval(fit: Fit, path: str, group: int = 0) -> ConfidenceInterval:
     """Estimate and 95 % interval of a free parameter.
 
@@ -379,10 +385,8 @@ def interval(fit: Fit, path: str, group: int = 0) -> ConfidenceInterval:
     """
     parameter = parameter_of(path)
     if parameter.change_point:
-        value = float(fit.value(path)[group])
         places, costs = fit.problem.change_costs(fit.minimum.x, path)
-        likely = [value, *places[costs < costs.min(initial=np.inf) + _UNLIKELY]]
-        return ConfidenceInterval(value, min(likely), max(likely))
+        return likely_places(places, costs, float(fit.value(path)[group]))
     if parameter.kinked:
         value = float(fit.value(path)[group])
         estimate = _plateau(fit, path, group) or ConfidenceInterval(

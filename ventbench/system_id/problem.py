@@ -269,7 +269,9 @@ class Problem:
         ).x
         return other if self.cost(other) < self.cost(x) else x
 
-    def change_costs(self, x: Floats, path: str) -> tuple[Floats, Floats]:
+    def change_costs(
+        self, x: Floats, path: str, after: Floats | None = None
+    ) -> tuple[Floats, Floats]:
         """Costs, nats, of a change between any two breaths, all else as at ``x``.
 
         Whether a breath comes before or after the change is all that matters to it, so that two
@@ -278,12 +280,13 @@ class Problem:
         Args:
             x: unknowns, ``(U,)``.
             path: parameter of a change point.
+            after: unknowns of breaths after the change, if they differ.
 
         Returns:
             Positions between two breaths, and the cost of each, without the prior; ``(k,)`` each.
             At least two breaths lie on either side, if there are four.
         """
-        both = np.stack([self.values(x)] * 2)
+        both = np.stack([self.values(x), self.values(x if after is None else after)])
         both[:, :, self.predictor.names.index(path)] = np.array([[2.0], [-1.0]])
         seen = self.predictor.predict_all(both)
         white = np.stack([self._white(self._residual(each)) for each in seen])

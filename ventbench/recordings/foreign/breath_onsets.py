@@ -73,6 +73,16 @@ LAYOUTS: dict[str, Layout] = {
             },
             required=("timestamp", "pressure", "control_in", "control_out", "cycle_number"),
         ),
+        Layout(
+            "servo",
+            "what a Servo ventilator exports as text, [REC] in the first line, in any language; "
+            "inspirations are the phases in which more flows in than out",
+            {
+                "time": "time", "pressure": "pressure", "flow": "flow", "volume": "volume",
+                "expiration": "u_out",
+            },
+            required=("time", "pressure", "flow", "expiration"),
+        ),
     )
 }  # fmt: skip
 

@@ -11,7 +11,7 @@ import csv
 import gzip
 import re
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError, require
-from ventbench.recordings.foreign.units import is_unit, spelled, unit_of
+from ventbench.recordings.foreign.units import UNITS, is_unit, spelled, unit_of
 
 #: Lines that decide on separator, decimal mark and header, and of those, the ones that are split.
 _LOOKED_AT = 400
@@ -51,6 +51,9 @@ RATES = ("fs", "rate", "samplingrate", "samplerate", "freq", "frequency", "sampl
 
 #: Share of the lines that may be no rows before a file is refused, and number of lines anyway.
 _STRAY, _STRAY_LINES = 0.01, 20
+
+#: First lines of what a Servo ventilator exports beside recordings.
+_NO_WAVEFORMS = {"[TRE]": "trends", "[RECRUITMENT]": "a manoeuvre", "[LOG]": "events"}
 
 _Row: TypeAlias = tuple[int, list[str]]
 
@@ -101,12 +104,16 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     named = re.fullmatch(r"\ufeff?\"?sep=(.)\"?", lines[0].strip("\n"))
     if named is not None:  # a spreadsheet's own line
         separator, lines[0] = separator or named[1], ""
+    of_servo = _above_servo_data(file, lines)
+    if of_servo:
+        separator, lines[:of_servo] = separator or "\t", [""] * of_servo
     looked_at = [line for line in lines[:_LOOKED_AT] if line.strip()]
     separator, decimal = _dialect(file, looked_at, separator, decimal)
     rows = [(k + 1, _cells(line, separator)) for k, line in enumerate(lines) if line.strip()]
     shown = {"\t": "tab", " ": "blanks"}.get(separator, repr(separator))
     note = f"Text ({encoding}), cells separated by {shown}, decimal {decimal!r}"
-    return _table(file, rows, decimal, note, packed=separator == " ")
+    table = _table(file, rows, decimal, note, packed=separator == " ")
+    return _by_units(table) if of_servo else table
 
 
 def _decoded(file: str) -> tuple[str, str]:
@@ -401,6 +408,37 @@ def _delimited_breaths(file: str, lines: list[str], encoding: str) -> Table:
     columns = {"flow": flows, "pressure": pressures, "breath": breaths}
     units = {"flow": "L/min", "pressure": "cmH2O"}
     return Table(file, columns, units, numbers.astype(np.int64), 50.0, tuple(notes))
+
+
+def _above_servo_data(file: str, lines: list[str]) -> int:
+    """Number of lines up to ``[DATA]`` in a recording of a Servo ventilator; 0 for other text."""
+    stripped = [line.strip() for line in lines]
+    if stripped[0] not in ("[REC]", *_NO_WAVEFORMS):
+        return 0
+    if "[DATA]" not in stripped or stripped[0] != "[REC]":
+        what = _NO_WAVEFORMS.get(stripped[0], "no line [DATA]")
+        raise InputError(f"{file} of a Servo ventilator holds {what}; export a recording ([REC])")
+    return stripped.index("[DATA]") + 1
+
+
+def _by_units(table: Table) -> Table:
+    """Name the columns of a Servo recording, which are in its language, by their units.
+
+    The first is the time. Two letters tell a phase, since pauses have longer names; in an
+    inspiration more flows in than out.
+    """
+    roles, units = {next(iter(table.columns)): "time"}, {"time": "s"}
+    for name, unit in table.units.items():
+        role = next((r for r in ("pressure", "flow", "volume") if unit in UNITS[r]), "time")
+        if role not in units:
+            roles[name], units[role] = role, unit
+    columns = {roles.get(name, name): values for name, values in table.columns.items()}
+    told = [x for x in columns.values() if x.dtype.kind == "U" and np.mean(x != "") > 0.5]
+    if told and "flow" in columns:
+        phase = np.array([text[:2].casefold() for text in told[0]])
+        inward = [each for each in set(phase) if np.nansum(columns["flow"][phase == each]) > 0]
+        columns["expiration"] = 1.0 - np.isin(phase, inward)
+    return replace(table, columns=columns, units=units)
 
 
 def read_spreadsheet(file: str) -> Table:

@@ -33,7 +33,8 @@ def mechanics(
     recordings: Annotated[
         Path,
         typer.Argument(
-            help="File in the public schema with flow or volume, or a RespiraWorks Parquet file."
+            help="File in the public schema with flow or volume, the folder of a session of such "
+            "files, or a RespiraWorks Parquet file."
         ),
     ],
     clip: Clip = False,
@@ -43,8 +44,9 @@ def mechanics(
     """Identify lungs from pressure with flow or volume, and check their labels.
 
     Needs no model of a valve and therefore accepts recordings of any ventilator. Reports R, C and
-    further terms of the lung, whether its label holds, and which known settings it may be. For a
-    RespiraWorks file it prints a Markdown table of the runs.
+    further terms of the lung, whether its label holds, and which known settings it may be. Files of
+    one session share what is wrong with its sensors. For a RespiraWorks file it prints a Markdown
+    table of the runs.
 
     Example: `ventbench mechanics lab.csv`
     """
@@ -57,12 +59,12 @@ def mechanics(
         emit([_run(run) for run in runs], json)
         _say_runs(console, runs)
         return
-    lungs = _identify(recordings, clip=clip, pad=pad)
-    emit([_lung(lung) for lung in lungs], json)
-    console.print(_table(lungs))
-    for lung in lungs:
+    named = _of_session(recordings, clip=clip, pad=pad)
+    emit([_lung(lung) for lung in named.values()], json)
+    console.print(_table(named))
+    for name, lung in named.items():
         for note in lung.notes:
-            console.print(f"{lung.label}: {note}", markup=False, highlight=False)
+            console.print(f"{name}: {note}", markup=False, highlight=False)
 
 
 def _is_respiraworks(path: Path) -> bool:
@@ -72,7 +74,7 @@ def _is_respiraworks(path: Path) -> bool:
 
     from ventbench.recordings.scan import kind_of
 
-    if kind_of(path) != "parquet":
+    if path.is_dir() or kind_of(path) != "parquet":
         return False
     try:
         return {"run", "test", "breath"} <= set(parquet.read_schema(path).names)
@@ -88,6 +90,20 @@ def _survey(path: Path, progress: Callable[[int, int], None]) -> tuple[SurveyedR
     if all(run.mechanics is None for run in runs):
         raise InputError(f"{path}: no run has flow or volume; log one of them beside pressure")
     return runs
+
+
+def _of_session(path: Path, *, clip: bool, pad: bool) -> dict[str, Mechanics]:
+    """Lungs of a file by label; of a folder by file and label."""
+    from ventbench.mechanics import share_faults
+    from ventbench.recordings.read import session_files
+
+    files = session_files(path)
+    found = {
+        f"{file.stem}: {lung.label}" if len(files) > 1 else lung.label: lung
+        for file in files
+        for lung in _identify(file, clip=clip, pad=pad)
+    }
+    return dict(zip(found, share_faults(list(found.values())), strict=True))
 
 
 def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
@@ -142,7 +158,7 @@ def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
     )
 
 
-def _table(lungs: tuple[Mechanics, ...]) -> Any:
+def _table(lungs: dict[str, Mechanics]) -> Any:
     from rich.table import Table
 
     from ventbench.mechanics.labels import label_texts, tolerance_text, value_text
@@ -153,10 +169,10 @@ def _table(lungs: tuple[Mechanics, ...]) -> Any:
     )
     for name in ("label", "R", "C", "label holds", "may be", "also needs"):
         table.add_column(name)
-    for lung in lungs:
+    for label, lung in lungs.items():
         match = lung.match
         table.add_row(
-            lung.label,
+            label,
             value_text(match.fitted_R, match.ci95_R),
             value_text(match.fitted_C, match.ci95_C),
             *label_texts(match, lung.settings),
@@ -164,9 +180,6 @@ def _table(lungs: tuple[Mechanics, ...]) -> Any:
         )
     return table
 
-
-#: What a session on a bench, and a collection, calls its recording.
-SESSION = "recording.csv.gz"
 
 #: Share of a diagnosis before which its remaining time is a guess.
 _TOO_EARLY = 0.15
@@ -180,8 +193,8 @@ def diagnose(
     recordings: Annotated[
         Path,
         typer.Argument(
-            help="CSV, CSV.GZ or Parquet file in the public schema, or the folder of a session on "
-            "a bench."
+            help="CSV, CSV.GZ or Parquet file in the public schema, or the folder of a session, "
+            "whose recordings are diagnosed as one."
         ),
     ],
     out: Annotated[
@@ -251,8 +264,6 @@ def diagnose(
     if patient and passive:
         raise InputError("--patient and --passive contradict each other; choose one of them")
     errors.require("jinja2", "rerun")
-    if recordings.is_dir() and (recordings / SESSION).is_file():
-        recordings = recordings / SESSION
     said = notes()
     with progress_bars() as shown:
         reading = counted(shown, f"reading {recordings}")

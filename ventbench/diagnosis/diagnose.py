@@ -328,7 +328,7 @@ def _diagnose(
         remaining=adequacy.regions,
         open_loop=open_loop,
         lungs=lungs,
-        request=None if rejected or by_flow else _request(conclusion, settings),
+        request=None if rejected or by_flow else _request(conclusion),
         traces=Traces(breaths, uses.judging, pressures["before"], pressures["refit"],
                       pressures["after"], flow, volume),
         split=_ids(breaths, uses),
@@ -508,7 +508,6 @@ def _missing_mechanism(
     values = estimates.with_form_error(
         estimates.parameter_estimates(recording_model.fit, name),
         name,
-        recording_model.evaluator.settings.estimates,
         alone=len(conclusion.names) == 1,
     )
     changes = [p.name for p in mechanism(name).description.parameters if p.change_point]
@@ -532,7 +531,7 @@ def _missing_mechanism(
     )
 
 
-def _request(conclusion: Conclusion, settings: SelectionConfig) -> BreathRequest | None:
+def _request(conclusion: Conclusion) -> BreathRequest | None:
     rivals = [rival.fitted for other in conclusion.alternatives.values() for rival in other.models]
     noise = Noise((conclusion.noise.sigma[0],), (0.0,))
-    return request_breaths(conclusion.named, rivals, noise=noise, settings=settings.experiments)
+    return request_breaths(conclusion.named, rivals, noise=noise)

@@ -27,9 +27,9 @@ from . import small
 
 HERE = Path(__file__).parent.parent
 
-#: Rows of the table of the method page, ``| pattern | `file.py::test`, ... |``.
+#: Rows of the table of the method page, ``|pattern|`file.py::test`, ...|``.
 ROWS = re.findall(
-    r"^\| (\d+)\. (.*?) \| (.*::.*) \|$",
+    r"^\|(\d+)\. (.*?)\|(.*::.*)\|$",
     (HERE.parent / "docs" / "missing_physics_method.md").read_text("utf-8"), re.MULTILINE,
 )  # fmt: skip
 

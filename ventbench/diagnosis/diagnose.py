@@ -288,11 +288,10 @@ def _diagnose(
     # that have an order in time do not scatter.
     scatters = simulators.is_base_physics and not any(c.of == "gain" for c in adequacy.changes)
     gain_error = conclusion.gain_sd * np.abs(gain) if scatters else None
-    sensor = sensor_noise(breaths, settings.residuals)
+    sensor = sensor_noise(breaths)
     open_loop = compare_open_loop(
         breaths, uses.judging, pressures,
-        noise_floor(float(noise.sigma[0]), sensor, settings.residuals),
-        settings.residuals, gain_error, sensor,
+        noise_floor(float(noise.sigma[0]), sensor), gain_error, sensor,
     )  # fmt: skip
     if adequacy.changes:  # breaths that err more because of a change are no outliers
         open_loop = replace(open_loop, usual=open_loop.after.rmse)

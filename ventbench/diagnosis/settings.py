@@ -332,19 +332,9 @@ class ResidualSettings:
     """Test of where the simulator errs: ranges of phase, command, pressure and so on.
 
     Attributes:
-        phase_step: width of the ranges of time in a phase, s.
-        openings: ends of the ranges of the inspiratory valve's command, %.
-        edge_times: ends of the ranges of the time since a valve's edge, s.
-        edge: change of the command that is an edge, percentage points.
-        ranges: about how many ranges flow, volume and pressure are divided into.
-        parts: parts that the recording is divided into.
         min_breaths: fewest breaths that a range must have.
         flips: random sign flips; a p-value is at least ``1 / (flips + 1)``.
         level: family-wise chance that any range is reported if nothing is missing.
-        mean_share: share of that chance that the test of the mean gets; the test of the square,
-            whose differences are skewed, errs less often than it may.
-        min_excess: excess of the squared error that is reported, as a share of the noise's
-            variance. Noise that differs a little from range to range is no missing physics.
         certain: p-value below which ranges are ordered by their share of the error.
         veto_level: false discovery rate of the tests that veto "nothing is missing": as rare as a
             false name, by ``held_out_test.threshold``.
@@ -352,40 +342,15 @@ class ResidualSettings:
             of a converter of 12 bits over 80 cmH2O.
         absorbed: times the scatter of quiet readings from which the model's noise may hold part of
             what is missing. Coloured noise scatters about a parabola by a quarter less than at all.
-        beginning: length of what is reported as the beginning of inspiration, s.
-        quiet_after: time after the start of expiration from which little moves, s.
-        quiet_samples: fewest quiet samples of a breath that show the sensor's scatter.
-        quiet_factor: times that scatter that the noise may have; it is coloured, and a converter
-            rounds a quiet signal more than a moving one.
-        least_noise: least scatter that is taken seriously, cmH2O: a converter hides less.
-        set_aside: share of the breaths, those that err most, without which it is asked whether
-            more than the noise is left. A wrong first reading puts a whole breath off, since every
-            simulation starts there.
     """
 
-    phase_step: float = 0.1
-    openings: tuple[float, ...] = (
-        0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0,
-    )  # fmt: skip
-    edge_times: tuple[float, ...] = (0.0, 0.035, 0.07, 0.105, 0.15, 0.2, 0.3, 0.5, 1.0, 3.0)
-    edge: float = 5.0
-    ranges: int = 10
-    parts: int = 5
     min_breaths: int = 5
     flips: int = 2000
     level: float = 0.05
-    mean_share: float = 0.8
-    min_excess: float = 0.3
     certain: float = 0.01
     veto_level: float = 0.01
     negligible: float = 0.02
     absorbed: float = 1.5
-    beginning: float = 0.2
-    quiet_after: float = 0.6
-    quiet_samples: int = 10
-    quiet_factor: float = 3.0
-    least_noise: float = 0.05
-    set_aside: float = 0.1
 
 
 @dataclass(frozen=True)

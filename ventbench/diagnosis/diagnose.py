@@ -44,6 +44,7 @@ from ventbench.diagnosis.residual_analysis import (
     sensor_noise,
 )
 from ventbench.diagnosis.result import Diagnosis
+from ventbench.diagnosis.selection.acceptance import explained_share
 from ventbench.diagnosis.selection.alternatives import Alternatives
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
@@ -309,6 +310,7 @@ def _diagnose(
     form, term = estimates.split_form(term, tuple(missing))
     swings = None if term is None else estimates.oscillation(conclusion)
     term = term if swings is None else None
+    left = (open_loop.after.rmse, open_loop.unexplained if adequacy.vetoed else 0.0)
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
     unnamed = unnamed or is_unexplained(open_loop, settings.correction) or adequacy.vetoed
     verdict: Verdict = "named" if missing or swings else "unnamed" if unnamed else "nothing_missing"
@@ -318,7 +320,7 @@ def _diagnose(
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(
-            _missing_mechanism(name, changed, recording_model, simulator_model, breaths)
+            _missing_mechanism(name, changed, recording_model, simulator_model, breaths, left)
             for name, changed in missing.items()
         ) + ((swings,) if swings else ()),
         nonparametric=term,
@@ -498,8 +500,11 @@ def _missing_mechanism(
     recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None,
     breaths: Breaths,
+    left: tuple[float, float],
 ) -> MissingMechanism:
+    """A missing mechanism; ``left`` are the error and what is shown to be no noise of it, cmH2O."""
     conclusion = recording_model.conclusion
+    worth = conclusion.worths.get(name, float("nan"))
     alternatives = conclusion.alternatives.get(name, Alternatives((), 1.0, ()))
     own = {}
     if simulator_model is not None and changed:
@@ -525,8 +530,9 @@ def _missing_mechanism(
         nats=conclusion.held_out_gains.get(name, 0.0),
         changed=changed,
         simulator_values={key: estimate.value for key, estimate in own.items()},
-        worth=conclusion.worths.get(name, float("nan")),
+        worth=worth,
         breaths=affected,
+        explains=explained_share(worth, *left),
     )
 
 

@@ -166,6 +166,9 @@ def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
     least = findings.settings.residuals.negligible
     if missing.worth < least:
         doubts.append(f"{missing.name} is worth less than {least:g} cmH2O")
+    if missing.explains < _WEAK:
+        share = f"{100 * missing.explains:.0f} %"
+        doubts.append(f"{missing.name} explains {share} of the error that is no noise")
     return doubts
 
 

@@ -137,6 +137,7 @@ def hypotheses(
                 unnamed(terms, told * weight * probability, at, [place])
     elif main or found["verdict"] == "nothing_missing":
         told = _doubted(shares.named if main else shares.nothing, found["open_loop"], shares.doubt)
+        told *= min((missing.get("explains", 1.0) for missing in found["mechanisms"]), default=1.0)
         for terms, probability in stated:
             add(terms, told * probability)
     else:

@@ -11,6 +11,7 @@ import pytest
 from ventbench.diagnosis.adequacy import Adequacy, check_residuals, order_p_value, passes_fdr
 from ventbench.diagnosis.identification import without_saturated
 from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
+from ventbench.recordings import join
 
 from . import made
 
@@ -115,3 +116,16 @@ def test_saturated_readings_are_left_out():
         same, nothing = without_saturated(whole)
         assert nothing is None
         assert same is whole
+
+
+def test_a_sensor_that_saturates_on_one_lung_does_so_on_all():
+    """Pattern 11: readings that are few on one lung are as censored as the many on another."""
+    one, other = (made.breaths(label, n=20) for label in ("R50C10", "R20C50"))
+    top = float(np.quantile(other.pressure, 0.995))
+    both = join([one, dataclasses.replace(other, breath_id=other.breath_id + 100)])
+    clipped = dataclasses.replace(both, pressure=np.minimum(both.pressure, top))
+    seldom = np.count_nonzero(other.pressure >= top)
+    assert 0 < seldom < 0.01 * other.pressure.size
+    assert without_saturated(clipped[20:])[1] is None
+    kept, _ = without_saturated(clipped)
+    np.testing.assert_array_equal(np.isnan(kept.pressure), both.pressure >= top)

@@ -10,7 +10,6 @@ import pytest
 
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.settings import EstimateSettings
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import parameter, paths
 from ventbench.system_id import make_data, parameter_values
@@ -51,7 +50,6 @@ def test_two_lags_may_change_places():
 
 
 def test_reported_intervals_contain_an_error_of_the_form():
-    settings = EstimateSettings(form_error=0.02)
     sharp = Estimate(0.1, "s", (0.0999, 0.1001))
     wide = Estimate(0.1, "s", (0.05, 0.15))
     unknown = Estimate(0.1, "s", (-np.inf, np.inf))
@@ -60,20 +58,20 @@ def test_reported_intervals_contain_an_error_of_the_form():
         (wide, 0.05, 0.15),
         (unknown, -np.inf, np.inf),
     ):
-        widened = estimates.with_form_error({"tau": own}, "sensor_lag", settings)["tau"]
+        widened = estimates.with_form_error({"tau": own}, "sensor_lag", 0.02)["tau"]
         assert (widened.value, widened.unit) == (0.1, "s")
         assert widened.ci95 == pytest.approx((low, high), rel=0.01)
     low, _ = estimates.with_form_error(
-        {"tau": Estimate(0.001, "s", (0.0, 0.002))}, "sensor_lag", EstimateSettings(form_error=5.0)
+        {"tau": Estimate(0.001, "s", (0.0, 0.002))}, "sensor_lag", 5.0
     )["tau"].ci95
     assert low == parameter("sensor_lag.tau").low  # not beyond what is possible
     # Slow stress trades against C: what acts beside it shifts its size and its time.
     own = {"ratio": Estimate(0.5, "1", (0.49, 0.51)), "time": Estimate(1.1, "s", (1.09, 1.11))}
     for alone, share in ((True, 0.02), (False, 0.201)):
-        widened = estimates.with_form_error(own, "viscoelasticity", settings, alone=alone)
+        widened = estimates.with_form_error(own, "viscoelasticity", 0.02, alone=alone)
         for each in widened.values():
             low, high = each.ci95  # by factors: a stress that is too small is farther off
             assert high / each.value == pytest.approx(np.exp(1.96 * share), rel=0.02)
             assert each.value / low == pytest.approx(np.exp(1.96 * share), rel=0.02)
     breath = {"amplitude": Estimate(2.0, "cmH2O", (1.9, 2.1))}
-    assert estimates.with_form_error(breath, "patient_effort", settings) == breath
+    assert estimates.with_form_error(breath, "patient_effort") == breath

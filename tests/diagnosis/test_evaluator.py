@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ventbench.diagnosis import patient_effort
 from ventbench.diagnosis.evaluator import (
     Evaluator,
     cross_validated_gain,
@@ -20,7 +21,7 @@ from ventbench.diagnosis.selection.candidate_comparison import (
     fit_with_noise,
     hopeless_above,
 )
-from ventbench.diagnosis.settings import ForwardSelectionSettings, PatientEffortSettings
+from ventbench.diagnosis.settings import ForwardSelectionSettings
 from ventbench.physics import paths
 from ventbench.system_id import START, Data, Noise, make_data, parameter_values
 
@@ -28,7 +29,6 @@ from . import small
 
 #: Without tails, so that sums of squares are all there is.
 GAUSSIAN = Noise((0.2,), (0.0,), np.inf)
-PRIOR = PatientEffortSettings()
 DELAY, LAG = Hypothesis(("valve_delay",)), Hypothesis(("sensor_lag",))
 
 
@@ -189,16 +189,16 @@ def brute_force(made: Evaluator, values: np.ndarray, duration: float, which: int
         return float(-0.5 * np.sum((error / size) ** 2 + np.log(2 * np.pi * size**2)))
 
     grid = np.linspace(-4.0, 4.0, 33)
-    prior = np.exp(-0.5 * (grid / PRIOR.amplitude_sd) ** 2) / (
-        PRIOR.amplitude_sd * np.sqrt(2 * np.pi)
+    prior = np.exp(-0.5 * (grid / patient_effort.AMPLITUDE_SD) ** 2) / (
+        patient_effort.AMPLITUDE_SD * np.sqrt(2 * np.pi)
     )
-    logs = np.array([[likelihood(a, onset) for a in grid] for onset in PRIOR.onsets])
+    logs = np.array([[likelihood(a, onset) for a in grid] for onset in patient_effort.ONSETS])
     top = logs.max()
     mixed = np.mean(np.sum(np.exp(logs - top) * prior, axis=1)) * (grid[1] - grid[0])
     return float(
         np.logaddexp(
-            np.log1p(-PRIOR.probability) + likelihood(0.0, 0.0),
-            np.log(PRIOR.probability * mixed) + top,
+            np.log1p(-patient_effort.PROBABILITY) + likelihood(0.0, 0.0),
+            np.log(patient_effort.PROBABILITY * mixed) + top,
         )
     )
 

@@ -14,8 +14,6 @@ from ventbench.system_id import START, Noise
 
 from . import small
 
-SCREENING = small.SETTINGS.screening
-
 #: Coloured, and without tails.
 NOISE = Noise((0.2,), (0.5,), np.inf)
 
@@ -33,7 +31,7 @@ def bent() -> Linear:
         small.made(small.effect("turbulent_resistance", quadratic=1.0), noise=0.1)
     )
     base = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-6, iterations=30)
-    return Linear(evaluator, base, linearise(base.problem, base.minimum.x, SCREENING, clip=np.inf))
+    return Linear(evaluator, base, linearise(base.problem, base.minimum.x, clip=np.inf))
 
 
 def whitened(difference: np.ndarray) -> np.ndarray:
@@ -122,7 +120,7 @@ def test_outlying_samples_are_clipped(bent):
         bent.base.problem, data=dataclasses.replace(bent.base.problem.data, measured=seen)
     )
     at = bent.base.minimum.x
-    free, cut = (linearise(problem, at, SCREENING, clip=clip).residual for clip in (np.inf, 4.0))
+    free, cut = (linearise(problem, at, clip=clip).residual for clip in (np.inf, 4.0))
     assert np.abs(free).max() > 15.0
     assert np.abs(cut).max() < 5.0
 
@@ -130,6 +128,6 @@ def test_outlying_samples_are_clipped(bent):
 def test_a_valve_gain_of_each_breath_is_absorbed_by_the_breath(bent):
     evaluator = dataclasses.replace(bent.evaluator, gain_sd=0.1)
     fitted = evaluator.fit(Hypothesis(), NOISE, iterations=2)
-    place = linearise(fitted.problem, fitted.minimum.x, SCREENING)
+    place = linearise(fitted.problem, fitted.minimum.x)
     assert place.own_basis.shape[1] == 2
     assert place.shared_basis.shape[0] == 4

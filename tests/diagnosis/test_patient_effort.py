@@ -26,7 +26,7 @@ from ventbench.system_id import Noise
 from . import small
 
 EFFORT = Hypothesis(("patient_effort",))
-TERM = PatientEffortTerm(small.SETTINGS)
+TERM = PatientEffortTerm()
 NOISE = Noise((0.1,), (0.0,), np.inf)
 
 
@@ -137,7 +137,7 @@ def test_the_prediction_is_the_mean_over_efforts(active, fitted):
 
 def test_only_a_hypothesis_with_effort_has_a_breath_term(active, fitted):
     assert active.breath_term(fitted) == TERM
-    assert isinstance(breath_term(("leak",), small.SETTINGS), NoBreathTerm)
+    assert isinstance(breath_term(("leak",)), NoBreathTerm)
 
 
 def test_a_warm_start_with_efforts_is_left_alone_unless_it_is_refitted(fitted):

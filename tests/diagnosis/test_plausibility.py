@@ -10,6 +10,7 @@ import pytest
 
 from ventbench.diagnosis.selection.acceptance import (
     excludes_neutral,
+    explained_share,
     is_consistent,
     is_plausible,
 )
@@ -69,3 +70,12 @@ def test_a_gain_that_few_breaths_carry_or_that_is_negative_is_none():
     few = np.zeros(20)
     few[:5] = 30.0  # an effect that lives in a quarter of the breaths
     assert is_consistent(few + 0.01, SETTINGS)
+
+
+def test_a_shadow_of_an_effect_explains_the_square_of_their_correlation():
+    effect, template = np.random.default_rng(4).standard_normal((2, 500))
+    left = effect - template * (effect @ template) / (template @ template)
+    before, after = (float(np.sqrt(np.mean(error**2))) for error in (effect, left))
+    correlation = effect @ template / np.linalg.norm(effect) / np.linalg.norm(template)
+    assert explained_share(before - after, after, after) == pytest.approx(correlation**2)
+    assert explained_share(0.3, 0.2, 0.0) == explained_share(np.nan, 0.2, 0.5) == 1.0

@@ -280,6 +280,7 @@ def test_doubts_stand_in_the_first_sentence():
     for changed, doubt in (
         ({"confidence": 0.33}, "valve_delay is preferred over other names at 33 % only"),
         ({"worth": 0.01}, "valve_delay is worth less than 0.02 cmH2O"),
+        ({"explains": 0.2}, "valve_delay explains 20 % of the error that is no noise"),
         (
             {"parameters": {"delay": Estimate(high, "s", (0.9 * high, high))}},
             "the strength of valve_delay is at the end of its range",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis.residual_analysis import (
+    MIN_EXCESS,
     compare_open_loop,
     is_unexplained,
     locate,
@@ -125,7 +126,7 @@ def test_an_error_of_volume_is_found_along_it():
 
 def test_noise_that_differs_a_little_from_place_to_place_is_no_place():
     """A quarter more variance in expiration stays below what is material; three times do not."""
-    assert DEFAULT.residuals.min_excess > 0.25
+    assert MIN_EXCESS > 0.25
     for seed, times, wanted in ((8, 1.25, False), (9, 3.0, True)):
         recorded, pressure, *_ = exact(seed, n=200)
         noise = SD * np.random.default_rng(seed).standard_normal(pressure.shape)

@@ -10,7 +10,6 @@ from ventbench.diagnosis.hypothesis import Hypothesis, Partition, make_partition
 from ventbench.diagnosis.identification import split
 from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.rig_fit import fit_rigs
-from ventbench.diagnosis.settings import RigSettings
 from ventbench.physics import paths
 from ventbench.plants import frozen
 from ventbench.recordings import load
@@ -53,7 +52,7 @@ def test_strengths_a_rig_on_the_public_recordings(public_recordings):
     shared = fit(partition, Hypothesis(NAMES), white, tolerance=0.1)
     noise = robust_noise(shared.residual, partition.data.weight)
     shared = fit(partition, Hypothesis(NAMES), noise, warm_start=shared, tolerance=0.1)
-    own = fit_rigs(evaluator, shared, partition, rigs[uses.fitted], RigSettings())
+    own = fit_rigs(evaluator, shared, partition, rigs[uses.fitted])
     assert own is not None
     pooled, by_rig = errors(pressures(shared)), errors(own.pressures(data, rigs, first))
     lungs = list(breaths.by_lung_index)
@@ -75,7 +74,7 @@ def test_rigs_may_differ_in_a_shape_parameter():
     terms, start = Hypothesis((name,), (shape,)), {f"{name}.opening": 0.05}
     fitted = evaluator.fit(terms, Noise((0.2,), (0.0, 0.0)), start=start)
     rigs = np.arange(len(evaluator.training.data)) % 2
-    own = fit_rigs(evaluator, fitted, evaluator.training, rigs, RigSettings())
+    own = fit_rigs(evaluator, fitted, evaluator.training, rigs)
     assert own is not None
     about = parameter_of(shape)
     assert np.all((own.values[shape] >= about.low) & (own.values[shape] <= about.high))

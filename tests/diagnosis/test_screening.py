@@ -110,7 +110,7 @@ MILD = {
 def test_screening_ranks_a_mild_effect_among_the_first(name):
     evaluator = small.split(small.made(small.effect(name, **MILD[name]), seed=3))
     base = fit_with_noise(evaluator, Hypothesis())
-    found = screen_mechanisms(base, fit_with_white_noise(evaluator, base), small.SETTINGS)
+    found = screen_mechanisms(base, fit_with_white_noise(evaluator, base))
     assert {candidate.name for candidate in found} == set(library())
     place = [candidate.name for candidate in found].index(name)
     assert place < 5, [candidate.name for candidate in found]
@@ -128,7 +128,7 @@ def test_a_threshold_starts_where_it_was_simulated_too():
     evaluator = small.split(small.strange(stuck, seed=5))
     base = fit_with_noise(evaluator, Hypothesis())
     white = fit_with_white_noise(evaluator, base)
-    (band,) = screen_mechanisms(base, white, small.SETTINGS, ("valve_dead_band",))
+    (band,) = screen_mechanisms(base, white, ("valve_dead_band",))
     assert band.hypothesis.free == ("valve_dead_band.crack",)
     starts = [start["valve_dead_band.width"] for start in (band.start, *band.other_starts)]
     assert 3.5 in starts
@@ -143,14 +143,11 @@ def test_screening_ranks_only_the_allowed_mechanisms_that_are_missing(plain):
     named = plain.evaluator.fit(Hypothesis(("leak",)), plain.base.noise, plain.base, iterations=1)
     assert "leak" not in {
         candidate.name
-        for candidate in screen_mechanisms(
-            named, fit_with_white_noise(plain.evaluator, named), small.SETTINGS
-        )
+        for candidate in screen_mechanisms(named, fit_with_white_noise(plain.evaluator, named))
     }
     some = screen_mechanisms(
         plain.base,
         fit_with_white_noise(plain.evaluator, plain.base),
-        small.SETTINGS,
         ("leak", "inertance"),
     )
     assert {candidate.name for candidate in some} == {"leak", "inertance"}

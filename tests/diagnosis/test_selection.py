@@ -124,9 +124,7 @@ def test_the_held_out_test_needs_enough_gain_from_more_than_one_breath():
 
 
 def test_without_a_promising_candidate_there_is_no_comparison(plain):
-    found = screen_mechanisms(
-        plain.base, fit_with_white_noise(plain.evaluator, plain.base), small.SETTINGS
-    )
+    found = screen_mechanisms(plain.base, fit_with_white_noise(plain.evaluator, plain.base))
     faint = [candidate for candidate in found if candidate.promise <= 3.0]
     assert faint
     assert compare_candidates(plain.evaluator, plain.base, faint) is None
@@ -139,7 +137,7 @@ def test_a_comparison_ranks_candidates_at_one_noise():
     found = compare_candidates(
         evaluator,
         base,
-        screen_mechanisms(base, fit_with_white_noise(evaluator, base), small.SETTINGS),
+        screen_mechanisms(base, fit_with_white_noise(evaluator, base)),
     )
     assert found is not None
     assert found.ranked[0].name == "turbulent_resistance"

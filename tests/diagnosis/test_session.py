@@ -77,7 +77,7 @@ def by_oracle(m: dict[str, dict[str, float]], noise: float = 0.1) -> Evaluator:
 def test_a_step_is_promising_and_is_found_at_its_breath(name):
     evaluator = small.split(stepped(name))
     base = fit_with_noise(evaluator, Hypothesis())
-    candidates = screen_mechanisms(base, base, small.SETTINGS, evaluator.allowed_mechanisms)
+    candidates = screen_mechanisms(base, base, evaluator.allowed_mechanisms)
     ranked = sorted(candidates, key=lambda candidate: -candidate.promise)
     assert name in [candidate.name for candidate in ranked[:3]]
     (own,) = (candidate for candidate in ranked if candidate.name == name)

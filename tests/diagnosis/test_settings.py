@@ -27,7 +27,3 @@ def test_every_setting_is_described_in_its_group():
         described = type(group).__doc__ or ""
         for setting in dataclasses.fields(group):
             assert f"    {setting.name}: " in described, f"{field.name}.{setting.name}"
-
-
-def test_efforts_begin_within_the_grid_and_one_step():
-    assert DEFAULT.patient_effort.onset_span == pytest.approx(1.7)

@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy import integrate
 
 from ventbench import mechanics
 from ventbench.base.errors import InputError
@@ -17,6 +18,7 @@ from ventbench.mechanics.labels import (
     LungMatch,
     label_texts,
     match_label,
+    session_fault,
     tolerance_text,
     value_text,
 )
@@ -384,3 +386,37 @@ def test_the_label_comes_first_where_it_holds():
     found = only(recording(16.0, 20.0, label=(20.0, 20.0), seed=7))
     assert found.match.label_matches
     assert found.settings[0].id == "R20C20"
+
+
+def by_volume(R: float, C: float) -> Breaths:
+    return recording(R, C, n=6, dt=0.03, sensors=("volume",), seed=3)
+
+
+def read(breaths: Breaths, share: float = 1.0, late: int = 0) -> Breaths:
+    """What a sensor reads that sees a share of the volume, and late by some samples."""
+    assert breaths.volume is not None
+    return replace(breaths, volume=share * np.roll(breaths.volume, late, axis=1))
+
+
+def test_faults_of_a_session_belong_to_all_its_recordings():
+    """A volume that reads 40 % makes R20C50 a lung that R50C20 would explain."""
+    loose = [only(read(by_volume(R, 20.0), late=10)) for R in (5.0, 20.0, 50.0)]
+    weak, sound = only(read(by_volume(20.0, 50.0), 0.4)), only(by_volume(20.0, 20.0))
+    assert label_texts(weak.match, weak.settings) == ("no", "R50C20")
+    shared = mechanics.share_faults([*loose, weak, sound])
+    assert label_texts(shared[3].match, shared[3].settings) == ("unknown", "R20C50")
+    assert "3 of the 5 lungs of its session show flow or volume" in shared[3].notes[-1]
+    assert shared[4] is sound, "what matches its label all the same is not doubted"
+    assert mechanics.share_faults(shared)[3] is shared[3]
+    # One bad recording among eight says nothing of the others.
+    assert mechanics.share_faults([loose[0], weak, *[sound] * 6])[1] is weak
+
+
+@pytest.mark.parametrize(("shown", "count", "stray"), [(0, 1, 0.05), (2, 3, 0.2), (5, 8, 0.05)])
+def test_a_fault_of_a_session_by_bayes(shown, count, stray):
+    def likely(share: float) -> float:
+        return share**shown * (1.0 - share) ** (count - shown)
+
+    by_fault = 0.05 * integrate.quad(likely, 0.0, 1.0)[0]
+    expected = by_fault / (by_fault + 0.95 * likely(stray))
+    assert session_fault(shown, count, stray) == pytest.approx(expected, rel=1e-9)

@@ -117,3 +117,19 @@ def test_the_runs_of_the_other_ventilator(public_recordings, tmp_path):
     two.loc[two["run"] == days[1]].to_parquet(tmp_path / "mute.parquet")
     message = run(tmp_path / "mute.parquet", code=2)
     assert "no run has flow or volume" in message
+
+
+def test_the_files_of_a_session_share_their_faults(tmp_path):
+    """A flow that comes late shows on one lung, and makes another setting of the next."""
+    for name, share, late in (("a", 1.0, 9), ("b", 1.0, 9), ("c", 0.4, 0), ("d", 1.0, 0)):
+        breaths = recorded("R20C50")
+        assert breaths.flow is not None
+        flow = share * np.roll(breaths.flow, late, axis=1)
+        write(replace(breaths, flow=flow), tmp_path / f"{name}.csv")
+    alone = run(tmp_path / "c.csv", "--json", "-")
+    assert [setting["settings"] for setting in json.loads(alone)] == [["R50C20"]]
+    text = run(tmp_path, "--json", tmp_path / "lungs.json")
+    assert "c: R20C50: 2 of the 4 lungs of its session show flow or volume" in text
+    *_, weak, sound = json.loads((tmp_path / "lungs.json").read_text())
+    assert (weak["settings"], weak["match"]["informative"]) == ([], False)
+    assert sound["match"]["label_matches"] is True

@@ -12,7 +12,6 @@ from ventbench.diagnosis.evaluator import make_evaluator
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.selection.screening import screen_mechanisms
-from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics import Description, Mechanism, Parameter, library, paths, physics
 from ventbench.physics.catalogue import extended
 from ventbench.system_id import Predictor, fit, interval, make_data
@@ -99,6 +98,6 @@ def test_screening_puts_it_first(relieved):
     with extended(POP_OFF_VALVE):
         evaluator = make_evaluator(relieved[1], np.arange(12) % 2 == 1, paths(NAMES))
         null = fit_with_noise(evaluator, Hypothesis())
-        candidates = screen_mechanisms(null, fit_with_white_noise(evaluator, null), DEFAULT, NAMES)
+        candidates = screen_mechanisms(null, fit_with_white_noise(evaluator, null), NAMES)
     assert candidates[0].name == "pop_off_valve"
     assert candidates[0].nats > 50.0

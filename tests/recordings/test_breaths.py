@@ -271,3 +271,16 @@ def test_join_refuses_nothing_and_unequal_lengths(make):
         join([])
     with pytest.raises(InputError, match=r"breaths of \[6, 8\] samples.*cut them to 6 samples"):
         join([make(2), make(2, samples=6)])
+
+
+def test_a_folder_is_a_session_whose_recordings_are_joined(make, tmp_path):
+    first, other = make(3), make(2, samples=6)
+    write(other, tmp_path / "b.csv")
+    write(first, tmp_path / "a.csv.gz")
+    whole = load(tmp_path)
+    assert whole.breath_id.tolist() == [1, 2, 3, 4, 5]
+    np.testing.assert_array_equal(whole.pressure[:3], first.pressure)
+    np.testing.assert_array_equal(whole.u_in[3:, :6], other.u_in)
+    assert whole.notes[0] == "Breaths 1 to 3 are those of a.csv.gz."
+    (tmp_path / "b.csv").unlink()
+    assert load(tmp_path).sha256 == load(tmp_path / "a.csv.gz").sha256

@@ -33,7 +33,8 @@ def mechanics(
     recordings: Annotated[
         Path,
         typer.Argument(
-            help="File in the public schema with flow or volume, or a RespiraWorks Parquet file."
+            help="File in the public schema with flow or volume, the folder of a session of such "
+            "files, or a RespiraWorks Parquet file."
         ),
     ],
     clip: Clip = False,
@@ -43,8 +44,9 @@ def mechanics(
     """Identify lungs from pressure with flow or volume, and check their labels.
 
     Needs no model of a valve and therefore accepts recordings of any ventilator. Reports R, C and
-    further terms of the lung, whether its label holds, and which known settings it may be. For a
-    RespiraWorks file it prints a Markdown table of the runs.
+    further terms of the lung, whether its label holds, and which known settings it may be. Files of
+    one session share what is wrong with its sensors. For a RespiraWorks file it prints a Markdown
+    table of the runs.
 
     Example: `ventbench mechanics lab.csv`
     """
@@ -53,12 +55,12 @@ def mechanics(
             runs = _survey(recordings, counted(shown, f"identifying the lungs of {recordings}"))
         _say_runs(told([_run(run) for run in runs], json), runs)
         return
-    lungs = _identify(recordings, clip=clip, pad=pad)
-    console = told([_lung(lung) for lung in lungs], json)
-    console.print(_table(lungs))
-    for lung in lungs:
+    named = _of_session(recordings, clip=clip, pad=pad)
+    console = told([_lung(lung) for lung in named.values()], json)
+    console.print(_table(named))
+    for name, lung in named.items():
         for note in lung.notes:
-            console.print(f"{lung.label}: {note}", markup=False, highlight=False)
+            console.print(f"{name}: {note}", markup=False, highlight=False)
 
 
 def _is_respiraworks(path: Path) -> bool:
@@ -68,7 +70,7 @@ def _is_respiraworks(path: Path) -> bool:
 
     from ventbench.recordings.scan import kind_of
 
-    if kind_of(path) != "parquet":
+    if path.is_dir() or kind_of(path) != "parquet":
         return False
     try:
         return {"run", "test", "breath"} <= set(parquet.read_schema(path).names)
@@ -84,6 +86,20 @@ def _survey(path: Path, progress: Callable[[int, int], None]) -> tuple[SurveyedR
     if all(run.mechanics is None for run in runs):
         raise InputError(f"{path}: no run has flow or volume; log one of them beside pressure")
     return runs
+
+
+def _of_session(path: Path, *, clip: bool, pad: bool) -> dict[str, Mechanics]:
+    """Lungs of a file by label; of a folder by file and label."""
+    from ventbench.mechanics import share_faults
+    from ventbench.recordings.read import session_files
+
+    files = session_files(path)
+    found = {
+        f"{file.stem}: {lung.label}" if len(files) > 1 else lung.label: lung
+        for file in files
+        for lung in _identify(file, clip=clip, pad=pad)
+    }
+    return dict(zip(found, share_faults(list(found.values())), strict=True))
 
 
 def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
@@ -138,28 +154,25 @@ def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
     )
 
 
-def _table(lungs: tuple[Mechanics, ...]) -> Any:
+def _table(lungs: dict[str, Mechanics]) -> Any:
     from ventbench.mechanics.labels import label_texts, tolerance_text, value_text
 
     columns = ("label", "R", "C", "label holds", "may be", "also needs")
     rows = (
         (
-            lung.label,
+            label,
             value_text(lung.match.fitted_R, lung.match.ci95_R),
             value_text(lung.match.fitted_C, lung.match.ci95_C),
             *label_texts(lung.match, lung.settings),
             ", ".join(term.name for term in lung.terms) or "-",
         )
-        for lung in lungs
+        for label, lung in lungs.items()
     )
     return table_of(
         "Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O", columns, rows,
         left=columns, caption=f"A label holds with {tolerance_text()}, beyond the intervals.",
     )  # fmt: skip
 
-
-#: What a session on a bench, and a collection, calls its recording.
-SESSION = "recording.csv.gz"
 
 #: Share of a diagnosis before which its remaining time is a guess.
 _TOO_EARLY = 0.15
@@ -173,8 +186,8 @@ def diagnose(
     recordings: Annotated[
         Path,
         typer.Argument(
-            help="CSV, CSV.GZ or Parquet file in the public schema, or the folder of a session on "
-            "a bench."
+            help="CSV, CSV.GZ or Parquet file in the public schema, or the folder of a session, "
+            "whose recordings are diagnosed as one."
         ),
     ],
     out: Annotated[
@@ -242,8 +255,6 @@ def diagnose(
     if patient and passive:
         raise InputError("--patient and --passive contradict each other; choose one of them")
     errors.require("jinja2", "rerun")
-    if recordings.is_dir() and (recordings / SESSION).is_file():
-        recordings = recordings / SESSION
     said = notes()
     with bars() as shown:
         reading = counted(shown, f"reading {recordings}")

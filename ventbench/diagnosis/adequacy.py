@@ -29,9 +29,13 @@ from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import Change, ErrorRegion, Quantity
 from ventbench.diagnosis.hypothesis import FittedModel, Linearisation, linearise, varies_by_breath
 from ventbench.diagnosis.residual_analysis import errors, locate
-from ventbench.diagnosis.settings import DEFAULT, DetectionSettings, ResidualSettings
+from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.recordings.breaths import Breaths
+
+#: Gain on the testing breaths that is expected at a detection limit, nats: twice the bound of the
+#: held-out test, since the gain itself scatters; and strengths at which the effect is simulated.
+_NATS, _ROUNDS = 2.0 * DEFAULT.held_out_test.threshold, 2
 
 
 def detection_limits(evaluator: Evaluator, fitted: FittedModel) -> dict[str, float]:
@@ -46,20 +50,19 @@ def detection_limits(evaluator: Evaluator, fitted: FittedModel) -> dict[str, flo
         possible strength would have been seen. Mechanisms that differ from breath to breath are
         left out, and none is below the least strength that is named.
     """
-    linear = linearise(fitted.problem, fitted.minimum.x, evaluator.settings.screening)
+    linear = linearise(fitted.problem, fitted.minimum.x)
     count = [float(part.data.weight.sum()) for part in (evaluator.held_out, evaluator.training)]
     share = count[0] / max(count[1], 1.0)
-    settings = evaluator.settings.detection
     names = [
         name
         for name in evaluator.allowed_mechanisms
         if name not in fitted.names and not varies_by_breath(name)
     ]
-    limits = parallel_map(lambda name: _limit(linear, name, share, settings), names)
+    limits = parallel_map(lambda name: _limit(linear, name, share), names)
     return dict(zip(names, limits, strict=True))
 
 
-def _limit(linear: Linearisation, name: str, share: float, settings: DetectionSettings) -> float:
+def _limit(linear: Linearisation, name: str, share: float) -> float:
     """Strength at which the testing breaths gain enough, by the secant from two strengths."""
     about = mechanism(name).description
     strength, predictor = about.strength, linear.problem.predictor
@@ -68,7 +71,7 @@ def _limit(linear: Linearisation, name: str, share: float, settings: DetectionSe
     distance = abs(strength.mild - strength.neutral)
     others = [p for p in about.parameters[1:] if not p.shape]
     limit = np.inf
-    for _ in range(settings.rounds):
+    for _ in range(_ROUNDS):
         trial = linear.values.copy()
         trial[:, column] = strength.neutral + distance
         for other in others:
@@ -77,7 +80,7 @@ def _limit(linear: Linearisation, name: str, share: float, settings: DetectionSe
         nats = 0.5 * share * float(np.sum(template**2))
         if not nats > 0.0:
             return np.inf
-        limit = distance * float(np.sqrt(settings.nats / nats))
+        limit = distance * float(np.sqrt(_NATS / nats))
         if limit > largest and distance >= largest:
             return np.inf
         distance = float(np.clip(limit, 0.2 * distance, largest))

@@ -166,9 +166,7 @@ def _of_rigs(
     evaluator, conclusion = model.evaluator, model.conclusion
     names = evaluator.training.predictor.names
     partition = make_partition(data.select(split.fitted), names, evaluator.settings)
-    return fit_rigs(
-        evaluator, conclusion.named, partition, rigs[split.fitted], evaluator.settings.rigs
-    )
+    return fit_rigs(evaluator, conclusion.named, partition, rigs[split.fitted])
 
 
 def _with_rigs(

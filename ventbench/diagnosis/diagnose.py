@@ -45,6 +45,7 @@ from ventbench.diagnosis.residual_analysis import (
     sensor_noise,
 )
 from ventbench.diagnosis.result import Diagnosis
+from ventbench.diagnosis.selection.acceptance import explained_share
 from ventbench.diagnosis.selection.alternatives import Alternatives
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
@@ -289,11 +290,10 @@ def _diagnose(
     # that have an order in time do not scatter.
     scatters = simulators.is_base_physics and not any(c.of == "gain" for c in adequacy.changes)
     gain_error = conclusion.gain_sd * np.abs(gain) if scatters else None
-    sensor = sensor_noise(breaths, settings.residuals)
+    sensor = sensor_noise(breaths)
     open_loop = compare_open_loop(
         breaths, uses.judging, pressures,
-        noise_floor(float(noise.sigma[0]), sensor, settings.residuals),
-        settings.residuals, gain_error, sensor,
+        noise_floor(float(noise.sigma[0]), sensor), gain_error, sensor,
     )  # fmt: skip
     if adequacy.changes:  # breaths that err more because of a change are no outliers
         open_loop = replace(open_loop, usual=open_loop.after.rmse)
@@ -311,6 +311,7 @@ def _diagnose(
     form, term = estimates.split_form(term, tuple(missing))
     swings = None if term is None else estimates.oscillation(conclusion)
     term = term if swings is None else None
+    left = (open_loop.after.rmse, open_loop.unexplained if adequacy.vetoed else 0.0)
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
     unnamed = unnamed or is_unexplained(open_loop, settings.correction) or adequacy.vetoed
     verdict: Verdict = "named" if missing or swings else "unnamed" if unnamed else "nothing_missing"
@@ -320,7 +321,9 @@ def _diagnose(
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(
-            _missing_mechanism(name, changed, recording_model, simulator_model, breaths, data)
+            _missing_mechanism(
+                name, changed, recording_model, simulator_model, breaths, data, left
+            )
             for name, changed in missing.items()
         ) + ((swings,) if swings else ()),
         nonparametric=term,
@@ -329,7 +332,7 @@ def _diagnose(
         remaining=adequacy.regions,
         open_loop=open_loop,
         lungs=lungs,
-        request=None if rejected or by_flow else _request(conclusion, settings),
+        request=None if rejected or by_flow else _request(conclusion),
         traces=Traces(breaths, uses.judging, pressures["before"], pressures["refit"],
                       pressures["after"], flow, volume),
         split=_ids(breaths, uses),
@@ -501,8 +504,11 @@ def _missing_mechanism(
     simulator_model: IdentifiedModel | None,
     breaths: Breaths,
     data: Data,
+    left: tuple[float, float],
 ) -> MissingMechanism:
+    """A missing mechanism; ``left`` are the error and what is shown to be no noise of it, cmH2O."""
     conclusion = recording_model.conclusion
+    worth = conclusion.worths.get(name, float("nan"))
     alternatives = conclusion.alternatives.get(name, Alternatives((), 1.0, ()))
     own = {}
     if simulator_model is not None and changed:
@@ -510,7 +516,6 @@ def _missing_mechanism(
     values = estimates.with_form_error(
         estimates.parameter_estimates(recording_model.fit, name),
         name,
-        recording_model.evaluator.settings.estimates,
         alone=len(conclusion.names) == 1,
     )
     changes = [p.name for p in mechanism(name).description.parameters if p.change_point]
@@ -530,12 +535,13 @@ def _missing_mechanism(
         nats=conclusion.held_out_gains.get(name, 0.0),
         changed=changed,
         simulator_values={key: estimate.value for key, estimate in own.items()},
-        worth=conclusion.worths.get(name, float("nan")),
+        worth=worth,
         breaths=affected,
+        explains=explained_share(worth, *left),
     )
 
 
-def _request(conclusion: Conclusion, settings: SelectionConfig) -> BreathRequest | None:
+def _request(conclusion: Conclusion) -> BreathRequest | None:
     rivals = [rival.fitted for other in conclusion.alternatives.values() for rival in other.models]
     noise = Noise((conclusion.noise.sigma[0],), (0.0,))
-    return request_breaths(conclusion.named, rivals, noise=noise, settings=settings.experiments)
+    return request_breaths(conclusion.named, rivals, noise=noise)

@@ -85,7 +85,7 @@ def fit(
     x = layout.pack(first)
     if restart:
         x = delay_restarts(problem, x, settings)
-    x = breath_term(hypothesis.names, settings).start(problem, x, before, refit=restart)
+    x = breath_term(hypothesis.names).start(problem, x, before, refit=restart)
     tolerance = settings.fit.tolerance if tolerance is None else tolerance
     iterations = settings.fit.iterations if iterations is None else iterations
     if start or warm_start is None or warm_start.hypothesis != hypothesis:  # else it was smoothed
@@ -218,7 +218,7 @@ def _beyond_the_cliff(
 
 
 def _best_delay(problem: Problem, x: Floats, path: str, settings: SelectionConfig) -> Floats:
-    linear = linearise(problem, x, settings.screening, clip=np.inf)
+    linear = linearise(problem, x, clip=np.inf)
     column = problem.predictor.names.index(path)
     loss = float(np.sum(problem.noise.loss(linear.residual)))
     best, least = x, loss - settings.fit.delay_gain
@@ -451,7 +451,7 @@ class Evaluator:
 
     def breath_term(self, fitted: FittedModel) -> BreathTerm:
         """Term of a model whose parameters differ from breath to breath."""
-        return breath_term(fitted.names, self.settings)
+        return breath_term(fitted.names)
 
     def differs_by_breath(self, path: str) -> bool:
         """Whether a parameter has a value of its own in each breath."""

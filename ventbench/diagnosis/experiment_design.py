@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ventbench.diagnosis.candidate_breaths import Family, Rig, families
 from ventbench.diagnosis.findings import BreathRequest
-from ventbench.diagnosis.settings import DEFAULT, ExperimentSettings
 from ventbench.physics.catalogue import parameter, strength_path
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.levenberg_marquardt import Minimum
@@ -24,6 +23,13 @@ from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import Problem, parameter_of
 from ventbench.task.lungs import Lung
+
+#: Breaths that are proposed; and expected log-likelihood ratio, nats, below which nothing is.
+_BREATHS, _LEAST = 5, 1.0
+
+#: Pressures, cmH2O, within which every hypothesis must predict a breath (the noise of a start may
+#: go below zero), the factor by which one that is not safe is weakened, and how often.
+_LIMITS, _WEAKER, _ATTEMPTS = (-1.0, 50.0), 0.75, 3
 
 #: Share of the diagonal that keeps a Hessian invertible where data say nothing.
 _RIDGE = 1e-9
@@ -51,7 +57,6 @@ def request_breaths(
     alternatives: Sequence[FittedHypothesis],
     *,
     noise: Noise | None = None,
-    settings: ExperimentSettings = DEFAULT.experiments,
 ) -> BreathRequest | None:
     """Find the breaths to record next.
 
@@ -63,7 +68,6 @@ def request_breaths(
         chosen: the best hypothesis, on the recorded breaths.
         alternatives: hypotheses to distinguish it from.
         noise: model of the measurement noise; that of ``chosen`` if not given.
-        settings: number of breaths, limits and thresholds.
 
     Returns:
         Commands with what to do in words, or None if no safe breaths would distinguish them.
@@ -76,10 +80,10 @@ def request_breaths(
         recorded_rows = np.flatnonzero((data.lung == label) & (data.weight[:, 0].any(axis=1)))
         if not recorded_rows.size:
             continue
-        design = _best_on_lung(chosen, alternatives, noise, settings, recorded_rows)
+        design = _best_on_lung(chosen, alternatives, noise, recorded_rows)
         if design and (best is None or design.nats > best.nats):
             best = design
-    if best is None or best.nats < settings.min_information:
+    if best is None or best.nats < _LEAST:
         return None
     return _worded(best, (chosen, *alternatives), float(np.median(data.dt)))
 
@@ -238,7 +242,7 @@ class _Design:
 
 def _best_on_lung(
     chosen: FittedHypothesis, alternatives: Sequence[FittedHypothesis], noise: Noise,
-    settings: ExperimentSettings, recorded_rows: NDArray[np.intp],
+    recorded_rows: NDArray[np.intp],
 ) -> _Design | None:  # fmt: skip
     """The best design on the lung of the recorded breaths ``here``."""
     problem = chosen.problem
@@ -248,9 +252,7 @@ def _best_on_lung(
     start = float(np.median(values[:, -1]))
     samples, dt = problem.data.u_in.shape[1], float(np.median(problem.data.dt))
     every = (chosen, *alternatives)
-    kinds = _safe(
-        families(rig, samples, dt, settings), every, problem.data, recorded_rows, start, settings
-    )
+    kinds = _safe(families(rig, samples, dt), every, problem.data, recorded_rows, start)
     if not kinds:
         return None
     data = _data(kinds, problem.data, recorded_rows)
@@ -267,7 +269,7 @@ def _best_on_lung(
         )
     ]
     lung = Lung(float(problem.data.R[recorded_rows[0]]), float(problem.data.C[recorded_rows[0]]))
-    return _best(kinds, pairs, settings.breaths, lung)
+    return _best(kinds, pairs, _BREATHS, lung)
 
 
 def _best(
@@ -293,11 +295,11 @@ def _best(
 
 def _safe(
     kinds: tuple[Family, ...], hypotheses: Sequence[FittedHypothesis], recorded: Data,
-    recorded_rows: NDArray[np.intp], start: float, settings: ExperimentSettings,
+    recorded_rows: NDArray[np.intp], start: float,
 ) -> tuple[Family, ...]:  # fmt: skip
     """Breaths that every hypothesis predicts within the pressure limits, weakened where needed."""
-    low, high = settings.pressure_limits
-    for attempt in range(settings.attempts + 1):
+    low, high = _LIMITS
+    for attempt in range(_ATTEMPTS + 1):
         data = _data(kinds, recorded, recorded_rows)
         safe = np.ones(len(data), bool)
         for hypothesis in hypotheses:
@@ -307,10 +309,10 @@ def _safe(
             inside = (pressure >= low) & (pressure <= high)  # False where it is not finite
             safe &= inside.all(axis=1)
         parts = np.split(safe, np.cumsum([len(kind.u_in) for kind in kinds])[:-1])
-        if safe.all() or attempt == settings.attempts:
+        if safe.all() or attempt == _ATTEMPTS:
             break
         kinds = tuple(
-            kind.scaled(np.where(part, 1.0, settings.weaker))
+            kind.scaled(np.where(part, 1.0, _WEAKER))
             for kind, part in zip(kinds, parts, strict=True)
         )
     left = (kind.select(part) for kind, part in zip(kinds, parts, strict=True))

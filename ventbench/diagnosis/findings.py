@@ -45,6 +45,7 @@ class MissingMechanism:
         breaths: of a change at a breath, the id of the first breath after it, and the ids between
             which that lies with 95 %; else None.
         affected: ids of the breaths in which it acts, if it acts in some only.
+        explains: share of the squared error that is shown to be no noise which it explains, 0..1.
     """
 
     name: str
@@ -57,6 +58,7 @@ class MissingMechanism:
     worth: float = float("nan")
     breaths: tuple[int, int, int] | None = None
     affected: tuple[int, ...] = ()
+    explains: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ventbench.diagnosis.settings import DEFAULT, ScreeningSettings, SelectionConfig
+from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.levenberg_marquardt import Minimum
@@ -80,18 +80,15 @@ class Linearisation:
         return 0.5 * share**2 * power, share
 
 
-def linearise(
-    problem: Problem, x: Floats, settings: ScreeningSettings, *, clip: float | None = None
-) -> Linearisation:
+def linearise(problem: Problem, x: Floats, *, clip: float = 4.0) -> Linearisation:
     """Linearise a problem at its unknowns.
 
     Args:
         problem: breaths and noise.
         x: unknowns in coordinates, ``(U,)``.
-        settings: settings of the projections.
-        clip: whitened residuals are cut off here; as the settings have it if None.
+        clip: whitened residuals are cut off here, in standard deviations, so that no single sample
+            decides.
     """
-    clip = settings.clip if clip is None else clip
     residual, slopes = problem.jacobian(x)
     weight, noise = problem.data.weight, problem.noise
     white = np.clip(noise.whiten(residual, weight), -clip, clip)
@@ -103,7 +100,7 @@ def linearise(
     # Groups may give a shared parameter, such as the valve's gain, one unknown for each breath.
     counts = [len(np.unique(layout.index[:, k])) for k in range(len(layout.paths))]
     breath |= np.array([count == len(white) and count > 1 for count in counts])
-    own = _orthonormal(rows[:, breath], settings.ridge)
+    own = _orthonormal(rows[:, breath])
     values = problem.values(x)
     partial = Linearisation(problem, values, residual, white, own, np.zeros((0, white.size)))
     columns = []
@@ -113,20 +110,24 @@ def linearise(
             columns.append(np.where((layout.index[:, k] == unknown)[:, None], left, 0.0).ravel())
     shared = partial.shared_basis
     if columns:
-        shared = _orthonormal(np.asarray(columns)[None], settings.ridge)[0]
+        shared = _orthonormal(np.asarray(columns)[None])[0]
     whole = Linearisation(problem, values, problem.predict(x), white, own, shared)
     clean = whole.without_shared(whole.without_own(white[:, None]))[:, 0]
     return Linearisation(problem, values, whole.prediction, clean, own, shared)
 
 
-def _orthonormal(rows: Floats, ridge: float) -> Floats:
+#: Eigenvalues of a projection below this share of the largest count as zero.
+_RIDGE = 1e-9
+
+
+def _orthonormal(rows: Floats) -> Floats:
     """Orthonormal bases of the row spaces, ``(n, j, m)``; dependent rows become zero."""
     if rows.shape[1] == 0:
         return rows
     gram = np.matmul(rows, rows.swapaxes(1, 2))
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / scale[:, :, None] / scale[:, None, :])
-    kept = values > ridge * np.maximum(values[:, -1:], 1e-300)
+    kept = values > _RIDGE * np.maximum(values[:, -1:], 1e-300)
     size = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
     return np.matmul((vectors * size[:, None, :]).swapaxes(1, 2), rows / scale[:, :, None])
 

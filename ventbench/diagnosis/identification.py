@@ -114,20 +114,26 @@ def without_saturated(
     """Breaths without the readings at which the pressure sensor saturates, and what these are.
 
     A saturated reading is censored: it says only that the pressure was at least that. Readings that
-    merely come near a largest one thin out towards it; those that saturate pile up there.
+    merely come near a largest one thin out towards it; those that saturate pile up there. A sensor
+    that saturates on one lung of a session does so on all.
 
     Returns:
         The breaths, and the reading, cmH2O, with its share of all readings; None if none saturates.
     """
     pressure = np.where(breaths.valid, breaths.pressure, np.nan)
-    values, counts = np.unique(pressure[np.isfinite(pressure)], return_counts=True)
-    if len(values) < 2 or counts[-1] < max(
-        settings.saturated_share * counts.sum(), 10 * counts[-2]
-    ):
+    known = np.isfinite(pressure)
+    top = float(np.max(pressure, initial=-np.inf, where=known))
+
+    def piles_up(own: Floats) -> bool:
+        values, counts = np.unique(own[np.isfinite(own)], return_counts=True)
+        if len(values) < 2 or values[-1] < top:
+            return False
+        return bool(counts[-1] >= max(settings.saturated_share * counts.sum(), 10 * counts[-2]))
+
+    if not any(piles_up(pressure[index]) for index in breaths.by_lung_index.values()):
         return breaths, None
-    masked = np.where(pressure == values[-1], np.nan, breaths.pressure)
-    share = float(counts[-1] / counts.sum())
-    return replace(breaths, pressure=masked), (float(values[-1]), share)
+    masked = np.where(pressure == top, np.nan, breaths.pressure)
+    return replace(breaths, pressure=masked), (top, float(np.mean(pressure[known] == top)))
 
 
 def usable(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> tuple[Breaths, list[str]]:

@@ -365,7 +365,7 @@ class _Evidence:
         What each breath has of its own, its start and perhaps its gain, is refitted to first order.
         """
         problem, x = _from_first_readings(evaluator, fitted, partition)
-        linear = linearise(problem, x, evaluator.settings.screening, clip=np.inf)
+        linear = linearise(problem, x, clip=np.inf)
         strength, *others = mechanism(name).description.parameters
         strengths = strengths or strength.screening_strengths()
         names, grids = [p.name for p in others if p.grid], [p.grid for p in others if p.grid]

@@ -28,7 +28,6 @@ from ventbench.diagnosis.gaussian_process import (
     uses,
 )
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
-from ventbench.diagnosis.settings import LatentInputSettings
 from ventbench.physics.events.oscillations import HALF_SWING
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import LEAST_SIGMA, MOST_AR, Noise
@@ -51,8 +50,29 @@ _NOISE_LIMITS = (
 #: First steps of a climb: in these coordinates, and in the logarithms of size and frequency.
 _STEPS = (0.2, 0.2, 0.2, 0.02)
 
-#: Accuracy of all these coordinates at the end of a climb.
-_TOLERANCE = 0.01
+#: Accuracy of all these coordinates and of the log-likelihood, nats, at the end of a climb.
+_TOLERANCE, _NATS = 0.01, 0.2
+
+#: How far a climb may move the logarithm of a frequency: to the next one of the grid.
+_FREQUENCY_SPAN = 0.1
+
+#: Grids: frequencies of periodic inputs, Hz, from heart beats to the pulsation of a supply;
+#: correlation times of smooth ones, s; standard deviations, cmH2O. Those of a flow or of a valve's
+#: gain are shares, of :data:`RELATIVE_SIZE` 1/cmH2O.
+_FREQUENCIES = (*np.arange(0.6, 2.0, 0.1), *np.arange(2.0, 9.1, 0.25))
+_CORRELATION_TIMES = (0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2)
+_SIZES = np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2])
+RELATIVE_SIZE = 0.1
+
+#: Most times that the parameters beside an input, its kernel, and its size and noise are found in
+#: turn, and log-likelihood, nats, that another round must gain.
+_ROUNDS, _GAIN = 3, 1.0
+
+#: Correlation of neighbouring samples from which a climb also starts from white noise.
+_COLOURED = 0.2
+
+#: Components of a unit covariance with less variance are left out.
+_MIN_VARIANCE = 1e-2
 
 #: Size of an input, as a share of that it starts from, below which it is none.
 _LEAST_SIZE = 0.1
@@ -105,9 +125,8 @@ def fit_latent_inputs(
         places: places to test.
     """
     model, dt = at_best_noise(evaluator, fitted), evaluator.training.data.dt
-    linear, settings = _Linear.of(model), evaluator.settings.latent_inputs
-    every = () if places == (GAIN_SCATTER,) else _kernels(settings)
-    parts = {kernel: components(dt, kernel, settings.min_variance) for kernel in every}
+    linear, every = _Linear.of(model), () if places == (GAIN_SCATTER,) else _kernels()
+    parts = {kernel: components(dt, kernel, _MIN_VARIANCE) for kernel in every}
 
     def best(place: str) -> LatentInput:
         return _fit_input(evaluator, linear, place, parts)
@@ -171,7 +190,7 @@ def at_best_noise(evaluator: Evaluator, fitted: FittedModel) -> FittedModel:
             return -evaluator.training_log_likelihood(fitted, _noise_at(fitted.noise, point))
 
         start = _noise_point(fitted.noise)
-        noise = _noise_at(fitted.noise, _climb(fall, start, _NOISE_LIMITS, settings.latent_inputs))
+        noise = _noise_at(fitted.noise, _climb(fall, start, _NOISE_LIMITS))
         climbed = evaluator.training_log_likelihood(fitted, noise)
         fitted = _updated(fitted, fitted.minimum.x, noise)
         if climbed < before + settings.fit.noise_gain:
@@ -335,7 +354,7 @@ def _fit_input(
         place: where it acts.
         parts: components of the kernels that are compared.
     """
-    settings, training = evaluator.settings.latent_inputs, evaluator.training
+    training = evaluator.training
     if place == GAIN_SCATTER:
         parts = {Kernel(False, 1.0): np.ones((len(training.data), 1, 1))}
     if place == CIRCUIT:  # water swings; anything else there is a leak or another resistance
@@ -347,19 +366,19 @@ def _fit_input(
         if known is not None:
             process = _Process.of(known.process.kernel, known.process.components, responses)
             known = known._replace(process=process)
-        first = _best_kernel(linear.own, processes, noise, _unit(place, settings), known, settings)
-        return _climb_process(linear.own, first, responses, training.data.dt, settings)
+        first = _best_kernel(linear.own, processes, noise, _unit(place), known)
+        return _climb_process(linear.own, first, responses, training.data.dt)
 
     model = linear.model
-    starts = _first_noises(model.noise, settings.coloured)
-    best = max((climbed(linear, noise) for noise in starts), key=lambda fit: fit.nats)
-    least = float(linear.own.whitened(model.noise).marginal(1.0).nats.sum()) + settings.gain
-    for _ in range(settings.rounds if best.nats > least else 0):
+    starts = (climbed(linear, noise) for noise in _first_noises(model.noise))
+    best = max(starts, key=lambda fit: fit.nats)
+    least = float(linear.own.whitened(model.noise).marginal(1.0).nats.sum()) + _GAIN
+    for _ in range(_ROUNDS if best.nats > least else 0):
         problem, x = replace(linear.model.problem, noise=best.noise), linear.model.minimum.x
         x = likeliest_beside(problem, x, linear.breaths, best.process.responses, best.size)
         linear = _Linear.of(_updated(linear.model, x, best.noise))
         trial = climbed(linear, best.noise, best)
-        if trial.nats < best.nats + settings.gain:
+        if trial.nats < best.nats + _GAIN:
             break
         best, model = trial, linear.model
     model = _updated(model, model.minimum.x, best.noise)
@@ -370,7 +389,7 @@ def _fit_input(
     responses = input_responses(evaluator.held_out, problem.values(x), place)
     each = np.ones((len(responses), 1, 1))
     if place != GAIN_SCATTER:
-        each = components(problem.data.dt, kernel, settings.min_variance)
+        each = components(problem.data.dt, kernel, _MIN_VARIANCE)
     process = _Process.of(kernel, each, responses)
     whitened = LinearBreaths.of(problem, x).whitened(best.noise, process.responses)
     return LatentInput(
@@ -387,23 +406,22 @@ def _updated(model: FittedModel, x: Floats, noise: Noise) -> FittedModel:
     return FittedModel(model.hypothesis, problem, minimum, likelihood)
 
 
-def _first_noises(noise: Noise, least: float) -> list[Noise]:
+def _first_noises(noise: Noise) -> list[Noise]:
     """Noises that a climb starts from: the given one, and white noise if it is coloured.
 
-    Noise is coloured if the correlation of neighbouring samples exceeds ``least``.
     Coloured noise excuses slow errors, and beside it a slow input may be at a lower maximum.
     """
     ar = noise.ar[0]
-    if abs(ar) < least:
+    if abs(ar) < _COLOURED:
         return [noise]
     sigma = (noise.sigma[0] * float(np.sqrt(1.0 - ar**2)), *noise.sigma[1:])
     return [noise, replace(noise, sigma=sigma, ar=(0.0, *noise.ar[1:]))]
 
 
-def _kernels(settings: LatentInputSettings) -> list[Kernel]:
+def _kernels() -> list[Kernel]:
     """Kinds and scales that are compared."""
-    kernels = [Kernel(True, float(scale)) for scale in settings.frequencies]
-    return kernels + [Kernel(False, float(scale)) for scale in settings.correlation_times]
+    kernels = [Kernel(True, float(scale)) for scale in _FREQUENCIES]
+    return kernels + [Kernel(False, float(scale)) for scale in _CORRELATION_TIMES]
 
 
 def _best_kernel(
@@ -412,14 +430,13 @@ def _best_kernel(
     noise: Noise,
     unit: float,
     known: _Fit | None,
-    settings: LatentInputSettings,
 ) -> _Fit:
     """The process and the size of the largest likelihood at one noise.
 
     Samples have the weights that they have beside the input that is known, if there is one. Sizes
     are multiples of ``unit``.
     """
-    sizes = np.asarray(settings.sizes) * unit
+    sizes = _SIZES * unit
     if known is None:
         whitened, size = breaths.whitened(noise), 1.0
     else:
@@ -440,13 +457,7 @@ def _best_kernel(
     return best
 
 
-def _climb_process(
-    breaths: LinearBreaths,
-    first: _Fit,
-    responses: Floats,
-    dt: Floats,
-    settings: LatentInputSettings,
-) -> _Fit:
+def _climb_process(breaths: LinearBreaths, first: _Fit, responses: Floats, dt: Floats) -> _Fit:
     """Maximise the likelihood by the size of an input, its frequency and the noise beside it.
 
     Correlation times stay on their grid: each has components of its own, which cost as much as the
@@ -459,7 +470,7 @@ def _climb_process(
         noise, size, process = _noise_at(first.noise, point), float(np.exp(point[2])), first.process
         if kernel.periodic:
             moved = kernel._replace(scale=float(np.exp(point[3])))
-            parts = components(dt, moved, settings.min_variance)
+            parts = components(dt, moved, _MIN_VARIANCE)
             process = _Process.of(moved, parts, responses)
         marginal = breaths.whitened(noise, process.responses).marginal(size, best.coefficients)
         nats = float(marginal.nats.sum())
@@ -471,8 +482,8 @@ def _climb_process(
     limits = [*_NOISE_LIMITS, (start[2] + np.log(_LEAST_SIZE), start[2] - np.log(_LEAST_SIZE))]
     if kernel.periodic:
         start.append(np.log(kernel.scale))
-        limits.append((start[3] - settings.frequency_span, start[3] + settings.frequency_span))
-    _climb(fall, np.array(start), limits, settings)
+        limits.append((start[3] - _FREQUENCY_SPAN, start[3] + _FREQUENCY_SPAN))
+    _climb(fall, np.array(start), limits)
     if not kernel.periodic:
         return best
     top = best
@@ -485,10 +496,7 @@ def _climb_process(
 
 
 def _climb(
-    fall: Callable[[Floats], float],
-    start: Floats,
-    limits: Sequence[tuple[float, float]],
-    settings: LatentInputSettings,
+    fall: Callable[[Floats], float], start: Floats, limits: Sequence[tuple[float, float]]
 ) -> Floats:
     """Where a function of the coordinates of a climb is least, near a start (Nelder and Mead)."""
     low, high = np.transpose(limits)
@@ -500,7 +508,7 @@ def _climb(
         options={
             "initial_simplex": np.vstack([start, start + np.diag(steps)]),
             "xatol": _TOLERANCE,
-            "fatol": settings.climb_tolerance,
+            "fatol": _NATS,
         },
     ).x  # fmt: skip
 
@@ -516,6 +524,6 @@ def _noise_at(noise: Noise, point: Floats) -> Noise:
     return replace(noise, sigma=(sigma, *noise.sigma[1:]), ar=(ar, *noise.ar[1:]))
 
 
-def _unit(place: str, settings: LatentInputSettings) -> float:
+def _unit(place: str) -> float:
     """Factor from sizes in cmH2O to those of a place."""
-    return settings.relative_size if place in (SUPPLY, GAIN_SCATTER) else 1.0
+    return RELATIVE_SIZE if place in (SUPPLY, GAIN_SCATTER) else 1.0

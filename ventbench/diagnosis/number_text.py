@@ -1,4 +1,4 @@
-"""Numbers, ranges and errors as a person reads them: units, digits, intervals, places."""
+"""Numbers, ranges and errors as a person reads them: units, digits, intervals, places, lungs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,14 @@ from collections.abc import Sequence
 
 from ventbench.diagnosis.findings import ErrorRegion
 from ventbench.diagnosis.residual_axes import EDGE
-from ventbench.mechanics.labels import Estimate
+from ventbench.mechanics.labels import (
+    APPARATUS,
+    GAIN,
+    TOLERANCE_C,
+    TOLERANCE_R,
+    Estimate,
+    LungMatch,
+)
 from ventbench.physics import parameter
 
 #: Axes whose ranges are parts of a breath: an effect is described best by these.
@@ -158,3 +165,34 @@ def breaths_in_words(ids: Sequence[int]) -> str:
         shown = [*shown[: _LISTED - 1], f"others up to {ids[-1]}"]
     text = " and ".join(filter(None, [", ".join(shown[:-1]), *shown[-1:]]))
     return f"breath{'s' * (len(ids) > 1)} {text}"
+
+
+def lung(match: LungMatch) -> str:
+    """Whether a lung is what its label says, within which tolerance, and what else it may be."""
+    values = [
+        f"{name} {quantity(Estimate(value, unit, ends))}"
+        for name, value, ends, unit in (
+            ("R", match.fitted_R, match.ci95_R, "cmH2O/(L/s)"),
+            ("C", match.fitted_C, match.ci95_C, "mL/cmH2O"),
+        )
+        if math.isfinite(value)
+    ]
+    fitted = f"{' and '.join(values)}, from {match.source}" if values else "R and C unknown"
+    if not values:
+        return f"Whether the lung matches its label {match.label} is unknown: {fitted}."
+    gain = ""
+    if match.source == "pressure":
+        gain = f", and a valve gain wrong by {100 * (GAIN - 1):.0f} %"
+    tolerance = (
+        f"tolerance: R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, "
+        f"C by a factor of {TOLERANCE_C:g}{gain}"
+    )
+    others = [name for name in match.settings if name != match.label][:2]
+    if match.label_matches:
+        also = f" Within the same tolerance it could be {' or '.join(others)}." if others else ""
+        return f"The lung matches its label {match.label}: {fitted} ({tolerance}).{also}"
+    known = f" It may be {' or '.join(others)}." if others else ""
+    if not match.informative:
+        why = "" if match.doubt else ", since the intervals are too wide"
+        return f"Whether the lung matches its label {match.label} is unknown{why}: {fitted}.{known}"
+    return f"The lung does not match its label {match.label}: {fitted} ({tolerance}).{known}"

@@ -22,7 +22,6 @@ import numpy as np
 
 from ventbench.diagnosis.gaussian_process import LinearBreaths
 from ventbench.diagnosis.hypothesis import FittedModel, Linearisation, linearise
-from ventbench.diagnosis.settings import PatientEffortSettings, SelectionConfig
 from ventbench.system_id.data import Floats
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.noise import Noise
@@ -31,6 +30,22 @@ from ventbench.system_id.problem import Problem, make_unknowns
 
 EFFORT = "patient_effort"
 AMPLITUDE, ONSET, DURATION = (f"{EFFORT}.{p}" for p in ("amplitude", "onset", "duration"))
+
+#: Prior of efforts: standard deviation of the amplitude, cmH2O; grids of onsets after the breath's
+#: start and of durations, s; length of time in which efforts begin, s, the grid and one step; share
+#: of the breaths that have one.
+AMPLITUDE_SD, ONSETS = 3.0, np.array([0.1 * k for k in range(17)])
+_DURATIONS, _SPAN, PROBABILITY = (0.4, 0.6, 0.8, 1.0, 1.3), ONSETS[-1] - ONSETS[0] + 0.1, 0.6
+
+#: 1 / variance of amplitude, 1 / cmH2O^2, and of a uniform onset, 1 / s^2.
+_PRECISION = (AMPLITUDE_SD**-2.0, 12.0 / _SPAN**2)
+
+#: Amplitude at which an effort's effect is simulated, cmH2O.
+_TEMPLATE = 1.0
+
+#: Nats by which another effort of a breath must be better to be moved to; and where the fit of each
+#: breath's effort ends: expected fall of the cost, nats, and steps.
+_RESTART_GAIN, _TOLERANCE, _STEPS = 1.0, 0.2, 7
 
 
 class ScreenedTerm(NamedTuple):
@@ -84,9 +99,9 @@ class BreathTerm(Protocol):
         ...
 
 
-def breath_term(names: Iterable[str], settings: SelectionConfig) -> BreathTerm:
+def breath_term(names: Iterable[str]) -> BreathTerm:
     """The breath term of a hypothesis with the terms ``names``."""
-    return PatientEffortTerm(settings) if EFFORT in tuple(names) else NoBreathTerm()
+    return PatientEffortTerm() if EFFORT in tuple(names) else NoBreathTerm()
 
 
 class NoBreathTerm:
@@ -135,13 +150,6 @@ class Evidence(NamedTuple):
 class PatientEffortTerm:
     """Efforts of a patient, integrated out in each breath."""
 
-    settings: SelectionConfig
-
-    @property
-    def prior(self) -> PatientEffortSettings:
-        """Prior of the efforts."""
-        return self.settings.patient_effort
-
     def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm:
         """Expected gain: sums over the grid of onsets, at the best duration of a grid."""
         evidence = [self.evidence([linearisation])[0] for linearisation in linearisations]
@@ -162,7 +170,7 @@ class PatientEffortTerm:
         own, none = make_unknowns(problem.data, (START,)), np.zeros(len(values))
         passive_problem = replace(problem, unknowns=own, fixed=passive, mean=none, precision=none)
         at = own.pack({START: values[:, -1]})
-        evidence = self.evidence([self._linearise(passive_problem, at, np.inf)], duration)[0]
+        evidence = self.evidence([linearise(passive_problem, at, clip=np.inf)], duration)[0]
         tried = {AMPLITUDE: evidence.amplitude, ONSET: evidence.onset}
         if refit:
             breathwise, minimum = self._fit_each_breath(passive_problem, at, evidence)
@@ -172,7 +180,7 @@ class PatientEffortTerm:
         for column, value in zip(columns, tried.values(), strict=True):
             trial[column] = value
         trial = np.clip(trial, *layout.bounds())
-        least = problem.log_likelihood(x) + self.prior.restart_gain
+        least = problem.log_likelihood(x) + _RESTART_GAIN
         likelier = problem.log_likelihood(trial) > least
         for column in columns:
             trial[column] = np.where(likelier, trial[column], x[column])
@@ -181,7 +189,7 @@ class PatientEffortTerm:
     def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
         """Integrate efforts out of breaths without any, at the fitted duration, ``(n,)``."""
         duration = float(fitted.column(DURATION)[0])
-        linear = self._linearise(problem, x, np.inf)
+        linear = linearise(problem, x, clip=np.inf)
         start = self.evidence([linear], duration)[0]
         breathwise, minimum = self._fit_each_breath(problem, x, start)
         curvature = minimum.hessian[
@@ -190,21 +198,20 @@ class PatientEffortTerm:
         amplitude = minimum.x[breathwise.unknowns.of(AMPLITUDE)]
         with_effort = breathwise.log_likelihood(minimum.x) + self._log_volume(curvature, amplitude)
         gained = with_effort - problem.log_likelihood(x)
-        share = self.prior.probability
-        laplace = np.logaddexp(np.log(1.0 - share), np.log(share) + gained)
+        laplace = np.logaddexp(np.log(1.0 - PROBABILITY), np.log(PROBABILITY) + gained)
         # A weak effort's onset is free, as on the grid; for a strong one that is too coarse.
         return np.maximum(self._faint_gain(problem, x, self._effects(linear, duration)), laplace)
 
     def _faint_gain(self, problem: Problem, x: Floats, effects: list[Floats]) -> Floats:
         """Log-likelihood that faint efforts gain, as a sum over the grid of onsets, ``(n,)``."""
-        breaths, noise, prior = LinearBreaths.of(problem, x), problem.noise, self.prior
-        size = prior.amplitude_sd / prior.template
+        breaths, noise = LinearBreaths.of(problem, x), problem.noise
+        size = AMPLITUDE_SD / _TEMPLATE
         active = [
             breaths.whitened(noise, effect[:, None]).marginal(size).nats for effect in effects
         ]
         mixed = np.logaddexp.reduce(active, axis=0) - np.log(len(effects))
         gained = mixed - breaths.whitened(noise).marginal(size).nats
-        return np.logaddexp(np.log(1.0 - prior.probability), np.log(prior.probability) + gained)
+        return np.logaddexp(np.log(1.0 - PROBABILITY), np.log(PROBABILITY) + gained)
 
     def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
         """Integrate efforts out around the efforts that the fit found, ``(n,)``."""
@@ -221,13 +228,12 @@ class PatientEffortTerm:
         curvature = np.matmul(rows * noise.influence(white)[:, None], rows.swapaxes(1, 2))
         index = layout.index[:, columns]
         prior = np.concatenate([problem.precision[index[:, :-2]], np.zeros((len(data), 2))], axis=1)
-        prior[:, -2:] = self._precision
+        prior[:, -2:] = _PRECISION
         curvature = curvature + prior[:, :, None] * np.eye(len(columns))
         active = noise.log_likelihood(residual, data.weight)
         active = active + self._log_volume(curvature, fitted.column(AMPLITUDE))
         passive = noise.log_likelihood(fitted.residual_without(EFFORT), data.weight)
-        share = self.prior.probability
-        return np.logaddexp(np.log(1.0 - share) + passive, np.log(share) + active)
+        return np.logaddexp(np.log(1.0 - PROBABILITY) + passive, np.log(PROBABILITY) + active)
 
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Mean over the efforts of the fitted breaths: nobody knows the effort of a new breath."""
@@ -248,7 +254,7 @@ class PatientEffortTerm:
             duration: duration of the efforts, s; the best of the grid if not given.
         """
         best: list[Evidence] = []
-        for length in self.prior.durations if duration is None else (duration,):
+        for length in _DURATIONS if duration is None else (duration,):
             effects = self._effects(linearisations[0], length)
             new = [
                 self._grid_evidence(linearisation, length, effects)
@@ -265,30 +271,30 @@ class PatientEffortTerm:
         """Change of the prediction by an effort at each onset of the grid, ``(n, c, T)`` each."""
         predictor = linearisation.problem.predictor
         columns = [predictor.names.index(path) for path in (AMPLITUDE, ONSET, DURATION)]
-        points = np.repeat(linearisation.values[None], len(self.prior.onsets), axis=0)
-        for point, onset in zip(points, self.prior.onsets, strict=True):
-            point[:, columns] = (self.prior.template, onset, duration)
+        points = np.repeat(linearisation.values[None], len(ONSETS), axis=0)
+        for point, onset in zip(points, ONSETS, strict=True):
+            point[:, columns] = (_TEMPLATE, onset, duration)
         return list(predictor.predict_all(points) - linearisation.prediction)
 
     def _grid_evidence(
         self, linearisation: Linearisation, duration: float, effects: list[Floats]
     ) -> Evidence:
-        prior, logs, means = self.prior, [], []
+        logs, means = [], []
+        precision = (_TEMPLATE / AMPLITUDE_SD) ** 2
         for effect in effects:
             white = linearisation.whiten(effect)
             template = linearisation.without_own(white[:, None])[:, 0]
             power = np.sum(template**2, axis=1)
             match = -np.sum(linearisation.residual * template, axis=1)
-            precision = (prior.template / prior.amplitude_sd) ** 2
             logs.append(0.5 * match**2 / (power + precision) - 0.5 * np.log1p(power / precision))
-            means.append(match / (power + precision) * prior.template)
+            means.append(match / (power + precision) * _TEMPLATE)
         log_factors, amplitudes = np.stack(logs, 1), np.stack(means, 1)
         mixed = np.logaddexp.reduce(log_factors, axis=1)
-        mixed = mixed - np.log(len(prior.onsets)) + np.log(prior.probability)
+        mixed = mixed - np.log(len(ONSETS)) + np.log(PROBABILITY)
         top = np.argmax(log_factors, axis=1)
-        nats = np.logaddexp(np.log(1.0 - prior.probability), mixed)
+        nats = np.logaddexp(np.log(1.0 - PROBABILITY), mixed)
         rows = np.arange(len(top))
-        return Evidence(nats, duration, amplitudes[rows, top], np.asarray(prior.onsets)[top])
+        return Evidence(nats, duration, amplitudes[rows, top], ONSETS[top])
 
     def _fit_each_breath(
         self, passive_problem: Problem, x: Floats, start: Evidence
@@ -299,13 +305,12 @@ class PatientEffortTerm:
         layout = make_unknowns(
             passive_problem.data, (*paths, AMPLITUDE, ONSET), dict.fromkeys(paths, every)
         )
-        precision = self._precision
         problem = replace(
             passive_problem,
             unknowns=layout,
-            mean=np.concatenate([passive_problem.mean, none, none + np.mean(self.prior.onsets)]),
+            mean=np.concatenate([passive_problem.mean, none, none + np.mean(ONSETS)]),
             precision=np.concatenate(
-                [passive_problem.precision, none + precision[0], none + precision[1]]
+                [passive_problem.precision, none + _PRECISION[0], none + _PRECISION[1]]
             ),
         )
         first = dict(zip(paths, passive_problem.unknowns.unpack(x).T, strict=True))
@@ -313,7 +318,7 @@ class PatientEffortTerm:
         low, high = layout.bounds()
         return problem, minimise(
             problem.cost, problem.normal, layout.pack(first), low, high,
-            tolerance=self.prior.tolerance, iterations=self.prior.iterations,
+            tolerance=_TOLERANCE, iterations=_STEPS,
         )  # fmt: skip
 
     def _log_volume(self, curvature: Floats, amplitude: Floats) -> Floats:
@@ -326,14 +331,6 @@ class PatientEffortTerm:
         """
         across, own = curvature[:, -2:, :-2], curvature[:, :-2, :-2]
         inner = curvature[:, -2:, -2:] - across @ np.linalg.solve(own, across.swapaxes(1, 2))
-        width, span = self.prior.amplitude_sd, self.prior.onset_span
-        prior = -0.5 * (amplitude / width) ** 2 - np.log(np.sqrt(2.0 * np.pi) * width * span)
+        norm = np.sqrt(2.0 * np.pi) * AMPLITUDE_SD * _SPAN
+        prior = -0.5 * (amplitude / AMPLITUDE_SD) ** 2 - np.log(norm)
         return np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(inner)[1] + prior
-
-    @property
-    def _precision(self) -> tuple[float, float]:
-        """1 / variance of amplitude, 1 / cmH2O^2, and of a uniform onset, 1 / s^2."""
-        return (self.prior.amplitude_sd**-2.0, 12.0 / self.prior.onset_span**2)
-
-    def _linearise(self, problem: Problem, x: Floats, clip: float | None) -> Linearisation:
-        return linearise(problem, x, self.settings.screening, clip=clip)

@@ -18,6 +18,7 @@ from ventbench.diagnosis.latent_inputs import (
     GAIN_SCATTER,
     MEASUREMENT,
     PLACES,
+    RELATIVE_SIZE,
     SUPPLY,
     LatentInput,
     fit_latent_inputs,
@@ -257,7 +258,7 @@ def _is_negligible_input(
     if latent is None or not selected.names:
         return False
     limits = settings.latent_inputs
-    least = limits.least_size * (limits.relative_size if latent.place == SUPPLY else 1.0)
+    least = limits.least_size * (RELATIVE_SIZE if latent.place == SUPPLY else 1.0)
     if latent.size >= least:
         return False
     return unnamed.nats < _least_beside_names(evaluator, selected)

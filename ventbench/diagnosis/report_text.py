@@ -17,6 +17,7 @@ from ventbench.diagnosis.number_text import (
     breaths_in_words,
     error_phrase,
     error_region,
+    lung,
     probability,
     quantity,
     quantity_like,
@@ -25,14 +26,7 @@ from ventbench.diagnosis.number_text import (
     signed,
     two_digits,
 )
-from ventbench.mechanics.labels import (
-    APPARATUS,
-    GAIN,
-    TOLERANCE_C,
-    TOLERANCE_R,
-    Estimate,
-    LungMatch,
-)
+from ventbench.mechanics.labels import Estimate
 from ventbench.physics import mechanism, parameter
 from ventbench.physics.catalogue import events
 
@@ -172,6 +166,9 @@ def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
     least = findings.settings.residuals.negligible
     if missing.worth < least:
         doubts.append(f"{missing.name} is worth less than {least:g} cmH2O")
+    if missing.explains < _WEAK:
+        share = f"{100 * missing.explains:.0f} %"
+        doubts.append(f"{missing.name} explains {share} of the error that is no noise")
     return doubts
 
 
@@ -514,39 +511,6 @@ def open_loop(findings: Findings) -> str:
         f"Root-mean-square open-loop error on {len(errors.held_out_breaths)} held-out breaths: "
         f"{given} cmH2O as given{others}; measurement noise {noise}."
     )
-
-
-def lung(match: LungMatch) -> str:
-    """Whether a lung is what its label says, within which tolerance, and what else it may be."""
-    values = [
-        f"{name} {quantity(Estimate(value, unit, ends))}"
-        for name, value, ends, unit in (
-            ("R", match.fitted_R, match.ci95_R, "cmH2O/(L/s)"),
-            ("C", match.fitted_C, match.ci95_C, "mL/cmH2O"),
-        )
-        if math.isfinite(value)
-    ]
-    fitted = f"{' and '.join(values)}, from {match.source}" if values else "R and C unknown"
-    if not values:
-        return f"Whether the lung matches its label {match.label} is unknown: {fitted}."
-    gain = ""
-    if match.source == "pressure":
-        gain = f", and a valve gain wrong by {100 * (GAIN - 1):.0f} %"
-    tolerance = (
-        f"tolerance: R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, "
-        f"C by a factor of {TOLERANCE_C:g}{gain}"
-    )
-    others = [name for name in match.settings if name != match.label][:2]
-    if match.label_matches:
-        also = f" Within the same tolerance it could be {' or '.join(others)}." if others else ""
-        return f"The lung matches its label {match.label}: {fitted} ({tolerance}).{also}"
-    known = f" It may be {' or '.join(others)}." if others else ""
-    if not match.informative:
-        return (
-            f"Whether the lung matches its label {match.label} is unknown, since the intervals are "
-            f"too wide: {fitted}.{known}"
-        )
-    return f"The lung does not match its label {match.label}: {fitted} ({tolerance}).{known}"
 
 
 def _it(findings: Findings) -> str:

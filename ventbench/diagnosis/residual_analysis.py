@@ -15,12 +15,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.diagnosis.findings import ErrorRegion, OpenLoopComparison, OpenLoopError
-from ventbench.diagnosis.residual_axes import Axis, axes
+from ventbench.diagnosis.residual_axes import EDGE_SIZE, Axis, axes
 from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings, ResidualSettings
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 
 Floats = NDArray[np.float64]
+
+#: Length of what is reported as the beginning of inspiration, s.
+_BEGINNING = 0.2
+
+#: Share of the breaths, those that err most, without which it is asked whether more than noise is
+#: left: a wrong first reading puts a whole breath off, since every simulation starts there.
+_SET_ASIDE = 0.1
+
+#: Time after the start of expiration from which little moves, s; fewest quiet samples of a breath
+#: that show the sensor's scatter; times that scatter that the noise may have (it is coloured, and a
+#: converter rounds a quiet signal more than a moving one); least scatter, cmH2O.
+_QUIET_AFTER, _QUIET_SAMPLES, _QUIET_FACTOR, _LEAST_NOISE = 0.6, 10, 3.0, 0.05
+
+#: Share of the chance of any range that the test of the mean gets; the test of the square, whose
+#: differences are skewed, errs less often than it may.
+_MEAN_SHARE = 0.8
+
+#: Excess of the squared error that is reported, as a share of the noise's variance: noise that
+#: differs a little from range to range is no missing physics.
+MIN_EXCESS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +73,6 @@ def compare_open_loop(
     held_out: NDArray[np.bool_],
     pressures: dict[str, Floats],
     noise_floor: float,
-    settings: ResidualSettings = DEFAULT.residuals,
     gain_error: Floats | None = None,
     sensor: float = float("nan"),
 ) -> OpenLoopComparison:
@@ -65,7 +84,6 @@ def compare_open_loop(
         pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
             T)``.
         noise_floor: standard deviation of the noise, cmH2O.
-        settings: length of the beginning of inspiration.
         gain_error: standard deviation of the pressure because gains differ from breath to breath,
             cmH2O, ``(n, T)``; None if they do not.
         sensor: that of :func:`sensor_noise`.
@@ -79,10 +97,10 @@ def compare_open_loop(
             for stage, simulated in pressures.items()
         }
 
-    whole, beginning = by_stage(inspiration), settings.beginning
+    whole = by_stage(inspiration)
     parts = {
-        f"first {beginning:g} s of inspiration": inspiration & (breaths.time <= beginning),
-        "rest of inspiration": inspiration & (breaths.time > beginning),
+        f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
+        "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
         "expiration": (breaths.u_out == 1) & breaths.valid & held_out[:, None],
     }
     lungs = breaths.by_lung_index
@@ -95,18 +113,18 @@ def compare_open_loop(
     groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
     scatter = 0.0 if gain_error is None else float(np.sqrt(np.mean(gain_error[inspiration] ** 2)))
     error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
-    usual = _usual_error(error, settings.set_aside)
+    usual = _usual_error(error)
     return OpenLoopComparison(
         ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups, scatter, usual,
         sensor,
     )  # fmt: skip
 
 
-def _usual_error(error: Floats, set_aside: float) -> float:
+def _usual_error(error: Floats) -> float:
     """Root mean square of errors ``(n, T)`` without the breaths that err most."""
     squares, counts = np.nansum(error**2, axis=1), np.isfinite(error).sum(axis=1)
     order = np.argsort(squares / np.maximum(counts, 1))
-    kept = order[: len(order) - math.ceil(set_aside * len(order))] if len(order) > 2 else order
+    kept = order[: len(order) - math.ceil(_SET_ASIDE * len(order))] if len(order) > 2 else order
     total = counts[kept].sum()
     return float(np.sqrt(squares[kept].sum() / total)) if total else float("nan")
 
@@ -121,37 +139,31 @@ def is_unexplained(
     )
 
 
-def sensor_noise(breaths: Breaths, settings: ResidualSettings = DEFAULT.residuals) -> float:
+def sensor_noise(breaths: Breaths) -> float:
     """Standard deviation of the sensor, cmH2O, by quiet readings alone; NaN if nothing is quiet.
 
     Late in an expiration hardly anything moves, so that the scatter about a parabola shows the
     sensor. A converter hides the scatter of a quiet signal; its step's own scatter is a floor.
-
-    Args:
-        breaths: the recording.
-        settings: which part of expirations is quiet.
     """
     late = (breaths.u_out == 1) & breaths.valid & np.isfinite(breaths.pressure)
     scatter = []
     for time, pressure, u_in, use in zip(
         breaths.time, breaths.pressure, breaths.u_in, late, strict=True
     ):
-        if use.sum() < settings.quiet_samples:
+        if use.sum() < _QUIET_SAMPLES:
             continue
-        use = use & (time > time[use][0] + settings.quiet_after)
-        use &= np.abs(u_in - np.median(u_in[use]) if use.any() else u_in) < settings.edge
-        if use.sum() >= settings.quiet_samples:
+        use = use & (time > time[use][0] + _QUIET_AFTER)
+        use &= np.abs(u_in - np.median(u_in[use]) if use.any() else u_in) < EDGE_SIZE
+        if use.sum() >= _QUIET_SAMPLES:
             left = pressure[use] - np.polyval(np.polyfit(time[use], pressure[use], 2), time[use])
             scatter.append(1.4826 * np.median(np.abs(left)))
     if not scatter:
         return float("nan")
     step = np.diff(np.unique(breaths.pressure[late])).min(initial=np.inf) / np.sqrt(12.0)
-    return max(float(np.median(scatter)), float(step), settings.least_noise)
+    return max(float(np.median(scatter)), float(step), _LEAST_NOISE)
 
 
-def noise_floor(
-    noise_sd: float, sensor: float, settings: ResidualSettings = DEFAULT.residuals
-) -> float:
+def noise_floor(noise_sd: float, sensor: float) -> float:
     """Standard deviation of the measurement, cmH2O, which no simulator can beat.
 
     The noise of a model that fits badly contains the model's own slow errors; the floor is never
@@ -160,9 +172,8 @@ def noise_floor(
     Args:
         noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
         sensor: that of :func:`sensor_noise`; NaN if unknown.
-        settings: give the factor.
     """
-    return float(np.fmin(noise_sd, settings.quiet_factor * sensor))
+    return float(np.fmin(noise_sd, _QUIET_FACTOR * sensor))
 
 
 def flow_and_volume(breaths: Breaths, fit: Fit, pressure: Floats) -> tuple[Floats, Floats]:
@@ -218,7 +229,7 @@ def locate(
         of the error. Neighbouring ranges with errors of one sign are merged.
     """
     error, usable = errors(breaths, refit)
-    all_axes = axes(breaths, refit, flow, volume, settings)
+    all_axes = axes(breaths, refit, flow, volume)
     if len(breaths) < settings.min_breaths or not all_axes or not usable.any():
         return ()
     columns = [_test_columns(axis, error, usable) for axis in all_axes]
@@ -229,12 +240,12 @@ def locate(
         excess, two_sided=False, seed=seed + 1, weight=outside[0], settings=settings
     )
     with np.errstate(invalid="ignore"):
-        is_material = _nanmean(excess) > settings.min_excess * variance
+        is_material = _nanmean(excess) > MIN_EXCESS * variance
         by_square = np.where(is_material, by_square, 1.0)
         adds = np.hypot(np.sqrt(variance), _nanmean(mean)) - np.sqrt(variance)
         by_mean = np.where(adds >= least, by_mean, 1.0)
-    by_mean = by_mean / settings.mean_share
-    p_value = np.minimum(1.0, np.minimum(by_mean, by_square / (1.0 - settings.mean_share)))
+    by_mean = by_mean / _MEAN_SHARE
+    p_value = np.minimum(1.0, np.minimum(by_mean, by_square / (1.0 - _MEAN_SHARE)))
     sign = np.where(by_mean <= settings.level, np.sign(np.nan_to_num(_nanmean(mean))), 0.0)
 
     regions: list[ErrorRegion] = []

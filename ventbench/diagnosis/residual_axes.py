@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
 from ventbench.recordings.breaths import Breaths
 
 Floats = NDArray[np.float64]
@@ -16,6 +15,18 @@ Integers = NDArray[np.int64]
 #: Share of the extreme values at either end that the ranges of a quantity need not hold.
 _EXTREME = 0.005
 
+#: Width of the ranges of time in a phase, s; about how many ranges flow, volume and pressure are
+#: divided into; parts that the recording is divided into.
+_PHASE_STEP, _RANGES, _COUNT = 0.1, 10, 5
+
+#: Ends of the ranges of the inspiratory valve's command, %, and of the time since an edge, s.
+_OPENINGS = np.array(
+    [0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0]
+)
+_EDGE_TIMES = np.array([0.0, 0.035, 0.07, 0.105, 0.15, 0.2, 0.3, 0.5, 1.0, 3.0])
+
+#: Change of the inspiratory valve's command that is an edge, percentage points.
+EDGE_SIZE = 5.0
 
 #: Axis of the time since a valve's edge.
 EDGE = "time since a valve edge"
@@ -45,11 +56,7 @@ class Axis:
 
 
 def axes(
-    breaths: Breaths,
-    pressure: Floats,
-    flow: Floats | None = None,
-    volume: Floats | None = None,
-    settings: ResidualSettings = DEFAULT.residuals,
+    breaths: Breaths, pressure: Floats, flow: Floats | None = None, volume: Floats | None = None
 ) -> tuple[Axis, ...]:
     """All axes of a recording.
 
@@ -62,7 +69,6 @@ def axes(
         pressure: simulated, cmH2O, ``(n, T)``.
         flow: simulated, into the lung, mL/s, ``(n, T)``.
         volume: simulated, mL, ``(n, T)``.
-        settings: widths of the ranges.
     """
     acted = before(np.asarray(breaths.u_out)) == 0
     start = np.where(acted & breaths.valid, breaths.time, np.inf).min(axis=1, keepdims=True)
@@ -72,24 +78,23 @@ def axes(
     ).min(axis=1, keepdims=True)
     # A breath without the phase has no time in it.
     start, opened = (np.where(np.isfinite(time), time, np.nan) for time in (start, opened))
-    u_in, step = before(breaths.u_in), settings.phase_step
-    since = since_edge(breaths, settings.edge)
+    u_in = before(breaths.u_in)
 
     def edges(values: Floats) -> Floats:
-        return round_edges(values, breaths.valid, settings.ranges)
+        return round_edges(values, breaths.valid)
 
     all_axes = [
-        _phase("time since inspiration", breaths.time - start, acted & breaths.valid, step),
-        _phase("time since expiration", breaths.time - opened, ~acted & breaths.valid, step),
-        _axis("valve opening", "%", np.array(settings.openings), u_in, acted),
-        _axis(EDGE, "s", np.array(settings.edge_times), since),
+        _phase("time since inspiration", breaths.time - start, acted & breaths.valid),
+        _phase("time since expiration", breaths.time - opened, ~acted & breaths.valid),
+        _axis("valve opening", "%", _OPENINGS, u_in, acted),
+        _axis(EDGE, "s", _EDGE_TIMES, since_edge(breaths)),
         _axis("pressure", "cmH2O", edges(pressure), pressure),
     ]
     if flow is not None:
         all_axes.append(_axis("flow", "mL/s", edges(flow), flow))
     if volume is not None:
         all_axes.append(_axis("volume", "mL", edges(volume), volume))
-    return (*all_axes, *_parts(breaths, settings.parts), *_lungs(breaths))
+    return (*all_axes, *_parts(breaths), *_lungs(breaths))
 
 
 def before(values: NDArray) -> NDArray:
@@ -100,31 +105,24 @@ def before(values: NDArray) -> NDArray:
     return np.concatenate([values[:, :1], values[:, :-1]], axis=1)
 
 
-def since_edge(breaths: Breaths, edge: float = DEFAULT.residuals.edge) -> Floats:
-    """Time since either valve's last edge before each sample, s; NaN before any, ``(n, T)``.
-
-    Args:
-        breaths: n breaths of T samples.
-        edge: change of the inspiratory valve's command that is an edge, percentage points.
-    """
+def since_edge(breaths: Breaths) -> Floats:
+    """Time since either valve's last edge before each sample, s; NaN before any, ``(n, T)``."""
     u_in, u_out = breaths.u_in, np.asarray(breaths.u_out, float)
     is_edge = np.zeros(u_in.shape, bool)
-    is_edge[:, 0] = u_in[:, 0] > edge  # a breath begins with the valve shut
-    is_edge[:, 1:] = (np.abs(np.diff(u_in)) > edge) | (np.diff(u_out) != 0)
+    is_edge[:, 0] = u_in[:, 0] > EDGE_SIZE  # a breath begins with the valve shut
+    is_edge[:, 1:] = (np.abs(np.diff(u_in)) > EDGE_SIZE) | (np.diff(u_out) != 0)
     at = np.maximum.accumulate(np.where(is_edge, breaths.time, -np.inf), axis=1)
     earlier = np.concatenate([np.full((len(at), 1), -np.inf), at[:, :-1]], axis=1)
     return np.where(np.isfinite(earlier), breaths.time - earlier, np.nan)
 
 
-def round_edges(
-    values: Floats, valid: NDArray[np.bool_], ranges: int = DEFAULT.residuals.ranges
-) -> Floats:
-    """Ends of about ``ranges`` ranges at round numbers, without the most extreme values."""
+def round_edges(values: Floats, valid: NDArray[np.bool_]) -> Floats:
+    """Ends of about ten ranges at round numbers, without the most extreme values."""
     inside = values[valid & np.isfinite(values)]
     if inside.size == 0:
         return np.array([0.0, 1.0])
     low, high = np.quantile(inside, [_EXTREME, 1.0 - _EXTREME])
-    wanted = max((high - low) / ranges, 1e-6)
+    wanted = max((high - low) / _RANGES, 1e-6)
     scale = 10.0 ** np.floor(np.log10(wanted))
     step = scale * next(x for x in (1.0, 2.0, 5.0, 10.0) if x * scale >= 0.999 * wanted)
     first, last = np.floor(low / step), max(np.ceil(high / step), np.floor(low / step) + 1)
@@ -143,15 +141,16 @@ def _axis(
     return Axis(name, unit, edges, np.where(within, bins, -1))
 
 
-def _phase(name: str, time: Floats, inside: NDArray[np.bool_], step: float) -> Axis:
+def _phase(name: str, time: Floats, inside: NDArray[np.bool_]) -> Axis:
+    step = _PHASE_STEP
     longest = np.max(time, initial=step, where=inside & np.isfinite(time))
     edges = np.round(step * np.arange(np.ceil(longest / step - 1e-6) + 1), 6)
     return _axis(name, "s", edges, time, inside)
 
 
-def _parts(breaths: Breaths, parts: int) -> list[Axis]:
+def _parts(breaths: Breaths) -> list[Axis]:
     """Parts of the recording by the number of the breath."""
-    n, count = len(breaths), min(parts, len(breaths))
+    n, count = len(breaths), min(_COUNT, len(breaths))
     cuts = np.round(np.linspace(0, n, count + 1))
     number = np.repeat(np.arange(n)[:, None], breaths.time.shape[1], axis=1)
     bins = np.where(breaths.valid, np.searchsorted(cuts, number, side="right") - 1, -1)

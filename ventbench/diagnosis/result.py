@@ -228,6 +228,7 @@ def _mechanism(missing: MissingMechanism) -> dict[str, Any]:
         "simulator_has": missing.simulator_values,
         "first_breath": missing.breaths,
         "affected_breaths": list(missing.affected),
+        "explains": missing.explains,
     }
 
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from ventbench.diagnosis.evaluator import Evaluator, make_problem
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition, varies_by_breath
-from ventbench.diagnosis.settings import RigSettings
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.noise import Noise
@@ -30,6 +29,13 @@ _GAIN = "gain"
 
 #: Parameters whose centre is that of the lung, not that of all rigs.
 _OF_THE_LUNG = ("R", "C")
+
+#: Standard deviation between rigs to start with (of the logarithm, or as a share of a mild effect),
+#: and least one of a logarithm: a smaller one would end the search for it.
+_SCATTER, _LEAST = 0.3, 0.01
+
+#: Rounds in which parameters and scatter are estimated in turn; end of each search, nats and steps.
+_ROUNDS, _TOLERANCE, _STEPS = 4, 0.05, 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +78,8 @@ class RigFit:
 
 
 def fit_rigs(
-    evaluator: Evaluator, fitted: FittedModel, partition: Partition, rigs: NDArray[np.int64],
-    settings: RigSettings,
-) -> RigFit | None:  # fmt: skip
+    evaluator: Evaluator, fitted: FittedModel, partition: Partition, rigs: NDArray[np.int64]
+) -> RigFit | None:
     """Fit the parameters of a model to each rig of some breaths.
 
     Args:
@@ -82,7 +87,6 @@ def fit_rigs(
         fitted: the model, fitted to all rigs together.
         partition: breaths to fit.
         rigs: rig of each of them, ``(n,)``.
-        settings: scatter to start with, and rounds.
 
     Returns:
         None if there is one rig alone, or breaths differ from each other by more than their rig.
@@ -113,16 +117,15 @@ def fit_rigs(
         about = parameter_of(path)
         # A shape parameter may have no mild effect; it is of the size of its range.
         size = 1.0 if about.scale == "log" else abs(about.mild) or about.high - about.low
-        scatter[path] = settings.scatter * size
-    for _ in range(settings.rounds):
+        scatter[path] = _SCATTER * size
+    for _ in range(_ROUNDS):
         precision = np.zeros(len(x))
         for path in scatter:
             precision[layout.of(path)] = scatter[path] ** -2.0
         posed = replace(problem, unknowns=layout, mean=mean, precision=precision)
         minimum = minimise(
-            posed.cost, posed.normal, x, low, high, tolerance=settings.tolerance,
-            iterations=settings.iterations,
-        )  # fmt: skip
+            posed.cost, posed.normal, x, low, high, tolerance=_TOLERANCE, iterations=_STEPS
+        )
         x = minimum.x
         variance = np.diag(np.linalg.inv(minimum.hessian + 1e-9 * np.eye(len(x))))
         for path in scatter:
@@ -131,7 +134,7 @@ def fit_rigs(
                 members = own[around[path] == group]
                 mean[members] = x[members].mean()
             spread = float(np.sqrt(np.mean((x[own] - mean[own]) ** 2 + variance[own])))
-            least = settings.least * (1.0 if parameter_of(path).scale == "log" else 1e-3)
+            least = _LEAST * (1.0 if parameter_of(path).scale == "log" else 1e-3)
             scatter[path] = max(spread, least)
     values = {path: parameter_of(path).physical(x[layout.of(path)]) for path in paths}
     gains = x[layout.of(_GAIN)]

@@ -1,4 +1,4 @@
-"""Every threshold of the diagnosis, in one versioned object.
+"""Every threshold of a verdict, in one versioned object.
 
 ``nats`` are differences of log-likelihood (natural logarithm). ``criterion`` is the Bayesian
 information criterion, ``-2 log L + k log n``, so that 2 of it correspond to one nat. How they act
@@ -10,10 +10,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import numpy as np
-
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-13"
+VERSION = "selection-14"
 
 
 @dataclass(frozen=True)
@@ -85,23 +83,9 @@ class ScreeningSettings:
     """First-order ranking of what could be added to a hypothesis.
 
     Attributes:
-        clip: whitened residuals are cut off here, in standard deviations, so that no single sample
-            decides.
-        ridge: eigenvalues of a projection below this share of the largest count as zero.
-        min_step: least multiple of a template that starts a fit.
-        max_step: largest multiple of a template that starts a fit; first order does not hold far.
-        shape_promise: nats by which another shape than the default must promise more to be fitted
-            from the start; a parameter costs about half the logarithm of the samples.
-        derivatives_at_once: directions of one compiled derivative.
         nonparametric_terms: basis terms that are candidates; None for all that are registered.
     """
 
-    clip: float = 4.0
-    ridge: float = 1e-9
-    min_step: float = 0.2
-    max_step: float = 3.0
-    shape_promise: float = 4.0
-    derivatives_at_once: int = 16
     nonparametric_terms: tuple[str, ...] | None = None
 
 
@@ -270,55 +254,10 @@ class PlausibilitySettings:
 
 
 @dataclass(frozen=True)
-class PatientEffortSettings:
-    """Prior of the patient's efforts, which differ from breath to breath.
-
-    Attributes:
-        onsets: grid of onsets, s after the breath's start.
-        durations: grid of durations, s.
-        template: amplitude at which an effort's effect is simulated, cmH2O.
-        amplitude_sd: prior standard deviation of the amplitude, cmH2O.
-        probability: prior share of breaths that have an effort.
-        restart_gain: log-likelihood of a breath, nats, by which another effort must be better to be
-            moved to.
-        tolerance: expected fall of the cost, nats, at which the fit of each breath's effort ends.
-        iterations: most steps of that fit.
-    """
-
-    onsets: tuple[float, ...] = tuple(0.1 * k for k in range(0, 17))
-    durations: tuple[float, ...] = (0.4, 0.6, 0.8, 1.0, 1.3)
-    template: float = 1.0
-    amplitude_sd: float = 3.0
-    probability: float = 0.6
-    restart_gain: float = 1.0
-    tolerance: float = 0.2
-    iterations: int = 7
-
-    @property
-    def onset_span(self) -> float:
-        """Length of time in which efforts begin, s: the grid and one step."""
-        return self.onsets[-1] - self.onsets[0] + 0.1
-
-
-@dataclass(frozen=True)
 class LatentInputSettings:
     """Inputs that vary in time and that no command explains: Gaussian processes.
 
     Attributes:
-        frequencies: frequencies of periodic inputs, Hz: heart beats to the pulsation of a supply.
-        correlation_times: correlation times of smooth inputs, s.
-        sizes: standard deviations, cmH2O.
-        relative_size: factor from ``sizes`` to those of a flow or of the valve's gain, which are
-            shares, 1/cmH2O.
-        rounds: most times that the model's parameters beside an input, its kernel, and its size and
-            noise are found in turn.
-        gain: log-likelihood, nats, that another round must gain.
-        climb_tolerance: log-likelihood, nats, to which size and noise are climbed.
-        frequency_span: how far a climb may move the logarithm of a frequency: to the next one of
-            the grid.
-        coloured: correlation of neighbouring samples from which a climb also starts from white
-            noise; below it, both starts are one.
-        min_variance: components of a unit covariance with less variance are left out.
         threshold: held-out log-likelihood, nats, from which an input is accepted: more than for a
             term, since places, scales and sizes are searched. It must also be this far ahead of
             coloured noise and of scatter of the valve's gain.
@@ -340,38 +279,12 @@ class LatentInputSettings:
             right yet; on the public rig, 22 % were taken for scatter then, and a name too many.
     """
 
-    frequencies: tuple[float, ...] = tuple(
-        float(f) for f in (*np.arange(0.6, 2.0, 0.1), *np.arange(2.0, 9.1, 0.25))
-    )
-    correlation_times: tuple[float, ...] = (0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2)
-    sizes: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
-    relative_size: float = 0.1
-    rounds: int = 3
-    gain: float = 1.0
-    climb_tolerance: float = 0.2
-    frequency_span: float = 0.1
-    coloured: float = 0.2
-    min_variance: float = 1e-2
     threshold: float = 8.0
     least_size: float = 0.4
     sensor_amplitude: float = 0.3
     sensor_noise: float = 1.0
     scatter_share: float = 0.5
     early_scatter: float = 0.05
-
-
-@dataclass(frozen=True)
-class DetectionSettings:
-    """Strengths that a recording in which nothing is missing would have shown.
-
-    Attributes:
-        nats: gain on the testing breaths that is expected at the limit: twice the threshold of the
-            held-out test, since the gain itself scatters.
-        rounds: strengths at which the effect is simulated, each nearer to the limit.
-    """
-
-    nats: float = 2.0 * 4.6
-    rounds: int = 2
 
 
 @dataclass(frozen=True)
@@ -398,27 +311,6 @@ class CorrectionSettings:
 
 
 @dataclass(frozen=True)
-class RigSettings:
-    """Parameters of each rig, where a recording has several.
-
-    Attributes:
-        scatter: standard deviation between rigs to start with: of the logarithm, or as a share of a
-            mild effect.
-        least: least standard deviation of a logarithm between rigs; a smaller one would end the
-            search for it.
-        rounds: rounds in which parameters and their scatter are estimated in turn.
-        tolerance: expected fall of the cost, nats, at which a search ends.
-        iterations: most steps of a search.
-    """
-
-    scatter: float = 0.3
-    least: float = 0.01
-    rounds: int = 4
-    tolerance: float = 0.05
-    iterations: int = 15
-
-
-@dataclass(frozen=True)
 class SimulatorSettings:
     """Comparison of the recording with the simulator under diagnosis.
 
@@ -436,37 +328,13 @@ class SimulatorSettings:
 
 
 @dataclass(frozen=True)
-class EstimateSettings:
-    """Estimates as they are reported.
-
-    Attributes:
-        form_error: standard deviation of what the library's equations miss, as a share of a
-            parameter. Lags, dead times and compliances that recordings of the strangers' challenge
-            know to 1 % by their noise were 1 to 3 % off: steps of time, jitter of the clock, forms
-            of what acts beside them.
-    """
-
-    form_error: float = 0.015
-
-
-@dataclass(frozen=True)
 class ResidualSettings:
     """Test of where the simulator errs: ranges of phase, command, pressure and so on.
 
     Attributes:
-        phase_step: width of the ranges of time in a phase, s.
-        openings: ends of the ranges of the inspiratory valve's command, %.
-        edge_times: ends of the ranges of the time since a valve's edge, s.
-        edge: change of the command that is an edge, percentage points.
-        ranges: about how many ranges flow, volume and pressure are divided into.
-        parts: parts that the recording is divided into.
         min_breaths: fewest breaths that a range must have.
         flips: random sign flips; a p-value is at least ``1 / (flips + 1)``.
         level: family-wise chance that any range is reported if nothing is missing.
-        mean_share: share of that chance that the test of the mean gets; the test of the square,
-            whose differences are skewed, errs less often than it may.
-        min_excess: excess of the squared error that is reported, as a share of the noise's
-            variance. Noise that differs a little from range to range is no missing physics.
         certain: p-value below which ranges are ordered by their share of the error.
         veto_level: false discovery rate of the tests that veto "nothing is missing": as rare as a
             false name, by ``held_out_test.threshold``.
@@ -474,74 +342,15 @@ class ResidualSettings:
             of a converter of 12 bits over 80 cmH2O.
         absorbed: times the scatter of quiet readings from which the model's noise may hold part of
             what is missing. Coloured noise scatters about a parabola by a quarter less than at all.
-        beginning: length of what is reported as the beginning of inspiration, s.
-        quiet_after: time after the start of expiration from which little moves, s.
-        quiet_samples: fewest quiet samples of a breath that show the sensor's scatter.
-        quiet_factor: times that scatter that the noise may have; it is coloured, and a converter
-            rounds a quiet signal more than a moving one.
-        least_noise: least scatter that is taken seriously, cmH2O: a converter hides less.
-        set_aside: share of the breaths, those that err most, without which it is asked whether
-            more than the noise is left. A wrong first reading puts a whole breath off, since every
-            simulation starts there.
     """
 
-    phase_step: float = 0.1
-    openings: tuple[float, ...] = (
-        0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0,
-    )  # fmt: skip
-    edge_times: tuple[float, ...] = (0.0, 0.035, 0.07, 0.105, 0.15, 0.2, 0.3, 0.5, 1.0, 3.0)
-    edge: float = 5.0
-    ranges: int = 10
-    parts: int = 5
     min_breaths: int = 5
     flips: int = 2000
     level: float = 0.05
-    mean_share: float = 0.8
-    min_excess: float = 0.3
     certain: float = 0.01
     veto_level: float = 0.01
     negligible: float = 0.02
     absorbed: float = 1.5
-    beginning: float = 0.2
-    quiet_after: float = 0.6
-    quiet_samples: int = 10
-    quiet_factor: float = 3.0
-    least_noise: float = 0.05
-    set_aside: float = 0.1
-
-
-@dataclass(frozen=True)
-class ExperimentSettings:
-    """Breaths that are proposed to tell alternatives apart.
-
-    Attributes:
-        breaths: number of proposed breaths.
-        variants: candidate breaths of each kind.
-        pressure_limits: cmH2O, within which every alternative must predict a proposed breath; the
-            noise of a starting pressure may go a little below zero.
-        min_information: expected log-likelihood ratio, nats, below which nothing is proposed.
-        weaker: factor by which a breath that is not safe is weakened.
-        attempts: times that it is.
-        max_opening: largest command of the inspiratory valve, %.
-        inspiration: length of most inspirations, s.
-        fast_inspiration: length of fast inflations, s.
-        slow_inspiration: length of slow inflations, s.
-        hold: length of a hold with both valves shut, s.
-        shutter: length of the interruptions of an expiration, s.
-    """
-
-    breaths: int = 5
-    variants: int = 5
-    pressure_limits: tuple[float, float] = (-1.0, 50.0)
-    min_information: float = 1.0
-    weaker: float = 0.75
-    attempts: int = 3
-    max_opening: float = 100.0
-    inspiration: float = 1.0
-    fast_inspiration: float = 0.35
-    slow_inspiration: float = 1.5
-    hold: float = 2.0
-    shutter: float = 0.16
 
 
 @dataclass(frozen=True)
@@ -555,15 +364,10 @@ class SelectionConfig:
     forward: ForwardSelectionSettings = field(default_factory=ForwardSelectionSettings)
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
     plausibility: PlausibilitySettings = field(default_factory=PlausibilitySettings)
-    patient_effort: PatientEffortSettings = field(default_factory=PatientEffortSettings)
     latent_inputs: LatentInputSettings = field(default_factory=LatentInputSettings)
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)
-    rigs: RigSettings = field(default_factory=RigSettings)
-    detection: DetectionSettings = field(default_factory=DetectionSettings)
     simulator: SimulatorSettings = field(default_factory=SimulatorSettings)
-    estimates: EstimateSettings = field(default_factory=EstimateSettings)
     residuals: ResidualSettings = field(default_factory=ResidualSettings)
-    experiments: ExperimentSettings = field(default_factory=ExperimentSettings)
     version: str = VERSION
 
     def as_dict(self) -> dict[str, Any]:

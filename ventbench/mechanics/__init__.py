@@ -3,6 +3,7 @@
 from ventbench.mechanics.identify import Mechanics as Mechanics
 from ventbench.mechanics.identify import Term as Term
 from ventbench.mechanics.identify import identify as identify
+from ventbench.mechanics.identify import share_faults as share_faults
 from ventbench.mechanics.labels import match_label as match_label
 from ventbench.mechanics.labels import match_labels as match_labels
 from ventbench.mechanics.labels import matching_settings as matching_settings

@@ -8,19 +8,21 @@ sensor does not see, a reversed sign, another unit, a volume that drifts.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.mechanics.labels import (
+    WRONG,
     Estimate,
     LungMatch,
     fits,
     match_label,
     matching_settings,
+    session_fault,
 )
 from ventbench.mechanics.regression import (
     BASE,
@@ -144,6 +146,18 @@ _EXTRAPOLATION_ERROR = 0.5
 #: Least degrees of freedom of an interval; with fewer it would say nothing.
 _LEAST_FREEDOM = 4
 
+#: Faults of a sensor that may be those of a session, in words, and share of the lungs of a sound
+#: session that seem to have one: rigs have inertance and leaks, which look like the last two.
+FAULTS = {
+    "unsound": ("flow or volume that no lung has", 0.05),
+    "clipped": ("flow that is clipped", 0.05),
+    "late": ("flow that is late", 0.2),
+    "zero": ("a zero of the flow that is off", 0.2),
+}
+
+#: Terms by which a fit allows for a fault where it shows.
+_FITTED = {"late": "inertance", "zero": "leak"}
+
 #: Faults of the flow sensor that look like an effect.
 _SENSORS = {"inertance": ("flow_sensor_lag",), "leak": ("flow_sensor_zero",)}
 
@@ -186,6 +200,7 @@ class Mechanics:
         breaths: number of breaths that were used.
         samples: number of smoothed samples.
         notes: warnings to the reader.
+        faults: what may be wrong with the sensors, of :data:`FAULTS`.
     """
 
     label: str
@@ -199,6 +214,7 @@ class Mechanics:
     breaths: int
     samples: int
     notes: tuple[str, ...]
+    faults: tuple[str, ...] = ()
 
 
 #: Shares of the time that a lung takes, measured: smoothing, and what delays the pressure.
@@ -208,7 +224,7 @@ _SMOOTHING, _DELAY = 0.08, 0.62
 def identify(
     breaths: Breaths, progress: Callable[[int, int], object] | None = None
 ) -> tuple[Mechanics, ...]:
-    """Identify each lung of a recording with flow or volume.
+    """Identify each lung of a recording with flow or volume; they are one session.
 
     Args:
         breaths: the recording.
@@ -228,7 +244,44 @@ def identify(
         lungs.append(_identify_lung(name, part, told))
         told(1.0)
         done += len(part)
-    return tuple(lungs)
+    return share_faults(lungs)
+
+
+def share_faults(lungs: Sequence[Mechanics]) -> tuple[Mechanics, ...]:
+    """Let lungs of one session share what is wrong with its sensors.
+
+    A lung that does not match its label has another setting, or a sensor is at fault. Where a
+    fault is likelier than a wrong label, by what the others show (:func:`~.labels.session_fault`),
+    the lung's setting is unknown. A label that holds all the same is not doubted.
+
+    Args:
+        lungs: all lungs that were recorded with the same sensors, of one or several recordings.
+    """
+    shown = {fault: sum(fault in lung.faults for lung in lungs) for fault in FAULTS}
+    return tuple(_doubted(lung, shown, len(lungs)) for lung in lungs)
+
+
+def _doubted(lung: Mechanics, shown: dict[str, int], count: int) -> Mechanics:
+    match = lung.match
+    if match.label_matches or not match.informative or not math.isfinite(match.fitted_C):
+        return lung
+    likely = {
+        fault: 1.0 if fault in lung.faults else session_fault(shown[fault], count, FAULTS[fault][1])
+        for fault in FAULTS
+        if not (fault in _FITTED and fault in lung.faults)
+    }
+    fault = max(likely, key=lambda name: likely[name])
+    if likely[fault] <= WRONG:
+        return lung
+    who = "It shows"
+    if fault not in lung.faults:
+        who = f"{shown[fault]} of the {count} lungs of its session show"
+    doubt = (
+        f"{who} {FAULTS[fault][0]}, which is likelier than a wrong label, so that whether "
+        f"{lung.label} holds is unknown."
+    )
+    match = replace(match, informative=False, doubt=doubt)
+    return replace(lung, match=match, settings=(), notes=(*lung.notes, doubt))
 
 
 def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -> Mechanics:
@@ -251,12 +304,19 @@ def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -
     notes = tuple(_notes(breaths, at_lung, table, noise))
     samples = sum(len(segment) for segment in at_lung)
     problem = problem_with(breaths, best.resistance(0.0), best.compliance())
+    shows = {fault: term in [s.name for s in selected] for fault, term in _FITTED.items()}
+    shows |= {
+        "unsound": problem is not None,
+        "clipped": any(found.column == "flow" for found in find_saturation(breaths)),
+    }
+    faults = tuple(fault for fault in FAULTS if shows[fault])
     if problem is not None:
         R, C = (Estimate(math.nan, unit, (math.nan, math.nan)) for unit in _UNITS)
         match = LungMatch(name, R.value, C.value, R.ci95, C.ci95, False, source)
         return Mechanics(
-            name, R, C, full.offset(), (), match, (), noise, len(table), samples, (problem, *notes)
-        )
+            name, R, C, full.offset(), (), match, (), noise, len(table), samples,
+            (problem, *notes), faults,
+        )  # fmt: skip
     match = match_label(label, best.resistance, best.compliance(), source)
     known = matching_settings(best.resistance, best.compliance())
     if match.label_matches:  # what holds comes first, whatever is nearer
@@ -264,7 +324,7 @@ def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -
     return Mechanics(
         name, best.resistance(0.0), best.compliance(), full.offset(),
         (*_delay_term(delayed_by, best), *(full.term(term) for term in selected)),
-        match, known, noise, len(table), samples, notes,
+        match, known, noise, len(table), samples, notes, faults,
     )  # fmt: skip
 
 

@@ -59,6 +59,7 @@ class LungMatch:
         source: ``pressure`` (given the valve's gain) or ``pressure and flow``.
         settings: ids of known settings that the lung may be, the nearest first.
         informative: False if the label is within tolerance only because the intervals are wide.
+        doubt: why the label cannot be judged although the intervals are narrow, as a sentence.
     """
 
     label: str
@@ -70,6 +71,7 @@ class LungMatch:
     source: str
     settings: tuple[str, ...] = ()
     informative: bool = True
+    doubt: str = ""
 
 
 #: Resistance, cmH2O/(L/s), at a flow, L/s.
@@ -150,6 +152,8 @@ def label_texts(match: LungMatch, settings: tuple[Lung, ...]) -> tuple[str, str]
     if not math.isfinite(match.fitted_C):
         return "unknown", "unknown"
     others = [setting.id for setting in settings if setting.id != match.label]
+    if match.doubt:
+        return "unknown", match.label
     if not match.informative:
         return "unknown", f"{match.label}, or {others[0]}" if others else match.label
     if match.label_matches:
@@ -210,3 +214,24 @@ def _of_fit(fit: Fit) -> list[tuple[Lung, Resistance, Estimate]]:
 
 def _log(ratio: float) -> float:
     return math.log(ratio) if ratio > 0.0 else -math.inf
+
+
+#: Before anything is seen: share of the sessions with a fault of a kind, and of the wrong labels.
+_FAULTY, WRONG = 0.05, 0.05
+
+
+def session_fault(shown: int, count: int, stray: float) -> float:
+    """Probability that a fault which some recordings of a session show is in all of them.
+
+    A fault of the session shows in a share ``s`` of its recordings, uniform before it is seen, so
+    that ``k`` of ``n`` show it with the probability ``1 / ((n + 1) binomial(n, k))``. In a sound
+    session each recording shows it by chance.
+
+    Args:
+        shown: number k of recordings that show the fault.
+        count: number n of recordings.
+        stray: share of the recordings of a sound session that show it.
+    """
+    by_fault = 1.0 / ((count + 1) * math.comb(count, shown))
+    by_chance = stray**shown * (1.0 - stray) ** (count - shown)
+    return _FAULTY * by_fault / (_FAULTY * by_fault + (1.0 - _FAULTY) * by_chance)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.mechanics.identify import Mechanics, identify
+from ventbench.mechanics.identify import Mechanics, identify, share_faults
 from ventbench.mechanics.labels import label_texts, value_text
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 from ventbench.recordings.respiraworks import RespiraWorksRun, load_respiraworks
@@ -67,7 +67,7 @@ def breaths_of(run: RespiraWorksRun) -> Breaths:
 def survey(
     path: str | os.PathLike[str], progress: Callable[[int, int], object] | None = None
 ) -> tuple[SurveyedRun, ...]:
-    """Identify the lung of every run of a RespiraWorks file.
+    """Identify the lung of every run of a RespiraWorks file; the runs of a day are one session.
 
     Args:
         path: the file.
@@ -76,15 +76,19 @@ def survey(
     Raises:
         RecordingError: if the file cannot be read.
     """
-    surveyed = []
+    found: list[Mechanics | None] = []
     runs = load_respiraworks(path)
     for run in runs:
         breaths = breaths_of(run)
         measured = breaths.flow is not None or breaths.volume is not None
-        surveyed.append(SurveyedRun(run, identify(breaths)[0] if measured else None))
+        found.append(identify(breaths)[0] if measured else None)
         if progress is not None:
-            progress(len(surveyed), len(runs))
-    return tuple(surveyed)
+            progress(len(found), len(runs))
+    for day in {run.name for run in runs}:
+        own = {i: lung for i, lung in enumerate(found) if lung and runs[i].name == day}
+        for i, lung in zip(own, share_faults(list(own.values())), strict=True):
+            found[i] = lung
+    return tuple(map(SurveyedRun, runs, found))
 
 
 def survey_table(surveyed: tuple[SurveyedRun, ...]) -> str:

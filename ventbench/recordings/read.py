@@ -132,6 +132,9 @@ VARIABLE = "VENTBENCH_RECORDINGS"
 
 FilePath = str | os.PathLike[str]
 
+#: What a session on a bench calls its recording, and how the names of recordings end.
+SESSION, _SUFFIXES = "recording.csv.gz", (".csv", ".csv.gz", ".parquet", ".pq")
+
 
 #: What is told how much of a file has been read, and of how much: bytes, or rows of Parquet.
 Progress = Callable[[int, int], object]
@@ -147,8 +150,9 @@ def load(
     """Read a recording (CSV, gzipped CSV or Parquet) into memory.
 
     Args:
-        path: the file; or a table in memory with the same columns, such as
-            :meth:`~ventbench.Breaths.to_frame` returns. Breaths are returned as they are.
+        path: the file; the folder of a session, whose recordings become one; or a table in memory
+            with the same columns, such as :meth:`~ventbench.Breaths.to_frame` returns. Breaths are
+            returned as they are.
         clip: clip u_in to 0..100 %.
         pad: accept breaths of unequal length and pad the short ones (see `Breaths`).
         progress: called with how much has been read and of how much, block by block.
@@ -168,6 +172,11 @@ def load(
     """
     if isinstance(path, Breaths):
         return path
+    if isinstance(path, str | os.PathLike) and Path(path).is_dir():
+        first, *others = session_files(path)
+        if others:
+            return _joined((first, *others), clip=clip, progress=progress)
+        path = first
     source = open_source(path)
     log = ProblemLog(source.file)
     tally = Tally()
@@ -188,6 +197,36 @@ def load(
     breaths = _assemble(whole, tally.table(), source.file)
     file = None if source.kind == "table" else source.file
     return replace(breaths, source=file, sha256=source.sha256, notes=notes)
+
+
+def session_files(path: FilePath) -> tuple[Path, ...]:
+    """The recordings of a session: those of a folder, by name; or the file itself.
+
+    Args:
+        path: a file, or a folder of recordings; that of a session on a bench has one.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        return (folder,)
+    if (folder / SESSION).is_file():
+        return (folder / SESSION,)
+    files = (file for file in folder.iterdir() if file.name.endswith(_SUFFIXES))
+    return tuple(sorted(files)) or (folder,)
+
+
+def _joined(files: tuple[Path, ...], *, clip: bool, progress: Progress | None) -> Breaths:
+    """The breaths of a session, numbered in the order of its files; short ones are padded."""
+    import pandas as pd
+
+    frames, notes, first = [], [], 1
+    for file in files:
+        part = load(file, clip=clip, pad=True, progress=progress)
+        last = first + len(part) - 1
+        notes += [f"Breaths {first} to {last} are those of {file.name}.", *part.notes]
+        frames.append(replace(part, breath_id=np.arange(first, last + 1)).to_frame())
+        first = last + 1
+    whole = load(pd.concat(frames, ignore_index=True), pad=True)
+    return replace(whole, source=str(files[0].parent), notes=tuple(notes))
 
 
 def check(

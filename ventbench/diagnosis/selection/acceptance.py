@@ -82,6 +82,24 @@ def is_consistent(gains: np.ndarray, settings: PlausibilitySettings) -> bool:
     return bool(np.quantile(drawn.sum(axis=1), settings.bootstrap_level) > 0.0)
 
 
+def explained_share(worth: float, left: float, rest: float) -> float:
+    """Share of the squared error which is no noise that a name explains, 0..1.
+
+    A name may be no more than the shadow of an effect that the library lacks: if one effect causes
+    both, the name's part is the squared correlation of its template with that effect.
+
+    Args:
+        worth: root-mean-square error that the name takes away, cmH2O; NaN if unknown.
+        left: error with the name, cmH2O.
+        rest: part of it that tests of the residuals show to be no noise, cmH2O.
+
+    Returns:
+        The share; 1 where nothing is known to be left.
+    """
+    explained = max(worth, 0.0) * (2.0 * left + max(worth, 0.0))
+    return explained / (explained + rest**2) if rest > 0.0 and np.isfinite(worth) else 1.0
+
+
 def passes_heldout_test(
     gains: Floats,
     settings: HeldOutTestSettings = DEFAULT.held_out_test,

@@ -154,7 +154,7 @@ def _fitted_instead(
         return list(known[-1].ranked[1 : count + 1])
     base = evaluator.fit(rest, selected.noise, selected)
     white = fit_with_white_noise(evaluator, base)
-    candidates = screen_mechanisms(base, white, evaluator.settings, evaluator.allowed_mechanisms)
+    candidates = screen_mechanisms(base, white, evaluator.allowed_mechanisms)
     others = [candidate for candidate in candidates if candidate.name != name]
     comparison = compare_candidates(evaluator, base, others, white, restarts=False, rival=selected)
     if comparison is None or not passes_heldout_test(

@@ -89,7 +89,7 @@ def forward_selection(
             break
         tell(f"comparing mechanisms ({len(current.names)} selected)")
         white = fit_with_white_noise(evaluator, current)
-        candidates = screen_mechanisms(current, white, settings, evaluator.allowed_mechanisms)
+        candidates = screen_mechanisms(current, white, evaluator.allowed_mechanisms)
         comparison = compare_candidates(evaluator, current, candidates, white)
         if comparison is not None:
             comparisons.append(comparison)

@@ -303,7 +303,7 @@ def special_case_of(
     without = evaluator.fit(selected.hypothesis, noise, selected)
     whole = unnamed.full.log_likelihood - without.log_likelihood
     white = fit_with_white_noise(evaluator, selected)
-    candidates = screen_mechanisms(selected, white, evaluator.settings, names)
+    candidates = screen_mechanisms(selected, white, names)
     comparison = compare_candidates(evaluator, selected, candidates, white)
     # R, C and the valves that were fitted beside the term are near the truth; those fitted without
     # it make up for the effect, and a fit that starts from them may end in a local minimum.

@@ -22,7 +22,7 @@ from ventbench.diagnosis.hypothesis import (
     varies_by_breath,
 )
 from ventbench.diagnosis.patient_effort import breath_term
-from ventbench.diagnosis.settings import ScreeningSettings, SelectionConfig
+from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.catalogue import (
     basis_terms,
     intermittent,
@@ -35,6 +35,16 @@ from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Floats
 from ventbench.system_id.predictor import Predictor
 from ventbench.system_id.problem import BETWEEN
+
+#: Least and largest multiple of a template that starts a fit; first order does not hold far.
+_STEPS = (0.2, 3.0)
+
+#: Nats by which another shape than the default must promise more to be fitted from the start; a
+#: parameter costs about half the logarithm of the samples.
+_SHAPE_PROMISE = 4.0
+
+#: Directions of one compiled derivative.
+_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
@@ -65,10 +75,7 @@ class Candidate:
 
 
 def screen_mechanisms(
-    fitted: FittedModel,
-    whitened: FittedModel,
-    settings: SelectionConfig,
-    names: tuple[str, ...] | None = None,
+    fitted: FittedModel, whitened: FittedModel, names: tuple[str, ...] | None = None
 ) -> list[Candidate]:
     """Rank the mechanisms that a hypothesis does not have, the most promising first.
 
@@ -79,20 +86,16 @@ def screen_mechanisms(
     Args:
         fitted: the hypothesis.
         whitened: the hypothesis, fitted at white noise.
-        settings: every threshold.
         names: mechanisms to rank; the whole library if None.
     """
-    linear = [
-        linearise(model.problem, model.minimum.x, settings.screening)
-        for model in (fitted, whitened)
-    ]
+    linear = [linearise(model.problem, model.minimum.x) for model in (fitted, whitened)]
     predictor = fitted.problem.predictor
     missing = [name for name in names or library() if name not in fitted.names]
 
     def candidate(name: str) -> Candidate:
-        screened = breath_term((name,), settings).screen(linear)
+        screened = breath_term((name,)).screen(linear)
         if screened is None:
-            return _screen(predictor, linear, name, settings.screening)
+            return _screen(predictor, linear, name)
         nats, white_nats = screened.nats
         return Candidate(name, Hypothesis((name,)), screened.start, nats, white_nats)
 
@@ -103,9 +106,7 @@ def screen_mechanisms(
     return list({candidate.name: candidate for candidate in mixed}.values())
 
 
-def _screen(
-    predictor: Predictor, linear: list[Linearisation], name: str, settings: ScreeningSettings
-) -> Candidate:
+def _screen(predictor: Predictor, linear: list[Linearisation], name: str) -> Candidate:
     """Simulate a mechanism at all points of its grid, and keep the best.
 
     A shape parameter is free where another value than its default promises more.
@@ -143,7 +144,7 @@ def _screen(
             continue
         if all(given.get(path, neutral) == neutral for path, neutral in shapes.items()):
             usual[k] = max(usual[k], nats)
-        step = float(np.clip(multiple, settings.min_step, settings.max_step))
+        step = float(np.clip(multiple, *_STEPS))
         scale = 1.0 if first.kinked else step
         strength = float(np.clip(given[own[0]] * scale, first.low, first.high))
         place = tuple(given[path] for path in several)
@@ -155,7 +156,7 @@ def _screen(
             start, simulated = given | {own[0]: strength}, given
         best[k] = nats
     fixed = {p: v for p, v in start.items() if parameter(p).discrete and v != parameter(p).neutral}
-    asked = float(best.max() - usual.max()) > settings.shape_promise
+    asked = float(best.max() - usual.max()) > _SHAPE_PROMISE
     free = tuple(p for p in shapes if asked and start.get(p, shapes[p]) != shapes[p])
     added = Hypothesis((name,), free, tuple(fixed.items()))
     rest = tuple(trial for _, trial in starts.values() if trial != start) if several else ()
@@ -238,10 +239,10 @@ def score_nonparametric_terms(fitted: FittedModel, settings: SelectionConfig) ->
     """
     missing = [name for name in nonparametric_terms(settings) if name not in fitted.names]
     columns = [f"{n}.{p.name}" for n in missing for p in mechanism(n).description.parameters]
-    slopes = _slopes(fitted, columns, settings.screening.derivatives_at_once)
+    slopes = _slopes(fitted, columns)
     problem, x = fitted.problem, fitted.minimum.x
     white = replace(problem, noise=replace(problem.noise, ar=(0.0, 0.0)))
-    linear = [linearise(at, x, settings.screening) for at in (problem, white)]
+    linear = [linearise(at, x) for at in (problem, white)]
     projected = [
         linearisation.without_shared(linearisation.without_own(linearisation.whiten(slopes)))
         for linearisation in linear
@@ -258,15 +259,15 @@ def score_nonparametric_terms(fitted: FittedModel, settings: SelectionConfig) ->
     return sorted(candidates, key=lambda candidate: -candidate.promise)
 
 
-def _slopes(fitted: FittedModel, columns: list[str], together: int) -> Floats:
+def _slopes(fitted: FittedModel, columns: list[str]) -> Floats:
     """Derivatives of the prediction by coefficients, ``(n, q, c, T)``."""
     predictor = fitted.problem.predictor
     index = [predictor.names.index(path) for path in columns]
     parts = []
-    for first in range(0, len(index), together):
-        some = index[first : first + together]
+    for first in range(0, len(index), _AT_ONCE):
+        some = index[first : first + _AT_ONCE]
         # Filled up to one size, so that one compiled function serves.
-        filled = tuple(some + some[:1] * (together - len(some)))
+        filled = tuple(some + some[:1] * (_AT_ONCE - len(some)))
         parts.append(predictor.derivatives(fitted.values, filled)[1][:, : len(some)])
     return np.concatenate(parts, axis=1)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -242,53 +242,37 @@ def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
     sentence for each conflict, with the record's hash.
     """
     sentences: list[str] = []
-    before = _Before()
+    known: dict[str, Record | HardwareRecord] = {}  # by hash
+    first: dict[str, Record] = {}  # on each draws, by their name
+    newest: dict[tuple[str, str, str], Record] = {}  # of each entry, by draws, track and name
+    withdrawn: set[str] = set()
     for index, entry in enumerate(records):
-        if index >= start:
-            sentences += _conflicts(entry, before)
-        before.append(entry)
+        name, found = f"record {entry.sha256}", list[str]()
+        if isinstance(entry, Withdrawal):
+            if entry.withdraws not in known:
+                found = [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
+            elif entry.withdraws in withdrawn:
+                found = [f"{name} withdraws {entry.withdraws[:12]} once more"]
+            withdrawn.add(entry.withdraws)
+        else:
+            if entry.sha256 in known:
+                found = [f"{name} is on the leaderboard already"]
+            elif isinstance(entry, Record):
+                common = first.get(entry.header.draws.season)
+                found = _conflicts(entry, common, newest.get(entry.key), known)
+            known[entry.sha256] = entry
+            if isinstance(entry, Record):
+                first.setdefault(entry.header.draws.season, entry)
+                newest[entry.key] = entry
+        sentences += found if index >= start else []
     return sentences
 
 
-@dataclass
-class _Before:
-    """What the records before one say.
-
-    The first score on each draws, by their name; the newest of each entry, by draws, track and
-    name; all scores, by hash; hashes of hardware records, and of what was taken back.
-    """
-
-    first: dict[str, Record] = field(default_factory=dict)
-    newest: dict[tuple[str, str, str], Record] = field(default_factory=dict)
-    known: dict[str, Record] = field(default_factory=dict)
-    hardware: set[str] = field(default_factory=set)
-    withdrawn: set[str] = field(default_factory=set)
-
-    def append(self, entry: AnyRecord) -> None:
-        if isinstance(entry, Withdrawal):
-            self.withdrawn.add(entry.withdraws)
-        elif isinstance(entry, HardwareRecord):
-            self.hardware.add(entry.sha256)
-        else:
-            self.first.setdefault(entry.header.draws.season, entry)
-            self.newest[entry.key] = entry
-            self.known[entry.sha256] = entry
-
-
-def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
-    name = f"record {entry.sha256}"
-    if isinstance(entry, Withdrawal):
-        if entry.withdraws not in before.known and entry.withdraws not in before.hardware:
-            return [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
-        if entry.withdraws in before.withdrawn:
-            return [f"{name} withdraws {entry.withdraws[:12]} once more"]
-        return []
-    if entry.sha256 in before.known or entry.sha256 in before.hardware:
-        return [f"{name} is on the leaderboard already"]
-    sentences: list[str] = []
-    if isinstance(entry, HardwareRecord):
-        return sentences
-    first = before.first.get(entry.header.draws.season)
+def _conflicts(
+    entry: Record, first: Record | None, newest: Record | None, known: Mapping[str, Any]
+) -> list[str]:
+    """Conflicts of a score with the first on its draws, the newest of its entry, and all others."""
+    name, sentences = f"record {entry.sha256}", list[str]()
     if first is not None:
         # Records can only be compared over the same simulators, draws and reference errors.
         keys = ("simulators", "draws", "headroom")
@@ -298,7 +282,7 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
             for key, own, common in zip(keys, entry.basis, first.basis, strict=True)
             if own != common
         ]
-    superseded, newest = entry.header.supersedes, before.newest.get(entry.key)
+    superseded = entry.header.supersedes
     if superseded is None:
         if newest is not None:
             sentences.append(
@@ -306,8 +290,8 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
                 f"{newest.sha256[:12]}; a new one must name it, with --supersedes and a --reason"
             )
         return sentences
-    old = before.known.get(superseded)
-    if old is None:
+    old = known.get(superseded)
+    if not isinstance(old, Record):
         sentences.append(f"{name}, key supersedes: {superseded[:12]} is not there")
     elif old.key != entry.key:
         sentences.append(f"{name}, key supersedes: is of another entry or track")

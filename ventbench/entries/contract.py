@@ -284,6 +284,7 @@ _ADVICE = {
     "timeout": "answer within milliseconds; train before submitting",
     "memory": "keep to 512 MiB beyond Python and its packages",
 }
+_IMPORT_ADVICE = "it must be possible to import it with what the sandbox has"
 _OTHER_ADVICE = "see the limits of the sandbox in docs/submitting.md"
 _TO_RUN: tuple[Group, ...] = ("run", "repeat", "time")
 
@@ -320,7 +321,9 @@ def check(
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))
     findings = list(inspect_folder(folder))
-    opened = _opened(name)
+    opened = None
+    with contextlib.suppress(SubmissionError):  # the checks have said why
+        opened = open_submission(name)
     if opened is None or any(f.problem for f in findings if f.group == "source"):
         return _report(name, findings, left_out=_TO_RUN)
     done = 0
@@ -343,13 +346,6 @@ def assert_ready(name: str, runner: Runner | None = None) -> None:
     report = check(name, runner)
     if not report.ok:
         raise AssertionError("\n".join(report.lines()))
-
-
-def _opened(name: str) -> Submission | None:
-    try:
-        return open_submission(name)
-    except SubmissionError:
-        return None  # the checks have said why
 
 
 def _ran(
@@ -375,7 +371,9 @@ def _ran(
             answers = joined(answers, run_all(driver, [thrice], runner, clock, count))
             runs = [*runs, thrice]
     except SubmissionError as error:
-        problems = [_import_finding(problem, name) for problem in error.problems]
+        # Each begins with the label.
+        texts = [problem.removeprefix(f"{name}: ") for problem in error.problems]
+        problems = [_placed("run", text, _IMPORT_ADVICE) for text in texts]
         return _report(name, [*findings, *problems], left_out=_TO_RUN[1:], sandbox=sandbox)
     findings += _failure_findings(runs, answers) or _failure_findings([timed_run], timed_answers)
     findings += _clipping_notes(answers.commands[: len(plain_runs)])
@@ -394,12 +392,6 @@ def _ran(
 def _report(name: str, findings: list[Finding], **others: object) -> CheckReport:
     order = sorted(findings, key=lambda finding: GROUPS.index(finding.group))
     return CheckReport(name, tuple(order), **others)  # type: ignore[arg-type]
-
-
-def _import_finding(problem: str, label: str) -> Finding:
-    """Finding of a submission that cannot be imported, whose label the problem begins with."""
-    advice = "it must be possible to import it with what the sandbox has"
-    return _placed("run", problem.removeprefix(f"{label}: "), advice)
 
 
 def _failure_findings(runs: Sequence[ContractRun], answers: Answers) -> list[Finding]:

@@ -135,7 +135,9 @@ def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
     from hardware_eval.emulation.loopback import loopback
     from hardware_eval.emulation.simulated import simulated_lung
 
-    device = loopback(simulated_lung(port.removeprefix(VIRTUAL)))
+    # With the noise and the converter of a PVP: without them all repeats would be one.
+    lung = simulated_lung(port.removeprefix(VIRTUAL), noise=0.1, quantum=0.0703)
+    device = loopback(lung)
     return device, device.clock
 
 

@@ -86,7 +86,7 @@ def _reset(
     return _pack(states.episode), _pack(states.progress), states.episode.cell.pip, seen.T
 
 
-@partial(jax.jit, static_argnames="layouts")
+@partial(jax.jit, static_argnames="layouts", donate_argnames=("progress", "count"))
 def _step(
     episodes: Array,
     progress: Array,
@@ -232,8 +232,9 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         ended, info = ~nothing if self._count == STEPS else nothing.copy(), {}
         if self._count == STEPS:
             info = {"error": np.asarray(error) / environment.SCORED_STEPS, "_error": ended}
-        # Copies, which may be written to, as learners expect.
-        return np.array(seen.T, order="C"), np.array(reward), ended, nothing, info
+        # Copies, which may be written to, as learners expect; turned by numpy, not one more program.
+        turned = np.array(np.asarray(seen).T, order="C")
+        return turned, np.array(reward), ended, nothing, info
 
 
 class Ventilator(gymnasium.Env[Floats, Floats]):
@@ -301,7 +302,7 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         if self._one._count >= STEPS:
             raise InputError("no episode is under way: call reset() first")
         seen, reward, ended, _, last = self._one.step(np.asarray(action, np.float32).reshape(1, 1))
-        info = {**self._info, "pressure": float(self._one.pressure[0])}
+        info = {**self._info, "pressure": float(np.asarray(self._one.pressure)[0])}
         u_in = 50.0 + 50.0 * float(np.ravel(action)[0])
         self._seen.append((info["pressure"], 40.0 * float(seen[0, 1]), u_in))
         if ended[0]:

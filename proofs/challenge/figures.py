@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -259,27 +258,14 @@ def paired(ours: Mapping[Any, JudgedCase], other: Mapping[Any, JudgedCase]) -> d
     return found
 
 
-_NOTHING, _SEVERAL, _LOST = "nothing missing", "several names", "no answer"
-
 #: Most hypotheses of equal probability that are told one by one.
 _TOLD = 3
-
-
-def confusion(cases: Sequence[JudgedCase]) -> dict[str, dict[str, int]]:
-    """Counts by truth, then by answer, over the cases with one effect or none."""
-    table: dict[str, Counter[str]] = {}
-    for case in sorted(cases, key=lambda c: c.effects):
-        if len(case.effects) <= 1:
-            truth = case.effects[0] if case.effects else _NOTHING
-            answer = full_answer(case) if len(case.named) <= 1 else _SEVERAL
-            table.setdefault(truth, Counter())[answer] += 1
-    return {truth: dict(counts.most_common()) for truth, counts in table.items()}
 
 
 def full_answer(case: JudgedCase) -> str:
     """The likeliest hypotheses in words."""
     if case.problem:
-        return _LOST
+        return "no answer"
     if len(case.leading) > _TOLD:
         return f"{len(case.leading)} answers alike"
-    return " or ".join(" + ".join(sorted(terms)) or _NOTHING for terms in case.leading)
+    return " or ".join(" + ".join(sorted(terms)) or "nothing missing" for terms in case.leading)

@@ -37,7 +37,7 @@ _RIVALS = {"leak": (), "lag": ("circuit_compliance",)}
 _KNOWN = ("exhalation_valve_delay", "circuit_compliance", "valve_curve", "sensor_lag")
 
 #: Kinds that need minutes a pair.
-SLOW = ("leak_driven", "lag_driven", "lung_pressure", "gain_pressure", "lag_pressure")
+SLOW = ("lung_pressure", "gain_pressure", "lag_pressure")
 
 
 @dataclass(frozen=True)
@@ -139,28 +139,6 @@ def _has_grown(now: Term | None, before: Term | None) -> bool:
     return x.ci95[0] > y.ci95[1]
 
 
-def _driven(pair: Pair, material: Material) -> Answered:
-    """An added leak or lag by two diagnoses from flow: what is named with it and not without."""
-    from ventbench.diagnosis.diagnose import diagnose
-
-    kind = pair.kind.removesuffix("_driven")
-    add = with_leak if kind == "leak" else slower_sensor
-    diagnosis = diagnose(
-        add(material.runs[pair.second], pair.strength), patient=False, drive="flow"
-    )
-    wanted = _NAMES[kind]
-    named = {mechanism.name: mechanism for mechanism in diagnosis.mechanisms}
-    before = material.driven(pair.first)
-    value, interval = None, None
-    if wanted in named:
-        estimate = next(iter(named[wanted].parameters.values()))
-        value, interval = estimate.value, estimate.ci95
-    wrong = tuple(sorted(set(named) - before - {wanted, *_RIVALS[kind]}))
-    in_class = wanted in named or bool(set(_RIVALS[kind]) & (set(named) - before))
-    words = ", ".join(named) or "nothing"
-    return Answered(pair, words, wanted in named, wrong, value, interval, in_class)
-
-
 def with_leak(breaths: Breaths, slope: float) -> Breaths:
     """Add a linear leak between flow sensor and lung to a recording.
 
@@ -235,7 +213,6 @@ def _lung_of(breaths: Breaths) -> Lung:
 
 _TOOLS: dict[str, Callable[[Pair, Material], Answered]] = {
     "label": _label, "lung": _lung, "drive": _lung, "leak": _added, "lag": _added,
-    "leak_driven": _driven, "lag_driven": _driven,
     "lung_pressure": _diagnosed, "gain_pressure": _diagnosed, "lag_pressure": _diagnosed,
 }  # fmt: skip
 

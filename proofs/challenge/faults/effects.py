@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, Strength
-from proofs.challenge.questions import DrawnCase, Kind
-from ventbench.base.errors import InputError
+from proofs.challenge.questions import DrawnCase, Kind, drawn
 from ventbench.task.lungs import Lung
 
 
@@ -116,23 +115,8 @@ _SAMPLING = ((0.03, 84), (0.025, 100), (0.0333, 76))
 
 
 def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
-    """Draw cases of one kind or of all kinds, in random order.
-
-    Raises:
-        InputError: if the generator has no such kind, or there are fewer cases than kinds.
-    """
-    if kind != "all" and kind not in SHARES:
-        raise InputError(f"the generator faults has no kind {kind}; choose {', '.join(SHARES)}")
-    if count < (len(SHARES) if kind == "all" else 1):
-        raise InputError(f"{count} cases are too few; ask for at least {len(SHARES)}")
-    sizes: dict[Kind, int] = {}
-    if kind == "all":
-        sizes = {each: max(1, int(share * count)) for each, share in SHARES.items()}
-        sizes["single"] += count - sum(sizes.values())
-    else:
-        sizes[kind] = count
-    cases = [DrawnCase(each, case) for each, n in sizes.items() for case in _of_kind(each, n, rng)]
-    return [cases[i] for i in rng.permutation(len(cases))]
+    """See :func:`proofs.challenge.questions.drawn`."""
+    return drawn(SHARES, _of_kind, kind, count, rng)
 
 
 def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[FaultsCase]:

@@ -45,11 +45,13 @@ class Disturbances:
     """
 
     def __init__(self, effects: EffectsByName, began: Floats, rng: np.random.Generator) -> None:
-        n = len(began)
+        # The same breath has the same random numbers, however often it is asked for.
+        alike, which = np.unique(began, return_inverse=True)
+        n = len(alike)
         # Drawn in any case, so that one effect does not change the random numbers of the others.
-        present = rng.uniform(size=n) < _EFFORT_SHARE
-        self._onset = rng.uniform(0.0, 1.2, n)
-        size = rng.uniform(0.7, 1.3, n)
+        present = (rng.uniform(size=n) < _EFFORT_SHARE)[which]
+        self._onset = rng.uniform(0.0, 1.2, n)[which]
+        size = rng.uniform(0.7, 1.3, n)[which]
         phases = rng.uniform(0.0, 2.0 * np.pi, 2)
         self._effort = effects.get("patient_effort")
         if self._effort:
@@ -245,7 +247,7 @@ class Circuit:
         self._tubing = 1e-3 * parameter("circuit_compliance", "compliance")
         self._mass = parameter("inertance", "inertance")
         self._stress = parameter("viscoelasticity", "ratio") / self._recoil.C
-        self._relax = parameter("viscoelasticity", "time") or 1.0
+        self._relax = parameter("viscoelasticity", "time")
         self._slow = parameter("sensor_lag", "tau")
         self._second: tuple[float, float] | None = None
         if "second_compartment" in effects:
@@ -283,7 +285,7 @@ class Circuit:
         q = self._supplied(x, after, h, asked, t)
         inside = -self._disturbances.pull(t)
         slope = 0.0
-        if self._stress:
+        if self._relax:
             left = 1.0 / (1.0 + h / self._relax)
             inside = inside + x[STRESS] * left
             slope = h * self._stress * left
@@ -344,7 +346,7 @@ class Circuit:
             after[SECOND] = x[SECOND] + h * (flow - first)
         else:
             after[VOLUME] = x[VOLUME] + h * flow
-        if self._stress:
+        if self._relax:
             after[STRESS] = x[STRESS] / (1.0 + h / self._relax) + slope * flow
 
     def _supplied(self, x: Floats, after: Floats, h: Floats, asked: Floats, t: Floats) -> Floats:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case, Effect
+from proofs.challenge.questions import coloured_noise
 
 Floats = NDArray[np.float64]
 EffectsByName = Mapping[str, Effect]
@@ -113,13 +114,7 @@ class Sensor:
     ) -> None:
         self._step = case.step
         n = len(position)
-        white = rng.standard_normal((n, case.samples))
-        slow = rng.standard_normal((n, case.samples))
-        fresh = np.sqrt(1.0 - case.correlation**2)
-        for k in range(1, case.samples):
-            slow[:, k] = case.correlation * slow[:, k - 1] + fresh * slow[:, k]
-        mixed = np.sqrt(1.0 - case.coloured) * white + np.sqrt(case.coloured) * slow
-        self._noise = case.noise * mixed
+        self._noise = coloured_noise(case, case.correlation, rng, (n, case.samples))
         self._offset = np.zeros(n)
         if "sensor_drift" in effects:
             drift = effects["sensor_drift"]

@@ -113,13 +113,14 @@ def summaries(breaths: Breaths) -> Floats:
         np.log(spread / noise), np.log(noise), line[0] - 5.0,
         np.log(max(line[1], 0.1) / breaths.R[0]), np.log(max(line[2], 0.1) * breaths.C[0] / 1e3),
         np.log(breaths.R[0]), np.log(breaths.C[0]), np.log(step), np.log(len(u)),
-        np.log(np.mean(r[inside] ** 4) / spread**4), np.mean(np.isclose(p[inside], p.max(), atol=0.05)),
+        np.log(np.mean(r[inside] ** 4) / spread**4),
+        np.mean(np.isclose(p[inside], p.max(), atol=0.05)),
     ]  # fmt: skip
     signals = (
         q**2, v**2, q * v, np.gradient(q, axis=1), late, _late(q, 2) - q, _late(q, 4) - q,
         np.cumsum(np.where(inside, above, 0.0), axis=1), np.cumsum(v, axis=1), np.exp(-time / 0.05),
         np.exp(-time / 0.2), above**2, above * q, np.maximum(p - high, 0.0), n, n * q, n * v,
-        n * late, time * late, np.sin(2.0 * np.pi * u), np.sin(np.pi * u), _late((u > 0.0) * 1.0, 1),
+        n * late, time * late, np.sin(2.0 * np.pi * u), np.sin(np.pi * u), _late(np.sign(u), 1),
         _late(np.minimum(u, 4.0), 1), np.cumsum(q, axis=1) * q, time, _late(np.sign(change), 1),
     )  # fmt: skip
     x = np.stack([signal[inside] for signal in signals], axis=1)

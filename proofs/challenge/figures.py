@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
 from proofs.challenge.judge import CONFIDENT, JudgedCase
 from proofs.challenge.questions import CLASSES
@@ -45,11 +46,8 @@ class Figure:
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % score interval (Wilson) of a share."""
-    z = 1.959964
-    centre = hits + z * z / 2
-    reach = z * np.sqrt(hits * (count - hits) / count + z * z / 4)
-    low, high = (centre - reach) / (count + z * z), (centre + reach) / (count + z * z)
-    return max(float(low), 0.0), min(float(high), 1.0)
+    found = binomtest(hits, count).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def share(

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from proofs.cli import tabulated
+from ventbench.base.files import json_values
 from ventbench.cli.options import (
     JsonFile,
     RecordingsDir,
@@ -77,9 +78,8 @@ def samples(
 
 
 def _plain(table: Any) -> list[dict[str, Any]]:
-    rows = table.to_dict("records")
     # What is not reached is NaN in the table and null in JSON.
-    return [{k: None if v != v else v for k, v in row.items()} for row in rows]
+    return json_values(table.to_dict("records"))
 
 
 def _summary(result: Any, frame: Any) -> Any:

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 import ventbench
@@ -271,16 +272,8 @@ def _open(path: Path, kinds: tuple[str, ...]) -> None:
 
 def _stored(path: Path, pair: Pair) -> Answered | None:
     try:
-        plain = json.loads(path.read_text("utf-8"))
-        value = Answered(
-            Pair(**plain.pop("pair")),
-            **plain
-            | {
-                "wrong_names": tuple(plain["wrong_names"]),
-                "interval": tuple(plain["interval"]) if plain["interval"] else None,
-            },
-        )
-    except (OSError, ValueError, TypeError, KeyError):
+        value = msgspec.json.decode(path.read_bytes(), type=Answered)
+    except (OSError, msgspec.DecodeError):
         return None
     return value if value.pair == pair else None
 

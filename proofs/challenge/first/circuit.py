@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Base
-from proofs.challenge.first.instruments import EffectsByName, Floats
+from proofs.challenge.first.instruments import EffectsByName, Floats, solve_falling
 
 #: Flow at which both forms of turbulence cost the same pressure, L/s.
 _EQUAL_TURBULENCE = 0.7
@@ -139,12 +139,11 @@ class Recoil:
 
 def _sigmoid_width(capacity: float) -> float:
     """Width of the sigmoid whose span above zero pressure is ``capacity``, both cmH2O."""
-    low, high = 1.0, 100.0
-    for _ in range(80):
-        d = 0.5 * (low + high)
-        span = 4.0 * d * (1.0 - 1.0 / (1.0 + np.exp(_LOWER_BEND / d)))
-        low, high = (d, high) if span < capacity else (low, d)
-    return low
+
+    def missing(d: float) -> float:
+        return -4.0 * d * (1.0 - 1.0 / (1.0 + np.exp(_LOWER_BEND / d)))
+
+    return solve_falling(missing, -capacity, 1.0, 100.0)
 
 
 class Airway:

@@ -4,12 +4,13 @@ Amortised inference in the sense of K. Cranmer, J. Brehmer, G. Louppe (PNAS 117 
 recording becomes a row of summaries of what a line through pressure, flow and volume leaves, by
 phase and breath, and small networks give each term of the vocabulary a probability of its own.
 ``benchmarks/train_classifier.py`` trains them on draws that are no challenge's. It knows the
-generators, which no other diagnoser does; sizes of effects it does not tell.
+generators, which no other diagnoser does; sizes of effects, R and C it does not tell.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from proofs.diagnosers.common import intervals, see
+from ventbench import recordings
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id import fit
 
-Floats = NDArray[np.float64]
+Floats, Flags = NDArray[np.float64], NDArray[np.bool_]
 
 #: The weights, with what they were trained on, and their SHA-256.
 WEIGHTS = Path(__file__).with_suffix(".npz")
@@ -40,15 +40,31 @@ _BANDS, _AFTER = ((0.5, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 15.0)), (1, 3, 8)
 
 def diagnose(folder: Path) -> dict[str, Any]:
     """Answer a case."""
-    seen = see(folder)
-    weights = load()
-    (chances,) = probabilities(weights, summaries(seen.breaths.select(~seen.apart))[None])
-    fitted = fit(seen.observed)
+    question = json.loads((folder / "case.json").read_text())
+    breaths = recordings.load(folder / question["recording"])
+    apart = np.isin(breaths.breath_id, question["withheld"])
+    seen, asked, weights = breaths.select(~apart), breaths.select(apart), load()
+    (chances,) = probabilities(weights, summaries(seen)[None])
+    told = zip(asked.breath_id.tolist(), predicted(seen, asked), asked.valid, strict=True)
     return {
         "hypotheses": hypotheses(weights["terms"].tolist(), chances),
-        "pressures": seen.pressures(seen.predict(fitted)),
-        "parameters": intervals(fitted, ("R", "C")),
+        "pressures": {str(breath): p[valid].tolist() for breath, p, valid in told},
     }
+
+
+def predicted(seen: Breaths, asked: Breaths) -> Floats:
+    """Pressures of breaths by the line, cmH2O, ``(k, T)``; an expiration falls as those seen do."""
+    base, inside, out, p = _line(seen)
+    line = np.linalg.lstsq(base[inside], p[inside], rcond=None)[0]
+    rows, last = np.arange(len(p)), seen.valid.sum(axis=1) - 1
+    rest, opened = float(np.median(p[rows, last])), np.argmax(seen.u_out == 1, axis=1)
+    after = np.minimum(opened[:, None] + np.arange(p.shape[1]), last[:, None])
+    above = np.where(out[rows[:, None], after], p[rows[:, None], after] - rest, 0.0).sum(axis=0)
+    base = _line(asked)[0]
+    told, opened = base @ line, np.argmax(asked.u_out == 1, axis=1)
+    since = np.maximum(np.arange(told.shape[1]) - opened[:, None], 0)
+    top = told[np.arange(len(told)), opened][:, None] - rest
+    return np.where(asked.u_out == 0, told, rest + top * (above / max(above[0], 1e-9))[since])
 
 
 def load() -> dict[str, NDArray[Any]]:
@@ -90,18 +106,12 @@ def hypotheses(terms: list[str], chances: Floats) -> list[dict[str, Any]]:
 
 def summaries(breaths: Breaths) -> Floats:
     """Summaries of a recording whose breaths have pressures, ``(m,)``."""
-    u, p = breaths.u_in, np.nan_to_num(breaths.pressure)
-    counted = breaths.valid & np.isfinite(breaths.pressure)
-    dt = np.where(breaths.valid, breaths.dt, 0.0)
-    inside, out = counted & (breaths.u_out == 0), counted & (breaths.u_out == 1)
-    inside[:, 0] = False
+    base, inside, out, p = _line(breaths)
+    u, q, v = breaths.u_in, base[..., 1], base[..., 2]
     step = float(np.median(breaths.dt[breaths.valid]))
     rows, last = np.arange(len(u)), breaths.valid.sum(axis=1) - 1
     n = np.broadcast_to(np.linspace(-1.0, 1.0, len(u))[:, None], u.shape)
-    # A command acts from its sample on, a pressure is read before it.
-    q = _late(np.where(breaths.u_out == 0, _GAIN * u, 0.0), 1)
-    v, time = np.cumsum(q * _late(dt, 1), axis=1), np.cumsum(_late(dt, 1), axis=1)
-    base = np.stack([np.ones_like(q), q, v], axis=-1)
+    time = np.cumsum(_late(np.where(breaths.valid, breaths.dt, 0.0), 1), axis=1)
     frame, upper = np.linalg.qr(base[inside])
     line = np.linalg.solve(upper + 1e-9 * np.eye(3), frame.T @ p[inside])
     r = np.where(inside, p - base @ line, 0.0)
@@ -148,6 +158,17 @@ def summaries(breaths: Breaths) -> Floats:
     for series in (*each.T, p[:, 0], *silent, breathed):
         found += _course(series)
     return np.nan_to_num(np.array(found, float), posinf=0.0, neginf=0.0)
+
+
+def _line(breaths: Breaths) -> tuple[Floats, Flags, Flags, Floats]:
+    """One, flow and volume, ``(n, T, 3)``; samples that count in either phase; pressures."""
+    counted = breaths.valid & np.isfinite(breaths.pressure)
+    inside, out = counted & (breaths.u_out == 0), counted & (breaths.u_out == 1)
+    inside[:, 0] = False
+    # A command acts from its sample on, a pressure is read before it.
+    q = _late(np.where(breaths.u_out == 0, _GAIN * breaths.u_in, 0.0), 1)
+    v = np.cumsum(q * _late(np.where(breaths.valid, breaths.dt, 0.0), 1), axis=1)
+    return np.stack([np.ones_like(q), q, v], -1), inside, out, np.nan_to_num(breaths.pressure)
 
 
 def _late(signal: Floats, samples: int) -> Floats:

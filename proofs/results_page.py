@@ -200,12 +200,7 @@ def proof_section(proof: Proof) -> str:
 
 
 def pairs_section(report: str, *, half: str) -> str:
-    """Rates and detection curves of real pairs as Markdown.
-
-    Args:
-        report: tables of :func:`~proofs.real.pairs.report`.
-        half: ``"development"`` or ``"sealed"``.
-    """
+    """Tables of :func:`~proofs.real.comparisons.report` for a half of the pairs as Markdown."""
     option = " --sealed" if half == "sealed" else ""
     return (
         f"```sh\npython -m proofs pairs --recordings DIR --out runs/pairs{option}\n```\n\n"

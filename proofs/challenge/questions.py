@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from hardware_eval.emulation.cases import Case
 from ventbench.base.errors import InputError
 
 Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 
 #: Classes of effects that the pressure of a single lung may not tell apart.
 CLASSES: tuple[frozenset[str], ...] = (

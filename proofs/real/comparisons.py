@@ -22,7 +22,7 @@ from proofs.real.pairs import KINDS, Material, Pair, Split, load, pairs
 from proofs.real.parts import slower_sensor
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.mechanics.identify import Mechanics, Term, identify
+from ventbench.mechanics.identify import Term, identify
 from ventbench.mechanics.labels import TOLERANCE_C, TOLERANCE_R, Estimate
 from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
@@ -78,27 +78,17 @@ def _label(pair: Pair, material: Material) -> Answered:
 
 
 def _lung(pair: Pair, material: Material) -> Answered:
-    a, b = material.mechanics(pair.first), material.mechanics(pair.second)
+    matches = [material.mechanics(run).match for run in (pair.first, pair.second)]
     truth = {part[0] for part in pair.truth.split(", ")} & {"R", "C"}
-    differs = {
-        name
-        for name, tolerance, x, y in (
-            ("R", TOLERANCE_R, _at_label(a, "R"), _at_label(b, "R")),
-            ("C", TOLERANCE_C, _at_label(a, "C"), _at_label(b, "C")),
+    parts = {}
+    for name, tolerance in (("R", TOLERANCE_R), ("C", TOLERANCE_C)):  # R at the flow of the labels
+        x, y = (
+            Estimate(getattr(match, f"fitted_{name}"), "", getattr(match, f"ci95_{name}"))
+            for match in matches
         )
-        if _apart(x, y, tolerance)
-    }
-    parts = [
-        f"{name} {_at_label(a, name).value:.3g} -> {_at_label(b, name).value:.3g}"
-        for name in sorted(differs, reverse=True)
-    ]
-    return Answered(pair, ", ".join(parts) or "nothing of the lung", differs == truth)
-
-
-def _at_label(lung: Mechanics, name: str) -> Estimate:
-    """R at the flow of the labels, or C."""
-    match = lung.match
-    return Estimate(getattr(match, f"fitted_{name}"), "", getattr(match, f"ci95_{name}"))
+        if _apart(x, y, tolerance):
+            parts[name] = f"{name} {x.value:.3g} -> {y.value:.3g}"
+    return Answered(pair, ", ".join(parts.values()) or "nothing of the lung", set(parts) == truth)
 
 
 def _apart(x: Estimate, y: Estimate, tolerance: float) -> bool:

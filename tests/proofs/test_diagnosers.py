@@ -123,6 +123,8 @@ def test_a_verdict_has_its_share_and_what_it_may_have_missed_the_rest() -> None:
     assert told[terms("valve_dead_band")] == pytest.approx(0.8 * 0.25)
     assert told[terms("leak", "cough")] == told[terms("cough")] == pytest.approx(0.1 * 0.6 / 8)
     assert terms() not in told
+    alike = shares_of("named", named("viscoelasticity", 0.6, "second_compartment"))
+    assert alike[terms("viscoelasticity")] == pytest.approx(0.8), "the other has no name here"
     changed = shares_of("named", changes=[{"of": "gain", "drifts": False}], saturated={})
     assert changed[terms("gain_step", "saturation")] == pytest.approx(0.8)
 

@@ -148,13 +148,11 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
     """
     assert isinstance(case, StrangerCase)
     quiet = replace(case, gain_scatter=0.0)
-    rng = np.random.default_rng(seed)
-    number = breaths.breath_id - 1
-
-    def command(k: int, shown: Floats, due: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        return shown, breaths.u_in[:, k]
-
-    return _run(quiet, rng, breaths.time, breaths.u_out, command, number, REPLAY_STEP, start)[0]
+    return _run(
+        quiet, np.random.default_rng(seed), breaths.time, breaths.u_out,
+        lambda k, shown, due: (shown, breaths.u_in[:, k]), breaths.breath_id - 1, REPLAY_STEP,
+        start,
+    )[0]  # fmt: skip
 
 
 def _run(

@@ -139,13 +139,14 @@ def board_section(result: Board) -> str:
             "",
             f"World `{generator}`:",
             "",
-            f"| diagnoser | cases | {' | '.join(_BOARD.values())} |",
+            f"| diagnoser | code | cases | {' | '.join(_BOARD.values())} |",
         ]
-        lines.append("|---" * (len(_BOARD) + 2) + "|")
+        lines.append("|---" * (len(_BOARD) + 3) + "|")
         for row in rows:
             figures = {figure.what: figure for figure in row.figures}
             cells = " | ".join(_cell(figures[what]) for what in _BOARD)
-            lines.append(f"| {row.diagnoser} | {len(row.cases)} | {cells} |")
+            code = ", ".join(row.versions) or "–"
+            lines.append(f"| {row.diagnoser} | {code} | {len(row.cases)} | {cells} |")
         compared = {row.diagnoser: d for row in rows if (d := result.differences(row))}
         if compared:
             what = next(iter(compared.values()))
@@ -199,12 +200,7 @@ def proof_section(proof: Proof) -> str:
 
 
 def pairs_section(report: str, *, half: str) -> str:
-    """Rates and detection curves of real pairs as Markdown.
-
-    Args:
-        report: tables of :func:`~proofs.real.pairs.report`.
-        half: ``"development"`` or ``"sealed"``.
-    """
+    """Tables of :func:`~proofs.real.comparisons.report` for a half of the pairs as Markdown."""
     option = " --sealed" if half == "sealed" else ""
     return (
         f"```sh\npython -m proofs pairs --recordings DIR --out runs/pairs{option}\n```\n\n"

@@ -57,14 +57,13 @@ def log_likelihood_loss(case: Case, breaths: Breaths, index: int) -> float:
     chosen = breaths.select(np.linspace(0, len(breaths) - 1, count).astype(int))
     start = np.full(count, case.base.peep)
     response = generator_of(case).replay(case, chosen, start, seed=index)
+    base, effect = case.base, case.effects[index]
     before, after = case.effects[:index], case.effects[index + 1 :]
 
     def squared_error(*left: Effect) -> float:
         rest = replace(case, effects=(*before, *left, *after))
         return float(np.sum(_refitted(rest, base, chosen, start, response, seed=index) ** 2))
 
-    base, effect = case.base, case.effects[index]
-    before, after = case.effects[:index], case.effects[index + 1 :]
     if effect.name == "inertance" and "circuit" in effect.parameters:
         # The circuit that came with it stays, and is refitted: behind a high resistance, a little
         # less of it does most of what the mass does.
@@ -89,17 +88,26 @@ def _refitted(
     case: Case, base: Base, breaths: Breaths, start: Floats, response: Floats, seed: int
 ) -> Floats:
     """Residuals of the best rig, by Gauss-Newton steps that are halved until the error falls."""
-    replay = generator_of(case).replay
 
-    def run(at: Base, first: Floats) -> Floats:
-        return response - replay(replace(case, base=at), breaths, first, seed)
+    def run(*rigs: tuple[Base, Floats]) -> Floats:
+        """Residuals of rigs with their initial pressures, all side by side, ``(k, n, T)``."""
+        many = breaths.select(np.tile(np.arange(len(breaths)), len(rigs)))
+        values = {
+            key: np.repeat([getattr(rig, key) for rig, _ in rigs], len(breaths))
+            for key in _REFITTED
+        }
+        one = replace(case, base=replace(base, **values))  # type: ignore[arg-type]
+        told = generator_of(case).replay(one, many, np.concatenate([s for _, s in rigs]), seed)
+        return response - told.reshape(len(rigs), *response.shape)
 
-    error = run(base, start)
+    (error,) = run((base, start))
     for _ in range(_ITERATIONS):
-        stepped = [run(_changed(base, key, _STEP), start) for key in _REFITTED]
-        slopes = np.stack([(error - other) / _STEP for other in stepped])
+        stepped = run(
+            *((_changed(base, key, _STEP), start) for key in _REFITTED), (base, start + _STEP)
+        )
+        changes = (error - stepped) / _STEP
+        slopes, by_start = changes[:-1], changes[-1]
         # Initial pressures are projected out, breath by breath; their steps follow afterwards.
-        by_start = (error - run(base, start + _STEP)) / _STEP
         square = np.sum(by_start**2, axis=1)
         along = np.einsum("knt,nt->kn", slopes, by_start) / square
         projected = slopes - along[:, :, None] * by_start
@@ -108,19 +116,16 @@ def _refitted(
         step = np.linalg.lstsq(jacobian, remaining.ravel(), rcond=None)[0]
         shift = np.sum((error - np.tensordot(step, slopes, 1)) * by_start, axis=1) / square
         limited = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
-        better = None
-        for share in _STEP_SHARES:
-            tried, first = base, start + share * shift
+        tried = [(base, start + share * shift) for share in _STEP_SHARES]
+        for k, share in enumerate(_STEP_SHARES):
             for key, value in zip(_REFITTED, limited, strict=True):
-                tried = _changed(tried, key, share * float(value))
-            tried_error = run(tried, first)
-            if np.sum(tried_error**2) < np.sum(error**2):
-                better = tried, first, tried_error
-                break
-        if better is None:
+                tried[k] = _changed(tried[k][0], key, share * float(value)), tried[k][1]
+        errors = run(*tried)
+        better = np.flatnonzero(np.sum(errors**2, axis=(1, 2)) < np.sum(error**2))
+        if not better.size:
             break
-        gain = 1.0 - np.sum(better[2] ** 2) / np.sum(error**2)
-        base, start, error = better
+        gain = 1.0 - np.sum(errors[better[0]] ** 2) / np.sum(error**2)
+        (base, start), error = tried[better[0]], errors[better[0]]
         if gain < _LEAST_DECREASE:
             break
     return error

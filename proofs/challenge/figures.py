@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
 from proofs.challenge.judge import CONFIDENT, JudgedCase
 from proofs.challenge.questions import CLASSES
@@ -46,11 +46,8 @@ class Figure:
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % score interval (Wilson) of a share."""
-    z = 1.959964
-    centre = hits + z * z / 2
-    reach = z * np.sqrt(hits * (count - hits) / count + z * z / 4)
-    low, high = (centre - reach) / (count + z * z), (centre + reach) / (count + z * z)
-    return max(float(low), 0.0), min(float(high), 1.0)
+    found = binomtest(hits, count).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def share(
@@ -259,27 +256,14 @@ def paired(ours: Mapping[Any, JudgedCase], other: Mapping[Any, JudgedCase]) -> d
     return found
 
 
-_NOTHING, _SEVERAL, _LOST = "nothing missing", "several names", "no answer"
-
 #: Most hypotheses of equal probability that are told one by one.
 _TOLD = 3
-
-
-def confusion(cases: Sequence[JudgedCase]) -> dict[str, dict[str, int]]:
-    """Counts by truth, then by answer, over the cases with one effect or none."""
-    table: dict[str, Counter[str]] = {}
-    for case in sorted(cases, key=lambda c: c.effects):
-        if len(case.effects) <= 1:
-            truth = case.effects[0] if case.effects else _NOTHING
-            answer = full_answer(case) if len(case.named) <= 1 else _SEVERAL
-            table.setdefault(truth, Counter())[answer] += 1
-    return {truth: dict(counts.most_common()) for truth, counts in table.items()}
 
 
 def full_answer(case: JudgedCase) -> str:
     """The likeliest hypotheses in words."""
     if case.problem:
-        return _LOST
+        return "no answer"
     if len(case.leading) > _TOLD:
         return f"{len(case.leading)} answers alike"
-    return " or ".join(" + ".join(sorted(terms)) or _NOTHING for terms in case.leading)
+    return " or ".join(" + ".join(sorted(terms)) or "nothing missing" for terms in case.leading)

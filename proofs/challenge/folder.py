@@ -12,14 +12,7 @@ from typing import Any
 
 import msgspec
 
-from hardware_eval.emulation.cases import (
-    Base,
-    Case,
-    Effect,
-    encrypt,
-    random_generator,
-    unseal,
-)
+from hardware_eval.emulation.cases import Case, encrypt, random_generator, unseal
 from proofs.challenge.faults.effects import FaultsCase
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger.effects import StrangerCase
@@ -72,16 +65,13 @@ def encode_answers(secret: str, drawn: list[DrawnCase], nats: list[list[float]])
 def decode_answers(text: bytes) -> Truth:
     """Return the cases and the nats of their effects from the plain text of the answers."""
     return [
-        (DrawnCase(entry["kind"], _case(entry["case"])), [float(nats) for nats in entry["nats"]])
+        (
+            DrawnCase(entry["kind"], msgspec.convert(case, _CASES[case.get("generator", "first")])),
+            [float(nats) for nats in entry["nats"]],
+        )
         for entry in json.loads(text)["cases"]
+        for case in (entry["case"],)
     ]
-
-
-def _case(value: dict[str, Any]) -> Case:
-    effects = tuple(Effect(**effect) for effect in value["effects"])
-    base = None if value["base"] is None else Base(**value["base"])
-    kind = _CASES[value.get("generator", "first")]
-    return kind(**(value | {"effects": effects, "base": base}))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from proofs.challenge import contract
-from proofs.challenge.figures import Figure, by_kind, confusion, paired, scores, second_round
+from proofs.challenge.figures import Figure, by_kind, paired, scores, second_round
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.generators import generator_of
 from proofs.challenge.judge import JudgedCase, judge
@@ -76,8 +76,7 @@ class Judged:
             "diagnoser": self.diagnoser, "generator": self.generator,
             "draws": [asdict(draw) for draw in self.draws], "unanswered": list(self.unanswered),
             "figures": [asdict(figure) for figure in self.figures],
-            "confusion": confusion(list(self.cases.values())), "versions": list(self.versions),
-            "cases": cases,
+            "versions": list(self.versions), "cases": cases,
         }  # fmt: skip
 
 

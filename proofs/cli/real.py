@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from proofs.cli import ResultsPage
+from proofs.cli import ResultsPage, tabulated
 from ventbench.cli.options import JsonFile, RecordingsDir, bars, claim_out, emit, recordings_folder
 
 if TYPE_CHECKING:
@@ -91,24 +91,21 @@ def _show(console: Any, result: Proof) -> None:
 
 
 def _table(result: Proof) -> Any:
-    from rich.table import Table
-
-    table = Table(title="Open-loop MAE on held-out real breaths, cmH2O")
-    table.add_column("part", no_wrap=True)
-    for name in ("n", "before", "refit", "after", "cut"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for name in ("named", "without a name", "label misfits"):
-        table.add_column(name)
+    rows = []
     for name, part in result.parts.items():
         errors = (f"{part['mae'][k] or float('nan'):.2f}" for k in ("before", "refit", "after"))
         share = part["cut_percent"]
-        table.add_row(
+        rows.append((
             name, str(part["held_out"]), *errors, "-" if share is None else f"{share:.0f} %",
             ", ".join(mechanism["name"] for mechanism in part["mechanisms"]) or "-",
             part["slot"]["name"] if part["slot"] else "-",
             ", ".join(misfit["label"] for misfit in part["misfitting_labels"]) or "-",
-        )  # fmt: skip
-    return table
+        ))  # fmt: skip
+    heads = ("part", "n", "before", "refit", "after", "cut", "named", "without a name",
+             "label misfits")  # fmt: skip
+    return tabulated(
+        "Open-loop MAE on held-out real breaths, cmH2O", heads, rows, left=(0, 6, 7, 8)
+    )
 
 
 def pairs(
@@ -119,7 +116,7 @@ def pairs(
         typer.Option(
             metavar="KIND",
             help="Only this kind (may be repeated): label, lung, drive, leak, lag; and, minutes a "
-            "pair, leak_driven, lag_driven, lung_pressure, gain_pressure, lag_pressure.",
+            "pair, lung_pressure, gain_pressure, lag_pressure.",
         ),
     ] = None,
     sealed: Annotated[

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from proofs.cli import tabulated
+from ventbench.base.files import json_values
 from ventbench.cli.options import (
     JsonFile,
     RecordingsDir,
@@ -51,8 +53,6 @@ def samples(
 
     Example: `python -m proofs study samples --lung R20C50 --seeds 5`
     """
-    from rich.console import Console
-
     from proofs.studies import samples as work
     from ventbench.base import errors, files
     from ventbench.task.lungs import scored_lung
@@ -74,22 +74,15 @@ def samples(
     files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
     table = result.summary()
     emit({"lung": result.lung, "methods": _plain(table)}, json)
-    console = Console(stderr=str(json) == "-")
-    console.print(_summary(result, table))
-    console.print(f"wrote {out}", markup=False, highlight=False)
+    _print(_summary(result, table), out, json)
 
 
 def _plain(table: Any) -> list[dict[str, Any]]:
-    rows = table.to_dict("records")
     # What is not reached is NaN in the table and null in JSON.
-    return [{k: None if v != v else v for k, v in row.items()} for row in rows]
+    return json_values(table.to_dict("records"))
 
 
 def _summary(result: Any, frame: Any) -> Any:
-    from rich.table import Table
-
-    caption = f"The corrected PID: {result.start:.3f}; best PID of the grid: {result.best_pid:.3f}."
-    table = Table(title=f"{result.lung}: nominal score, cmH2O, and experience", caption=caption)
     # The file has more columns, and longer names for them.
     heads = {
         "method": "method",
@@ -100,12 +93,10 @@ def _summary(result: Any, frame: Any) -> Any:
         "episodes_to_2_percent": "to 2 %",
         "seconds_to_2_percent": "s to 2 %",
     }
-    for name, head in heads.items():
-        first = name == "method"
-        table.add_column(head, justify="left" if first else "right", no_wrap=first)
-    for row in _plain(frame):
-        table.add_row(*("-" if row[k] is None else str(row[k]) for k in heads))
-    return table
+    rows = [["-" if row[k] is None else str(row[k]) for k in heads] for row in _plain(frame)]
+    caption = f"The corrected PID: {result.start:.3f}; best PID of the grid: {result.best_pid:.3f}."
+    title = f"{result.lung}: nominal score, cmH2O, and experience"
+    return tabulated(title, heads.values(), rows, caption=caption)
 
 
 @app.command()
@@ -156,7 +147,8 @@ def controllers(
         for row in table.to_dict("records")
     ]  # fmt: skip
     heads = ("variant", "what", *work.FIGURES, "difference to base")
-    _print("Mean |pressure - target|, cmH2O, averaged over seeds", heads, rows, 2, out, json)
+    title = "Mean |pressure - target|, cmH2O, averaged over seeds"
+    _print(tabulated(title, heads, rows, left=(0, 1)), out, json)
 
 
 @app.command()
@@ -198,7 +190,7 @@ def networks(
         for row in table.to_dict("records")
     ]  # fmt: skip
     heads = ("variant", "mean", "median", "difference to base", "95 %, paired by breath")
-    _print("Held-out open-loop MAE, cmH2O", heads, rows, 1, out, json)
+    _print(tabulated("Held-out open-loop MAE, cmH2O", heads, rows), out, json)
 
 
 def _check(only: list[str] | None, known: dict[str, Any]) -> None:
@@ -211,17 +203,9 @@ def _check(only: list[str] | None, known: dict[str, Any]) -> None:
             )
 
 
-def _print(
-    title: str, heads: tuple[str, ...], rows: list[tuple[str, ...]], left: int, out: Path, json: Any
-) -> None:
+def _print(shown: Any, out: Path, json: Any) -> None:
     from rich.console import Console
-    from rich.table import Table
 
     console = Console(stderr=str(json) == "-")
-    table = Table(title=title)
-    for k, head in enumerate(heads):
-        table.add_column(head, justify="left" if k < left else "right")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
+    console.print(shown)
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)

@@ -115,7 +115,7 @@ def hypotheses(
     names, places = vocabulary["names"], vocabulary["places"]
     foreign = sorted(names.keys() - {*library(), "saturation"})
     session = _session(found)
-    stated = [(terms | session, p) for terms, p in _names(found)]
+    stated = [(terms | session, p) for terms, p in _names(found, names)]
     main, slot = stated[0][0], found["slot"]
     weights: dict[frozenset[str], float] = {}
 
@@ -168,11 +168,13 @@ def _session(found: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(names | ({"saturation"} if found["saturated"] is not None else set()))
 
 
-def _names(found: Mapping[str, Any]) -> list[tuple[frozenset[str], float]]:
-    """Sets of names, the stated ones first: each is replaced by each of its alternatives."""
+def _names(
+    found: Mapping[str, Any], known: Mapping[str, Any]
+) -> list[tuple[frozenset[str], float]]:
+    """Sets of names, the stated ones first: each is replaced by each known alternative."""
     choices = []
     for missing in found["mechanisms"]:
-        others = missing["alternatives"][:4]
+        others = [name for name in missing["alternatives"] if name in known][:4]
         sure = float(np.clip(missing["confidence"], 0.05, 0.99)) if others else 1.0
         rest = [(name, (1.0 - sure) / len(others)) for name in others]
         choices.append([(missing["name"], sure), *rest])

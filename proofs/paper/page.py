@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,11 +12,10 @@ from proofs.paper.report import Chart, Reproduction
 from ventbench import palette
 from ventbench.base import files
 from ventbench.base.errors import require
-from ventbench.pages import graphics
+from ventbench.pages.diagnosis.charts import Chart as Axes
 
-#: Size of a chart and of its plot: left, top, right and bottom margins.
+#: Size of a chart, px.
 WIDTH, HEIGHT = 640.0, 280.0
-LEFT, TOP, RIGHT, BOTTOM = 44.0, 18.0, 8.0, 34.0
 
 
 def write_reproduction(path: Path | str, reproduction: Reproduction) -> Path:
@@ -51,7 +49,7 @@ def html(reproduction: Reproduction) -> str:
         about=reproduction.about,
         summary=reproduction.summary(),
         sections=[
-            (section, [_chart(chart) for chart in section.charts])
+            (section, [(chart, _axes(chart)) for chart in section.charts])
             for section in reproduction.sections
         ],
         not_reproduced=reproduction.not_reproduced,
@@ -65,51 +63,15 @@ def html(reproduction: Reproduction) -> str:
     )
 
 
-def _chart(chart: Chart) -> dict[str, Any]:
-    """Lines, ticks and labels of a chart, in pixels."""
+def _axes(chart: Chart) -> Axes:
+    """Axes of a chart with its lines, in their order."""
     values = np.array([v for line in chart.lines for v in line.y if math.isfinite(v)])
     ends = np.array([x for line in chart.lines for x in line.x])
     low, high = min(float(values.min()), 0.0), float(values.max())
-    high += 0.05 * (high - low)
-
-    def across(x: Any) -> Any:
-        first, last = float(ends.min()), float(ends.max())
-        if chart.logarithmic:
-            x, first, last = np.log(x), math.log(first), math.log(last)
-        share = (np.asarray(x, float) - first) / max(last - first, 1e-9)
-        return LEFT + share * (WIDTH - LEFT - RIGHT)
-
-    def up(y: Any) -> Any:
-        share = (np.asarray(y, float) - low) / (high - low)
-        return HEIGHT - BOTTOM - share * (HEIGHT - TOP - BOTTOM)
-
-    marks: Any
-    if chart.logarithmic:
-        marks = 10.0 ** np.arange(math.ceil(math.log10(ends.min())), math.log10(ends.max()) + 0.01)
-    else:
-        marks = _ticks(float(ends.min()), float(ends.max()))
-    return {
-        "title": chart.title,
-        "x_label": chart.x_label,
-        "y_label": chart.y_label,
-        "lines": [
-            {
-                "name": line.name,
-                "path": graphics.path(np.stack([across(line.x), up(line.y)], axis=-1)),
-                "dashed": line.dashed,
-            }
-            for line in chart.lines
-        ],
-        "x": [(f"{mark:g}", round(float(across(mark)), 1)) for mark in marks],
-        "y": [(f"{mark:g}", round(float(up(mark)), 1)) for mark in _ticks(low, high)],
-        "width": WIDTH, "height": HEIGHT, "left": LEFT, "right": WIDTH - RIGHT,
-        "top": TOP, "bottom": HEIGHT - BOTTOM,
-    }  # fmt: skip
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers from low to high, about five."""
-    raw = (high - low) / 5.0
-    power = 10.0 ** math.floor(math.log10(raw))
-    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= raw)
-    return [round(k * step, 10) for k in range(math.ceil(low / step), int(high / step + 1e-9) + 1)]
+    axes = Axes(
+        (float(ends.min()), float(ends.max())), (low, high + 0.05 * (high - low)), chart.x_label,
+        chart.y_label, chart.title, WIDTH, HEIGHT, log=chart.logarithmic,
+    )  # fmt: skip
+    for line in chart.lines:
+        axes.line("dash" if line.dashed else "", line.x, line.y)
+    return axes

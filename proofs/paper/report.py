@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
+
+from ventbench.base.files import json_values
 
 #: How a claim of the paper came out; ``none`` where a section makes no claim.
 Verdict = Literal["agrees", "in part", "differs", "none"]
@@ -128,7 +129,7 @@ class Reproduction:
                 for place, what, why in self.not_reproduced
             ],
         }
-        return _finite(plain)
+        return json_values(plain)
 
     def summary(self) -> Table:
         """A row a section: place, claim, verdict and finding."""
@@ -162,11 +163,3 @@ class Reproduction:
 def _markdown(table: Table) -> str:
     texts = [list(table.columns), ["---"] * len(table.columns), *table.texts()]
     return "\n".join(f"| {' | '.join(row)} |" for row in texts)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(own) for key, own in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(own) for own in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 import ventbench
@@ -21,7 +22,7 @@ from proofs.real.pairs import KINDS, Material, Pair, Split, load, pairs
 from proofs.real.parts import slower_sensor
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.mechanics.identify import Mechanics, Term, identify
+from ventbench.mechanics.identify import Term, identify
 from ventbench.mechanics.labels import TOLERANCE_C, TOLERANCE_R, Estimate
 from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
@@ -37,7 +38,7 @@ _RIVALS = {"leak": (), "lag": ("circuit_compliance",)}
 _KNOWN = ("exhalation_valve_delay", "circuit_compliance", "valve_curve", "sensor_lag")
 
 #: Kinds that need minutes a pair.
-SLOW = ("leak_driven", "lag_driven", "lung_pressure", "gain_pressure", "lag_pressure")
+SLOW = ("lung_pressure", "gain_pressure", "lag_pressure")
 
 
 @dataclass(frozen=True)
@@ -77,27 +78,17 @@ def _label(pair: Pair, material: Material) -> Answered:
 
 
 def _lung(pair: Pair, material: Material) -> Answered:
-    a, b = material.mechanics(pair.first), material.mechanics(pair.second)
+    matches = [material.mechanics(run).match for run in (pair.first, pair.second)]
     truth = {part[0] for part in pair.truth.split(", ")} & {"R", "C"}
-    differs = {
-        name
-        for name, tolerance, x, y in (
-            ("R", TOLERANCE_R, _at_label(a, "R"), _at_label(b, "R")),
-            ("C", TOLERANCE_C, _at_label(a, "C"), _at_label(b, "C")),
+    parts = {}
+    for name, tolerance in (("R", TOLERANCE_R), ("C", TOLERANCE_C)):  # R at the flow of the labels
+        x, y = (
+            Estimate(getattr(match, f"fitted_{name}"), "", getattr(match, f"ci95_{name}"))
+            for match in matches
         )
-        if _apart(x, y, tolerance)
-    }
-    parts = [
-        f"{name} {_at_label(a, name).value:.3g} -> {_at_label(b, name).value:.3g}"
-        for name in sorted(differs, reverse=True)
-    ]
-    return Answered(pair, ", ".join(parts) or "nothing of the lung", differs == truth)
-
-
-def _at_label(lung: Mechanics, name: str) -> Estimate:
-    """R at the flow of the labels, or C."""
-    match = lung.match
-    return Estimate(getattr(match, f"fitted_{name}"), "", getattr(match, f"ci95_{name}"))
+        if _apart(x, y, tolerance):
+            parts[name] = f"{name} {x.value:.3g} -> {y.value:.3g}"
+    return Answered(pair, ", ".join(parts.values()) or "nothing of the lung", set(parts) == truth)
 
 
 def _apart(x: Estimate, y: Estimate, tolerance: float) -> bool:
@@ -137,28 +128,6 @@ def _has_grown(now: Term | None, before: Term | None) -> bool:
         return True
     x, y = (next(iter(term.parameters.values())) for term in (now, before))
     return x.ci95[0] > y.ci95[1]
-
-
-def _driven(pair: Pair, material: Material) -> Answered:
-    """An added leak or lag by two diagnoses from flow: what is named with it and not without."""
-    from ventbench.diagnosis.diagnose import diagnose
-
-    kind = pair.kind.removesuffix("_driven")
-    add = with_leak if kind == "leak" else slower_sensor
-    diagnosis = diagnose(
-        add(material.runs[pair.second], pair.strength), patient=False, drive="flow"
-    )
-    wanted = _NAMES[kind]
-    named = {mechanism.name: mechanism for mechanism in diagnosis.mechanisms}
-    before = material.driven(pair.first)
-    value, interval = None, None
-    if wanted in named:
-        estimate = next(iter(named[wanted].parameters.values()))
-        value, interval = estimate.value, estimate.ci95
-    wrong = tuple(sorted(set(named) - before - {wanted, *_RIVALS[kind]}))
-    in_class = wanted in named or bool(set(_RIVALS[kind]) & (set(named) - before))
-    words = ", ".join(named) or "nothing"
-    return Answered(pair, words, wanted in named, wrong, value, interval, in_class)
 
 
 def with_leak(breaths: Breaths, slope: float) -> Breaths:
@@ -235,7 +204,6 @@ def _lung_of(breaths: Breaths) -> Lung:
 
 _TOOLS: dict[str, Callable[[Pair, Material], Answered]] = {
     "label": _label, "lung": _lung, "drive": _lung, "leak": _added, "lag": _added,
-    "leak_driven": _driven, "lag_driven": _driven,
     "lung_pressure": _diagnosed, "gain_pressure": _diagnosed, "lag_pressure": _diagnosed,
 }  # fmt: skip
 
@@ -294,16 +262,8 @@ def _open(path: Path, kinds: tuple[str, ...]) -> None:
 
 def _stored(path: Path, pair: Pair) -> Answered | None:
     try:
-        plain = json.loads(path.read_text("utf-8"))
-        value = Answered(
-            Pair(**plain.pop("pair")),
-            **plain
-            | {
-                "wrong_names": tuple(plain["wrong_names"]),
-                "interval": tuple(plain["interval"]) if plain["interval"] else None,
-            },
-        )
-    except (OSError, ValueError, TypeError, KeyError):
+        value = msgspec.json.decode(path.read_bytes(), type=Answered)
+    except (OSError, msgspec.DecodeError):
         return None
     return value if value.pair == pair else None
 

@@ -51,17 +51,10 @@ KINDS: dict[str, str] = {
     "drive": "blower against proportional valve, same lung: nothing of the lung differs (flow)",
     "leak": "a leak was added to the recording (flow)",
     "lag": "a lag of the pressure sensor was added to the recording (flow)",
-    "leak_driven": "the same leaks, diagnosed from flow",
-    "lag_driven": "the same lags, diagnosed from flow",
     "lung_pressure": "a simulator fitted to one lung, a recording of another (pressure)",
     "gain_pressure": "the gain of the valve was changed by 12 % (pressure)",
     "lag_pressure": "a lag of the pressure sensor was added to the recording (pressure)",
 }
-
-#: Runs and strengths that are diagnosed from flow: clean ones in which flow itself was logged.
-_DRIVEN_RUNS = ("1", "3", "4", "5")
-_DRIVEN_DAY = "2020-07-31-UFlow-Performance"
-_DRIVEN = {"leak": (0.5, 1.0, 4.0), "lag": (0.01, 0.02, 0.08)}
 
 
 @dataclass(frozen=True)
@@ -105,22 +98,12 @@ class Material:
     drives: Mapping[str, str]
     lungs: Mapping[str, Breaths]
     _mechanics: dict[str, Mechanics] = field(default_factory=dict, repr=False)
-    _driven: dict[str, frozenset[str]] = field(default_factory=dict, repr=False)
 
     def mechanics(self, run: str) -> Mechanics:
         """Mechanics of a run, computed once."""
         if run not in self._mechanics:
             self._mechanics[run] = identify(self.runs[run])[0]
         return self._mechanics[run]
-
-    def driven(self, run: str) -> frozenset[str]:
-        """Names that a diagnosis of a run from its flow gives, computed once."""
-        if run not in self._driven:
-            from ventbench.diagnosis.diagnose import diagnose
-
-            diagnosis = diagnose(self.runs[run], patient=False, drive="flow")
-            self._driven[run] = frozenset(m.name for m in diagnosis.mechanisms)
-        return self._driven[run]
 
 
 def load(folder: Path) -> Material:
@@ -174,13 +157,6 @@ def _flow_pairs(material: Material) -> Iterator[Pair]:
             for strength in strengths:
                 truth = kind if strength else "nothing added"
                 yield Pair(f"{kind} {strength:g} {name}", kind, truth, name, name, strength)
-
-    for kind, strengths in _DRIVEN.items():
-        for test in _DRIVEN_RUNS:
-            name = f"{_DRIVEN_DAY}#{test}"
-            for strength in strengths if name in label else ():
-                own = f"{kind}_driven"
-                yield Pair(f"{own} {strength:g} {name}", own, kind, name, name, strength)
 
 
 def _pressure_pairs(material: Material) -> Iterator[Pair]:

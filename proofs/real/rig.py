@@ -16,13 +16,7 @@ import numpy as np
 
 import ventbench
 from proofs import code_version
-from proofs.real.parts import (
-    PARTS,
-    Part,
-    Setting,
-    by_names_alone,
-    has_unnamed,
-)
+from proofs.real.parts import PARTS, Part, Setting, by_names_alone, has_unnamed
 from ventbench import recordings
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -258,9 +252,7 @@ def named(mechanisms: list[dict[str, Any]], name: str) -> dict[str, Any] | None:
     return next((mechanism for mechanism in mechanisms if mechanism["name"] == name), None)
 
 
-def claims(
-    parts: Mapping[str, Mapping[str, Any]], impossible: Mapping[str, str]
-) -> list[Claim]:  # fmt: skip
+def claims(parts: Mapping[str, Mapping[str, Any]], impossible: Mapping[str, str]) -> list[Claim]:
     """Judge the claims about the parts that are finished or impossible.
 
     Args:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import trim_mean
 
 from ventbench.base import files
 from ventbench.base.errors import require
@@ -41,9 +42,7 @@ def interquartile_mean(values: ArrayLike) -> Floats:
     Args:
         values: shape ``(n, ...)``; ``floor(n / 4)`` values are cut at each end.
     """
-    values = np.sort(np.asarray(values, float), axis=0)
-    cut = int(CUT * len(values))
-    return np.mean(values[cut : len(values) - cut], axis=0)
+    return trim_mean(np.asarray(values, float), CUT, axis=0)
 
 
 def band(values: ArrayLike) -> tuple[Floats, Floats]:

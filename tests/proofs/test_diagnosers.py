@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.answer import answer
+from proofs.challenge.faults import laboratory
+from proofs.challenge.faults.effects import FaultsCase
 from proofs.challenge.first.rig import record
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.make import make
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Limits, built_in, find
 from proofs.challenge.vocabulary import PUBLISHED, TERMS, VOCABULARY
-from proofs.diagnosers import lisdd
+from proofs.diagnosers import classifier, lisdd
 from proofs.diagnosers.common import Templates
 from proofs.diagnosers.gaussian_process import _Process
 from proofs.diagnosers.sindy import thresholded_least_squares
@@ -23,7 +27,7 @@ from proofs.diagnosers.ventbench import Calibration, hypotheses
 
 def test_the_project_enters_itself_and_its_rivals() -> None:
     assert built_in() == (
-        "forward_search", "gaussian_process", "lisdd", "refit", "sindy", "ventbench",
+        "classifier", "forward_search", "gaussian_process", "lisdd", "refit", "sindy", "ventbench",
     )  # fmt: skip
 
 
@@ -63,6 +67,31 @@ def test_sparse_regression_finds_the_terms_that_act() -> None:
     assert not thresholded_least_squares(x, y, 2.0).any()
 
 
+def test_a_classifier_weighs_sets_as_if_terms_were_independent() -> None:
+    names, chances = ["cough", "leak", "valve_lag"], np.array([0.1, 0.6, 0.3])
+    told = classifier.hypotheses(names, chances)
+    found = {frozenset(each["terms"]): each["probability"] for each in told}
+    assert len(found) == 8
+    for chosen, probability in found.items():
+        inside = np.isin(names, list(chosen))
+        assert probability == pytest.approx(np.where(inside, chances, 1.0 - chances).prod())
+
+
+def test_the_classifier_has_its_weights_and_sees_what_drifts() -> None:
+    weights = classifier.load()
+    assert weights["terms"].tolist() == sorted(TERMS)
+    assert classifier.WEIGHTS.stat().st_size < 200_000
+    drift = Effect("sensor_drift", "strong", "linear", {"drift": 3.0})
+    lag = Effect("clock_offset", "strong", "plain", {"offset": 0.07})
+    quiet = FaultsCase("", 20.0, 50.0, (), Base(20.0, 50.0), breaths=16, samples=84)
+    cases = [replace(quiet, effects=effects) for effects in ((), (drift,), (lag,))]
+    rows = [classifier.summaries(laboratory.record(c, np.random.default_rng(0))) for c in cases]
+    chances = classifier.probabilities(weights, np.array(rows))
+    for k, name in ((1, "sensor_drift"), (2, "clock_offset")):
+        at = sorted(TERMS).index(name)
+        assert chances[k, at] > 10.0 * chances[0, at]
+
+
 SHARES = Calibration(nothing=0.9, named=0.8, placed=0.7, alone=0.25, foreign=0.6, doubt=2.0)
 
 
@@ -94,6 +123,8 @@ def test_a_verdict_has_its_share_and_what_it_may_have_missed_the_rest() -> None:
     assert told[terms("valve_dead_band")] == pytest.approx(0.8 * 0.25)
     assert told[terms("leak", "cough")] == told[terms("cough")] == pytest.approx(0.1 * 0.6 / 8)
     assert terms() not in told
+    alike = shares_of("named", named("viscoelasticity", 0.6, "second_compartment"))
+    assert alike[terms("viscoelasticity")] == pytest.approx(0.8), "the other has no name here"
     changed = shares_of("named", changes=[{"of": "gain", "drifts": False}], saturated={})
     assert changed[terms("gain_step", "saturation")] == pytest.approx(0.8)
 

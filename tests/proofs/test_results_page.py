@@ -74,8 +74,8 @@ def test_the_board_has_a_column_and_a_difference_for_each() -> None:
     draws = (Draw("words", "abc123", 5, 5),)
     rows = (Judged("ours", "faults", draws, ours), Judged("flat", "faults", draws, other))
     text = board_section(Board("ours", {"faults": rows}))
-    assert "\n| ours | 5 | 0 (0..0) | 1 (1..1) |" in text
-    assert "\n| flat | 3 | 6.91 (6.91..6.91) | 0 (0..0) |" in text
+    assert "\n| ours | – | 5 | 0 (0..0) | 1 (1..1) |" in text
+    assert "\n| flat | – | 3 | 6.91 (6.91..6.91) | 0 (0..0) |" in text
     assert "\n| flat | -6.91 (-6.91..-6.91) | -1 (-1..-1) | – |" in text
     assert text.count("\n| ours |") == 1
     assert "| `faults` | `words` | `abc123` |" in text

@@ -20,9 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, Strength
-from proofs.challenge.questions import DrawnCase, Kind
-from ventbench.base.errors import InputError
+from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, EffectFamily, Strength
+from proofs.challenge.questions import DrawnCase, Kind, drawn
 from ventbench.task.lungs import Lung
 
 
@@ -46,51 +45,40 @@ class FaultsCase(Case):
 
 
 @dataclass(frozen=True)
-class Family:
+class Family(EffectFamily):
     """A fault.
 
     Attributes:
-        parameter: parameter that carries the strength, as in the vocabulary.
-        mild: its mean in a mild fault.
-        strong: its mean in a strong fault.
-        ranges: further parameters with the ends of a uniform distribution.
-        forms: forms of its course.
-        both: whether the strength may be negative.
         share: ends of the share of the breaths that it affects; None for all.
     """
 
-    parameter: str
-    mild: float
-    strong: float
-    ranges: tuple[tuple[str, tuple[float, float]], ...] = ()
     forms: tuple[str, ...] = ("plain",)
-    both: bool = False
     share: tuple[float, float] | None = None
 
 
-_COURSES = ("linear", "warm-up")
+_COURSES, _BOTH = ("linear", "warm-up"), (1.0, -1.0)
 
 FAULTS: dict[str, Family] = {
     "saturation": Family("level", 31.0, 24.0),
     "clock_offset": Family("offset", 0.03, 0.07),
     "clock_skew": Family("skew", 0.012, 0.03),
     "lost_commands": Family("share", 0.06, 0.15),
-    "late_commands": Family("share", 0.12, 0.3, (("delay", (0.06, 0.12)),)),
-    "gain_step": Family("change", 0.08, 0.25, both=True),
-    "gain_drift": Family("change", 0.1, 0.3, forms=_COURSES, both=True),
-    "zero_step": Family("change", 0.8, 2.0, both=True),
-    "sensor_drift": Family("drift", 1.2, 3.0, forms=_COURSES, both=True),
-    "resistance_step": Family("change", 0.25, 0.6, both=True),
-    "resistance_drift": Family("change", 0.3, 0.6, forms=_COURSES, both=True),
-    "compliance_step": Family("change", 0.15, 0.35, both=True),
-    "compliance_drift": Family("change", 0.2, 0.4, forms=_COURSES, both=True),
+    "late_commands": Family("share", 0.12, 0.3, ranges=(("delay", (0.06, 0.12)),)),
+    "gain_step": Family("change", 0.08, 0.25, signs=_BOTH),
+    "gain_drift": Family("change", 0.1, 0.3, forms=_COURSES, signs=_BOTH),
+    "zero_step": Family("change", 0.8, 2.0, signs=_BOTH),
+    "sensor_drift": Family("drift", 1.2, 3.0, forms=_COURSES, signs=_BOTH),
+    "resistance_step": Family("change", 0.25, 0.6, signs=_BOTH),
+    "resistance_drift": Family("change", 0.3, 0.6, forms=_COURSES, signs=_BOTH),
+    "compliance_step": Family("change", 0.15, 0.35, signs=_BOTH),
+    "compliance_drift": Family("change", 0.2, 0.4, forms=_COURSES, signs=_BOTH),
     "intermittent_leak": Family("conductance", 9.0, 22.0, share=(0.2, 0.5)),
     "disconnection": Family("share", 0.08, 0.25),
-    "relief_leak": Family("opening", 26.0, 19.0, (("conductance", (20.0, 40.0)),)),
+    "relief_leak": Family("opening", 26.0, 19.0, ranges=(("conductance", (20.0, 40.0)),)),
     "trapped_gas": Family("pressure", 2.0, 5.0),
     "command_rounding": Family("step", 1.0, 2.0, forms=("nearest", "truncation")),
-    "supply_ripple": Family("amplitude", 0.08, 0.18, (("frequency", (2.0, 8.0)),)),
-    "circuit_water": Family("amplitude", 0.7, 1.6, (("frequency", (3.0, 7.0)),)),
+    "supply_ripple": Family("amplitude", 0.08, 0.18, ranges=(("frequency", (2.0, 8.0)),)),
+    "circuit_water": Family("amplitude", 0.7, 1.6, ranges=(("frequency", (3.0, 7.0)),)),
     "secretions": Family("increase", 0.5, 1.2, share=(0.3, 0.6)),
     "cough": Family("pressure", 5.0, 14.0, share=(0.1, 0.3)),
 }
@@ -116,23 +104,8 @@ _SAMPLING = ((0.03, 84), (0.025, 100), (0.0333, 76))
 
 
 def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
-    """Draw cases of one kind or of all kinds, in random order.
-
-    Raises:
-        InputError: if the generator has no such kind, or there are fewer cases than kinds.
-    """
-    if kind != "all" and kind not in SHARES:
-        raise InputError(f"the generator faults has no kind {kind}; choose {', '.join(SHARES)}")
-    if count < (len(SHARES) if kind == "all" else 1):
-        raise InputError(f"{count} cases are too few; ask for at least {len(SHARES)}")
-    sizes: dict[Kind, int] = {}
-    if kind == "all":
-        sizes = {each: max(1, int(share * count)) for each, share in SHARES.items()}
-        sizes["single"] += count - sum(sizes.values())
-    else:
-        sizes[kind] = count
-    cases = [DrawnCase(each, case) for each, n in sizes.items() for case in _of_kind(each, n, rng)]
-    return [cases[i] for i in rng.permutation(len(cases))]
+    """See :func:`proofs.challenge.questions.drawn`."""
+    return drawn(SHARES, _of_kind, kind, count, rng)
 
 
 def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[FaultsCase]:
@@ -162,7 +135,7 @@ def _effect(
     size = getattr(family, strength) * rng.uniform(1.0 - _VARIATION, 1.0 + _VARIATION)
     if faint:  # a level or an opening is faint where nothing reaches it
         size = 90.0 if family.parameter in ("level", "opening") else _FAINT_SIZE * family.mild
-    if family.both and rng.uniform() < 0.5:
+    if family.signs == _BOTH and rng.uniform() < 0.5:
         size = -size
     values = {family.parameter: float(size)}
     values |= {key: float(rng.uniform(*span)) for key, span in family.ranges}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case, Effect
 from proofs.challenge.faults.effects import PARTIAL, FaultsCase, affected
+from proofs.challenge.questions import coloured_noise
 from ventbench.recordings.breaths import Breaths, make_breaths
 
 Floats = NDArray[np.float64]
@@ -118,7 +119,7 @@ def record(
             height = 0.0 if rng.uniform() < 0.2 else rng.uniform(0.2, 1.6)
             level[k, (time[k] >= at) & (time[k] < at + length)] = height
             at += length
-    summed, noise = np.zeros(n), _noise(case, rng, time.shape)
+    summed, noise = np.zeros(n), coloured_noise(case, 0.7, rng, time.shape)
 
     def command(k: int, pressure: Floats) -> Floats:
         nonlocal summed
@@ -153,7 +154,7 @@ def record_commands(
     """
     assert isinstance(case, FaultsCase)
     number = case.breaths + np.arange(len(time))
-    noise = _noise(case, rng, time.shape)
+    noise = coloured_noise(case, 0.7, rng, time.shape)
     return _run(case, rng, time, u_out, lambda k, pressure: u_in[:, k], number, noise)
 
 
@@ -193,13 +194,6 @@ def active(case: Case, breaths: Breaths) -> Flags | None:
         else:
             found |= faults.within(name, breaths.time)
     return found if found.any() else None
-
-
-def _noise(case: FaultsCase, rng: np.random.Generator, shape: tuple[int, ...]) -> Floats:
-    white, slow = rng.standard_normal(shape), rng.standard_normal(shape)
-    for k in range(1, shape[1]):
-        slow[:, k] = 0.7 * slow[:, k - 1] + np.sqrt(0.51) * slow[:, k]
-    return case.noise * (np.sqrt(1.0 - case.coloured) * white + np.sqrt(case.coloured) * slow)
 
 
 def _run(
@@ -251,7 +245,8 @@ def _run(
         pressure = np.minimum(pressure, faults.value("saturation", "level"))
     ones = np.ones(n)
     return make_breaths(
-        number + 1, case.lung_R * ones, case.lung_C * ones, time, u_in, u_out,
+        # A replay may ask for a breath several times, and takes the pressures alone.
+        number[0] + 1 + np.arange(n), case.lung_R * ones, case.lung_C * ones, time, u_in, u_out,
         np.round(pressure, 6),
     )  # fmt: skip
 

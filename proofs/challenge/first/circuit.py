@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Base
-from proofs.challenge.first.instruments import EffectsByName, Floats
+from proofs.challenge.first.instruments import EffectsByName, Floats, solve_falling
 
 #: Flow at which both forms of turbulence cost the same pressure, L/s.
 _EQUAL_TURBULENCE = 0.7
@@ -45,11 +45,13 @@ class Disturbances:
     """
 
     def __init__(self, effects: EffectsByName, began: Floats, rng: np.random.Generator) -> None:
-        n = len(began)
+        # The same breath has the same random numbers, however often it is asked for.
+        alike, which = np.unique(began, return_inverse=True)
+        n = len(alike)
         # Drawn in any case, so that one effect does not change the random numbers of the others.
-        present = rng.uniform(size=n) < _EFFORT_SHARE
-        self._onset = rng.uniform(0.0, 1.2, n)
-        size = rng.uniform(0.7, 1.3, n)
+        present = (rng.uniform(size=n) < _EFFORT_SHARE)[which]
+        self._onset = rng.uniform(0.0, 1.2, n)[which]
+        size = rng.uniform(0.7, 1.3, n)[which]
         phases = rng.uniform(0.0, 2.0 * np.pi, 2)
         self._effort = effects.get("patient_effort")
         if self._effort:
@@ -137,12 +139,11 @@ class Recoil:
 
 def _sigmoid_width(capacity: float) -> float:
     """Width of the sigmoid whose span above zero pressure is ``capacity``, both cmH2O."""
-    low, high = 1.0, 100.0
-    for _ in range(80):
-        d = 0.5 * (low + high)
-        span = 4.0 * d * (1.0 - 1.0 / (1.0 + np.exp(_LOWER_BEND / d)))
-        low, high = (d, high) if span < capacity else (low, d)
-    return low
+
+    def missing(d: float) -> float:
+        return -4.0 * d * (1.0 - 1.0 / (1.0 + np.exp(_LOWER_BEND / d)))
+
+    return solve_falling(missing, -capacity, 1.0, 100.0)
 
 
 class Airway:
@@ -245,7 +246,7 @@ class Circuit:
         self._tubing = 1e-3 * parameter("circuit_compliance", "compliance")
         self._mass = parameter("inertance", "inertance")
         self._stress = parameter("viscoelasticity", "ratio") / self._recoil.C
-        self._relax = parameter("viscoelasticity", "time") or 1.0
+        self._relax = parameter("viscoelasticity", "time")
         self._slow = parameter("sensor_lag", "tau")
         self._second: tuple[float, float] | None = None
         if "second_compartment" in effects:
@@ -283,7 +284,7 @@ class Circuit:
         q = self._supplied(x, after, h, asked, t)
         inside = -self._disturbances.pull(t)
         slope = 0.0
-        if self._stress:
+        if self._relax:
             left = 1.0 / (1.0 + h / self._relax)
             inside = inside + x[STRESS] * left
             slope = h * self._stress * left
@@ -344,7 +345,7 @@ class Circuit:
             after[SECOND] = x[SECOND] + h * (flow - first)
         else:
             after[VOLUME] = x[VOLUME] + h * flow
-        if self._stress:
+        if self._relax:
             after[STRESS] = x[STRESS] / (1.0 + h / self._relax) + slope * flow
 
     def _supplied(self, x: Floats, after: Floats, h: Floats, asked: Floats, t: Floats) -> Floats:

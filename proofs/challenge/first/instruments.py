@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case, Effect
+from proofs.challenge.questions import coloured_noise
 
 Floats = NDArray[np.float64]
 EffectsByName = Mapping[str, Effect]
@@ -75,10 +76,10 @@ def _curve(curve: Effect | None) -> tuple[Floats, Floats] | None:
     if curve.form == "library":
         y = x / (1.0 + x * loss / (1.0 - loss))
     elif curve.form == "tanh":
-        a = _solve_falling(lambda a: np.tanh(a) / a, 1.0 - loss)
+        a = solve_falling(lambda a: np.tanh(a) / a, 1.0 - loss)
         y = np.tanh(a * x) / a
     elif curve.form == "exponential":
-        a = _solve_falling(lambda a: -np.expm1(-a) / a, 1.0 - loss)
+        a = solve_falling(lambda a: -np.expm1(-a) / a, 1.0 - loss)
         y = -np.expm1(-a * x) / a
     elif curve.form == "power law":
         power = 1.0 + np.log10(1.0 - loss)
@@ -88,9 +89,10 @@ def _curve(curve: Effect | None) -> tuple[Floats, Floats] | None:
     return 100.0 * x, 100.0 * y
 
 
-def _solve_falling(function: Callable[[float], float], value: float) -> float:
-    """Argument in 1e-6..50 at which a falling function has a value, by bisection."""
-    low, high = 1e-6, 50.0
+def solve_falling(
+    function: Callable[[float], float], value: float, low: float = 1e-6, high: float = 50.0
+) -> float:
+    """Argument between two at which a falling function has a value, by bisection."""
     for _ in range(80):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if function(middle) > value else (low, middle)
@@ -113,13 +115,7 @@ class Sensor:
     ) -> None:
         self._step = case.step
         n = len(position)
-        white = rng.standard_normal((n, case.samples))
-        slow = rng.standard_normal((n, case.samples))
-        fresh = np.sqrt(1.0 - case.correlation**2)
-        for k in range(1, case.samples):
-            slow[:, k] = case.correlation * slow[:, k - 1] + fresh * slow[:, k]
-        mixed = np.sqrt(1.0 - case.coloured) * white + np.sqrt(case.coloured) * slow
-        self._noise = case.noise * mixed
+        self._noise = coloured_noise(case, case.correlation, rng, (n, case.samples))
         self._offset = np.zeros(n)
         if "sensor_drift" in effects:
             drift = effects["sensor_drift"]

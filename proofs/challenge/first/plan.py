@@ -18,8 +18,7 @@ from hardware_eval.emulation.cases import (
     draw_grid,
     rotate,
 )
-from proofs.challenge.questions import CLASSES, KINDS, DrawnCase, Kind
-from ventbench.base.errors import InputError
+from proofs.challenge.questions import CLASSES, DrawnCase, Kind, drawn
 from ventbench.task.lungs import LUNGS, Lung
 
 #: Share of each kind in a challenge of all kinds.
@@ -41,51 +40,25 @@ _SINGLE_ONLY = ("inertance", "command_rounding")
 
 
 def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
-    """Draw cases of one kind or of all kinds, in random order.
-
-    Args:
-        kind: kind of the cases.
-        count: number of cases.
-        rng: source of random numbers.
-
-    Raises:
-        InputError: if there are fewer cases than kinds.
-    """
-    if count < (len(KINDS) if kind == "all" else 1):
-        raise InputError(f"{count} cases are too few for {kind}; ask for at least {len(KINDS)}")
-    sizes: list[tuple[Kind, int]] = _sizes(count) if kind == "all" else [(kind, count)]
-    cases = [DrawnCase(k, case) for k, n in sizes for case in _of_kind(k, n, rng)]
-    return [cases[i] for i in rng.permutation(len(cases))]
-
-
-def _sizes(count: int) -> list[tuple[Kind, int]]:
-    """Whole numbers near the shares, at least one of each; single effects take what is left."""
-    sizes: list[tuple[Kind, int]] = [
-        (kind, max(1, int(share * count))) for kind, share in SHARES.items() if kind != "single"
-    ]
-    return [("single", count - sum(size for _, size in sizes)), *sizes]
+    """See :func:`proofs.challenge.questions.drawn`."""
+    return drawn(SHARES, _of_kind, kind, count, rng)
 
 
 def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[Case]:
-    if kind == "single":
-        for name, strength, lung, form in draw_grid(LIBRARY, count, rng, other=False):
-            yield draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
-    elif kind == "form":
-        names = tuple(name for name in LIBRARY if len(EFFECTS[name].forms) > 1)
-        for name, strength, lung, form in draw_grid(names, count, rng, other=True):
-            yield draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
-    elif kind == "outside":
-        for name, strength, lung, form in draw_grid(OUTSIDE, count, rng, other=False):
-            yield draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
-    elif kind == "masked":
-        for name, strength, lung, form in draw_grid(LIBRARY, count, rng, other=False):
-            yield _masked(lung, draw_effect(name, strength, rng, form), rng)
-    else:
+    if kind in ("null", "pair", "four"):
         for lung in rotate(list(LUNGS), count, rng):
             if kind == "null":
                 yield _null(lung, rng)
             else:
                 yield draw_case(lung, _combination(2 if kind == "pair" else 4, rng), rng)
+        return
+    several = tuple(name for name in LIBRARY if len(EFFECTS[name].forms) > 1)
+    names = {"form": several, "outside": OUTSIDE}.get(kind, LIBRARY)
+    for name, strength, lung, form in draw_grid(names, count, rng, other=kind == "form"):
+        if kind == "masked":
+            yield _masked(lung, draw_effect(name, strength, rng, form), rng)
+        else:
+            yield draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
 
 
 def _combination(size: int, rng: np.random.Generator) -> tuple[Effect, ...]:

@@ -6,6 +6,7 @@ expiration.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -118,17 +119,8 @@ def record(
     base = case.base or draw_base(case.lung_R, case.lung_C, rng)
     time = sampling_times(case.breaths, case.samples, case.jitter, rng)
     controller = RecordingController(case, time, rng, share)
-    return _run(case, base, time, expiratory(time), controller, np.arange(len(time)), rng, steps)
-
-
-class _GivenCommands:
-    """Commands that are known beforehand, in place of a controller."""
-
-    def __init__(self, u_in: Floats) -> None:
-        self._u_in = u_in
-
-    def command(self, k: int, measured: Floats) -> Floats:
-        return self._u_in[:, k]
+    number = np.arange(len(time))
+    return _run(case, base, time, expiratory(time), controller.command, number, rng, steps)
 
 
 def record_commands(
@@ -152,7 +144,7 @@ def record_commands(
         raise InputError(f"{case.name}: the rig of this case is not known")
     sized = replace(case, samples=time.shape[1])
     number = case.breaths + np.arange(len(time))
-    return _run(sized, case.base, time, u_out, _GivenCommands(u_in), number, rng, steps)
+    return _run(sized, case.base, time, u_out, lambda k, p: u_in[:, k], number, rng, steps)
 
 
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:
@@ -167,24 +159,23 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
     """
     assert case.base is not None
     clean = replace(case, noise=0.0, step=0.0, samples=breaths.time.shape[1])
-    given, rng = _GivenCommands(breaths.u_in), np.random.default_rng(seed)
-    number = breaths.breath_id - 1
-    simulated = _run(
-        clean, case.base, breaths.time, breaths.u_out, given, number, rng, steps, start
-    )
-    return simulated.pressure
+    return _run(
+        clean, case.base, breaths.time, breaths.u_out, lambda k, p: breaths.u_in[:, k],
+        breaths.breath_id - 1, np.random.default_rng(seed), steps, start,
+    ).pressure  # fmt: skip
 
 
 def _run(
     case: Case, base: Base, time: Floats, u_out: NDArray[np.int8],
-    controller: RecordingController | _GivenCommands, number: NDArray[np.int64],
+    command: Callable[[int, Floats], Floats], number: NDArray[np.int64],
     rng: np.random.Generator, steps: int | None = None, start: Floats | None = None,
 ) -> Breaths:  # fmt: skip
     """Simulate breaths side by side; ``number``: place of each in the recording, from 0."""
     n, samples = time.shape
     effects = {effect.name: effect for effect in case.effects}
     steps = steps or (FINE if "inertance" in effects else STEPS)
-    began = _PERIOD * number + rng.uniform(-0.05, 0.05, n)
+    alike, which = np.unique(number, return_inverse=True)
+    began = _PERIOD * number + rng.uniform(-0.05, 0.05, len(alike))[which]
     circuit = Circuit(effects, base, Disturbances(effects, began, rng))
     valve = Valve(effects, base.gain, n)
     sensor = Sensor(case, effects, number / max(case.breaths - 1, 1), rng)
@@ -200,7 +191,7 @@ def _run(
     lengths = np.diff(grid.nodes, axis=1)
     for k in range(samples):
         pressure[:, k] = sensor.read(k, state[READING])
-        wanted = np.clip(controller.command(k, pressure[:, k]), 0.0, 100.0)
+        wanted = np.clip(command(k, pressure[:, k]), 0.0, 100.0)
         u_in[:, k] = np.round(np.round(wanted / case.log_step) * case.log_step, 6)
         asked[:, k] = valve.flow(u_in[:, k])
         if k == samples - 1:

@@ -22,8 +22,7 @@ from typing import Literal
 import numpy as np
 
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, EffectFamily, Strength
-from proofs.challenge.questions import DrawnCase, Kind
-from ventbench.base.errors import InputError
+from proofs.challenge.questions import DrawnCase, Kind, drawn
 from ventbench.task.lungs import Lung
 
 #: Form of an effect whose parameter means the same as the library's of that name.
@@ -171,21 +170,8 @@ _SAMPLING = ((0.0319, 80), (0.0340, 80), (0.0250, 100))
 
 
 def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
-    """Draw cases of one kind or of all kinds, in random order.
-
-    Raises:
-        InputError: if the generator has no such kind, or there are fewer cases than kinds.
-    """
-    if kind == "form":
-        raise InputError("the stranger generator has no kind form: all of its forms are others")
-    if count < (len(SHARES) if kind == "all" else 1):
-        raise InputError(f"{count} cases are too few; ask for at least {len(SHARES)}")
-    sizes = {kind: count}
-    if kind == "all":
-        sizes = {k: max(1, int(share * count)) for k, share in SHARES.items()}
-        sizes["single"] += count - sum(sizes.values())
-    cases = [DrawnCase(k, case) for k, n in sizes.items() for case in _of_kind(k, n, rng)]  # type: ignore[arg-type]
-    return [cases[i] for i in rng.permutation(len(cases))]
+    """See :func:`proofs.challenge.questions.drawn`."""
+    return drawn(SHARES, _of_kind, kind, count, rng)
 
 
 def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[StrangerCase]:

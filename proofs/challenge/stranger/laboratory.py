@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case
+from proofs.challenge.questions import coloured_noise
 from proofs.challenge.stranger.effects import StrangerCase
 from proofs.challenge.stranger.rig import Floats, Rig
 from ventbench.recordings.breaths import Breaths, make_breaths
@@ -44,7 +45,7 @@ def record(
     Args:
         case: a case of this generator.
         rng: source of everything that varies.
-        steps: not used; the step is fixed.
+        steps: integration steps between two samples; as many as make up :data:`STEP` if None.
         share: scales target pressures above PEEP and explored commands.
     """
     assert isinstance(case, StrangerCase)
@@ -61,7 +62,7 @@ def record(
     proportional = np.exp(rng.uniform(np.log(0.2), np.log(case.proportional), n))
     integral = np.exp(rng.uniform(np.log(2.0), np.log(20.0), n))
     pulses = _explored(case, rng, time, share)
-    noise = _noise(case, rng, (n, samples))
+    noise = coloured_noise(case, case.correlation, rng, (n, samples))
     summed = np.zeros(n)
     most = min(100.0, _FLOW_LIMIT / (case.base.R * case.base.gain * 1e-3))
 
@@ -84,7 +85,8 @@ def record(
             np.round(np.minimum(u, most) / case.log_step) * case.log_step, 0, 100
         )
 
-    pressure, u_in = _run(case, rng, time, u_out, command, np.arange(n), STEP)
+    step = STEP if steps is None else case.interval / steps
+    pressure, u_in = _run(case, rng, time, u_out, command, np.arange(n), step)
     wrong = rng.uniform(size=pressure.shape) < case.outliers
     size = case.noise * rng.uniform(*_OUTLIER, pressure.shape)
     sign = rng.choice(np.array([-1.0, 1.0]), pressure.shape)
@@ -118,7 +120,7 @@ def record_commands(
     """
     assert isinstance(case, StrangerCase)
     n = len(time)
-    noise = _noise(case, rng, time.shape)
+    noise = coloured_noise(case, case.correlation, rng, time.shape)
 
     def command(k: int, shown: Floats, due: NDArray[np.bool_]) -> tuple[Floats, Floats]:
         measured = shown + noise[:, k]
@@ -146,13 +148,11 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
     """
     assert isinstance(case, StrangerCase)
     quiet = replace(case, gain_scatter=0.0)
-    rng = np.random.default_rng(seed)
-    number = breaths.breath_id - 1
-
-    def command(k: int, shown: Floats, due: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        return shown, breaths.u_in[:, k]
-
-    return _run(quiet, rng, breaths.time, breaths.u_out, command, number, REPLAY_STEP, start)[0]
+    return _run(
+        quiet, np.random.default_rng(seed), breaths.time, breaths.u_out,
+        lambda k, shown, due: (shown, breaths.u_in[:, k]), breaths.breath_id - 1, REPLAY_STEP,
+        start,
+    )[0]  # fmt: skip
 
 
 def _run(
@@ -168,18 +168,20 @@ def _run(
     assert case.base is not None
     n, samples = time.shape
     effects = {effect.name: effect for effect in case.effects}
-    size = np.zeros(n)
-    onset = rng.uniform(0.0, 0.5, n)
+    # The same breath has the same random numbers, however often it is asked for.
+    alike, which = np.unique(number, return_inverse=True)
+    m = len(alike)
+    onset, size = rng.uniform(0.0, 0.5, m), np.zeros(m)
     if "patient_effort" in effects:
-        acts = rng.uniform(size=n) < _EFFORTS
-        scatter = np.clip(1.0 + _EFFORT_SCATTER * rng.standard_normal(n), 0.3, 1.8)
+        acts = rng.uniform(size=m) < _EFFORTS
+        scatter = np.clip(1.0 + _EFFORT_SCATTER * rng.standard_normal(m), 0.3, 1.8)
         size = np.where(acts, effects["patient_effort"].parameters["amplitude"] * scatter, 0.0)
     rig = Rig(
         case.base, effects, number / max(case.breaths - 1, 1), case.dead_space,
-        rng.uniform(0.0, 2.0 * np.pi, n), np.stack([size, onset]),
+        rng.uniform(0.0, 2.0 * np.pi, m)[which], np.stack([size, onset])[:, which],
     )  # fmt: skip
-    gains = 1.0 + case.gain_scatter * rng.standard_normal(n)
-    spread = 0.2 * rng.standard_normal(n)
+    gains = 1.0 + case.gain_scatter * rng.standard_normal(m)[which]
+    spread = 0.2 * rng.standard_normal(m)[which]
     rig.start(case.base.peep + spread if start is None else start)
     delay = effects["valve_delay"].parameters["delay"] if "valve_delay" in effects else 0.0
     late = effects.get("exhalation_valve_delay")
@@ -233,17 +235,6 @@ def _with_memory(rig: Rig, wanted: Floats, these: NDArray[np.bool_]) -> Floats:
     rig.held = np.where(these, rig.held, held)
     rig.speed_of_command = np.where(these, rig.speed_of_command, before)
     return opening
-
-
-def _noise(case: StrangerCase, rng: np.random.Generator, shape: tuple[int, ...]) -> Floats:
-    """Noise of the sensor: white, and a coloured share."""
-    white = rng.standard_normal(shape) * np.sqrt(1.0 - case.coloured)
-    slow, a = np.zeros(shape), case.correlation
-    fresh = rng.standard_normal(shape)
-    slow[:, 0] = fresh[:, 0]
-    for k in range(1, shape[1]):
-        slow[:, k] = a * slow[:, k - 1] + np.sqrt(1.0 - a * a) * fresh[:, k]
-    return case.noise * (white + np.sqrt(case.coloured) * slow)
 
 
 def _explored(case: StrangerCase, rng: np.random.Generator, time: Floats, share: float) -> Floats:

@@ -2,13 +2,14 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import pairwise
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from hardware_eval.emulation.cases import LIBRARY
 from proofs.challenge.first.plan import CLASSES, OUTSIDE, draw
-from proofs.challenge.questions import KINDS
+from proofs.challenge.questions import Kind
 from proofs.challenge.truth import has_library_form
 from ventbench.base.errors import InputError
 from ventbench.physics import library
@@ -39,7 +40,7 @@ def test_the_whole_grid_is_drawn_evenly():
 def test_all_kinds_are_there_and_mixed():
     cases = drawn("all", 60)
     assert len(cases) == 60
-    assert {d.kind for d in cases} == set(KINDS)
+    assert {d.kind for d in cases} == set(get_args(Kind))
     kinds = [d.kind for d in cases]
     assert sum(a == b for a, b in pairwise(kinds)) < 35
 

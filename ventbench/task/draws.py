@@ -392,7 +392,6 @@ def random_scenarios(
     pip: Array,
     *,
     spread: Array | float | None = None,
-    breaths: int = protocol.BREATHS,
     smooth: bool = False,
 ) -> Scenario:
     """Draw new cells from the distributions of the development draws, for training.
@@ -405,7 +404,6 @@ def random_scenarios(
         spread: reach of the deviations of each cell, as a multiple of the draws' ranges, shape
             ``(n,)`` or ``()``; 0 for nominal cells. The delay stays below one step. If not given,
             the ranges themselves.
-        breaths: number of breaths with noise.
         smooth: represent the converter by noise of one step's width, since rounding has no
             derivative; else the cells round.
 
@@ -426,12 +424,12 @@ def random_scenarios(
     # The order of these two keys is that with which the published weights were trained.
     sd_key, noise_key = (keys[-3], keys[-2]) if smooth else (keys[-2], keys[-3])
     sd = jax.random.uniform(sd_key, (n, 1, 1), minval=NOISE_SD[0], maxval=NOISE_SD[1])
-    shape = (n, breaths, protocol.INSPIRATION_STEPS)
+    shape = (n, protocol.BREATHS, protocol.INSPIRATION_STEPS)
     noise = sd * jax.random.normal(noise_key, shape)
     if smooth:
         noise += QUANTUM * jax.random.uniform(keys[-1], shape, minval=-0.5, maxval=0.5)
     quantum = jnp.full(n, 0.0 if smooth else QUANTUM)
-    gain = _log_gain(jax.random.uniform(jax.random.fold_in(key, 1), (n, breaths)), jnp)
+    gain = _log_gain(jax.random.uniform(jax.random.fold_in(key, 1), shape[:2]), jnp)
     if spread is not None:
         scale = jnp.broadcast_to(spread, (n,))
         noise = scale[:, None, None] * noise

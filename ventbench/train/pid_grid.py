@@ -92,10 +92,7 @@ def _errors(plant: Plant, gains: Array, cells: Scenario) -> Array:
 
 
 def errors(
-    plants: Plant,
-    gains: Floats,
-    pips: tuple[float, ...] = protocol.PIPS,
-    batch: int = BATCH,
+    plants: Plant, gains: Floats, pips: tuple[float, ...] = protocol.PIPS, batch: int = BATCH
 ) -> NDArray[np.float32]:
     """Nominal error of each PID on each lung at each PIP.
 

@@ -87,14 +87,7 @@ class ResidualConfig:
         for name in ("updates", "copies", "learning_rate", "limit", "members"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"training: {name} = {getattr(self, name)} must be positive")
-        for name in (
-            "weight_decay",
-            "lam",
-            "first_breath",
-            "pressures",
-            "commands",
-            "ahead",
-        ):
+        for name in ("weight_decay", "lam", "first_breath", "pressures", "commands", "ahead"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"training: {name} = {getattr(self, name)} must not be negative")
         if not 0 <= self.spread <= 4:
@@ -288,12 +281,7 @@ def _advance(
         member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
         lung, pip = _cells(number, lungs, len(protocol.PIPS), config)
         member = jax.random.randint(member_key, lung.shape, 0, members)
-        cells = draws.random_scenarios(
-            scenario_key,
-            pips[pip],
-            spread=config.spread,
-            smooth=True,
-        )
+        cells = draws.random_scenarios(scenario_key, pips[pip], spread=config.spread, smooth=True)
         those = jax.tree.map(lambda leaf: leaf[member, lung], plants)
 
         def value(layers: Any) -> Array:

@@ -193,10 +193,7 @@ def groups_of_sessions(sessions: Sessions, labels: Sequence[Lung]) -> Groups:
 
 
 def inspirations(
-    breaths: Breaths,
-    sessions: Sessions,
-    labels: Sequence[Lung],
-    samples: int = SAMPLES,
+    breaths: Breaths, sessions: Sessions, labels: Sequence[Lung], samples: int = SAMPLES
 ) -> InspirationData:
     """Arrange breaths for the fit; the pressure of each inspiratory sample but the first counts.
 

@@ -21,13 +21,17 @@ import numpy as np
 from jax import Array
 
 from ventbench.plants.hybrid import ELASTIC_KNOTS, PLAYS, VALVE_KNOTS, Hybrid
+from ventbench.plants.population import DIRECTION_SUM
 from ventbench.task.lungs import Lung
 
 #: Kinds of rig that share parameters.
 RIG_COUNT = 4
 
-#: The plays' weights add up to less than this, so that pressure rises with a command held.
-DIRECTION_SUM = 0.98
+#: Orders of magnitude of what a kind of rig has of its own: delays and lags, s; L/cmH2O.
+_KIND = {
+    "valve_delay": 0.02, "valve_lag": 0.01, "sensor_lag": 0.01, "closing_delay": 0.03,
+    "closing_lag": 0.01, "opening_delay": 0.05, "circuit_compliance": 0.0008,
+}  # fmt: skip
 
 
 @flax.struct.dataclass
@@ -141,20 +145,12 @@ def plants(pooled: Pooled, groups: Groups) -> Hybrid:
         offset=pooled.offset[lung] + pooled.session_offset[session],
         slopes=jnp.exp(pooled.slopes + pooled.slopes_rig[rig] + gain),
         direction=direction(pooled)[rig],
-        valve_delay=jnp.exp(pooled.valve_delay[rig]),
-        valve_lag=jnp.exp(pooled.valve_lag[rig]),
-        circuit_compliance=jnp.exp(pooled.circuit_compliance[rig]),
-        sensor_lag=jnp.exp(pooled.sensor_lag[rig]),
-        rising=jnp.exp(pooled.rising[rig]),
-        falling=jnp.exp(pooled.falling[rig]),
+        **{name: jnp.exp(getattr(pooled, name)[rig]) for name in (*_KIND, "rising", "falling")},
         conductance=jnp.exp(pooled.conductance[rig] + pooled.session_conductance[session]),
         closing_conductance=jnp.exp(
             pooled.closing_conductance[rig] + pooled.session_closing_conductance[session]
         ),
-        opening_delay=jnp.exp(pooled.opening_delay[rig]),
-        closing_delay=jnp.exp(pooled.closing_delay[rig]),
         rest=jnp.exp(pooled.rest) + jnp.zeros_like(laminar),
-        closing_lag=jnp.exp(pooled.closing_lag[rig]),
     )
 
 
@@ -236,16 +232,7 @@ _GAUSSIAN = {
     "E": "compliance",
     "stiffening": "stiffening",
     "offset": "offset",
-    "valve_delay": "kind",
-    "valve_lag": "kind",
-    "sensor_lag": "kind",
-    "closing_delay": "kind",
-    "closing_lag": "kind",
-    "opening_delay": "kind",
-    "circuit_compliance": "kind",
-    "conductance": "kind",
-    "closing_conductance": "kind",
-    "rest": "kind",
+    **dict.fromkeys((*_KIND, "conductance", "closing_conductance", "rest"), "kind"),
 }
 _HEAVY_TAILED = {
     "session_gain": "rig_gain",
@@ -297,7 +284,6 @@ def centre(labels: Sequence[Lung], sessions: int, laminar_share: float = LAMINAR
     def rig(value: float) -> np.ndarray:
         return np.full(RIG_COUNT, np.log(value))
 
-    rigs = np.zeros(sessions)
     values: dict[str, Any] = dict(
         slopes=np.full(knots, np.log(SHEET_FLOW / FULL_OPENING)),
         slopes_rig=np.zeros((RIG_COUNT, knots)),
@@ -307,25 +293,13 @@ def centre(labels: Sequence[Lung], sessions: int, laminar_share: float = LAMINAR
         stiffening=np.zeros((len(labels), len(ELASTIC_KNOTS))),
         offset=np.zeros(len(labels)),
         direction=np.full((RIG_COUNT, len(PLAYS)), np.log(0.03)),
+        rest=np.log(5.0),
+        **{name: rig(value) for name, value in _KIND.items()},
         rising=rig(0.05),
         falling=rig(0.05),
-        valve_delay=rig(0.02),
-        valve_lag=rig(0.01),
-        sensor_lag=rig(0.01),
-        closing_delay=rig(0.03),
-        opening_delay=rig(0.05),
-        circuit_compliance=rig(0.0008),
         conductance=rig(0.2),
         closing_conductance=rig(0.2),
-        rest=np.log(5.0),
-        session_gain=rigs,
-        session_R=rigs,
-        session_K2=rigs,
-        session_E=rigs,
-        session_offset=rigs,
-        session_conductance=rigs,
-        session_closing_conductance=rigs,
-        closing_lag=rig(0.01),
+        **dict.fromkeys(_HEAVY_TAILED, np.zeros(sessions)),
     )
     pooled = Pooled(**{name: jnp.asarray(value, float) for name, value in values.items()})
     sheet = jnp.asarray(np.log(SHEET_FLOW))

@@ -32,10 +32,7 @@ from ventbench.train.rigs import random_effects
 from ventbench.train.rigs.data import InspirationData, inspirations, load_rig_recordings
 from ventbench.train.rigs.fit import Noise, simulate
 from ventbench.train.rigs.random_effects import Population, Prior, Units
-
-#: Standard deviation of the logarithm of the valve's last slope that is added, as between members
-#: of the ensemble: hardly anything is recorded there.
-UNRECORDED_SLOPE = 0.4
+from ventbench.train.rigs.train import UNRECORDED_SLOPE
 
 #: Standard deviations between rigs that the data start from, of logarithms unless said, by the
 #: beginning of a name; and of everything else.
@@ -226,7 +223,7 @@ class FittedPopulation:
     gain_sd: float
     gain_lag: float
 
-    def left_out(self) -> list[tuple[float, float]]:
+    def left_out(self) -> list[float]:
         """:func:`~ventbench.train.rigs.random_effects.surprise` of each session by the others."""
         out = []
         for j in range(len(self.sessions)):
@@ -352,7 +349,7 @@ def _write(fitted: FittedPopulation, known: frozen.Frozen) -> None:
     levels = np.linspace(0.0, 1.0, len(GAIN_QUANTILES))
     about = {
         "sessions": list(fitted.sessions),
-        "left_out": [round(share, 4) for _, share in fitted.left_out()],
+        "left_out": [round(share, 4) for share in fitted.left_out()],
         "deviations": {name: round(float(x), 4) for name, x in zip(NAMES, sd, strict=True)},
         "gain_breaths": len(fitted.gain),
         "gain_deviation": round(fitted.gain_sd, 4),

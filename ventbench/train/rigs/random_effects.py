@@ -130,15 +130,14 @@ def _expect(
     return beta, error, means, posterior + through @ error @ through.transpose(0, 2, 1)
 
 
-def surprise(units: Units, j: int, population: Population) -> tuple[float, float]:
+def surprise(units: Units, j: int, population: Population) -> float:
     """How a unit lies in a population that was fitted without it.
 
     Compared is what its data say, in the directions in which they say something, with what the
     population predicts, errors of the data included.
 
     Returns:
-        Logarithm of its predictive density, up to a constant of the unit, and the share of the
-        predicted units that are nearer to the middle: uniform in 0..1 if all is right.
+        Share of the predicted units that are nearer to the middle: uniform in 0..1 if all is right.
     """
     values, vectors = np.linalg.eigh(units.information[j])
     known = values > 1e-6 * values[-1]
@@ -148,5 +147,4 @@ def surprise(units: Units, j: int, population: Population) -> tuple[float, float
     covariance = np.eye(root.shape[1]) + root.T @ spread @ root
     off = estimate - root.T @ mean
     distance = float(off @ np.linalg.solve(covariance, off))
-    density = -0.5 * (np.linalg.slogdet(covariance)[1] + distance)
-    return float(density), float(chi2.cdf(distance, root.shape[1]))
+    return float(chi2.cdf(distance, root.shape[1]))

@@ -72,11 +72,7 @@ class Episodes:
 
 
 def draw(
-    key: Array,
-    lungs: Lungs,
-    count: int,
-    first: Array | int = 0,
-    vary: bool = True,
+    key: Array, lungs: Lungs, count: int, first: Array | int = 0, vary: bool = True
 ) -> Episodes:
     """Draw episodes: the lungs in turn, on any of their plants, with new deviations.
 
@@ -94,33 +90,9 @@ def draw(
     plant = jax.random.randint(plant_key, (count,), 0, which) * vary
     plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[plant, lung], lungs.plants)
     pip = (first + jnp.arange(count) // number) % len(protocol.PIPS)
-    cells = sample(key, count, number, first, vary)
+    wanted = jnp.asarray(protocol.PIPS, jnp.result_type(float))[pip]
+    cells = random_scenarios(key, wanted, spread=None if vary else 0.0)
     return Episodes(plants, cells, lungs.weights[lung, pip])
-
-
-def sample(
-    key: Array,
-    count: int,
-    lungs: int = 1,
-    first: Array | int = 0,
-    vary: bool = True,
-    *,
-    breaths: int = protocol.BREATHS,
-) -> Scenario:
-    """Draw cells with deviations as of the scored draws.
-
-    Args:
-        key: key of the random numbers.
-        count: number of cells E.
-        lungs: cells of that many lungs in turn get the same nominal PIP.
-        first: which of the six PIPs comes first.
-        vary: false for nominal cells, without any deviation.
-        breaths: breaths of each cell.
-    """
-    which = (first + jnp.arange(count) // lungs) % len(protocol.PIPS)
-    pip = jnp.asarray(protocol.PIPS, jnp.result_type(float))[which]
-    spread = None if vary else 0.0
-    return random_scenarios(key, pip, spread=spread, breaths=breaths)
 
 
 def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:

@@ -12,12 +12,7 @@ import optax
 from jax import Array
 
 from ventbench.controllers import rl_policy
-from ventbench.controllers.rl_policy import (
-    SCALE,
-    GaussianPolicy,
-    Parameters,
-    TanhNetwork,
-)
+from ventbench.controllers.rl_policy import SCALE, GaussianPolicy, Parameters, TanhNetwork
 from ventbench.task import protocol
 from ventbench.train.rl import episodes
 

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.answer import answer
@@ -18,7 +19,7 @@ from proofs.challenge.make import make
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Limits, built_in, find
 from proofs.challenge.vocabulary import PUBLISHED, TERMS, VOCABULARY
-from proofs.diagnosers import classifier, lisdd
+from proofs.diagnosers import classifier, evidence, lisdd
 from proofs.diagnosers.common import Templates
 from proofs.diagnosers.gaussian_process import _Process
 from proofs.diagnosers.sindy import thresholded_least_squares
@@ -27,7 +28,8 @@ from proofs.diagnosers.ventbench import Calibration, hypotheses
 
 def test_the_project_enters_itself_and_its_rivals() -> None:
     assert built_in() == (
-        "classifier", "forward_search", "gaussian_process", "lisdd", "refit", "sindy", "ventbench",
+        "classifier", "evidence", "forward_search", "gaussian_process", "lisdd", "refit", "sindy",
+        "ventbench",
     )  # fmt: skip
 
 
@@ -90,6 +92,30 @@ def test_the_classifier_has_its_weights_and_sees_what_drifts() -> None:
     for k, name in ((1, "sensor_drift"), (2, "clock_offset")):
         at = sorted(TERMS).index(name)
         assert chances[k, at] > 10.0 * chances[0, at]
+
+
+def test_evidence_of_coefficients_is_that_of_the_marginal_density() -> None:
+    rng = np.random.default_rng(3)
+    X, y, sd = rng.standard_normal((20, 3)), rng.standard_normal(20), np.array([0.5, 1.0, 2.0])
+    value, mean, sds = evidence.gaussian(X.T @ X, X.T @ y, sd)
+    marginal = stats.multivariate_normal(np.zeros(20), np.eye(20) + X * sd**2 @ X.T).logpdf(y)
+    assert value == pytest.approx(marginal - stats.norm.logpdf(y).sum())
+    precision = X.T @ X + np.diag(sd**-2)
+    np.testing.assert_allclose(mean, np.linalg.solve(precision, X.T @ y))
+    np.testing.assert_allclose(sds, np.sqrt(np.diag(np.linalg.inv(precision))))
+
+
+def test_an_event_is_found_in_the_breaths_that_it_affects() -> None:
+    rng = np.random.default_rng(4)
+    for acts in ([2, 5, 6], [0, 1, 2, 3, 4, 6, 7, 8, 9, 11]):
+        size = np.isin(np.arange(12), acts) * rng.uniform(0.7, 1.3, 12)
+        G = 40.0 * (np.eye(12) - 0.8 / 12)  # their mean is hardly known
+        b = G @ size + rng.standard_normal(12)
+        at, sizes = evidence.affected(G, b, 1.0, 1.0)
+        assert at.tolist() == acts
+        assert np.all(sizes > 0.2)
+    at, _ = evidence.affected(G, rng.standard_normal(12), 1.0, 1.0)
+    assert not len(at)
 
 
 SHARES = Calibration(nothing=0.9, named=0.8, placed=0.7, alone=0.25, foreign=0.6, doubt=2.0)

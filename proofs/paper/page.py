@@ -13,7 +13,7 @@ from proofs.paper.report import Chart, Reproduction
 from ventbench import palette
 from ventbench.base import files
 from ventbench.base.errors import require
-from ventbench.pages import graphics
+from ventbench.pages import panels
 
 #: Size of a chart and of its plot: left, top, right and bottom margins.
 WIDTH, HEIGHT = 640.0, 280.0
@@ -95,7 +95,7 @@ def _chart(chart: Chart) -> dict[str, Any]:
         "lines": [
             {
                 "name": line.name,
-                "path": graphics.path(np.stack([across(line.x), up(line.y)], axis=-1)),
+                "path": panels.path(np.stack([across(line.x), up(line.y)], axis=-1)),
                 "dashed": line.dashed,
             }
             for line in chart.lines

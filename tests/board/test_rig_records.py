@@ -13,8 +13,8 @@ from ventbench.board import (
     canonical,
     create,
     frames,
+    official_runs,
     pages,
-    rerun,
     rounds,
     store,
     verify,
@@ -224,12 +224,12 @@ def again(drafts, stressed, score):
 def test_a_second_stress_run_is_compared(drafts, again):
     recorded = opened(drafts["pid_robust"]).stress
     assert recorded is not None
-    assert rerun.stress_difference(recorded, again) == ""
+    assert official_runs.stress_difference(recorded, again) == ""
     for key, text in (("error", "stress.errors"), ("volume", "stress.volume_mL")):
         moved = dataclasses.replace(again, **{key: getattr(again, key) + 2.0})
-        assert rerun.stress_difference(recorded, moved).startswith(text)
+        assert official_runs.stress_difference(recorded, moved).startswith(text)
     newer = dataclasses.replace(recorded, stressors=recorded.stressors + 1)
-    assert "stressors are version" in rerun.stress_difference(newer, again)
+    assert "stressors are version" in official_runs.stress_difference(newer, again)
 
 
 def forge(board, draft, where, folder):
@@ -252,21 +252,21 @@ def test_a_forged_stress_figure_is_found(
 ):
     """Without a stressor by the replay of the same draws, with one by the second run."""
     monkeypatch.setattr(
-        rerun, "run_protocol", lambda *_, **__: dataclasses.replace(score, stressed=again)
+        official_runs, "run_protocol", lambda *_, **__: dataclasses.replace(score, stressed=again)
     )
 
     def second(folder, sha256):
-        (outcome,) = rerun.rerun(
+        (outcome,) = official_runs.rerun(
             folder, records=[sha256], load=lambda: simulators, runner=InProcessRunner
         )
         return outcome
 
     honest = second(board, opened(drafts["pid_robust"]).sha256)
-    assert honest.state == rerun.REPRODUCED, honest
+    assert honest.state == official_runs.REPRODUCED, honest
     for name, where in (("without", (0, 2, 3)), ("with", (40, 2, 3))):
         folder, sha256 = forge(board, drafts["pid_robust"], where, tmp_path / name)
         outcome = second(folder, sha256)
-        assert outcome.state == rerun.DIFFERENT
+        assert outcome.state == official_runs.DIFFERENT
         assert outcome.detail.startswith("stress.errors: differs by up to 0.01")
         text = "key stress.errors: without a stressor not what the same draws give, by up to 0.01"
         found = [x for x in verify.verify(folder, lambda: simulators).problems if text in x]

@@ -16,7 +16,7 @@ from ventbench.cli import app
 from ventbench.entries import contract
 from ventbench.entries.contract import STEPS
 from ventbench.entries.errors import SubmissionError
-from ventbench.entries.folder import check_files
+from ventbench.entries.folder import check_files, open_submission
 from ventbench.entries.review import check_sources
 from ventbench.entries.runner import InProcessRunner
 from ventbench.sandbox.configuration import Allowance
@@ -395,7 +395,7 @@ def test_nothing_is_run_or_imported(demo, tmp_path):
     (demo / "controller.py").write_text(bomb + (demo / "controller.py").read_text())
     (demo / "network.py").write_text(bomb)
     check_sources(demo)
-    contract._opened(str(demo))
+    open_submission(str(demo))
     check_files(demo)
     assert not (tmp_path / "ran").exists()
 

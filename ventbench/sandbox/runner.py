@@ -417,7 +417,7 @@ _BEFORE, _DURING = ("reset", "import", "construct"), ("act", "type", "value")
 
 
 class Verdict(NamedTuple):
-    """Kind, words and detail of a ``child.failures.Failure``."""
+    """Kind, words and detail of a ``child.cell.Failure``."""
 
     kind: str
     what: str

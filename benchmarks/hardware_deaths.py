@@ -49,6 +49,13 @@ LIMITS = {
     "bus": 0.070, "supply": 0.010,
 }  # fmt: skip
 
+#: What the table calls them.
+TITLES = {
+    "host": "host killed", "device": "program killed", "stopped": "program stopped",
+    "deadman": "deadman killed", "both": "both stopped", "bus": "sensor's bus blocked",
+    "supply": "supply lost",
+}  # fmt: skip
+
 #: A host runs for a random time in this range before it is killed, s.
 LIFE = (0.05, 0.5)
 
@@ -296,7 +303,7 @@ def main() -> None:
         own = [row for row in rows if (row["death"], row["vents"]) == (death, vents)]
         kills, within = (sum(row[name] for row in own) for name in ("kills", "within"))
         longest = [max(row[name] for row in own) for name in ("bound_ms", "median_ms", "worst_ms")]
-        name = death if vents else f"{death}, closed without current: nothing flows"
+        name = TITLES[death] + ("" if vents else ", closed without current: nothing flows")
         print(f"| {name} | {within}/{kills} | {', '.join(f'{ms:.0f}' for ms in longest)} |")
     loads = [row["load"] for row in rows]
     print(f"load {min(loads)} to {max(loads)} on {os.cpu_count()} processors")

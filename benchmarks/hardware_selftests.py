@@ -256,7 +256,7 @@ def main() -> None:
     work, began = WorkFolder(given.out, about), time.process_time()
     table = {
         label: {
-            kind: work.get(f"{label}, {kind}", partial(of_label, label, kind, **about))
+            kind: work.get(f"{label}-{KINDS.index(kind)}", partial(of_label, label, kind, **about))
             for kind in kinds
         }
         for label in labels

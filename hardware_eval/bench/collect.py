@@ -28,7 +28,7 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.write import write
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
-from ventbench.train.exploration import RANGES, ExplorationRanges, Limits, explore
+from ventbench.train.exploration import RANGES, Limits, explore
 
 Floats = NDArray[np.float64]
 
@@ -141,19 +141,11 @@ class BenchVentilator:
 
 
 def collect(
-    bench: Bench,
-    lung: str,
-    count: int,
-    out: Path,
-    *,
-    seed: int = 0,
-    ranges: ExplorationRanges | None = None,
-    limits: Limits | None = None,
-    pips: tuple[float, ...] = protocol.PIPS,
-    about: dict[str, Any] | None = None,
+    bench: Bench, lung: str, count: int, out: Path, *, seed: int = 0,
+    limits: Limits | None = None, about: dict[str, Any] | None = None,
     progress: Callable[[int], None] = lambda done: None,
-) -> Collection:
-    """Explore a lung; a folder that holds breaths of the same seed is continued.
+) -> Collection:  # fmt: skip
+    """Explore a lung at all PIPs in turn; a folder with breaths of the same seed is continued.
 
     Args:
         bench: device, clock, safety, operator.
@@ -161,9 +153,7 @@ def collect(
         count: breaths in all.
         out: folder of the log and the recording.
         seed: of the disturbances.
-        ranges: the paper's for the lung if not given.
         limits: pressures at which exploring is interrupted.
-        pips: cmH2O; they take turns.
         about: device, operator and notes for the log.
         progress: called with the number of finished breaths.
 
@@ -171,11 +161,11 @@ def collect(
         InputError: if there are no ranges for the lung, or the folder is of another collection.
         LinkError: if the device is lost; what is done is kept.
     """
-    if ranges is None and lung not in RANGES:
+    if lung not in RANGES:
         raise InputError(f"no ranges to explore {lung} in; they exist for {', '.join(RANGES)}")
     if count < 1:
         raise InputError(f"{count} breaths to collect: ask for one at least")
-    plan = {"lung": lung, "seed": seed, "pips": list(pips)}
+    plan = {"lung": lung, "seed": seed, "pips": list(protocol.PIPS)}
     ventilator, stopped, spoilt = BenchVentilator(bench, lung), "", 0
     with RawLog(out / LOG) as log:
         logged = list(lines(log.path))
@@ -190,14 +180,12 @@ def collect(
             for number in range(1, count + 1):
                 if number in done:
                     continue
-                pip = pips[(number - 1) % len(pips)]
+                pip = protocol.PIPS[(number - 1) % len(protocol.PIPS)]
                 ventilator.pip = pip
                 # A breath at a time, each with a seed of its own: a restart repeats none.
                 own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
                 with realtime.priority():
-                    explore(
-                        ventilator, lung, 1, seed=own, ranges=ranges, limits=limits, pips=(pip,)
-                    )
+                    explore(ventilator, lung, 1, seed=own, limits=limits, pips=(pip,))
                 run = PlannedRun(number, "explore", "exploration", lung, pip, number)
                 line = ventilator.log.line(run, 0, 0)
                 log.append({**line, "whole": not ventilator.stopped})

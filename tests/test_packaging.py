@@ -200,8 +200,7 @@ def test_wheel_content(wheel: Path) -> None:
         ("submissions", "ventbench/_submissions"),
         ("leaderboard", "ventbench/_leaderboard"),
     ]:
-        listed = [name for name in _git_files("--", folder) if not name.endswith(".actions")]
-        tracked = {name.replace(folder, inside, 1) for name in listed}
+        tracked = {name.replace(folder, inside, 1) for name in _git_files("--", folder)}
         assert tracked <= names, f"missing in the wheel: {sorted(tracked - names)}"
     assert any(name.startswith("ventbench/_data/") for name in names)
     assert "ventbench/_submissions/pid_best/controller.py" in names

@@ -179,7 +179,7 @@ def submissions_folder() -> Path:
 
 
 def leaderboard_folder() -> Path:
-    """Folder of the leaderboard that travels with ventbench, without commands in a wheel."""
+    """Folder of the leaderboard of the last round, which travels with ventbench."""
     return _folder("leaderboard")
 
 

@@ -3,7 +3,7 @@
 Residual networks, PPO and DQN correct the same PID, learn on the training rigs of one lung from as
 many breaths, and are scored on the ranked draws of a round: rigs that nobody trained on. Prints the
 normalised score of each seed, the interquartile mean, its 95 % interval over seeds, and processor
-time. What is finished is kept; the same command continues.
+time of the call that ended it. What is finished is kept; the same command continues.
 
 Usage:
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Parameter, Values
 
 
 class CommandRounding(Mechanism):
@@ -18,23 +17,17 @@ class CommandRounding(Mechanism):
         site="command",
         equation="u_effective = u + amount (floor(u + bias) - u)",
         parameters=(
-            Parameter(
-                "amount", "1",
-                "share of the rounding that is seen: 1 if the valve gets whole percents",
-                0.0, 1.0, 0.0, 1.0, 1.0,
-            ),
-            Parameter(
-                "bias", "%", "0 cuts off, 0.5 rounds to the nearest; no derivative: try both",
-                0.0, 0.5, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 0.5), discrete=True,
-            ),
+            Parameter("amount", "1",
+                      "share of the rounding that is seen: 1 if the valve gets whole percents",
+                      0.0, 1.0, 0.0, 1.0, 1.0),
+            Parameter("bias", "%", "0 cuts off, 0.5 rounds to the nearest; no derivative: try both",
+                      0.0, 0.5, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 0.5), discrete=True),
         ),
         source=(
             "Valve drivers that take integers while the controller logs its fractional request."
         ),
-        signature=(
-            "Cut off, half a percent of the command is missing on average, which looks like "
-            "a dead band of 0.5 %; what remains follows the fraction of each command."
-        ),
+        signature="Cut off, half a percent of the command is missing on average, which looks like "
+        "a dead band of 0.5 %; what remains follows the fraction of each command.",
         confusable=("valve_dead_band",),
         least=0.5,
         least_reason="a driver rounds or does not; half a rounding is another effect",
@@ -45,6 +38,3 @@ class CommandRounding(Mechanism):
         """The command, moved towards a whole number."""
         whole = jnp.floor(u_in + values["bias"])
         return u_in + values["amount"] * (whole - u_in)
-
-
-MECHANISM = CommandRounding()

@@ -5,8 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Parameter, Values
 
 
 class SensorLag(Mechanism):
@@ -19,17 +18,14 @@ class SensorLag(Mechanism):
         equation="tau dx/dt = p - x, second dy/dt = x - y",
         parameters=(
             Parameter("tau", "s", "time constant", 0.0, 0.25, 0.0, 0.05, 0.12),
-            Parameter(
-                "second", "s",
-                "time constant of a lag behind the first, as of a filter behind a sampling line",
-                0.0, 0.25, 0.0, 0.0, 0.0, shape=True,
-            ),
+            Parameter("second", "s",
+                      "time constant of a lag behind the first, as of a filter behind a sampling "
+                      "line",
+                      0.0, 0.25, 0.0, 0.0, 0.0, shape=True),
         ),
         source="Low-pass filter of sensor, sampling line and electronics: 5 to 120 ms.",
-        signature=(
-            "All edges of pressure are rounded, in inspiration and at the start of "
-            "expiration alike, whatever R is."
-        ),
+        signature="All edges of pressure are rounded, in inspiration and at the start of "
+        "expiration alike, whatever R is.",
         confusable=("valve_lag", "circuit_compliance", "valve_delay"),
         detectable=0.019,
         least=0.012,
@@ -51,6 +47,3 @@ class SensorLag(Mechanism):
         # So written, a second lag of 0 s changes no bit.
         after = first + values["second"] / (values["second"] + length) * (state[1] - first)
         return after, jnp.stack([first, after])
-
-
-MECHANISM = SensorLag()

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Mechanism, Site, Values
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Parameter, Site, Values
 
 #: Added to the fading, so that a steady drift is no division by zero.
 _STEADY = 1e-4
@@ -153,10 +152,8 @@ MECHANISMS = (
         site="sensor",
         equation=f"y = p + change where x > at, {_POSITION}",
         parameters=(
-            Parameter(
-                "change", "cmH2O", "change of the offset",
-                -8.0, 8.0, 0.0, 1.2, 3.0, scan=(1.2, -1.2),
-            ),
+            Parameter("change", "cmH2O", "change of the offset",
+                      -8.0, 8.0, 0.0, 1.2, 3.0, scan=(1.2, -1.2)),
             _AT,
         ),
         source="A sensor that is zeroed, knocked or plugged in anew between two breaths.",
@@ -171,20 +168,14 @@ MECHANISMS = (
         site="sensor",
         equation=f"y = p (1 + gain g) + drift g, {_GROWN}",
         parameters=(
-            Parameter(
-                "drift", "cmH2O", "change of the offset from the first breath to the last",
-                -8.0, 8.0, 0.0, 1.2, 3.0,
-            ),
-            Parameter(
-                "gain", "1", "change of the gain over the recording",
-                -0.3, 0.3, 0.0, 0.0, 0.0, shape=True, share=True,
-            ),
+            Parameter("drift", "cmH2O", "change of the offset from the first breath to the last",
+                      -8.0, 8.0, 0.0, 1.2, 3.0),
+            Parameter("gain", "1", "change of the gain over the recording",
+                      -0.3, 0.3, 0.0, 0.0, 0.0, shape=True, share=True),
             _WARMING,
         ),
-        source=(
-            "Temperature and ageing of piezoresistive sensors between two zeroings: up to 3 "
-            "cmH2O a recording."
-        ),
+        source="Temperature and ageing of piezoresistive sensors between two zeroings: up to 3 "
+        "cmH2O a recording.",
         signature=(
             "An error that grows with the number of the breath and is the same at all its samples."
         ),

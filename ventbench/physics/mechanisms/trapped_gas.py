@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Parameter, Values
 
 
 class TrappedGas(Mechanism):
@@ -15,20 +14,15 @@ class TrappedGas(Mechanism):
         site="alveolus",
         equation="P_alveolus(0) = p(0) + pressure",
         parameters=(
-            Parameter(
-                "pressure", "cmH2O", "excess in the lung at the first sample",
-                0.0, 10.0, 0.0, 1.5, 4.0,
-            ),
+            Parameter("pressure", "cmH2O", "excess in the lung at the first sample",
+                      0.0, 10.0, 0.0, 1.5, 4.0),
         ),
-        source=(
-            "Expiration that ends before the lung is empty leaves 1 to 15 cmH2O (Pepe and Marini, "
-            "Am. Rev. Respir. Dis. 126, 1982, 166)."
-        ),
+        source="Expiration that ends before the lung is empty leaves 1 to 15 cmH2O (Pepe and "
+        "Marini, Am. Rev. Respir. Dis. 126, 1982, 166).",
         signature=(
             "A breath begins above its first reading at once, and gas flows out before it is given."
         ),
         confusable=("leak", "zero_step"),
-        detectable=None,
         least=0.3,
         least_reason="a valve that closes some milliseconds late",
     )  # fmt: skip
@@ -36,6 +30,3 @@ class TrappedGas(Mechanism):
     def of_breath(self, values: Values, base: Values) -> Values:
         """Recoil above the pressure at the airway."""
         return {**base, "offset": base["offset"] + values["pressure"]}
-
-
-MECHANISM = TrappedGas()

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Parameter, Values
 
 
 class ValveDelay(Mechanism):
@@ -17,20 +16,15 @@ class ValveDelay(Mechanism):
         site="inspiratory valve",
         equation="q(t) = q_commanded(t - delay)",
         parameters=(
-            Parameter(
-                "delay", "s", "dead time",
-                0.0, 0.15, 0.0, 0.04, 0.08, scan=tuple(0.01 * k for k in range(16)), kinked=True,
-            ),
+            Parameter("delay", "s", "dead time",
+                      0.0, 0.15, 0.0, 0.04, 0.08, scan=tuple(0.01 * k for k in range(16)),
+                      kinked=True),
         ),
-        source=(
-            "Pure transport delay of driver, pilot and tubing; proportional valves of "
-            "ventilators answer after 10 to 100 ms, and a delay of one to three samples is "
-            "what fits of recorded breaths ask for."
-        ),
-        signature=(
-            "Pressure runs ahead of the recording after every edge of the command during "
-            "inspiration, by one constant time."
-        ),
+        source="Pure transport delay of driver, pilot and tubing; proportional valves of "
+        "ventilators answer after 10 to 100 ms, and a delay of one to three samples is what fits "
+        "of recorded breaths ask for.",
+        signature="Pressure runs ahead of the recording after every edge of the command during "
+        "inspiration, by one constant time.",
         confusable=("valve_lag", "sensor_lag", "circuit_compliance"),
         detectable=0.009,
         least=0.008,
@@ -41,6 +35,3 @@ class ValveDelay(Mechanism):
     def dead_time(self, values: Values, time: Array) -> Array:
         """The delay, s."""
         return values["delay"]
-
-
-MECHANISM = ValveDelay()

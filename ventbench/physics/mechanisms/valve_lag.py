@@ -5,8 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Parameter, Values
 
 
 class ValveLag(Mechanism):
@@ -19,19 +18,13 @@ class ValveLag(Mechanism):
         equation="tau dx/dt = q_commanded - x, second dq/dt = x - q",
         parameters=(
             Parameter("tau", "s", "time constant", 0.0, 0.2, 0.0, 0.04, 0.1),
-            Parameter(
-                "second", "s", "time constant of a lag behind the first, as of a pilot stage",
-                0.0, 0.2, 0.0, 0.0, 0.0, shape=True,
-            ),
+            Parameter("second", "s", "time constant of a lag behind the first, as of a pilot stage",
+                      0.0, 0.2, 0.0, 0.0, 0.0, shape=True),
         ),
-        source=(
-            "First-order actuator; time constants of 5 to 100 ms are usual for proportional "
-            "solenoid valves."
-        ),
-        signature=(
-            "Edges of the command arrive rounded during inspiration; the start of "
-            "expiration is not affected."
-        ),
+        source="First-order actuator; time constants of 5 to 100 ms are usual for proportional "
+        "solenoid valves.",
+        signature="Edges of the command arrive rounded during inspiration; the start of expiration "
+        "is not affected.",
         confusable=("sensor_lag", "circuit_compliance", "valve_delay"),
         detectable=0.009,
         least=0.008,
@@ -52,6 +45,3 @@ class ValveLag(Mechanism):
         first = (values["tau"] * state[0] + length * flow) / (values["tau"] + length)
         after = (values["second"] * state[1] + length * first) / (values["second"] + length)
         return after, jnp.stack([first, after])
-
-
-MECHANISM = ValveLag()

@@ -129,6 +129,10 @@ class FilterBank(BasisTerm):
     taus: tuple[float, ...]
     stateful = True
 
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
+        """The resting flow in all filters, L/s."""
+        return self.lasting(flow + 0.0 * pressure)
+
     def step(self, state: Array, x: Array, length: Array) -> Array:
         """Filters of ``x`` after an implicit step of ``length`` s."""
         taus = per_state(self.taus, state)

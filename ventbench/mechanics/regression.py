@@ -230,13 +230,8 @@ def cross_products(
     for segment in segments:
         row = indices.index(segment.breath)
         time = segment.time[segment.rows]
-        signals = np.concatenate(
-            [
-                course(segment, chosen)[segment.rows],
-                np.stack([segment.pressure, time - time.mean(), np.ones(len(time))], axis=1),
-            ],
-            axis=1,
-        )
+        seen = np.stack([segment.pressure, time - time.mean(), np.ones(len(time))], axis=1)
+        signals = np.concatenate([course(segment, chosen)[segment.rows], seen], axis=1)
         freedom[row] += len(segment) - 1
         white = _whiten(signals, segment.begins)
         known = 0.5 * segment.begins.sum() * np.log(1.0 - rho**2)
@@ -360,12 +355,8 @@ def _whiten(values: Floats, begins: Bools) -> Floats:
 def _without_start(white: Floats, start: Floats) -> tuple[Floats, Floats]:
     """Whiten signals ``(r, n, c)`` for what a lag still has in it from before the segment.
 
-    Args:
-        white: whitened signals.
-        start: its whitened course, ``(r, n)``.
-
-    Returns:
-        The signals, and half the logarithm of the determinant of the covariance, ``(r,)``.
+    ``start`` is its whitened course, ``(r, n)``. Also returns half the logarithm of the determinant
+    of the covariance, ``(r,)``.
     """
     length = np.maximum(np.linalg.norm(start, axis=1), 1e-12)
     grown = np.sqrt(1.0 + (_START * length) ** 2)

@@ -156,14 +156,8 @@ def _volume(time: Floats, flow: Floats | None, volume: Floats | None) -> Floats:
 def _compared(fine: NDArray[np.intp], known: Bools, half: int, step: int) -> tuple[Ints, Bools]:
     """Centres of windows of known samples, half a window apart, and which of them follow a gap.
 
-    Args:
-        fine: centres of windows in which flow and volume are known, ``(m,)``.
-        known: samples at which the pressure is known too, ``(T,)``.
-        half: half the width of the window, samples.
-        step: distance of the centres, samples.
-
-    Returns:
-        Indices into ``fine``, ``(n,)``, and a mask, ``(n,)``.
+    They are indices into ``fine``, centres of windows in which flow and volume are known, ``step``
+    samples apart; at the samples ``known`` the pressure is known too.
     """
     complete = np.zeros(len(known), bool)
     for start, stop in _runs(known):

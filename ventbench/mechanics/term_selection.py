@@ -281,10 +281,7 @@ def predicted(
 ) -> list[tuple[Floats, Floats]]:
     """Pressures of the lung that fits best if its sensor lags, and their derivatives, ``(m,)``.
 
-    Args:
-        segments: pieces of the recording.
-        table: their cross products with that lag.
-        lag: time constant of the sensor, s.
+    ``table`` has the cross products of the segments with that lag, s.
     """
     fitted = fit(table, np.ones(len(table), bool), range(len(_COLUMNS)))
     columns = [COLUMNS[c] for c in _COLUMNS]

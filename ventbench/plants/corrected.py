@@ -211,14 +211,9 @@ def stressed_plants(
 def _apply(
     line: Stressor, severity: Severity, part: float, own: dict[str, Floats], labels: Floats
 ) -> None:
-    """Change parameters of one condition in place.
+    """Change parameters ``(BREATHS, L, n)`` of one condition in place, by a share of the strength.
 
-    Args:
-        line: the stressor.
-        severity: its severity.
-        part: share of its strength.
-        own: parameters by path, ``(BREATHS, L, n)``.
-        labels: R and C that the labels say, ``(L, 2, 1)``.
+    ``labels`` are the R and C that the labels say, ``(L, 2, 1)``.
     """
     strength, share = line.at(severity), part * np.reshape(line.breaths, (-1, 1, 1))
     if line.rule == "add":

@@ -213,12 +213,8 @@ class Frozen:
     def about(self) -> dict[str, Any]:
         """Version and hashes that a score states of its simulators."""
         hashes = {name: self.manifest["files"][name]["sha256"] for name in (MEMBERS, SEEN)}
-        return {
-            "version": self.manifest["version"],
-            "kind": self.manifest["kind"],
-            "manifest_sha256": self.manifest_sha256,
-            "files": hashes,
-        }
+        about = {key: self.manifest[key] for key in ("version", "kind")}
+        return {**about, "manifest_sha256": self.manifest_sha256, "files": hashes}
 
 
 def seen(breaths: Breaths, fold: Ints) -> Seen:

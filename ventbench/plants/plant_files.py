@@ -128,12 +128,7 @@ def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict
         OSError: if it cannot be read.
     """
     try:
-        if Path(path).suffix == ".npz":
-            with np.load(path, allow_pickle=False) as npz:
-                head, arrays = json.loads(str(npz[_STRUCTURE])), dict(npz)
-        else:
-            head = json.loads(Path(path).read_bytes())
-            arrays = {}
+        head, arrays = _content(path)
         if not isinstance(head, dict) or head.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
         if not head["lungs"]:
@@ -158,15 +153,18 @@ def origin(path: Path) -> dict[str, Any]:
         OSError: if the file cannot be read.
     """
     try:
-        if Path(path).suffix == ".npz":
-            with np.load(path, allow_pickle=False) as npz:
-                head = json.loads(str(npz[_STRUCTURE]))
-        else:
-            head = json.loads(Path(path).read_bytes())
-        about = head["about"]
+        about = _content(path)[0]["about"]
     except (KeyError, TypeError, ValueError):
         return {}
     return dict(about) if isinstance(about, dict) else {}
+
+
+def _content(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    """Structure, and the arrays that stand beside it in an ``.npz``."""
+    if Path(path).suffix != ".npz":
+        return json.loads(Path(path).read_bytes()), {}
+    with np.load(path, allow_pickle=False) as npz:
+        return json.loads(str(npz[_STRUCTURE])), dict(npz)
 
 
 def save_plant(path: Path, plant: Any) -> None:
@@ -210,13 +208,9 @@ def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value).__name__
         in_file = FIELDS_IN_FILES.get(kind, {})
-        stored = {
-            in_file.get(field.name, field.name): field.name for field in dataclasses.fields(value)
-        }
-        fields = {
-            name: _encode(getattr(value, attribute), f"{path}.{name}", arrays)
-            for name, attribute in stored.items()
-        }
+        names = [field.name for field in dataclasses.fields(value)]
+        stored = {in_file.get(name, name): getattr(value, name) for name in names}
+        fields = {name: _encode(x, f"{path}.{name}", arrays) for name, x in stored.items()}
         return {"type": kind, "fields": fields}
     if isinstance(value, tuple | list):
         return {"tuple": [_encode(part, f"{path}.{i}", arrays) for i, part in enumerate(value)]}
@@ -234,11 +228,8 @@ def _decode(node: dict[str, Any], arrays: Any, as_array: Callable[[Any], Any]) -
         kind = stored_type(node["type"])
         in_file = FIELDS_IN_FILES.get(kind.__name__, {})
         attributes = {name: attribute for attribute, name in in_file.items()}
-        fields: dict[str, Any] = {
-            str(attributes.get(name, name)): _decode(child, arrays, as_array)
-            for name, child in node["fields"].items()
-        }
-        return kind(**fields)
+        children = {name: _decode(x, arrays, as_array) for name, x in node["fields"].items()}
+        return kind(**{str(attributes.get(name, name)): x for name, x in children.items()})
     if "tuple" in node:
         return tuple(_decode(child, arrays, as_array) for child in node["tuple"])
     if "array" in node:

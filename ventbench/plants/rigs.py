@@ -135,11 +135,6 @@ def load_rigs(simulator: Given = "frozen") -> Rigs:
 def rigs_of(official: Any) -> Rigs:
     """Rigs of a set of simulators, such as :func:`ventbench.plants.frozen.load` returns."""
     return Rigs(
-        LUNGS,
-        official.sessions_plants,
-        official.rigs,
-        official.about(),
-        official.manifest_sha256,
-        official.held_out_rigs,
-        official.population,
-    )
+        LUNGS, official.sessions_plants, official.rigs, official.about(),
+        official.manifest_sha256, official.held_out_rigs, official.population,
+    )  # fmt: skip

@@ -49,7 +49,7 @@ class Data:
     def select(self, which: ArrayLike | slice) -> Data:
         """Select breaths by mask, index or slice; they keep their positions."""
         index = which if isinstance(which, slice) else np.asarray(which)
-        return Data(**{name: array[index] for name, array in self._arrays().items()})
+        return Data(**{name: array[index] for name, array in vars(self).items()})
 
     def with_pressure(self, pressure: ArrayLike) -> Data:
         """Replace the pressure, cmH2O, ``(n, T)``, for example by a simulator's response.
@@ -69,9 +69,6 @@ class Data:
             raise InputError("a simulated pressure is not finite; use a stable simulator")
         measured = np.where(weight > 0, pressure[:, None], 0.0)
         return replace(self, measured=measured, weight=weight)
-
-    def _arrays(self) -> dict[str, Floats]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
 def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None = None) -> Data:
@@ -98,13 +95,7 @@ def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | Non
         raise InputError("no pressure is measured in these breaths")
     if position is None:
         position = np.linspace(0.0, 1.0, len(breaths)) if len(breaths) > 1 else np.zeros(1)
-    return Data(
-        u_in=breaths.u_in.astype(float),
-        u_out=breaths.u_out.astype(float),
-        dt=breaths.dt.astype(float),
-        measured=np.where(weight > 0, measured, 0.0),
-        weight=weight,
-        R=breaths.R.astype(float),
-        C=breaths.C.astype(float),
-        position=np.asarray(position, float),
-    )
+    names = ("u_in", "u_out", "dt", "R", "C")
+    plain = {name: getattr(breaths, name).astype(float) for name in names}
+    known = np.where(weight > 0, measured, 0.0)
+    return Data(measured=known, weight=weight, position=np.asarray(position, float), **plain)

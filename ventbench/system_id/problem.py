@@ -255,10 +255,7 @@ class Problem:
         The cost of a model that rings has many local minima. With larger steps the integrator damps
         the ringing, and most of these minima are gone.
 
-        Args:
-            x: start, ``(U,)``.
-            tolerance: see :func:`~ventbench.system_id.levenberg_marquardt.minimise`.
-            iterations: most evaluations of the normal equations.
+        Options as of :func:`~ventbench.system_id.levenberg_marquardt.minimise`.
         """
         if not any(needs_small_steps(path) for path in self.unknowns.paths):
             return x
@@ -299,12 +296,7 @@ class Problem:
     def at_likeliest_changes(self, x: Floats, least: float) -> Floats | None:
         """The point with each change between the breaths where it is likeliest, all else as it is.
 
-        Args:
-            x: unknowns, ``(U,)``.
-            least: nats by which another place must be likelier.
-
-        Returns:
-            The point; None if no change moves.
+        Another place must be likelier by ``least`` nats; None if no change moves.
         """
         moved = None
         for path in self.unknowns.paths:

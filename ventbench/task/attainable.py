@@ -162,23 +162,18 @@ def attainable(
         miss = pip - pressures(plants, cells, witness)
         slopes = _in_batches(all_slopes, plants, cells, witness)
         programs = LinearPrograms(COMMANDS)
-        gains = [
-            np.mean(np.abs(miss[i])) - programs.solve(miss[i], slopes[i], witness[i], radius)[1]
-            for i, radius in enumerate(np.full(n, CERTIFICATE_RADIUS))
-        ]
+        near = (miss, slopes, witness, np.full(n, CERTIFICATE_RADIUS))
+        left = [programs.solve(*own)[1] for own in zip(*near, strict=True)]
+        gains = np.mean(np.abs(miss), axis=1) - left
         full = np.full((n, COMMANDS), protocol.U_MAX)
         lower = np.mean(np.maximum(pip - pressures(plants, cells, full), 0.0), axis=1)
-    return Attainable(best, lower, np.array(gains), witness)
+    return Attainable(best, lower, gains, witness)
 
 
 def _descend(
-    plants: Plant,
-    cells: Scenario,
-    pip: Floats,
-    u_in: Floats,
-    iterations: int,
+    plants: Plant, cells: Scenario, pip: Floats, u_in: Floats, iterations: int,
     progress: Callable[[int], object],
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Improve commands in place; returns their errors, cmH2O, shape ``(n,)``."""
     n = len(u_in)
     miss = pip - pressures(plants, cells, u_in)

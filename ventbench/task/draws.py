@@ -156,16 +156,10 @@ class Draws:
 
 
 def build(
-    rigs: Sequence[Sequence[int]],
-    members: int,
-    *,
-    held_out: Sequence[Sequence[int]] = (),
-    drawn: Plant | None = None,
-    seed: bytes = DEVELOPMENT_SEED,
-    name: str = DEVELOPMENT,
-    n: int = COUNT,
-    pips: Sequence[float] = protocol.PIPS,
-) -> Draws:
+    rigs: Sequence[Sequence[int]], members: int, *, held_out: Sequence[Sequence[int]] = (),
+    drawn: Plant | None = None, seed: bytes = DEVELOPMENT_SEED, name: str = DEVELOPMENT,
+    n: int = COUNT, pips: Sequence[float] = protocol.PIPS,
+) -> Draws:  # fmt: skip
     """Make the draws of a seed; the result is the same everywhere.
 
     The rigs of a lung of one kind are drawn equally often, up to one, and so are the members. The
@@ -252,12 +246,9 @@ def ranked(rig: Ints) -> Bools:
 
 
 def _places(
-    rigs: Sequence[int],
-    held_out: Sequence[int],
-    anew: bool,
-    uniform: Callable[[tuple[int, ...]], Floats],
-    n: int,
-) -> Ints:
+    rigs: Sequence[int], held_out: Sequence[int], anew: bool,
+    uniform: Callable[[tuple[int, ...]], Floats], n: int,
+) -> Ints:  # fmt: skip
     """Rig of each draw of one lung."""
     kind = np.resize(np.array(PATTERN), n)
     kind[(kind == DRAWN) & (not anew)] = HELD_OUT
@@ -279,14 +270,9 @@ def _log_gain(numbers: Any, xp: Any) -> Any:
 
 
 def _balanced(numbers: Floats, choices: int) -> Ints:
-    """Deal choices to draws equally often, up to one, in random order.
+    """Deal ``0..choices - 1`` to draws equally often, up to one, in random order.
 
-    Args:
-        numbers: uniform; the first says which choice is dealt first.
-        choices: how many there are.
-
-    Returns:
-        ``0..choices - 1``, shape of ``numbers`` but for the first.
+    The numbers are uniform; the first says which choice is dealt first, and each other is a draw.
     """
     order = np.argsort(np.argsort(numbers[1:], kind="stable"), kind="stable")
     return (order + int(numbers[0] * choices)) % choices
@@ -388,13 +374,9 @@ def commitment(seed: bytes) -> str:
 
 
 def random_scenarios(
-    key: Array,
-    pip: Array,
-    *,
-    spread: Array | float | None = None,
-    breaths: int = protocol.BREATHS,
-    smooth: bool = False,
-) -> Scenario:
+    key: Array, pip: Array, *, spread: Array | float | None = None,
+    breaths: int = protocol.BREATHS, smooth: bool = False,
+) -> Scenario:  # fmt: skip
     """Draw new cells from the distributions of the development draws, for training.
 
     The development draws themselves are never among them. Pure, so that it can be compiled.
@@ -457,18 +439,11 @@ def deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -
         quantum: step of the converter, cmH2O, shape ``(...)``.
         noise: cmH2O, shape ``(..., BREATHS, INSPIRATION_STEPS)``.
     """
-    peep = protocol.PEEP + deviations["peep_shift"]
+    peep, start = protocol.PEEP + deviations["peep_shift"], deviations["start_shift"]
+    own = {name: deviations[name] for name in ("r_scale", "c_scale", "delay", "gain")}
+    dt = protocol.DT * deviations["dt_scale"]
     return Scenario(
-        pip=pip + deviations["pip_shift"],
-        peep=peep,
-        start=peep + deviations["start_shift"],
-        dt=protocol.DT * deviations["dt_scale"],
-        r_scale=deviations["r_scale"],
-        c_scale=deviations["c_scale"],
-        delay=deviations["delay"],
-        gain=deviations["gain"],
-        quantum=quantum,
-        noise=noise,
+        pip + deviations["pip_shift"], peep, peep + start, dt, quantum=quantum, noise=noise, **own
     )
 
 

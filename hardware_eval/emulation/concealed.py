@@ -94,14 +94,7 @@ def conceal(words: str, simulator: Any = "frozen") -> ConcealedLung:
 
 
 def reveal(path: Path, words: str) -> tuple[Lung, Effect]:
-    """Open a seal.
-
-    Args:
-        path: file that :meth:`ConcealedLung.write` wrote.
-        words: the words that the lung was made with.
-
-    Returns:
-        The lung's label and what it concealed.
+    """Open a seal that :meth:`ConcealedLung.write` wrote: the lung's label and what it concealed.
 
     Raises:
         InputError: if the file is no seal, or the words are others.

@@ -205,15 +205,9 @@ class _Bus:
 
 
 def serve(
-    bus: Connection,
-    wire: socket.socket,
-    make: Callable[[], Hal],
-    *,
-    begun: float,
-    normally_open: bool,
-    monostable: float,
-    log: Path | None,
-) -> None:
+    bus: Connection, wire: socket.socket, make: Callable[[], Hal], *, begun: float,
+    normally_open: bool, monostable: float, log: Path | None,
+) -> None:  # fmt: skip
     """Be the electronics until program and deadman have hung up.
 
     Args:

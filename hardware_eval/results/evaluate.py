@@ -126,11 +126,7 @@ VIRTUAL = "virtual:"
 
 
 def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
-    """Open a port and say nothing; see :func:`connect`.
-
-    Returns:
-        What carries the bytes, and the clock that it lives by.
-    """
+    """Open a port, say nothing, and return it with the clock it lives by; see :func:`connect`."""
     from hardware_eval.wire.link import Link
 
     if not port.startswith(VIRTUAL):

@@ -223,17 +223,15 @@ def _tables(
             tables.append([[] for _ in plan.pips])
         for place, pip in enumerate(plan.pips):
             for repeat in range(1, plan.repeats + 1):
+                cell = {"lung": lung, "pip": pip, "repeat": repeat}
                 run = runs.get((lung, pip, repeat))
-                rows = [] if run is None else [run[k] for k in protocol.SCORED_BREATHS]
                 if run is None:
-                    reason = failed.get((lung, pip, repeat), "stopped")
-                    passed = False
-                    stops.append(
-                        {"lung": lung, "pip": pip, "repeat": repeat, "reason": reason[:_REASON]}
-                    )
+                    reason, passed = failed.get((lung, pip, repeat), "stopped"), False
+                    stops.append({**cell, "reason": reason[:_REASON]})
                     for tables in (errors, pressures, commands):
                         tables[-1][place].append(None)
                     continue
+                rows = [run[k] for k in protocol.SCORED_BREATHS]
                 inspired = np.stack([row.pressure[: protocol.INSPIRATION_STEPS] for row in rows])
                 u_in = np.stack([row.u_in[: protocol.INSPIRATION_STEPS] for row in rows])
                 milli = np.round(1000.0 * inspired).astype(int)
@@ -255,15 +253,9 @@ def _tables(
 
 def _skipped(logged: list[dict[str, Any]], lungs: list[str]) -> dict[str, list[str]]:
     """Parts of the self-test that were left out on each lung, at any of its mountings."""
+    tests = [line for line in logged if line["type"] == "selftest" and line.get("go", True)]
     return {
-        lung: sorted(
-            {
-                part
-                for line in logged
-                if line["type"] == "selftest" and line["lung"] == lung and line.get("go", True)
-                for part in line["skipped"]
-            }
-        )
+        lung: sorted({part for line in tests if line["lung"] == lung for part in line["skipped"]})
         for lung in lungs
     }
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -174,15 +174,7 @@ class Trial:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
-
-        def plain(value: Any) -> Any:
-            if isinstance(value, (Interval, EntryTrial, Trial)):
-                value = vars(value)
-            if isinstance(value, dict):
-                return {key: plain(each) for key, each in value.items()}
-            return value
-
-        return files.json_values(plain(self))
+        return files.json_values(asdict(self))
 
     def __str__(self) -> str:
         rows = []

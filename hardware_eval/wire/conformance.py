@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 from hardware_eval.realtime import Clock
@@ -38,12 +39,7 @@ from hardware_eval.wire.messages import (
     encode,
 )
 from hardware_eval.wire.parser import NoAnswerError
-from hardware_eval.wire.probe import (
-    DiffersError,
-    LateError,
-    Probe,
-    UntriedError,
-)
+from hardware_eval.wire.probe import DiffersError, LateError, Probe, UntriedError
 
 #: Attempts at a check that a slow host spoils.
 _ATTEMPTS = 20
@@ -79,11 +75,9 @@ class Clause:
 
 
 def conformance(
-    transport: Transport,
-    clock: Clock,
-    tell: Callable[[Clause], None] = lambda clause: None,
+    transport: Transport, clock: Clock, tell: Callable[[Clause], None] = lambda clause: None,
     seed: int = 0,
-) -> list[Clause]:
+) -> list[Clause]:  # fmt: skip
     """Try a device by the specification.
 
     Args:
@@ -107,12 +101,10 @@ def conformance(
         except DiffersError as error:
             if attempt == _ATTEMPTS - 1:
                 raise NoAnswerError(f"the device does not answer a hello: {error}") from None
-    for text, check in CLAUSES:
-        done.append(_judged(host, text, check))
-        tell(done[-1])
-    for text in NOT_TRIED:
-        done.append(Clause(text, None, "no host can provoke it"))
-        tell(done[-1])
+    untried = (Clause(text, None, "no host can provoke it") for text in NOT_TRIED)
+    for clause in chain((_judged(host, text, check) for text, check in CLAUSES), untried):
+        done.append(clause)
+        tell(clause)
     host.transport.write(host.frame(Vent()))
     return done
 

@@ -61,11 +61,9 @@ class ConcealedLung:
 
 
 def conceal(words: str, simulator: Any = "frozen") -> ConcealedLung:
-    """Make the lung that the words determine.
+    """Make the lung that any words determine: the same words make the same lung.
 
-    Args:
-        words: any words; the same words make the same lung.
-        simulator: what the physics is added to; whatever :func:`ventbench.load_simulators` takes.
+    The physics is added to a simulator: whatever :func:`ventbench.load_simulators` takes.
 
     Raises:
         InputError: if there are no words.

@@ -55,15 +55,10 @@ class Emulator(Guard):
     """
 
     def __init__(
-        self,
-        service: DeviceService | Firmware,
-        *,
-        link: Path | None = None,
-        control: Path | None = None,
-        line_faults: Sequence[LineFault] = (),
-        log: Path | None = None,
+        self, service: DeviceService | Firmware, *, link: Path | None = None,
+        control: Path | None = None, line_faults: Sequence[LineFault] = (), log: Path | None = None,
         begun: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Open the terminal.
 
         Args:

@@ -256,12 +256,9 @@ def scored_plants(simulator: Any, lungs: list[str]) -> Simulators:
 
 
 def compare(
-    breaths: Breaths,
-    *,
-    simulator: Any = "frozen",
-    diagnose: bool = True,
+    breaths: Breaths, *, simulator: Any = "frozen", diagnose: bool = True,
     progress: Callable[[str, float], None] | None = None,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare simulators with a recording.
 
     Args:
@@ -316,9 +313,7 @@ def _distance(breaths: Breaths, simulated: Floats, index: NDArray[np.int64]) -> 
 def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
     """The breaths behind a hardware record, a log, a session's folder or a recording.
 
-    Args:
-        path: of the record, the log, the folder or a file in the public schema.
-        log: the raw log that a record names; looked for beside the record if not given.
+    The raw log that a record names is looked for beside it if it is not given.
 
     Raises:
         InputError: if the log is not there, or not the one that the record names.

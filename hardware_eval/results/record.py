@@ -108,14 +108,9 @@ def jitter(log: Path, entry: str | None = None) -> Jitter:
 
 
 def hardware_record(log: Path, submission: Submission) -> bytes:
-    """Make the hardware record of one entry.
+    """Make the hardware record of an entry, with the files that ran, from the log of a plan.
 
-    Args:
-        log: of a finished plan.
-        submission: the entry, with the files that ran.
-
-    Returns:
-        Canonical JSON, checked as the leaderboard checks it.
+    It is canonical JSON, checked as the leaderboard checks it.
 
     Raises:
         InputError: if the plan is not finished, the entry is not in it, or its files have changed.
@@ -202,12 +197,9 @@ def _scored(log: Path, name: str) -> dict[_Cell, list[LoggedBreath]]:
 
 
 def _tables(
-    plan: Plan,
-    lungs: list[str],
-    runs: Mapping[_Cell, list[LoggedBreath]],
-    logged: list[dict[str, Any]],
-    name: str,
-) -> dict[str, Any]:
+    plan: Plan, lungs: list[str], runs: Mapping[_Cell, list[LoggedBreath]],
+    logged: list[dict[str, Any]], name: str,
+) -> dict[str, Any]:  # fmt: skip
     """Errors, traces, stops and safety of every cell."""
     failed = {
         (line["lung"], line["pip"], line["repeat"]): line["reason"]

@@ -120,12 +120,9 @@ class Client:
     def __init__(
         self, transport: Transport, clock: Clock | None = None, timeout: float = ANSWER_TIMEOUT
     ) -> None:
-        """Talk through a transport.
+        """Talk through a :class:`~hardware_eval.wire.link.Link` or a loopback device.
 
-        Args:
-            transport: a :class:`~hardware_eval.wire.link.Link` or a loopback device.
-            clock: real time if not given; a loopback device needs its own.
-            timeout: time that an answer may take, s.
+        The latter needs its own clock. An answer may take ``timeout``, s.
         """
         self.welcome: Welcome | None = None
         self.reading: Reading | None = None

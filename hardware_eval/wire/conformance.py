@@ -78,16 +78,10 @@ def conformance(
     transport: Transport, clock: Clock, tell: Callable[[Clause], None] = lambda clause: None,
     seed: int = 0,
 ) -> list[Clause]:  # fmt: skip
-    """Try a device by the specification.
+    """Try a device by the specification, by the clock of its transport.
 
-    Args:
-        transport: carries bytes to it and back.
-        clock: of the transport.
-        tell: called with each line as it is known.
-        seed: of the session numbers.
-
-    Returns:
-        All lines, in the order of :data:`CLAUSES`, then those of :data:`NOT_TRIED`.
+    Returns all lines, in the order of :data:`CLAUSES`, then those of :data:`NOT_TRIED`; ``tell`` is
+    called with each as it is known. ``seed`` is that of the session numbers.
 
     Raises:
         NoAnswerError: if there is no device.

@@ -183,10 +183,7 @@ def apply(layers: tuple[Layer, ...], x: Array) -> Array:
 def untrained(key: Array, like: Residual, widths: tuple[int, ...]) -> Residual:
     """Return a controller with a new network that corrects nothing yet: its last layer is zero.
 
-    Args:
-        key: JAX key of the random weights of the hidden layers.
-        like: controller that gives PID, windows and limit.
-        widths: units of each hidden layer.
+    PID, windows and limit are those of another; ``widths`` are the units of each hidden layer.
     """
     sizes = [inputs(like), *widths]
     layers = []

@@ -8,7 +8,7 @@ readings that are clipped at an end of the sensor's range are left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +122,7 @@ def _smoothed(
         return None
     half = max(1, round(WINDOW / float(np.median(np.diff(time)))))
     step = max(1, half // _PER_HALF_WINDOW)
-    filled = _volume(time, flow, volume)
+    filled: Any = integrate(time, flow) if volume is None and flow is not None else volume
     flows = np.isfinite(filled)
     flows &= True if flow is None else np.isfinite(flow)
     fine = np.concatenate([
@@ -144,13 +144,6 @@ def _smoothed(
         q = weighted_sum(windows(flow, half)[fine - half], value)
     slope = weighted_sum(windows(flow, half)[fine - half], change)
     return rows, begins, p, t, v, q, slope, dose
-
-
-def _volume(time: Floats, flow: Floats | None, volume: Floats | None) -> Floats:
-    if volume is not None:
-        return volume
-    assert flow is not None
-    return integrate(time, flow)
 
 
 def _compared(fine: NDArray[np.intp], known: Bools, half: int, step: int) -> tuple[Ints, Bools]:

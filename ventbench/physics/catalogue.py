@@ -187,8 +187,9 @@ def _modules(home: ModuleType) -> list[ModuleType]:
 
 def _is_described(value: object, module: str) -> bool:
     """Whether a value is a class of mechanisms that a module defines, not imports."""
-    is_own = isinstance(value, type) and value.__module__ == module
-    return is_own and issubclass(value, Mechanism) and "description" in vars(value)
+    if not isinstance(value, type) or value.__module__ != module:
+        return False
+    return issubclass(value, Mechanism) and "description" in vars(value)
 
 
 def _names(parameters: Iterable[Parameter]) -> str:

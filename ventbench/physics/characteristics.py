@@ -7,8 +7,9 @@ that a new mechanism has one without more ado. Nothing here is fitted or integra
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism
-from ventbench.physics.mechanism import Mechanism, Network, Values, View
+from ventbench.physics.mechanism import Mechanism, Network, Pair, Values, View
 from ventbench.physics.parameters import BASE_PARAMETERS
 
 Floats = NDArray[np.float64]
@@ -177,30 +178,29 @@ def _late_outlet(
 
 def _flow_step(shown: Mechanism, own: Values, end: float) -> Characteristic:
     """Flow of the valve after its command steps to 0.5 L/s."""
-    zero, length = jnp.asarray(0.0), jnp.asarray(end / _STEPS)
+    zero = jnp.asarray(0.0)
     state = shown.initial_state(own, zero, zero) if shown.stateful else zero
-    flow, after = jnp.asarray(_FLOW), []
-    for _ in range(_STEPS):
-        now, state = shown.inflow(own, flow, state, length)
-        after.append(float(now))
-    return _response(end, 0.0, _FLOW, after, "flow of the valve, L/s")
+    step = partial(shown.inflow, own)
+    return _response(step, state, end, 0.0, _FLOW, "flow of the valve, L/s")
 
 
 def _pressure_step(shown: Mechanism, own: Values, end: float) -> Characteristic:
     """Reading of the sensor after the pressure steps from 5 to 20 cmH2O."""
-    low, length = jnp.asarray(_LOW), jnp.asarray(end / _STEPS)
+    low = jnp.asarray(_LOW)
     state = shown.initial_state(own, jnp.asarray(0.0), low) if shown.stateful else low
-    after = []
-    for _ in range(_STEPS):
-        now, state = shown.reading(own, jnp.asarray(_HIGH), state, length)
-        after.append(float(now))
-    return _response(end, _LOW, _HIGH, after, "reading of the sensor, cmH2O")
+    step = partial(shown.reading, own)
+    return _response(step, state, end, _LOW, _HIGH, "reading of the sensor, cmH2O")
 
 
 def _response(
-    end: float, low: float, high: float, after: list[float], y_label: str
-) -> Characteristic:
+    hook: Callable[[Array, Array, Array], Pair], state: Array, end: float, low: float, high: float,
+    y_label: str,
+) -> Characteristic:  # fmt: skip
     """Response to a step from ``low`` to ``high`` at time zero, with the edge as a vertical."""
+    after = []
+    for _ in range(_STEPS):
+        now, state = hook(jnp.asarray(high), state, jnp.asarray(end / _STEPS))
+        after.append(float(now))
     x = np.concatenate([[-0.1 * end, 0.0, 0.0], end / _STEPS * np.arange(1, _STEPS + 1)])
     step = np.concatenate([[low, low], np.full(_STEPS + 1, high)])
     return _in_time(x, step, np.concatenate([[low, low, low], after]), y_label)

@@ -126,14 +126,8 @@ def substep_lengths(
 def window_weights(start: Array, length: Array, past: tuple[Array, ...]) -> list[Array]:
     """Shares of a window in this sample, in each of P samples before, and in all earlier ones.
 
-    Args:
-        start: start of the window, s after the start of this sample; negative reaches back;
-            ``(...)``.
-        length: length of the window, s, positive, ``(...)``.
-        past: durations of the P samples before, the latest first, s, ``(...)`` each.
-
-    Returns:
-        P + 2 weights that add up to one, in that order, ``(...)`` each.
+    They are P + 2 weights that add up to one. The window begins so many s after this sample does
+    (negative reaches back), and has a positive length, s; ``past`` as of :func:`windows`.
     """
     last = start + length
     edges = [jnp.inf, *_begins(past), -jnp.inf]

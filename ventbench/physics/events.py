@@ -4,19 +4,10 @@ Diagnoses search for those that act in some breaths; stress tests and whoever na
 use all of them.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.mechanism import (
-    Description,
-    Mechanism,
-    Network,
-    Parameter,
-    Values,
-    View,
-)
+from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
 from ventbench.physics.mechanisms.leak import Leak
 from ventbench.physics.mechanisms.relief_leak import ReliefLeak
 
@@ -34,9 +25,7 @@ class LostCommands(Mechanism):
     """
 
     description = Description(
-        name="lost_commands",
-        title="commands that never reach the valve",
-        site="command",
+        name="lost_commands", title="commands that never reach the valve", site="command",
         equation="u_k = u_(k-1) where command k is lost",
         parameters=(
             Parameter("share", "1", "of the commands", 0.0, 1.0, 0.0, 0.06, 0.15, share=True),
@@ -51,9 +40,7 @@ class LateCommands(Mechanism):
     """Commands that come late, and act only if no later one has come before."""
 
     description = Description(
-        name="late_commands",
-        title="commands that reach the valve late",
-        site="command",
+        name="late_commands", title="commands that reach the valve late", site="command",
         equation="command k comes at t_k + delay, and is dropped if a later one has come",
         parameters=(
             Parameter("share", "1", "of the commands", 0.0, 1.0, 0.0, 0.12, 0.3, share=True),
@@ -69,9 +56,7 @@ class Cough(Mechanism):
     """A short push of the expiratory muscles: half a sine of pressure at the alveolus."""
 
     description = Description(
-        name="cough",
-        title="cough",
-        site="alveolus",
+        name="cough", title="cough", site="alveolus",
         equation="P_alveolus = ... + pressure sin(pi (t - onset) / duration) while it lasts",
         parameters=(
             Parameter("pressure", "cmH2O", "highest pressure of the muscles",
@@ -85,8 +70,7 @@ class Cough(Mechanism):
         source="A cough lasts 0.2 to 0.5 s and raises the pressure in the chest by 5 to 100 cmH2O "
         "(J. G. Widdicombe, Eur. Respir. J. 8, 1995, 1193).",
         signature="A short hump of pressure in some breaths, at any time.",
-        confusable=("patient_effort",),
-        least=1.0,
+        confusable=("patient_effort",), least=1.0,
         least_reason="less than the beating of a heart and the noise of a sensor",
     )  # fmt: skip
 
@@ -100,9 +84,7 @@ class Disconnection(Mechanism):
     """The circuit comes off and is put back: an open tube beside the lung."""
 
     description = Description(
-        name="disconnection",
-        title="circuit open to the room",
-        site="circuit",
+        name="disconnection", title="circuit open to the room", site="circuit",
         equation="q_out = conductance p while onset < t <= onset + duration",
         parameters=(
             Parameter("conductance", "mL/s per cmH2O", "of the open end",
@@ -132,9 +114,7 @@ class IntermittentLeak(Leak):
     """A leak that opens and seals between breaths, as a cuff or a mask that moves."""
 
     description = Description(
-        name="intermittent_leak",
-        title="leak in some breaths",
-        site="circuit",
+        name="intermittent_leak", title="leak in some breaths", site="circuit",
         equation=Leak.description.equation,
         parameters=(
             Parameter("conductance", "mL/s", "leak at 1 cmH2O",
@@ -145,8 +125,7 @@ class IntermittentLeak(Leak):
         ),
         source="Cuffs and masks lose 5 to 50 mL/s per root of a cmH2O when a patient moves.",
         signature="In some breaths pressure is lost, most in long and high ones.",
-        confusable=("leak", "secretions"),
-        least=Leak.description.least,
+        confusable=("leak", "secretions"), least=Leak.description.least,
         least_reason=Leak.description.least_reason,
     )  # fmt: skip
 
@@ -155,9 +134,7 @@ class ReliefValve(ReliefLeak):
     """A flow out of the circuit above a set, high pressure."""
 
     description = Description(
-        name="relief_valve",
-        title="relief valve of the circuit",
-        site="circuit",
+        name="relief_valve", title="relief valve of the circuit", site="circuit",
         equation="q_out = conductance max(p - opening, 0)",
         parameters=(
             Parameter("conductance", "mL/s per cmH2O", "of the open valve",
@@ -175,9 +152,7 @@ class Secretions(Mechanism):
     """A resistance that is higher while fluid lies in the airway."""
 
     description = Description(
-        name="secretions",
-        title="resistance that is higher in some breaths",
-        site="airway",
+        name="secretions", title="resistance that is higher in some breaths", site="airway",
         equation="R = R (1 + increase)",
         parameters=(
             Parameter("increase", "1", "of R in a breath, as a share",
@@ -188,8 +163,7 @@ class Secretions(Mechanism):
         "coughed up, and make flow rattle (A. Jubran, M. J. Tobin, Am. J. Respir. Crit. Care Med. "
         "150, 1994, 766).",
         signature="In some breaths an error that grows with flow.",
-        confusable=("resistance_step", "intermittent_leak"),
-        least=0.05,
+        confusable=("resistance_step", "intermittent_leak"), least=0.05,
         least_reason="resistors repeat to a few percent",
     )  # fmt: skip
 
@@ -214,9 +188,7 @@ class SupplyRipple(Mechanism):
     """A flow of the supply that pulsates, whatever is commanded."""
 
     description = Description(
-        name="supply_ripple",
-        title="ripple of the supply",
-        site="supply",
+        name="supply_ripple", title="ripple of the supply", site="supply",
         equation="q = q (1 + amplitude sin(2 pi (frequency t + phase)))",
         parameters=(
             Parameter("amplitude", "1", "of the flow", 0.0, 1.0, 0.0, 0.1, 0.2, share=True),
@@ -237,9 +209,7 @@ class CircuitWater(Mechanism):
     """Water in a tube, which gas that flows sets swinging."""
 
     description = Description(
-        name="circuit_water",
-        title="water that swings in a tube",
-        site="circuit",
+        name="circuit_water", title="water that swings in a tube", site="circuit",
         equation="p = ... + amplitude |Q| / (|Q| + 0.1 L/s) sin(2 pi (frequency t + phase))",
         parameters=(
             Parameter("amplitude", "cmH2O", "at a large flow", 0.0, 20.0, 0.0, 0.7, 1.6),

@@ -16,6 +16,9 @@ from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
 #: Values of a mechanism's parameters, by short name.
 Values = Mapping[str, Array]
 
+#: What a hook changes and what it keeps, an array each.
+Pair = tuple[Array, Array]
+
 #: What a mechanism changes: any pytree of arrays.
 Before = TypeVar("Before")
 
@@ -107,12 +110,9 @@ class Network:
         )
 
     def solve(self, pressure: Array, flow: Array, length: Array) -> tuple[Array, Array]:
-        """Pressure at the airway, cmH2O, and flow into the lung, L/s, after an implicit step.
+        """Pressure at the airway, cmH2O, and flow into the lung, L/s, after a step of a length, s.
 
-        Args:
-            pressure: pressure before the step, cmH2O.
-            flow: flow before the step, L/s.
-            length: length of the step, s.
+        Takes both as they were before it.
         """
         shut = self._balance(pressure, flow, length, jnp.zeros_like(self.outlet))
         vented = self._balance(pressure, flow, length, self.outlet)
@@ -247,9 +247,7 @@ class Mechanism:
         """
         return flow * 0.0
 
-    def inflow(
-        self, values: Values, flow: Array, state: Array, length: Array
-    ) -> tuple[Array, Array]:
+    def inflow(self, values: Values, flow: Array, state: Array, length: Array) -> Pair:
         """Flow that arrives at the airway, L/s, and the own state after the step."""
         return flow, state
 
@@ -261,9 +259,7 @@ class Mechanism:
         """Own state after a step with this flow into the lung, L/s."""
         return state
 
-    def reading(
-        self, values: Values, pressure: Array, state: Array, length: Array
-    ) -> tuple[Array, Array]:
+    def reading(self, values: Values, pressure: Array, state: Array, length: Array) -> Pair:
         """Pressure after the sensor's dynamics, cmH2O, and the own state after the step."""
         return pressure, state
 

@@ -14,12 +14,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.mechanism import Assembly, Mechanism, Network, Values, View
+from ventbench.physics.mechanism import Assembly, Mechanism, Network, Pair, Values, View
 
 #: Place of the first stage of the SDIRK method, as a share of the substep.
 _GAMMA = 1.0 - 0.5**0.5
-
-Pair = tuple[Array, Array]
 
 
 @flax.struct.dataclass
@@ -117,16 +115,9 @@ def sensor_output(assembly: Assembly, reading: Array) -> Array:
 
 
 def _implicit(
-    assembly: Assembly,
-    now: ContinuousState,
-    guess: ContinuousState,
-    ahead: Array,
-    commanded_flow: Array,
-    opened: Array,
-    time: Array,
-    length: Array,
-    peep: Array,
-) -> ContinuousState:
+    assembly: Assembly, now: ContinuousState, guess: ContinuousState, ahead: Array,
+    commanded_flow: Array, opened: Array, time: Array, length: Array, peep: Array,
+) -> ContinuousState:  # fmt: skip
     """Backward Euler step of ``length`` seconds that ends at ``time``.
 
     It starts at the share ``ahead`` of the way from ``now`` to ``guess``, which is near its end.
@@ -163,12 +154,9 @@ def _implicit(
 
 
 def _network(
-    assembly: Assembly,
-    start: ContinuousState,
-    inflow: Array,
-    view: View,
+    assembly: Assembly, start: ContinuousState, inflow: Array, view: View,
     state: Callable[[str], Array],
-) -> Network:
+) -> Network:  # fmt: skip
     zero = jnp.zeros_like(start.volume)
     network = Network(
         inflow=inflow, circuit=zero, leak=zero, leak_flow=zero, outlet=view.opened * view.outlet,
@@ -182,14 +170,9 @@ def _network(
 
 
 def _view(
-    assembly: Assembly,
-    start: ContinuousState,
-    guess: ContinuousState,
-    opened: Array,
-    time: Array,
-    length: Array,
-    peep: Array,
-) -> View:
+    assembly: Assembly, start: ContinuousState, guess: ContinuousState, opened: Array, time: Array,
+    length: Array, peep: Array,
+) -> View:  # fmt: skip
     base = assembly.base
     return View(
         time, start.volume, guess.pressure, guess.flow, jnp.zeros_like(start.volume), length,
@@ -204,11 +187,7 @@ def _inflow(
 
 
 def _joined(
-    mechanism: Mechanism,
-    own: Values,
-    network: Network,
-    state: Callable[[], Array],
-    view: View,
+    mechanism: Mechanism, own: Values, network: Network, state: Callable[[], Array], view: View
 ) -> Network:
     return mechanism.network(own, network, view.replace(state=state()))  # type: ignore[attr-defined]
 

@@ -45,12 +45,7 @@ from ventbench.plants.plant_files import FAMILIES, load_plants, origin
 from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
 from ventbench.plants.simulators import Simulators
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stacking import (
-    PlantsFor,
-    VmappedPlant,
-    nominal_plants,
-    stack_heterogeneous,
-)
+from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import read_simulated
 from ventbench.task.interfaces import Plant
@@ -126,15 +121,7 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
 
 
 def load_simulated(path: str | Path, breaths: Breaths) -> Simulators:
-    """Load simulated pressures that stand in a table beside the recorded ones.
-
-    Args:
-        path: CSV or Parquet; see :func:`~ventbench.recordings.read.read_simulated`.
-        breaths: the recording that they answer to.
-
-    Raises:
-        InputError: if the table has no such pressures for a breath.
-    """
+    """Simulated pressures in a table; see :func:`~ventbench.recordings.read.read_simulated`."""
     digest, name = files.sha256(Path(path)) if Path(path).is_file() else None, Path(path).name
     pressures = read_simulated(path, breaths)
     about: dict[str, Any] = {"kind": "pressures", "file": name, "sha256": digest}

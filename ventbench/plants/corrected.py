@@ -137,15 +137,10 @@ class Stressed:
 
 
 def reference_physics(plant: Plant, lungs: Sequence[Lung]) -> dict[str, Floats]:
-    """Parameters of the library's physics that say most of what a plant does.
+    """Parameters of the library's physics that say most of what the plants of L lungs do, by path.
 
-    Args:
-        plant: leaves ``(L, ...)``, one lung each on the leading axis.
-        lungs: labels, length L.
-
-    Returns:
-        Parameters by path: what the plant says, of its batch shape; for a plant that says nothing
-        those of the label, shape ``(L,)``.
+    They are what the plant says, of its batch shape; for a plant that says nothing those of the
+    labels, shape ``(L,)``.
     """
     wide: Any = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), plant)
     known = wide.parameters()

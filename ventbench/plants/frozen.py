@@ -175,10 +175,7 @@ class Frozen:
         return jax.tree.map(lambda leaf: leaf[:, at], self.members)
 
     def for_breaths(self, breaths: Breaths) -> Hybrid:
-        """Official simulators of breaths: of their lung, on the rig that their clock tells.
-
-        Returns:
-            Plants with leaves ``(n, ...)``.
+        """Official simulators of n breaths: of their lung, on the rig that their clock tells.
 
         Raises:
             InputError: if a lung is none of the recorded settings.
@@ -233,10 +230,7 @@ def folder() -> Path:
 
 
 def load(path: Path | None = None) -> Frozen:
-    """Read the official simulators and check every file against the manifest.
-
-    Args:
-        path: another folder, such as one that ``ventbench train simulator`` wrote.
+    """Read the official simulators, or those of a folder, and check them against the manifest.
 
     Raises:
         InputError: if a file is missing or is not what the manifest says.

@@ -158,18 +158,12 @@ class Hybrid:
         rest = self.rest + zero
         flow = self.valve(rest)
         state = HybridState(
-            elastic=pressure + self.offset,
-            drop=zero - self.offset,
-            sensor=pressure,
-            flow=flow,
-            commanded=(flow,) * (MEMORY + 1),
-            opened=(zero + 1.0,) * (MEMORY + 1),
-            past=(zero + 0.03,) * MEMORY,
-            plays=tuple(rest for _ in PLAYS),
-            u_in=rest,
+            elastic=pressure + self.offset, drop=zero - self.offset, sensor=pressure, flow=flow,
+            commanded=(flow,) * (MEMORY + 1), opened=(zero + 1.0,) * (MEMORY + 1),
+            past=(zero + 0.03,) * MEMORY, plays=tuple(rest for _ in PLAYS), u_in=rest,
             peep=pressure if peep is None else peep + zero,
             outlet=None if self.closing_lag is None else zero + 1.0,
-        )
+        )  # fmt: skip
         return state, self._signals(state, pressure)
 
     def step(

@@ -50,13 +50,9 @@ class MLP:
 
 
 def mlp(key: Array, sizes: tuple[int, ...], activation: str, last_scale: float = 1.0) -> MLP:
-    """Draw a network with LeCun-normal weights and zero biases.
+    """Draw a network with LeCun-normal weights, those of the last layer scaled, and zero biases.
 
-    Args:
-        key: a key that is used for nothing else.
-        sizes: sizes of the input, the hidden layers and the output; at least two numbers.
-        activation: a name in :data:`ACTIVATIONS`.
-        last_scale: factor on the weights of the last layer.
+    Sizes are those of input, hidden layers and output; the activation is one of `ACTIVATIONS`.
 
     Raises:
         ValueError: if a size is below 1, there are fewer than two, or the activation is unknown.
@@ -320,15 +316,9 @@ def _bend(pressure: Array) -> Array:
 def learned(
     key: Array, architecture: Architecture, normalisation: Normalisation | None = None
 ) -> Learned:
-    """Draw an untrained learned plant; :func:`ventbench.train.learned.fit` trains one.
+    """Draw an untrained learned plant in float32; :func:`ventbench.train.learned.fit` trains one.
 
-    Args:
-        key: a JAX key that is used for nothing else.
-        architecture: sizes of the networks.
-        normalisation: constants of the normalisation; the recordings' typical ones if not given.
-
-    Returns:
-        The plant with float32 leaves.
+    Without a normalisation, that of the recordings' typical values is taken.
     """
     shape, n = architecture, normalisation or Normalisation()
     inputs = shape.pressures + shape.controls

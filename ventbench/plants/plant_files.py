@@ -63,7 +63,7 @@ RENAMED: dict[str, str] = {}
 
 #: Names of fields in plant files, by class and field, where they differ from the attribute's.
 FIELDS_IN_FILES: dict[str, dict[str, str]] = {
-    "Corrected": {"with_mechanisms": "wanted", "without_mechanisms": "had"},
+    "Corrected": {"with_mechanisms": "wanted", "without_mechanisms": "had"}
 }
 
 
@@ -89,12 +89,9 @@ _STRUCTURE = "structure"
 def save_plants(
     path: Path, plants: Mapping[str, Plant], about: Mapping[str, Any] | None = None
 ) -> None:
-    """Write plants of some lungs in one step, as JSON or, if the path ends so, as ``.npz``.
+    """Write plants by lung id in one step, as JSON or, if the path ends so, as ``.npz``.
 
-    Args:
-        path: target, ``.json`` or ``.npz``.
-        plants: plants by the id of their lung, such as ``R20C50``.
-        about: JSON values that say where they come from.
+    ``about`` are JSON values that say where they come from.
 
     Raises:
         ValueError: if a parameter of a JSON file is not finite.
@@ -116,9 +113,7 @@ def save_plants(
 def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict[str, Plant]:
     """Read what :func:`save_plants` wrote.
 
-    Args:
-        path: path of the file, ``.json`` or ``.npz``.
-        as_array: makes the leaves; those of numpy take the precision in force where they are used.
+    ``as_array`` makes the leaves; those of numpy take the precision in force where they are used.
 
     Returns:
         Plants by the id of their lung, in the order of the file.
@@ -180,10 +175,8 @@ def save_plant(path: Path, plant: Any) -> None:
 def load_plant(path: Path, as_array: Callable[[Any], Any] = jnp.asarray) -> Any:
     """Read what :func:`save_plant` wrote.
 
-    Args:
-        path: path of the file.
-        as_array: makes the leaves; the default gives them the precision that is in force,
-            ``numpy.asarray`` that of the file.
+    ``as_array`` makes the leaves; the default gives them the precision that is in force,
+    ``numpy.asarray`` that of the file.
 
     Raises:
         InputError: if the file is not a plant file, or names an unknown type of plant.

@@ -71,11 +71,7 @@ class PythonSimulator:
 
 
 def python_simulator(value: Any, name: str) -> PythonSimulator:
-    """Adapt a function, a class or an object of plain Python.
-
-    Args:
-        value: see the module.
-        name: what messages call it.
+    """Adapt a function, a class or an object, see the module; messages call it by the name.
 
     Raises:
         InputError: if it cannot be called as any of them.

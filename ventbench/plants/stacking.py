@@ -47,15 +47,7 @@ def take(plants: PlantT, *index: int) -> PlantT:
 
 
 def nominal_plants(make: Callable[[Lung], Plant], breaths: Breaths) -> Plant:
-    """Plants of recorded breaths at what their labels say: nothing is learned.
-
-    Args:
-        make: gives the plant of a lung.
-        breaths: n recorded breaths.
-
-    Returns:
-        A plant with leaves ``(n, ...)``.
-    """
+    """Plants of n recorded breaths at what their labels say, leaves ``(n, ...)``."""
     labels = list(zip(breaths.R.tolist(), breaths.C.tolist(), strict=True))
     different = list(dict.fromkeys(labels))
     plants = stack([make(Lung(*label)) for label in different])
@@ -156,15 +148,8 @@ def open_loop_breaths(
 ) -> Floats:
     """Pressures that plants answer to the commands of recorded breaths with, in batches.
 
-    Each breath starts at its first recorded pressure.
-
-    Args:
-        plants_for: see :data:`PlantsFor`.
-        breaths: n breaths of T samples.
-        progress: called with the number of breaths of each batch, as it is done.
-
-    Returns:
-        cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
+    Each breath starts at its first recorded pressure. ``progress`` is called with the number of
+    breaths of each batch, as it is done. cmH2O, ``(n, T)``; NaN where the first pressure is blank.
     """
     n = len(breaths)
     batch = min(_BATCH, n)

@@ -214,16 +214,9 @@ FILL = {"u_in": 0.0, "u_out": 1, "pressure": np.nan, "flow": np.nan, "volume": n
 def stack(
     values: np.ndarray, lengths: np.ndarray, fill: float, width: int | None = None
 ) -> np.ndarray:
-    """Arrange consecutive breaths in rows.
+    """Arrange samples (m,) of consecutive breaths of lengths (n,) in rows, (n, T).
 
-    Args:
-        values: samples of all breaths, (m,).
-        lengths: samples of each breath, (n,), summing to m.
-        fill: value after a short breath.
-        width: T; the longest length if not given.
-
-    Returns:
-        An array (n, T) of the same type; a view if all lengths are T.
+    A value fills short breaths. T is the width, or the longest length; a view if all lengths are T.
     """
     width = int(lengths.max(initial=0)) if width is None else width
     if (lengths == width).all():
@@ -237,15 +230,9 @@ def stack(
 def stack_times(
     time: np.ndarray, lengths: np.ndarray, width: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Arrange times in rows, with intervals; in padding, time continues at the last interval.
+    """Times, s, (m,) in rows, and intervals, each (n, T); lengths of at least 2, as of `stack`.
 
-    Args:
-        time: s, (m,).
-        lengths: samples of each breath, at least 2, (n,).
-        width: T; the longest length if not given.
-
-    Returns:
-        time and dt, s, each (n, T).
+    In padding, time continues at the last interval.
     """
     padded = stack(time, lengths, np.nan, width)
     if (lengths != padded.shape[1]).any():
@@ -292,19 +279,8 @@ def make_breaths(
 ) -> Breaths:  # fmt: skip
     """Make breaths of equal length from arrays, for instance from a simulation.
 
-    Args:
-        breath_id: whole numbers, each once, (n,).
-        R: cmH2O/(L/s), (n,).
-        C: mL/cmH2O, (n,).
-        time: s, increasing in each breath and starting at 0, (n, T).
-        u_in: %, (n, T).
-        u_out: 0 or 1, (n, T).
-        pressure: cmH2O, (n, T).
-        flow: mL/s, (n, T), or None.
-        volume: mL, (n, T), or None.
-
-    Returns:
-        The breaths, as copies, all valid.
+    Arguments have the units and shapes of the attributes of :class:`Breaths`, and are copied. All
+    samples are valid.
 
     Raises:
         ValueError: if shapes differ, an id occurs twice, or time does not start at 0 and increase.

@@ -71,14 +71,9 @@ def is_fast(breaths: Breaths) -> bool:
 
 
 def decimate(breaths: Breaths) -> Decimation:
-    """Keep a reading every 20 ms and a sample at every change of a command.
+    """Keep a reading every 20 ms and a sample at every change of a command, at any rate.
 
-    Args:
-        breaths: n breaths at any rate, for instance 1000 Hz.
-
-    Returns:
-        The breaths with ``valid``, ``time`` and ``dt`` of the kept samples; ``time_inferred``,
-        labels and ids are the same. ``sha256`` still names the file.
+    ``valid``, ``time`` and ``dt`` are of the kept samples. ``sha256`` still names the file.
     """
     lengths = breaths.valid.sum(axis=1)
     kept = [_kept(breaths, i, int(length)) for i, length in enumerate(lengths)]

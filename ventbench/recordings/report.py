@@ -234,13 +234,9 @@ class Tally:
 
 
 def check_lengths(tally: Tally, log: ProblemLog, *, pad: bool, expected: int = 0) -> None:
-    """Check that all breaths have the same number of samples.
+    """Check that all breaths have ``expected`` samples; for 0, as many as is most common.
 
-    Args:
-        tally: all breaths.
-        log: receives the problems.
-        pad: allow shorter breaths, unless padding would need far more memory than the file.
-        expected: samples that a breath should have; 0 for the most common length.
+    With ``pad`` they may be shorter, unless padding would need far more memory than the file.
     """
     lengths, first_row = tally.column("lengths").astype(np.int64), tally.column("first_row")
     if len(lengths) == 0:

@@ -14,18 +14,10 @@ import numpy as np
 from ventbench.recordings.scan import kind_of
 from ventbench.recordings.schema import fail
 
-SIGNALS = {
-    "pressure": "cmH2O",
-    "flow": "mL/s",
-    "volume": "mL",
-    "target": "cmH2O",
-    "cmd_inh_valve": "as logged",
-    "cmd_exh_valve": "as logged",
-    "cmd_psol": "as logged",
-    "dp_inhale": "as logged",
-    "dp_exhale": "as logged",
-}
-"""Signals of a run and their units."""
+#: Signals of a run and their units.
+SIGNALS = {"pressure": "cmH2O", "flow": "mL/s", "volume": "mL", "target": "cmH2O"} | dict.fromkeys(
+    ("cmd_inh_valve", "cmd_exh_valve", "cmd_psol", "dp_inhale", "dp_exhale"), "as logged"
+)
 _LABELS = ("run", "test", "breath", "time_step", "R", "C", "drive")
 
 

@@ -310,12 +310,8 @@ def known_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> Kn
     """Interpolate single blank times and shift each breath to start at 0.
 
     Blank times between two known ones are linear in the sample number; those before the first or
-    after the last known one are extrapolated at the breath's mean interval.
-
-    Args:
-        time: times as in the file, s, NaN where blank, (m,).
-        starts: first row of each breath, (k,).
-        lengths: rows of each breath, (k,).
+    after the last known one are extrapolated at the breath's mean interval. Times are as in the
+    file, s, NaN where blank, (m,); starts and lengths as of :func:`leading_zeros`.
     """
     missing = np.isnan(time)
     n_missing = np.add.reduceat(missing.astype(np.int64), starts)
@@ -373,16 +369,11 @@ class Block:
 def scan(
     source: Source, log: ProblemLog, *, clip: bool = False, batch: int | None = None
 ) -> Iterator[Block]:
-    """Read and check a file.
+    """Read and check a file: blocks in its order, of ``batch`` breaths, or any number for None.
 
-    Args:
-        source: an open file.
-        log: receives all problems and warnings except those of the whole file (unequal lengths).
-        clip: bring u_in into 0..100 %.
-        batch: breaths in a block; None for blocks of any size.
-
-    Yields:
-        Blocks in file order, also after a problem; their values must not be used then.
+    The log receives all problems and warnings except those of the whole file (unequal lengths).
+    There are blocks after a problem too; their values must not be used. ``clip`` brings u_in into
+    0..100 %.
 
     Raises:
         RecordingError: the file cannot be parsed.
@@ -408,16 +399,12 @@ def _block(rows: Rows, columns: dict[str, np.ndarray]) -> Block:
     samples = {name: columns[name] for name in keep if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
     return Block(
-        breath_id=columns["breath_id"][starts],
-        R=columns["R"][starts],
-        C=columns["C"][starts],
-        first_row=rows.row0 + starts,
-        lengths=lengths,
+        breath_id=columns["breath_id"][starts], R=columns["R"][starts], C=columns["C"][starts],
+        first_row=rows.row0 + starts, lengths=lengths,
         n_inspiratory=leading_zeros(samples["u_out"], starts, lengths),
-        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
-        times=times,
+        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1), times=times,
         samples=samples,
-    )
+    )  # fmt: skip
 
 
 def join_blocks(blocks: Sequence[Block]) -> Block:

@@ -258,15 +258,7 @@ _RESPIRAWORKS = {"run", "test", "breath", "cmd_inh_valve", "cmd_exh_valve"}
 
 
 def check_header(file: str, names: Sequence[str], line: int | None) -> tuple[RecordingProblem, ...]:
-    """Check the names of the columns.
-
-    Args:
-        file: the path as the caller wrote it.
-        names: the column names in file order.
-        line: line of the header, or None in Parquet.
-
-    Returns:
-        A warning for each unknown column, which is ignored.
+    """Check the names of the columns, in line ``line``; return a warning for each unknown one.
 
     Raises:
         RecordingError: a column is missing or occurs twice.

@@ -52,9 +52,7 @@ class Data:
         return Data(**{name: array[index] for name, array in vars(self).items()})
 
     def with_pressure(self, pressure: ArrayLike) -> Data:
-        """Replace the pressure, cmH2O, ``(n, T)``, for example by a simulator's response.
-
-        A sample without a measured pressure keeps its weight of zero.
+        """Replace the pressure, cmH2O, ``(n, T)``; blank samples keep their weight of zero.
 
         Raises:
             InputError: if the shape differs, or a pressure with weight is not finite.
@@ -72,12 +70,9 @@ class Data:
 
 
 def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None = None) -> Data:
-    """Make the data of a fit from a recording.
+    """Make the data of a fit from a recording, with its flow if that is asked for.
 
-    Args:
-        breaths: breaths to convert; at least one.
-        flow: use the recorded flow as well.
-        position: place of each breath in its recording; evenly from 0 to 1 if not given.
+    Positions, the place of each breath in its recording, are evenly from 0 to 1 if not given.
 
     Raises:
         InputError: if there is no breath, no pressure or, when asked for, no flow.

@@ -119,12 +119,9 @@ class Predictor:
     """
 
     def __init__(
-        self,
-        data: Data,
-        names: tuple[str, ...],
-        substeps: int | None = None,
+        self, data: Data, names: tuple[str, ...], substeps: int | None = None,
         sizes: tuple[int, ...] = SIZES,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Choose the sizes to compile for.
 
         Args:

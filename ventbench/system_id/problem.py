@@ -122,14 +122,11 @@ class Unknowns:
 def make_unknowns(
     data: Data, paths: Iterable[str], groups: Mapping[str, ArrayLike] | None = None
 ) -> Unknowns:
-    """Lay out the unknowns of a fit.
+    """Lay out the unknowns of a fit with free parameters of some paths.
 
-    Args:
-        data: the breaths.
-        paths: free parameters.
-        groups: breaths that share a parameter, by its path, as whole numbers ``(n,)``. By default,
-            R and C belong to the lung, a parameter of scope ``breath`` to the breath, and all
-            others are shared by all breaths.
+    Groups are breaths that share a parameter, by its path, as whole numbers ``(n,)``. By default, R
+    and C belong to the lung, a parameter of scope ``breath`` to the breath, and all others are
+    shared by all breaths.
 
     Raises:
         InputError: if a group does not fit the data, or a parameter appears twice.
@@ -272,10 +269,6 @@ class Problem:
         Whether a breath comes before or after the change is all that matters to it, so that two
         simulations of it serve all places.
 
-        Args:
-            x: unknowns, ``(U,)``.
-            path: parameter of a change point.
-
         Returns:
             Positions between two breaths, and the cost of each, without the prior; ``(k,)`` each.
             At least two breaths lie on either side, if there are four.
@@ -327,10 +320,8 @@ class Problem:
 def parameter_values(data: Data, names: tuple[str, ...], given: Mapping[str, ArrayLike]) -> Floats:
     """Physical values of all columns of a predictor, ``(n, P + 1)``.
 
-    Args:
-        data: R, C, positions and starting pressures come from here.
-        names: paths of the predictor.
-        given: other values by path, a number or one for each breath; the rest is neutral.
+    R, C, positions and starting pressures are those of the data, unless they are given by path as
+    others are, a number or one for each breath; the rest is neutral.
 
     Raises:
         InputError: if a name is unknown or a value outside its bounds.

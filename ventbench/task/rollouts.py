@@ -161,15 +161,9 @@ def inspiration(
 
 
 def expiration(plant: Plant, scenario: Scenario, loop: LoopState) -> tuple[LoopState, Expirations]:
-    """Run the fixed commands of an expiration.
+    """Run the fixed commands of an expiration, from the state at the end of the inspiration.
 
-    Args:
-        plant: plants of the cells, from :func:`ventbench.task.environment.vary`.
-        scenario: the cells.
-        loop: state at the end of the inspiration.
-
-    Returns:
-        State of the loop afterwards, and what it shows, steps first.
+    Returns the state of the loop afterwards, and what it shows, steps first.
     """
 
     def expire(loop: LoopState, step: Array) -> tuple[LoopState, Expirations]:

@@ -1,7 +1,5 @@
 """The tubing takes up gas as pressure rises."""
 
-from __future__ import annotations
-
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
 
 
@@ -9,9 +7,7 @@ class CircuitCompliance(Mechanism):
     """A compliance at the airway, in parallel to the lung."""
 
     description = Description(
-        name="circuit_compliance",
-        title="compliance of the circuit",
-        site="circuit",
+        name="circuit_compliance", title="compliance of the circuit", site="circuit",
         equation="C_circuit dp/dt = q_in - q_lung - q_out",
         parameters=(
             Parameter("compliance", "mL/cmH2O", "of tubing, humidifier and dead space",
@@ -22,9 +18,7 @@ class CircuitCompliance(Mechanism):
         ),
         signature="Edges of pressure are rounded, the more the higher R, in inspiration and at the "
         "start of expiration.",
-        confusable=("valve_lag", "sensor_lag"),
-        detectable=0.4,
-        least=0.3,
+        confusable=("valve_lag", "sensor_lag"), detectable=0.4, least=0.3,
         least_reason="a syringe's worth of tubing; less moves no edge of 30 samples a second",
         ubiquitous=True,
     )  # fmt: skip

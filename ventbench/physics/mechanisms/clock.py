@@ -1,7 +1,5 @@
 """Clocks of commands and pressure that are not one: an offset, and different rates."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -12,9 +10,7 @@ class ClockOffset(Mechanism):
     """One dead time of all commands: that of a path or clock that all readings share."""
 
     description = Description(
-        name="clock_offset",
-        title="delay between commands and pressure",
-        site="sensor",
+        name="clock_offset", title="delay between commands and pressure", site="sensor",
         equation="y(t) = p(t - offset): both commands act late by one time",
         parameters=(
             Parameter("offset", "s", "common dead time",
@@ -25,8 +21,7 @@ class ClockOffset(Mechanism):
         "sensor with a dead time.",
         signature="All that happens in pressure comes late by one time, at edges of both valves "
         "alike.",
-        confusable=("valve_delay", "exhalation_valve_delay", "sensor_lag"),
-        least=0.008,
+        confusable=("valve_delay", "exhalation_valve_delay", "sensor_lag"), least=0.008,
         least_reason="a quarter of a sample: less is within the time stamps of a log",
     )  # fmt: skip
 
@@ -43,9 +38,7 @@ class ClockSkew(Mechanism):
     """A common dead time that grows through each breath."""
 
     description = Description(
-        name="clock_skew",
-        title="clocks of commands and pressure that run apart",
-        site="sensor",
+        name="clock_skew", title="clocks of commands and pressure that run apart", site="sensor",
         equation="y(t) = p(t - skew t), t = time since the start of the breath",
         parameters=(
             Parameter("skew", "1", "share of the time by which pressure falls behind",
@@ -56,8 +49,7 @@ class ClockSkew(Mechanism):
         "given as rounded numbers, to 0.1 to 4 %.",
         signature="Early edges are on time; others come late in proportion to the time in the "
         "breath.",
-        confusable=("clock_offset", "exhalation_valve_delay", "valve_delay"),
-        least=0.002,
+        confusable=("clock_offset", "exhalation_valve_delay", "valve_delay"), least=0.002,
         least_reason="4 ms at the end of a breath of 2 s",
     )  # fmt: skip
 

@@ -1,7 +1,5 @@
 """The driver passes whole percents only."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -12,9 +10,7 @@ class CommandRounding(Mechanism):
     """Integer positions of the valve behind a logged fractional command."""
 
     description = Description(
-        name="command_rounding",
-        title="command rounded to whole percents",
-        site="command",
+        name="command_rounding", title="command rounded to whole percents", site="command",
         equation="u_effective = u + amount (floor(u + bias) - u)",
         parameters=(
             Parameter("amount", "1",
@@ -28,8 +24,7 @@ class CommandRounding(Mechanism):
         ),
         signature="Cut off, half a percent of the command is missing on average, which looks like "
         "a dead band of 0.5 %; what remains follows the fraction of each command.",
-        confusable=("valve_dead_band",),
-        least=0.5,
+        confusable=("valve_dead_band",), least=0.5,
         least_reason="a driver rounds or does not; half a rounding is another effect",
         special_case_of=("valve_shape",),
     )  # fmt: skip

@@ -1,7 +1,5 @@
 """The expiratory valve answers late."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -16,8 +14,7 @@ class ExhalationValveDelay(Mechanism):
     """
 
     description = Description(
-        name="exhalation_valve_delay",
-        title="delay of the expiratory valve",
+        name="exhalation_valve_delay", title="delay of the expiratory valve",
         site="expiratory valve",
         equation="opening slow do/dt = u_out(t - opening (1 - slow)) - o",
         parameters=(
@@ -35,9 +32,7 @@ class ExhalationValveDelay(Mechanism):
         "closing apart. A diaphragm on a vented pilot opens as its pilot empties.",
         signature="Pressure stays up after the command to open, or falls slowly at first, whatever "
         "the lung; inspiration is not affected, unless closing is late too.",
-        confusable=("inertance", "sensor_lag"),
-        detectable=0.003,
-        least=0.008,
+        confusable=("inertance", "sensor_lag"), detectable=0.003, least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("outlet_memory",),
     )  # fmt: skip

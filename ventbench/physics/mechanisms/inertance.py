@@ -1,7 +1,5 @@
 """Gas has mass, and the tubing before it takes up gas."""
 
-from __future__ import annotations
-
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
 
 #: Inertance, cmH2O s2/L, at which half of the tubing's compliance acts, so that none acts without
@@ -17,9 +15,7 @@ class Inertance(Mechanism):
     """
 
     description = Description(
-        name="inertance",
-        title="inertance of the gas",
-        site="airway",
+        name="inertance", title="inertance of the gas", site="airway",
         equation="p = ... + inertance dQ/dt, tubing inertance / (inertance + 0.003) dp/dt = q_in - "
         "Q - q_out",
         parameters=(
@@ -32,9 +28,7 @@ class Inertance(Mechanism):
         "Lung Mechanics, Cambridge 2009), behind 0.1 to 1 mL/cmH2O of tubing.",
         signature="Overshoot and ringing after edges, above all at the start of expiration with "
         "low R; below 0.15 cmH2O s2/L without tubing invisible at 30 samples a second.",
-        confusable=("circuit_compliance", "exhalation_valve_delay"),
-        detectable=0.16,
-        least=0.008,
+        confusable=("circuit_compliance", "exhalation_valve_delay"), detectable=0.16, least=0.008,
         least_reason="less than the gas in a tracheal tube alone",
     )  # fmt: skip
 

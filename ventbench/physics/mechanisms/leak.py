@@ -1,7 +1,5 @@
 """Gas leaves beside the lung."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
@@ -14,9 +12,7 @@ class Leak(Mechanism):
     """A flow out of the airway that grows with its pressure."""
 
     description = Description(
-        name="leak",
-        title="leak at the airway",
-        site="circuit",
+        name="leak", title="leak at the airway", site="circuit",
         equation="q_leak = conductance p (p^2 + e^2)^((exponent - 1) / 2), e = 0.2 cmH2O",
         parameters=(
             Parameter("conductance", "mL/s", "leak at 1 cmH2O", 0.0, 50.0, 0.0, 8.0, 20.0),
@@ -27,10 +23,8 @@ class Leak(Mechanism):
         "mL/s per cmH2O is a usual leak of masks and cuffs.",
         signature="Pressure is lost late in inspiration and most in long, high plateaus; nearly "
         "all of it can hide in R and C.",
-        confusable=("viscoelasticity", "valve_dead_band", "supply_droop"),
-        detectable=0.25,
-        least=1.0,
-        least_reason="less than connectors are allowed to leak",
+        confusable=("viscoelasticity", "valve_dead_band", "supply_droop"), detectable=0.25,
+        least=1.0, least_reason="less than connectors are allowed to leak",
         special_case_of=("leak_shape",),
     )  # fmt: skip
 

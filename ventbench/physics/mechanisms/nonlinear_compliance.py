@@ -1,7 +1,5 @@
 """The lung has a capacity: it stiffens as it fills."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -18,9 +16,7 @@ class NonlinearCompliance(Mechanism):
     """A recoil that rises faster than volume."""
 
     description = Description(
-        name="nonlinear_compliance",
-        title="lung that stiffens as it fills",
-        site="alveolus",
+        name="nonlinear_compliance", title="lung that stiffens as it fills", site="alveolus",
         equation="P_elastic = (ln(1 + sigmoid x) - ln(1 - x)) / (1 + sigmoid) / stiffening, x = "
         "stiffening V / C",
         parameters=(
@@ -37,9 +33,7 @@ class NonlinearCompliance(Mechanism):
         "at 30 cmH2O.",
         signature="Pressure rises faster at high volume: end of inspiration of big breaths; "
         "expiration begins faster.",
-        confusable=("valve_curve", "leak"),
-        detectable=0.01,
-        least=0.003,
+        confusable=("valve_curve", "leak"), detectable=0.01, least=0.003,
         least_reason="stiffening by 5 % at 15 cmH2O; less is within the spread of springs",
         special_case_of=("recoil_shape",),
     )  # fmt: skip

@@ -1,7 +1,5 @@
 """The patient breathes in."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
@@ -15,9 +13,7 @@ class PatientEffort(Mechanism):
     """A pressure source at the alveolus: half a sine, or a muscle that relaxes after its peak."""
 
     description = Description(
-        name="patient_effort",
-        title="effort of the patient's muscles",
-        site="alveolus",
+        name="patient_effort", title="effort of the patient's muscles", site="alveolus",
         equation="P_alveolus = ... - amplitude ((1 - relaxing) sin(pi x) + relaxing m(x)), x = (t "
         "- onset) / duration, m = sin(3 pi x / 4) up to x = 2/3, then exp(4 - 6 x)",
         parameters=(
@@ -37,10 +33,8 @@ class PatientEffort(Mechanism):
         "s (S. A. Esau et al., J. Appl. Physiol. 55, 1983, 731).",
         signature="A dent in pressure that the commands do not explain and that differs from "
         "breath to breath: absent in some, early or late in others.",
-        confusable=("a source at the alveolus that repeats in every breath",),
-        detectable=0.3,
-        least=0.5,
-        least_reason="a muscle pressure that a trigger would hardly see",
+        confusable=("a source at the alveolus that repeats in every breath",), detectable=0.3,
+        least=0.5, least_reason="a muscle pressure that a trigger would hardly see",
     )  # fmt: skip
 
     def network(self, values: Values, network: Network, view: View) -> Network:

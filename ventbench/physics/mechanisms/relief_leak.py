@@ -1,7 +1,5 @@
 """Gas leaves beside the lung above a pressure."""
 
-from __future__ import annotations
-
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
 
 
@@ -9,9 +7,7 @@ class ReliefLeak(Mechanism):
     """A leak that opens at a pressure, as a valve with a weak spring or a mask that lifts."""
 
     description = Description(
-        name="relief_leak",
-        title="leak above a pressure",
-        site="circuit",
+        name="relief_leak", title="leak above a pressure", site="circuit",
         equation="q_leak = conductance max(p - opening, 0)",
         parameters=(
             Parameter("conductance", "mL/s per cmH2O", "above the opening pressure",
@@ -22,8 +18,7 @@ class ReliefLeak(Mechanism):
         source="Relief valves and masks lift at 10 to 40 cmH2O; a cuff seals up to its own "
         "pressure of 20 to 30 cmH2O.",
         signature="Pressure is cut off above a pressure, and as usual below.",
-        confusable=("leak", "supply_pressure", "nonlinear_compliance"),
-        least=1.0,
+        confusable=("leak", "supply_pressure", "nonlinear_compliance"), least=1.0,
         least_reason="less than connectors are allowed to leak",
     )  # fmt: skip
 

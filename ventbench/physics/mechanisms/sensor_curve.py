@@ -1,7 +1,5 @@
 """The pressure sensor is bent: right at both ends of its range, wrong between them."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -21,9 +19,7 @@ class SensorCurve(Mechanism):
     """A parabola on top of the true pressure."""
 
     description = Description(
-        name="sensor_curve",
-        title="bent characteristic of the pressure sensor",
-        site="sensor",
+        name="sensor_curve", title="bent characteristic of the pressure sensor", site="sensor",
         equation="y = p + 4 bend p / 40 (1 - p / 40)",
         parameters=(
             Parameter("bend", "cmH2O",
@@ -34,8 +30,7 @@ class SensorCurve(Mechanism):
         "compensated, several percent if not.",
         signature="An error by pressure alone, in inspiration and expiration alike, whatever flow "
         "and volume are.",
-        confusable=("nonlinear_compliance", "supply_pressure"),
-        least=0.25,
+        confusable=("nonlinear_compliance", "supply_pressure"), least=0.25,
         least_reason="half a percent of a usual sensor's full scale",
         special_case_of=("sensor_shape",),
     )  # fmt: skip

@@ -4,8 +4,6 @@ The position of a breath in its recording is 0 for the first and 1 for the last.
 after the position ``at``. A drift sets in steadily, or fades, as what warms up does.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -147,9 +145,7 @@ MECHANISMS = (
          ("compliance_step", "sensor_drift", "resistance_drift")),
     ),
     SensorChange(Description(
-        name="zero_step",
-        title="step of the pressure sensor's zero",
-        site="sensor",
+        name="zero_step", title="step of the pressure sensor's zero", site="sensor",
         equation=f"y = p + change where x > at, {_POSITION}",
         parameters=(
             Parameter("change", "cmH2O", "change of the offset",
@@ -158,14 +154,11 @@ MECHANISMS = (
         ),
         source="A sensor that is zeroed, knocked or plugged in anew between two breaths.",
         signature="From one breath on, an error that is the same at all samples.",
-        confusable=("sensor_drift", "a PEEP that is set anew"),
-        least=0.15,
+        confusable=("sensor_drift", "a PEEP that is set anew"), least=0.15,
         least_reason="two steps of a usual converter",
     )),
     SensorChange(Description(
-        name="sensor_drift",
-        title="drift of the pressure sensor",
-        site="sensor",
+        name="sensor_drift", title="drift of the pressure sensor", site="sensor",
         equation=f"y = p (1 + gain g) + drift g, {_GROWN}",
         parameters=(
             Parameter("drift", "cmH2O", "change of the offset from the first breath to the last",
@@ -179,10 +172,7 @@ MECHANISMS = (
         signature=(
             "An error that grows with the number of the breath and is the same at all its samples."
         ),
-        confusable=("zero_step", "a PEEP that changes during the recording"),
-        detectable=0.05,
-        least=0.15,
-        least_reason="two steps of a usual converter",
-        special_case_of=("drift_shape",),
+        confusable=("zero_step", "a PEEP that changes during the recording"), detectable=0.05,
+        least=0.15, least_reason="two steps of a usual converter", special_case_of=("drift_shape",),
     )),
 )  # fmt: skip

@@ -1,7 +1,5 @@
 """The valve's flow falls as the airway's pressure rises: the supply's pressure is finite."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
@@ -18,8 +16,7 @@ class SupplyPressure(Mechanism):
     """Flow through an orifice between a supply of some pressure and the airway."""
 
     description = Description(
-        name="supply_pressure",
-        title="valve flow that falls with airway pressure",
+        name="supply_pressure", title="valve flow that falls with airway pressure",
         site="inspiratory valve",
         equation=(
             "q = q_valve sqrt(1 - p / S), S = 30 cmH2O / (1 - (1 - loss)^2), the supply's pressure"
@@ -33,8 +30,7 @@ class SupplyPressure(Mechanism):
         "cmH2O. Sonic valves behind wall supplies lose nothing.",
         signature="Too little flow at high airway pressure, whatever the command: late in "
         "inspiration and in big breaths, without any memory.",
-        confusable=("leak", "supply_droop", "valve_curve", "nonlinear_compliance"),
-        least=0.04,
+        confusable=("leak", "supply_droop", "valve_curve", "nonlinear_compliance"), least=0.04,
         least_reason="a supply of 380 cmH2O; valves hold their flow to a few percent",
     )  # fmt: skip
 

@@ -1,7 +1,5 @@
 """Breaths begin with gas that the last one has left."""
 
-from __future__ import annotations
-
 from ventbench.physics.mechanism import Description, Mechanism, Parameter, Values
 
 
@@ -9,9 +7,7 @@ class TrappedGas(Mechanism):
     """A pressure in the lung above that at the airway when a breath begins (auto-PEEP)."""
 
     description = Description(
-        name="trapped_gas",
-        title="trapped gas at the start of a breath",
-        site="alveolus",
+        name="trapped_gas", title="trapped gas at the start of a breath", site="alveolus",
         equation="P_alveolus(0) = p(0) + pressure",
         parameters=(
             Parameter("pressure", "cmH2O", "excess in the lung at the first sample",
@@ -22,8 +18,7 @@ class TrappedGas(Mechanism):
         signature=(
             "A breath begins above its first reading at once, and gas flows out before it is given."
         ),
-        confusable=("leak", "zero_step"),
-        least=0.3,
+        confusable=("leak", "zero_step"), least=0.3,
         least_reason="a valve that closes some milliseconds late",
     )  # fmt: skip
 

@@ -1,7 +1,5 @@
 """Turbulence: the airway resists more at high flow."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
@@ -14,9 +12,7 @@ class TurbulentResistance(Mechanism):
     """A pressure drop that grows with the square of flow, or nearly."""
 
     description = Description(
-        name="turbulent_resistance",
-        title="resistance that grows with flow",
-        site="airway",
+        name="turbulent_resistance", title="resistance that grows with flow", site="airway",
         equation="p = ... + R Q + quadratic Q |Q| (Q^2 + e^2)^(exponent / 2 - 1), e = 0.02 L/s",
         parameters=(
             Parameter("quadratic", "cmH2O s2/L2", "second coefficient of Rohrer; drop at 1 L/s",
@@ -29,9 +25,7 @@ class TurbulentResistance(Mechanism):
         "smooth tube the exponent is 1.75 (Blasius).",
         signature="Pressure drop grows faster than flow: error at high flow, in inspiration and at "
         "the start of expiration, most in lungs with low R; fitted R falls below the label.",
-        confusable=("valve_curve",),
-        detectable=0.5,
-        least=1.0,
+        confusable=("valve_curve",), detectable=0.5, least=1.0,
         least_reason="the curvature of a straight tracheal tube; less is within R",
         special_case_of=("flow_shape",),
     )  # fmt: skip

@@ -1,7 +1,5 @@
 """Flow of the inspiratory valve is not proportional to the command."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -12,9 +10,7 @@ class ValveCurve(Mechanism):
     """Saturating or convex curve of the valve, linear at small commands."""
 
     description = Description(
-        name="valve_curve",
-        title="curve of the inspiratory valve",
-        site="inspiratory valve",
+        name="valve_curve", title="curve of the inspiratory valve", site="inspiratory valve",
         equation="q = gain u (1 + a x^m)^(-1/m), x = u / 100, a = (1 - loss)^-m - 1",
         parameters=(
             Parameter("loss", "1",
@@ -29,8 +25,7 @@ class ValveCurve(Mechanism):
         signature="Error of one sign that grows with the command: during the first samples of "
         "inspiration, at high flow.",
         confusable=("turbulent_resistance", "supply_droop", "nonlinear_compliance"),
-        detectable=0.015,
-        least=0.04,
+        detectable=0.015, least=0.04,
         least_reason="linearised valves hold their curve to a few percent",
         special_case_of=("valve_shape",),
     )  # fmt: skip

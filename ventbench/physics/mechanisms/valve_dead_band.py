@@ -1,7 +1,5 @@
 """The inspiratory valve passes nothing at small commands."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -19,8 +17,7 @@ class ValveDeadBand(Mechanism):
     """The first part of the stroke gives no flow."""
 
     description = Description(
-        name="valve_dead_band",
-        title="dead band of the inspiratory valve",
+        name="valve_dead_band", title="dead band of the inspiratory valve",
         site="inspiratory valve",
         equation="u_effective = 0 below width, u - (1 - crack) width above",
         parameters=(
@@ -39,9 +36,7 @@ class ValveDeadBand(Mechanism):
         signature="Too little flow at every small command, none at the smallest: late in "
         "inspiration, and in lungs with high R and low C, which are ventilated with small "
         "commands.",
-        confusable=("leak", "command_rounding", "valve_hysteresis"),
-        detectable=0.1,
-        least=0.25,
+        confusable=("leak", "command_rounding", "valve_hysteresis"), detectable=0.1, least=0.25,
         least_reason="a quarter of a percent of stroke, the resolution of drivers",
         special_case_of=("valve_shape",),
     )  # fmt: skip

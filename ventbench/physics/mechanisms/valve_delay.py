@@ -1,7 +1,5 @@
 """The inspiratory valve answers late: dead time."""
 
-from __future__ import annotations
-
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Parameter, Values
@@ -11,9 +9,7 @@ class ValveDelay(Mechanism):
     """Command of the inspiratory valve, shifted in time."""
 
     description = Description(
-        name="valve_delay",
-        title="dead time of the inspiratory valve",
-        site="inspiratory valve",
+        name="valve_delay", title="dead time of the inspiratory valve", site="inspiratory valve",
         equation="q(t) = q_commanded(t - delay)",
         parameters=(
             Parameter("delay", "s", "dead time",
@@ -25,9 +21,7 @@ class ValveDelay(Mechanism):
         "of recorded breaths ask for.",
         signature="Pressure runs ahead of the recording after every edge of the command during "
         "inspiration, by one constant time.",
-        confusable=("valve_lag", "sensor_lag", "circuit_compliance"),
-        detectable=0.009,
-        least=0.008,
+        confusable=("valve_lag", "sensor_lag", "circuit_compliance"), detectable=0.009, least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )  # fmt: skip

@@ -1,7 +1,5 @@
 """The inspiratory valve stands higher when closing than when opening."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
@@ -15,9 +13,7 @@ class ValveHysteresis(Mechanism):
     """Rate-independent memory of the command."""
 
     description = Description(
-        name="valve_hysteresis",
-        title="play of the inspiratory valve",
-        site="inspiratory valve",
+        name="valve_hysteresis", title="play of the inspiratory valve", site="inspiratory valve",
         equation="u_effective = u - h z, h = width / 2, z = (1 - smooth) ((1 - give) clip(x, -1, "
         "1) + give tanh x) + smooth (s + (z before - s) exp(-|d| / h)), x = z before + d / h, d = "
         "u - u before, s = sign d",
@@ -35,9 +31,7 @@ class ValveHysteresis(Mechanism):
         "memory is that of the travel, not of time.",
         signature="After each reversal of the command flow stays where it was; error of one sign "
         "while the command rises and of the other while it falls.",
-        confusable=("valve_dead_band", "valve_delay"),
-        detectable=0.1,
-        least=0.3,
+        confusable=("valve_dead_band", "valve_delay"), detectable=0.1, least=0.3,
         least_reason="a little more than the resolution of drivers",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )  # fmt: skip

@@ -1,7 +1,5 @@
 """Tissue relaxes: part of the recoil fades."""
 
-from __future__ import annotations
-
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
@@ -11,9 +9,7 @@ class Viscoelasticity(Mechanism):
     """A spring with a dashpot beside the lung's elastance."""
 
     description = Description(
-        name="viscoelasticity",
-        title="stress relaxation of the tissue",
-        site="alveolus",
+        name="viscoelasticity", title="stress relaxation of the tissue", site="alveolus",
         equation="dS/dt = ratio / C Q - S / time, P = V / C + S",
         parameters=(
             Parameter("ratio", "1", "elastance of the Maxwell element over that of the lung",
@@ -25,14 +21,10 @@ class Viscoelasticity(Mechanism):
         "ratio 0.05 to 0.7, 0.3 to 2 s. A second compartment has an impedance of the same order.",
         signature="Pressure creeps down while volume is held and lags behind slow changes, in "
         "inspiration and expiration; nearly all of it can hide in R and C.",
-        confusable=("leak", "supply_droop"),
-        detectable=0.02,
-        least=0.04,
-        least_reason="creep below that of rubber bellows",
-        special_case_of=("recoil_memory",),
+        confusable=("leak", "supply_droop"), detectable=0.02, least=0.04,
+        least_reason="creep below that of rubber bellows", special_case_of=("recoil_memory",),
         # Its slow stress trades against C, and what is left of another mechanism's form decides.
-        beside_error=0.2,
-        equivalents=("second_compartment",),
+        beside_error=0.2, equivalents=("second_compartment",),
     )  # fmt: skip
 
     stateful = True

@@ -1,7 +1,5 @@
 """The lung: a leak, a pressure drop and factors of its resistance, recoil and relaxing stresses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -31,9 +29,7 @@ class LeakShape(BasisTerm):
     """
 
     description = Description(
-        name="leak_shape",
-        title="f(p): any leak at the airway",
-        site="circuit",
+        name="leak_shape", title="f(p): any leak at the airway", site="circuit",
         equation="q_leak = f(p), f(0) = 0, df/dp straight between knots",
         parameters=coefficients(
             (f"{p:g} cmH2O" for p in _LEAK_KNOTS), unit="mL/s per cmH2O",
@@ -67,9 +63,7 @@ class FlowShape(BasisTerm):
     """
 
     description = Description(
-        name="flow_shape",
-        title="f(Q): any pressure drop of the airway",
-        site="airway",
+        name="flow_shape", title="f(Q): any pressure drop of the airway", site="airway",
         equation="p = ... + R Q + f(Q), f(0) = df/dQ(0) = 0, df/dQ straight between knots",
         parameters=coefficients(
             (f"{side} {q:g} L/s" for side in ("inwards", "outwards") for q in _FLOW_KNOTS[1:]),
@@ -109,9 +103,7 @@ class VolumeResistance(BasisTerm):
     """A factor of R, straight between knots; it is 1 at V / C = 5 cmH2O and below: there R is R."""
 
     description = Description(
-        name="volume_resistance",
-        title="R(V): resistance that depends on volume",
-        site="airway",
+        name="volume_resistance", title="R(V): resistance that depends on volume", site="airway",
         equation="p = ... + R (1 + f(V / C)) Q, f straight between knots, f(5 cmH2O) = 0",
         parameters=coefficients(
             (f"V / C = {s:g} cmH2O" for s in _VOLUME_KNOTS[1:]), unit="1",
@@ -141,8 +133,7 @@ class DirectionResistance(BasisTerm):
     """A factor of R for flow out of the lung; R itself is that of inspiration."""
 
     description = Description(
-        name="direction_resistance",
-        title="R(direction): another resistance outwards",
+        name="direction_resistance", title="R(direction): another resistance outwards",
         site="airway",
         equation="p = ... + R Q inwards, R (1 + c) Q outwards",
         parameters=coefficients(
@@ -184,9 +175,7 @@ class RecoilShape(BasisTerm):
     """
 
     description = Description(
-        name="recoil_shape",
-        title="f(V): any recoil of the lung",
-        site="alveolus",
+        name="recoil_shape", title="f(V): any recoil of the lung", site="alveolus",
         equation="P = integral of (1 + g(s)) / (1 + mean of g) ds up to s = V / C, g straight "
         "between knots, g(10 cmH2O) = 0",
         parameters=coefficients(
@@ -233,9 +222,7 @@ class RecoilMemory(FilterBank):
     """
 
     description = Description(
-        name="recoil_memory",
-        title="memory of p: any spectrum of relaxation",
-        site="alveolus",
+        name="recoil_memory", title="memory of p: any spectrum of relaxation", site="alveolus",
         equation="P = V / C + sum_k S_k, dS_k/dt = c_k / C Q - S_k / tau_k",
         parameters=coefficients(
             (f"{tau:g} s" for tau in _MEMORY_TAUS), unit="1",

@@ -1,7 +1,5 @@
 """Errors of the pressure sensor: a curve, filters, and a drift over the recording."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import jax
@@ -9,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Values
+from ventbench.physics.mechanism import Description, Pair, Values
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
@@ -36,9 +34,7 @@ class SensorShape(BasisTerm):
     """
 
     description = Description(
-        name="sensor_shape",
-        title="measurement: any curve of the pressure sensor",
-        site="sensor",
+        name="sensor_shape", title="measurement: any curve of the pressure sensor", site="sensor",
         equation="y = p + f(p), f straight between knots, f(5 cmH2O) = f(20 cmH2O) = 0",
         parameters=coefficients(
             (f"{p:g} cmH2O" for p in _SENSOR_KNOTS if p not in _SENSOR_FIXED), unit="cmH2O",
@@ -91,8 +87,7 @@ class SensorMemory(FilterBank):
     """A bank of first-order filters on the reading; a lasting pressure is shown as it is."""
 
     description = Description(
-        name="sensor_memory",
-        title="measurement: any linear memory of the pressure sensor",
+        name="sensor_memory", title="measurement: any linear memory of the pressure sensor",
         site="sensor",
         equation="y = p + sum_k c_k (s_k - p), tau_k ds_k/dt = p - s_k",
         parameters=coefficients(
@@ -110,9 +105,7 @@ class SensorMemory(FilterBank):
         """Pressure that the sensor shows in all filters, cmH2O."""
         return self.lasting(pressure + 0.0 * flow)
 
-    def reading(
-        self, values: Values, pressure: Array, state: Array, length: Array
-    ) -> tuple[Array, Array]:
+    def reading(self, values: Values, pressure: Array, state: Array, length: Array) -> Pair:
         """Implicit step of all filters."""
         after = self.step(state, pressure, length)
         return pressure + self.weighed(values, after - pressure), after
@@ -133,9 +126,7 @@ class DriftShape(BasisTerm):
     """An offset of the reading; that of the first breath is zero, as PEEP absorbs it."""
 
     description = Description(
-        name="drift_shape",
-        title="measurement: any drift of the sensor's zero",
-        site="sensor",
+        name="drift_shape", title="measurement: any drift of the sensor's zero", site="sensor",
         equation="y = p + f(x), x = position of the breath in the recording, f(0) = 0",
         parameters=coefficients(
             (f"position {x:g}" for x in _DRIFT_KNOTS[1:]), unit="cmH2O",

@@ -1,14 +1,12 @@
 """The valves: curve, filters and plays of the command, memory of the supply, and the outlet."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Network, Values, View
+from ventbench.physics.mechanism import Description, Network, Pair, Values, View
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
@@ -35,8 +33,7 @@ class ValveShape(BasisTerm):
     """
 
     description = Description(
-        name="valve_shape",
-        title="f(u): any curve of the inspiratory valve",
+        name="valve_shape", title="f(u): any curve of the inspiratory valve",
         site="inspiratory valve",
         equation="q = gain (u + f(u)), f straight between knots, f(0) = f(20 %) = 0",
         parameters=coefficients(
@@ -78,8 +75,7 @@ class CommandMemory(FilterBank):
     """
 
     description = Description(
-        name="command_memory",
-        title="memory of u: any linear memory of the valve",
+        name="command_memory", title="memory of u: any linear memory of the valve",
         site="inspiratory valve",
         equation="q = q_asked + sum_k c_k (s_k - q_asked), tau_k ds_k/dt = q_asked - s_k",
         parameters=coefficients(
@@ -94,9 +90,7 @@ class CommandMemory(FilterBank):
     rank = 2
     taus = _COMMAND_TAUS
 
-    def inflow(
-        self, values: Values, flow: Array, state: Array, length: Array
-    ) -> tuple[Array, Array]:
+    def inflow(self, values: Values, flow: Array, state: Array, length: Array) -> Pair:
         """Implicit step of all filters."""
         after = self.step(state, flow, length)
         return flow + self.weighed(values, after - flow), after
@@ -119,8 +113,7 @@ class CommandPlays(BasisTerm):
     """
 
     description = Description(
-        name="command_plays",
-        title="memory of u: any hysteresis of the valve",
+        name="command_plays", title="memory of u: any hysteresis of the valve",
         site="inspiratory valve",
         equation="u_effective = u + sum_k c_k (s_k - u), s_k = clip(s_k before, u -+ width_k / 2)",
         parameters=coefficients(
@@ -164,9 +157,7 @@ class SupplyMemory(FilterBank):
     """A factor of the flow that depends on the flow before; to first order, any such factor."""
 
     description = Description(
-        name="supply_memory",
-        title="memory of u: a factor by recent flow",
-        site="supply",
+        name="supply_memory", title="memory of u: a factor by recent flow", site="supply",
         equation="q = q_valve (1 + sum_k c_k s_k / (0.5 L/s)), tau_k ds_k/dt = q_valve - s_k",
         parameters=coefficients(
             (f"{tau:g} s" for tau in _SUPPLY_TAUS), unit="1",
@@ -180,9 +171,7 @@ class SupplyMemory(FilterBank):
     rank = 3
     taus = _SUPPLY_TAUS
 
-    def inflow(
-        self, values: Values, flow: Array, state: Array, length: Array
-    ) -> tuple[Array, Array]:
+    def inflow(self, values: Values, flow: Array, state: Array, length: Array) -> Pair:
         """Implicit step of all filters."""
         after = self.step(state, flow, length)
         return flow * (1.0 + self.weighed(values, after) / _SUPPLY_FLOW), after
@@ -207,8 +196,7 @@ class OutletShape(BasisTerm):
     """
 
     description = Description(
-        name="outlet_shape",
-        title="exhalation path: any conductance of the expiratory valve",
+        name="outlet_shape", title="exhalation path: any conductance of the expiratory valve",
         site="expiratory valve",
         equation="q_out = o (1 + f(p - PEEP)) (p - PEEP) / R_ex, o how far it is open, f straight "
         "between knots, f(5 cmH2O) = 0",
@@ -251,8 +239,7 @@ class OutletMemory(FilterBank):
     """
 
     description = Description(
-        name="outlet_memory",
-        title="exhalation path: any slow opening of the expiratory valve",
+        name="outlet_memory", title="exhalation path: any slow opening of the expiratory valve",
         site="expiratory valve",
         equation="q_out = o (p - PEEP) / R_ex, o = max(0, u_out + sum_k c_k (s_k - u_out)), tau_k "
         "ds_k/dt = u_out - s_k",

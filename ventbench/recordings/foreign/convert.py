@@ -95,21 +95,12 @@ class Imported:
 
 
 def import_recording(
-    path: str | Path,
-    *,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    layout: str | None = None,
-    lung: str | None = None,
-    rate: float | None = None,
-    split_breaths: bool = False,
-    invert: Iterable[str] = (),
-    offsets: Mapping[str, float] | None = None,
-    select: Mapping[str, str] | None = None,
-    skip_bad_breaths: bool = False,
-    separator: str | None = None,
-    decimal: str | None = None,
-) -> Imported:
+    path: str | Path, *, columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None, layout: str | None = None, lung: str | None = None,
+    rate: float | None = None, split_breaths: bool = False, invert: Iterable[str] = (),
+    offsets: Mapping[str, float] | None = None, select: Mapping[str, str] | None = None,
+    skip_bad_breaths: bool = False, separator: str | None = None, decimal: str | None = None,
+) -> Imported:  # fmt: skip
     """Read a recording of another laboratory.
 
     Args:

@@ -61,11 +61,9 @@ class ConcealedLung:
 
 
 def conceal(words: str, simulator: Any = "frozen") -> ConcealedLung:
-    """Make the lung that the words determine.
+    """Make the lung that any words determine: the same words make the same lung.
 
-    Args:
-        words: any words; the same words make the same lung.
-        simulator: what the physics is added to; whatever :func:`ventbench.load_simulators` takes.
+    The physics is added to a simulator: whatever :func:`ventbench.load_simulators` takes.
 
     Raises:
         InputError: if there are no words.
@@ -94,14 +92,7 @@ def conceal(words: str, simulator: Any = "frozen") -> ConcealedLung:
 
 
 def reveal(path: Path, words: str) -> tuple[Lung, Effect]:
-    """Open a seal.
-
-    Args:
-        path: file that :meth:`ConcealedLung.write` wrote.
-        words: the words that the lung was made with.
-
-    Returns:
-        The lung's label and what it concealed.
+    """Open a seal that :meth:`ConcealedLung.write` wrote: the lung's label and what it concealed.
 
     Raises:
         InputError: if the file is no seal, or the words are others.

@@ -130,12 +130,9 @@ class EmulatedHal(deadman.SupervisedHal):
     """Deadman and electronics as processes, as the device's program sees them."""
 
     def __init__(self, given: dict[str, Any], clock: Callable[[], float], begun: float) -> None:
-        """Start both.
+        """Start both, with arguments of :func:`serve` and :func:`emulated_lung`.
 
-        Args:
-            given: arguments of :func:`serve`.
-            clock: the program's, s.
-            begun: its zero on ``time.monotonic``, s.
+        ``clock`` is the program's, s, and ``begun`` its zero on ``time.monotonic``, s.
 
         Raises:
             InputError: if the electronics cannot be as asked.
@@ -205,15 +202,9 @@ class _Bus:
 
 
 def serve(
-    bus: Connection,
-    wire: socket.socket,
-    make: Callable[[], Hal],
-    *,
-    begun: float,
-    normally_open: bool,
-    monostable: float,
-    log: Path | None,
-) -> None:
+    bus: Connection, wire: socket.socket, make: Callable[[], Hal], *, begun: float,
+    normally_open: bool, monostable: float, log: Path | None,
+) -> None:  # fmt: skip
     """Be the electronics until program and deadman have hung up.
 
     Args:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import heapq
+import math
 import os
 import signal
 import socket
@@ -54,15 +55,10 @@ class Emulator(Guard):
     """
 
     def __init__(
-        self,
-        service: DeviceService | Firmware,
-        *,
-        link: Path | None = None,
-        control: Path | None = None,
-        line_faults: Sequence[LineFault] = (),
-        log: Path | None = None,
+        self, service: DeviceService | Firmware, *, link: Path | None = None,
+        control: Path | None = None, line_faults: Sequence[LineFault] = (), log: Path | None = None,
         begun: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Open the terminal.
 
         Args:
@@ -79,8 +75,7 @@ class Emulator(Guard):
         """
         now = time.monotonic()
         begun = now if begun is None else begun
-        self.actuations: deque[Actuation] = deque(maxlen=_REMEMBERED)
-        self.actuations.append(Actuation(now, 0.0, 1))
+        self.actuations = deque([Actuation(now, 0.0, 1)], maxlen=_REMEMBERED)
         self.line = Line(line_faults)
         self._outgoing: list[tuple[float, int, bytes]] = []
         self._order = count()
@@ -200,11 +195,7 @@ class Emulator(Guard):
 
 
 def tell(control: Path, text: str) -> None:
-    """Send a line to a running emulator.
-
-    Args:
-        control: path of its control socket.
-        text: see :class:`Emulator`.
+    """Send a line, see :class:`Emulator`, to the control socket of a running emulator.
 
     Raises:
         InputError: if no emulator listens there.
@@ -224,54 +215,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         epilog="Example: ventbench-hardware emulate --lung R20C50 --link ./lung --fault "
         "leak@10-13:0.1",
     )
-    parser.add_argument("--lung", default="R20C50", help="lung on the ventilator")
-    parser.add_argument(
-        "--plant", default="frozen", help="simulator: a name, a file or module:function"
-    )
-    parser.add_argument(
-        "--conceal",
-        metavar="WORDS",
-        help="a lung with physics that the simulator lacks; the words determine it",
-    )
-    parser.add_argument(
-        "--seal", type=Path, help="where the sealed answer of --conceal goes (JSON)"
-    )
-    parser.add_argument("--link", type=Path, help="symbolic link to make to the terminal")
-    parser.add_argument("--control", type=Path, help="control socket to make")
-    parser.add_argument("--log", type=Path, help="CSV of every order of the program to the valves")
-    parser.add_argument(
-        "--electronics", type=Path, help="CSV of everything that the valves do, and why"
-    )
-    parser.add_argument(
-        "--normally-closed",
-        action="store_true",
-        help="the expiratory valve is closed without current, as PVP's own",
-    )
-    parser.add_argument(
-        "--no-monostable", action="store_true", help="no monostable on the heartbeat pin"
-    )
-    parser.add_argument(
-        "--fault", action="append", default=[], help="KIND@START[-END][:STRENGTH], repeatedly"
-    )
-    parser.add_argument("--noise", type=float, default=0.0, help="sensor noise, cmH2O (SD)")
-    parser.add_argument(
-        "--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O"
-    )
-    parser.add_argument(
-        "--highest", type=float, default=float("inf"), help="end of the sensor's range, cmH2O"
-    )
-    parser.add_argument(
-        "--realtime",
-        action="store_true",
-        help="refuse to run without real-time scheduling, which is taken where it is granted",
-    )
-    parser.add_argument(
-        "--firmware",
-        type=Path,
-        metavar="FILE",
-        help="a program of hardware_eval/firmware as the device: .elf runs under QEMU",
-    )
-    parser.add_argument("--pressure-limit", type=float, help="device's own limit, cmH2O")
+    add = parser.add_argument
+    add("--lung", default="R20C50", help="lung on the ventilator")
+    add("--plant", default="frozen", help="simulator: a name, a file or module:function")
+    add("--conceal", metavar="WORDS",
+        help="a lung with physics that the simulator lacks; the words determine it")  # fmt: skip
+    add("--seal", type=Path, help="where the sealed answer of --conceal goes (JSON)")
+    add("--link", type=Path, help="symbolic link to make to the terminal")
+    add("--control", type=Path, help="control socket to make")
+    add("--log", type=Path, help="CSV of every order of the program to the valves")
+    add("--electronics", type=Path, help="CSV of everything that the valves do, and why")
+    add("--normally-closed", action="store_true",
+        help="the expiratory valve is closed without current, as PVP's own")  # fmt: skip
+    add("--no-monostable", action="store_true", help="no monostable on the heartbeat pin")
+    add("--fault", action="append", default=[], help="KIND@START[-END][:STRENGTH], repeatedly")
+    add("--noise", type=float, default=0.0, help="sensor noise, cmH2O (SD)")
+    add("--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O")
+    add("--highest", type=float, default=math.inf, help="end of the sensor's range, cmH2O")
+    add("--realtime", action="store_true", help="refuse to run without real-time scheduling, "
+        "which is taken where it is granted")  # fmt: skip
+    add("--firmware", type=Path, metavar="FILE",
+        help="a program of hardware_eval/firmware as the device: .elf runs under QEMU")  # fmt: skip
+    add("--pressure-limit", type=float, help="device's own limit, cmH2O")
     given = parser.parse_args(arguments)
     try:
         return _emulate(given)

@@ -96,11 +96,7 @@ _TEXT = re.compile(
 
 
 def parse(text: str, now: float = 0.0) -> AnyFault:
-    """Read a fault as people write it: ``KIND@START[-END][:STRENGTH]``.
-
-    Args:
-        text: such as ``leak@10-13:0.1``: from second 10 to second 13, strength 0.1.
-        now: device time from which the seconds count.
+    """Read a fault as people write it: ``KIND@START[-END][:STRENGTH]``, seconds from ``now`` on.
 
     Raises:
         InputError: if it says nothing of the kind.

@@ -70,12 +70,7 @@ class Firmware:
     """
 
     def __init__(self, image: Path, given: dict[str, Any], begun: float) -> None:
-        """Start the electronics.
-
-        Args:
-            image: file to run.
-            given: arguments of :func:`~hardware_eval.emulation.electronics.switch_on`.
-            begun: zero of the electronics' clock on ``time.monotonic``, s.
+        """Start the electronics for an image; ``given`` and ``begun`` as of `EmulatedHal`.
 
         Raises:
             InputError: if the image or its emulator is not there, or the lung cannot be as asked.

@@ -36,13 +36,9 @@ class LoopbackDevice:
     """
 
     def __init__(
-        self,
-        hal: Hal,
-        settings: DeviceSettings | None = None,
-        clock: VirtualClock | None = None,
-        latency: float = 0.001,
-        line: Line | None = None,
-    ) -> None:
+        self, hal: Hal, settings: DeviceSettings | None = None,
+        clock: VirtualClock | None = None, latency: float = 0.001, line: Line | None = None,
+    ) -> None:  # fmt: skip
         """Start the device on a clock, its own if none is given."""
         self.line = line or Line()
         self.clock = clock or VirtualClock()
@@ -58,11 +54,7 @@ class LoopbackDevice:
         self.clock.carry(self._run_until)
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the device.
-
-        Raises:
-            DisconnectedError: if the cable is out.
-        """
+        """Send bytes to the device; DisconnectedError if the cable is out."""
         self._require_cable()
         arrival = self.clock.now() + self.latency
         data = self.line.to_device(self.clock.now() - self.start, data)
@@ -70,11 +62,7 @@ class LoopbackDevice:
             heapq.heappush(self._incoming, (arrival, next(self._order), data))
 
     def read(self, timeout: float) -> bytes:
-        """Wait for bytes from the device; empty if none come within ``timeout``, s.
-
-        Raises:
-            DisconnectedError: if the cable is out.
-        """
+        """Wait for bytes from the device; empty if none come within ``timeout``, s."""
         deadline = self.clock.now() + timeout
         while True:
             self._require_cable()
@@ -91,11 +79,7 @@ class LoopbackDevice:
         """Nothing to release; the device goes on."""
 
     def reopen(self) -> None:
-        """Connect again.
-
-        Raises:
-            DisconnectedError: if the cable is still out.
-        """
+        """Connect again; DisconnectedError if the cable is still out."""
         self._require_cable()
 
     def unplug(self) -> None:

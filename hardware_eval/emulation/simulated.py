@@ -36,7 +36,6 @@ SHORTEST_HOLD = 1e-4
 #: Time in which the sensor of a disconnected tube falls to ambient pressure, s.
 _AMBIENT_LAG = 0.05
 
-
 #: Factor of the airway's resistance when it is occluded.
 _OCCLUSION = 100.0
 
@@ -45,16 +44,9 @@ class SimulatedHal:
     """A plant as a ventilator; compiles the plant once, before any time passes."""
 
     def __init__(
-        self,
-        plant: Plant,
-        *,
-        name: str = "simulated lung",
-        faults: Sequence[LungFault] = (),
-        noise: float = 0.0,
-        quantum: float = 0.0,
-        highest: float = math.inf,
-        seed: int = 0,
-    ) -> None:
+        self, plant: Plant, *, name: str = "simulated lung", faults: Sequence[LungFault] = (),
+        noise: float = 0.0, quantum: float = 0.0, highest: float = math.inf, seed: int = 0,
+    ) -> None:  # fmt: skip
         """Put a lung at rest at PEEP on the ventilator.
 
         Args:
@@ -221,12 +213,9 @@ def breath_begun(state: Any, restart: jax.Array) -> Any:
 
 
 def simulated_lung(lung_id: str, simulator: Any = "frozen", **settings: Any) -> SimulatedHal:
-    """Put a lung of a simulator on a simulated ventilator.
+    """Put a lung of what :func:`ventbench.load_simulators` takes on a simulated ventilator.
 
-    Args:
-        lung_id: id of the lung, such as ``"R20C50"``.
-        simulator: whatever :func:`ventbench.load_simulators` takes.
-        settings: further arguments of :class:`SimulatedHal`.
+    Settings are further arguments of :class:`SimulatedHal`.
 
     Raises:
         InputError: if there is no such simulator or lung.

@@ -136,16 +136,12 @@ def _show(everything: list[Any], rerun: str | None, mcap: Path | None, total: in
         return
     view = Views(*shown)
     for breath in everything:
-        run = PlannedRun(
-            breath.run, breath.kind, breath.entry, breath.lung, breath.pip, breath.repeat
-        )
+        names = ("run", "kind", "entry", "lung", "pip", "repeat")
+        run = PlannedRun(*(getattr(breath, name) for name in names))
         aims = waveform.target(np.arange(len(breath.time)), breath.pip)
-        columns = {
-            name: getattr(breath, name).tolist()
-            for name in ("time", "pressure", "flow", "requested", "u_in", "late")
-        }
-        log = BreathLog(**columns, u_out=breath.u_out.tolist(), target=aims.tolist())
-        view.breath(run, log, breath.run, total)
+        names = ("time", "pressure", "flow", "requested", "u_in", "u_out", "late")
+        columns = {name: getattr(breath, name).tolist() for name in names}
+        view.breath(run, BreathLog(**columns, target=aims.tolist()), breath.run, total)
     view.close()
 
 
@@ -175,13 +171,8 @@ Floats = NDArray[np.float64]
 #: into one of these, cmH2O.
 _PLATEAUS = (0.0, 12.5, 17.5, 22.5, 27.5, 32.5, float("inf"))
 _NAMES = (
-    "up to 12.5",
-    "12.5 to 17.5",
-    "17.5 to 22.5",
-    "22.5 to 27.5",
-    "27.5 to 32.5",
-    "above 32.5",
-)
+    "up to 12.5", "12.5 to 17.5", "17.5 to 22.5", "22.5 to 27.5", "27.5 to 32.5", "above 32.5",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -224,19 +215,15 @@ class Comparison:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
-        return files.json_values(
-            {
-                "simulator": self.simulator,
-                "unit": "cmH2O",
-                "lungs": {name: vars(value) for name, value in self.lungs.items()},
-                "waveforms": {
-                    name: {key: vars(value) for key, value in rows.items()}
-                    for name, rows in self.waveforms.items()
-                },
-                "horizon": self.horizon,
-                "diagnoses": {name: value.as_dict() for name, value in self.diagnoses.items()},
-            }
-        )
+        plain = {
+            name: {key: vars(value) for key, value in rows.items()}
+            for name, rows in {"": self.lungs, **self.waveforms}.items()
+        }
+        return files.json_values({
+            "simulator": self.simulator, "unit": "cmH2O", "lungs": plain.pop(""),
+            "waveforms": plain, "horizon": self.horizon,
+            "diagnoses": {name: value.as_dict() for name, value in self.diagnoses.items()},
+        })  # fmt: skip
 
     def __str__(self) -> str:
         rows = [f"open-loop distance of the {self.simulator} simulators, inspirations, cmH2O"]
@@ -269,12 +256,9 @@ def scored_plants(simulator: Any, lungs: list[str]) -> Simulators:
 
 
 def compare(
-    breaths: Breaths,
-    *,
-    simulator: Any = "frozen",
-    diagnose: bool = True,
+    breaths: Breaths, *, simulator: Any = "frozen", diagnose: bool = True,
     progress: Callable[[str, float], None] | None = None,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare simulators with a recording.
 
     Args:
@@ -322,20 +306,14 @@ def _distance(breaths: Breaths, simulated: Floats, index: NDArray[np.int64]) -> 
     mask = breaths.inspiratory[index]
     measured, answer = breaths.pressure[index], simulated[index]
     difference = np.where(mask, measured - answer, np.nan)[:, 1:]
-    return Distance(
-        int(index.size),
-        float(np.mean(distance(measured, answer, mask))),
-        float(np.mean(mae(measured, answer, mask))),
-        float(np.nanmean(difference)),
-    )
+    sums, means = (np.mean(of(measured, answer, mask)) for of in (distance, mae))
+    return Distance(int(index.size), float(sums), float(means), float(np.nanmean(difference)))
 
 
 def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
     """The breaths behind a hardware record, a log, a session's folder or a recording.
 
-    Args:
-        path: of the record, the log, the folder or a file in the public schema.
-        log: the raw log that a record names; looked for beside the record if not given.
+    The raw log that a record names is looked for beside it if it is not given.
 
     Raises:
         InputError: if the log is not there, or not the one that the record names.

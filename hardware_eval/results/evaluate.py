@@ -123,11 +123,7 @@ VIRTUAL = "virtual:"
 
 
 def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
-    """Open a port and say nothing; see :func:`connect`.
-
-    Returns:
-        What carries the bytes, and the clock that it lives by.
-    """
+    """Open a port, say nothing, and return it with the clock it lives by; see :func:`connect`."""
     from hardware_eval.wire.link import Link
 
     if not port.startswith(VIRTUAL):
@@ -144,9 +140,8 @@ def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
 def connect(port: str) -> Line:
     """Open a port, and a session.
 
-    Args:
-        port: a serial port or socket, in real time; or ``virtual:R20C50``, an emulated lung in this
-            process on a virtual clock, where breaths take a fraction of a second.
+    It is a serial port or socket, in real time; or ``virtual:R20C50``, an emulated lung in this
+    process on a virtual clock, where breaths take a fraction of a second.
 
     Raises:
         LinkError: if it cannot be opened, or no device answers.
@@ -241,24 +236,13 @@ def make_runner(sandbox: bool) -> Any:
 
 
 def evaluate(
-    submissions: Sequence[Submission],
-    line: Line,
-    out: Path,
-    operator: Operator,
-    *,
-    plan: Plan,
-    view: View | None = None,
-    sandbox: bool = True,
-    dry: bool = True,
+    submissions: Sequence[Submission], line: Line, out: Path, operator: Operator, *, plan: Plan,
+    view: View | None = None, sandbox: bool = True, dry: bool = True,
     before_lung: Callable[[Bench, str], Sheet | None] = lambda bench, lung: None,
-    settings: SafetySettings = DEFAULT,
-    operator_name: str = "",
-    notes: str = "",
-    rest: float = REST_S,
-    prepare_run: Callable[[PlannedRun], None] = lambda run: None,
-    calibration: Calibration | None = None,
-    fallback: FallbackSettings | None = None,
-) -> Evaluation:
+    settings: SafetySettings = DEFAULT, operator_name: str = "", notes: str = "",
+    rest: float = REST_S, prepare_run: Callable[[PlannedRun], None] = lambda run: None,
+    calibration: Calibration | None = None, fallback: FallbackSettings | None = None,
+) -> Evaluation:  # fmt: skip
     """Run a plan, or what is left of it, and make the records once it is done.
 
     Args:

@@ -108,14 +108,9 @@ def jitter(log: Path, entry: str | None = None) -> Jitter:
 
 
 def hardware_record(log: Path, submission: Submission) -> bytes:
-    """Make the hardware record of one entry.
+    """Make the hardware record of an entry, with the files that ran, from the log of a plan.
 
-    Args:
-        log: of a finished plan.
-        submission: the entry, with the files that ran.
-
-    Returns:
-        Canonical JSON, checked as the leaderboard checks it.
+    It is canonical JSON, checked as the leaderboard checks it.
 
     Raises:
         InputError: if the plan is not finished, the entry is not in it, or its files have changed.
@@ -202,12 +197,9 @@ def _scored(log: Path, name: str) -> dict[_Cell, list[LoggedBreath]]:
 
 
 def _tables(
-    plan: Plan,
-    lungs: list[str],
-    runs: Mapping[_Cell, list[LoggedBreath]],
-    logged: list[dict[str, Any]],
-    name: str,
-) -> dict[str, Any]:
+    plan: Plan, lungs: list[str], runs: Mapping[_Cell, list[LoggedBreath]],
+    logged: list[dict[str, Any]], name: str,
+) -> dict[str, Any]:  # fmt: skip
     """Errors, traces, stops and safety of every cell."""
     failed = {
         (line["lung"], line["pip"], line["repeat"]): line["reason"]
@@ -223,17 +215,15 @@ def _tables(
             tables.append([[] for _ in plan.pips])
         for place, pip in enumerate(plan.pips):
             for repeat in range(1, plan.repeats + 1):
+                cell = {"lung": lung, "pip": pip, "repeat": repeat}
                 run = runs.get((lung, pip, repeat))
-                rows = [] if run is None else [run[k] for k in protocol.SCORED_BREATHS]
                 if run is None:
-                    reason = failed.get((lung, pip, repeat), "stopped")
-                    passed = False
-                    stops.append(
-                        {"lung": lung, "pip": pip, "repeat": repeat, "reason": reason[:_REASON]}
-                    )
+                    reason, passed = failed.get((lung, pip, repeat), "stopped"), False
+                    stops.append({**cell, "reason": reason[:_REASON]})
                     for tables in (errors, pressures, commands):
                         tables[-1][place].append(None)
                     continue
+                rows = [run[k] for k in protocol.SCORED_BREATHS]
                 inspired = np.stack([row.pressure[: protocol.INSPIRATION_STEPS] for row in rows])
                 u_in = np.stack([row.u_in[: protocol.INSPIRATION_STEPS] for row in rows])
                 milli = np.round(1000.0 * inspired).astype(int)
@@ -255,15 +245,9 @@ def _tables(
 
 def _skipped(logged: list[dict[str, Any]], lungs: list[str]) -> dict[str, list[str]]:
     """Parts of the self-test that were left out on each lung, at any of its mountings."""
+    tests = [line for line in logged if line["type"] == "selftest" and line.get("go", True)]
     return {
-        lung: sorted(
-            {
-                part
-                for line in logged
-                if line["type"] == "selftest" and line["lung"] == lung and line.get("go", True)
-                for part in line["skipped"]
-            }
-        )
+        lung: sorted({part for line in tests if line["lung"] == lung for part in line["skipped"]})
         for lung in lungs
     }
 

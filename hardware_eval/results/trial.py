@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,13 +54,9 @@ class Interval:
 
 
 def as_mounted(errors: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean over cells of repeats, its standard error and degrees of freedom.
+    """Mean over cells of repeats, its standard error and degrees of freedom, ``(...)`` each.
 
-    Args:
-        errors: shape ``(..., cells, repeats)``, two repeats at least.
-
-    Returns:
-        Three arrays of shape ``(...)``; where no repeat differs the error is 0.
+    Errors have shape ``(..., cells, repeats)``, two repeats at least. Where none differs it is 0.
     """
     *_, cells, repeats = errors.shape
     variance = errors.var(axis=-1, ddof=1) / repeats / cells**2
@@ -70,11 +66,7 @@ def as_mounted(errors: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def mounted_anew(by_mounting: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean over mountings, its standard error and degrees of freedom.
-
-    Args:
-        by_mounting: shape ``(..., mountings)``, two at least.
-    """
+    """Mean over two mountings or more, the last axis, its standard error and degrees of freedom."""
     count = by_mounting.shape[-1]
     error = by_mounting.std(axis=-1, ddof=1) / math.sqrt(count)
     return by_mounting.mean(axis=-1), error, np.full(error.shape, count - 1.0)
@@ -174,15 +166,7 @@ class Trial:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
-
-        def plain(value: Any) -> Any:
-            if isinstance(value, (Interval, EntryTrial, Trial)):
-                value = vars(value)
-            if isinstance(value, dict):
-                return {key: plain(each) for key, each in value.items()}
-            return value
-
-        return files.json_values(plain(self))
+        return files.json_values(asdict(self))
 
     def __str__(self) -> str:
         rows = []

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -107,7 +108,9 @@ class LinkStatistics:
 class Client:
     """A session with one device.
 
-    Every method sends one message and waits for its answer, by the clock it was given.
+    Every method sends one message and waits for its answer, by the clock it was given. All raise
+    NoAnswerError if the device does not answer in time, DisconnectedError if the port goes away,
+    and RefusedError if the session is not open or the device refuses for another cause.
 
     Attributes:
         welcome: what the device told at the last :meth:`hello`; None before.
@@ -117,36 +120,25 @@ class Client:
     def __init__(
         self, transport: Transport, clock: Clock | None = None, timeout: float = ANSWER_TIMEOUT
     ) -> None:
-        """Talk through a transport.
+        """Talk through a :class:`~hardware_eval.wire.link.Link` or a loopback device.
 
-        Args:
-            transport: a :class:`~hardware_eval.wire.link.Link` or a loopback device.
-            clock: real time if not given; a loopback device needs its own.
-            timeout: time that an answer may take, s.
+        The latter needs its own clock. An answer may take ``timeout``, s.
         """
         self.welcome: Welcome | None = None
         self.reading: Reading | None = None
-        self._transport = transport
-        self._clock = clock or RealClock()
-        self._timeout = timeout
+        self._transport, self._clock, self._timeout = transport, clock or RealClock(), timeout
         self._parser = ParserState()
-        self._session = 0
-        self._sequence = 0
+        self._session, self._sequence = 0, 0
         self._counts: Counter[str] = Counter()
         self._round_trips: deque[float] = deque(maxlen=_REMEMBERED)
         self._pressure_limit: float | None = None
 
     def hello(self, pressure_limit: float | None = None) -> Welcome:
-        """Open a new session; the device vents.
+        """Open a new session; the device vents. It refuses another protocol version.
 
         Args:
             pressure_limit: pressure above which the device shall vent, cmH2O, if it is below the
                 device's own limit.
-
-        Raises:
-            NoAnswerError: if no device answers.
-            RefusedError: if the device has another protocol version.
-            DisconnectedError: if the port goes away.
         """
         self._session, self._sequence = secrets.randbits(32), 0
         self._pressure_limit = pressure_limit
@@ -159,29 +151,23 @@ class Client:
     def arm(self) -> Reading:
         """Begin a run: clear the causes of venting; commands must follow within 80 ms.
 
-        Raises:
-            RefusedError: if a cause of venting lasts, or the session is not open.
-            NoAnswerError: if the device does not answer.
-            DisconnectedError: if the port goes away.
+        The device refuses while a cause of venting lasts.
         """
         return self._persist(Arm(), Reading)
 
     def command(self, u_in: float, u_out: int, timeout: float | None = None) -> Reading:
-        """Set the valves, and return what the device applied.
+        """Set the valves, and return what the device applied, as it was when the command arrived.
+
+        If the device refuses, the lung is or will be vented; if it does not answer, it may have
+        obeyed.
 
         Args:
             u_in: inspiratory valve, %.
             u_out: expiratory valve, 0 closed, 1 open.
             timeout: time that the answer may take, s, if it is another than the client's.
 
-        Returns:
-            A reading that was taken when the command arrived.
-
         Raises:
             ValueError: if a value cannot be sent.
-            RefusedError: if the device refuses it; then the lung is or will be vented.
-            NoAnswerError: if the device does not answer in time; it may have obeyed.
-            DisconnectedError: if the port goes away.
         """
         seen = 0 if self.reading is None else milliseconds(self.reading.time)
         return self._ask(
@@ -189,32 +175,18 @@ class Client:
         )
 
     def heartbeat(self) -> Reading:
-        """Take a fresh reading; moves no valve and does not feed the watchdog.
-
-        Raises:
-            RefusedError: if the session is not open.
-            NoAnswerError: if the device does not answer in time.
-            DisconnectedError: if the port goes away.
-        """
+        """Take a fresh reading; moves no valve and does not feed the watchdog."""
         return self._ask(Heartbeat(), Reading, self._timeout)
 
     def vent(self) -> Reading:
         """Vent the lung until :meth:`arm`; works without a session too.
 
-        Raises:
-            NoAnswerError: if the device does not answer; its watchdog vents by itself.
-            DisconnectedError: if the port goes away; the watchdog vents.
+        Where this fails, the device's watchdog vents by itself.
         """
         return self._persist(Vent(), Reading)
 
     def counters(self) -> Counters:
-        """Return the device's error counters.
-
-        Raises:
-            RefusedError: if the session is not open.
-            NoAnswerError: if the device does not answer in time.
-            DisconnectedError: if the port goes away.
-        """
+        """Return the device's error counters."""
         return self._ask(Statistics(), Counters, self._timeout)
 
     def reconnect(self) -> Welcome:
@@ -222,7 +194,6 @@ class Client:
 
         Raises:
             LinkError: if the port does not come back.
-            NoAnswerError: if no device answers.
         """
         self._transport.reopen()
         self._parser = ParserState()
@@ -231,20 +202,15 @@ class Client:
     def close(self) -> None:
         """Vent if the device still listens, and release the port."""
         try:
-            self._ask(Vent(), Reading, self._timeout)
-        except (NoAnswerError, RefusedError, DisconnectedError):
-            pass  # the watchdog vents
+            with contextlib.suppress(NoAnswerError, RefusedError, DisconnectedError):
+                self._ask(Vent(), Reading, self._timeout)  # else the watchdog vents
         finally:
             self._transport.close()
 
     def statistics(self) -> LinkStatistics:
         """Return what the host counted."""
         trips = np.asarray(self._round_trips if self._round_trips else [np.nan])
-        names = (
-            "sent", "answered", "unanswered", "unexpected", "refused", "framing", "checksum",
-            "malformed", "sessions", "disconnections",
-        )  # fmt: skip
-        counts = {name: self._counts[name] for name in names}
+        counts = {x.name: self._counts[x.name] for x in fields(LinkStatistics) if x.type == "int"}
         return LinkStatistics(
             **counts,
             round_trip_median=float(np.median(trips)),

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 from hardware_eval.realtime import Clock
@@ -38,12 +39,7 @@ from hardware_eval.wire.messages import (
     encode,
 )
 from hardware_eval.wire.parser import NoAnswerError
-from hardware_eval.wire.probe import (
-    DiffersError,
-    LateError,
-    Probe,
-    UntriedError,
-)
+from hardware_eval.wire.probe import DiffersError, LateError, Probe, UntriedError
 
 #: Attempts at a check that a slow host spoils.
 _ATTEMPTS = 20
@@ -79,21 +75,13 @@ class Clause:
 
 
 def conformance(
-    transport: Transport,
-    clock: Clock,
-    tell: Callable[[Clause], None] = lambda clause: None,
+    transport: Transport, clock: Clock, tell: Callable[[Clause], None] = lambda clause: None,
     seed: int = 0,
-) -> list[Clause]:
-    """Try a device by the specification.
+) -> list[Clause]:  # fmt: skip
+    """Try a device by the specification, by the clock of its transport.
 
-    Args:
-        transport: carries bytes to it and back.
-        clock: of the transport.
-        tell: called with each line as it is known.
-        seed: of the session numbers.
-
-    Returns:
-        All lines, in the order of :data:`CLAUSES`, then those of :data:`NOT_TRIED`.
+    Returns all lines, in the order of :data:`CLAUSES`, then those of :data:`NOT_TRIED`; ``tell`` is
+    called with each as it is known. ``seed`` is that of the session numbers.
 
     Raises:
         NoAnswerError: if there is no device.
@@ -107,12 +95,10 @@ def conformance(
         except DiffersError as error:
             if attempt == _ATTEMPTS - 1:
                 raise NoAnswerError(f"the device does not answer a hello: {error}") from None
-    for text, check in CLAUSES:
-        done.append(_judged(host, text, check))
-        tell(done[-1])
-    for text in NOT_TRIED:
-        done.append(Clause(text, None, "no host can provoke it"))
-        tell(done[-1])
+    untried = (Clause(text, None, "no host can provoke it") for text in NOT_TRIED)
+    for clause in chain((_judged(host, text, check) for text, check in CLAUSES), untried):
+        done.append(clause)
+        tell(clause)
     host.transport.write(host.frame(Vent()))
     return done
 

@@ -133,10 +133,8 @@ class Link:
             policy: of :meth:`reopen`.
 
         Raises:
-            PortMissingError: if there is no such port.
-            PortBusyError: if another program has it.
-            PortForbiddenError: if the user may not open it.
-            LinkError: if it cannot be opened for another reason.
+            LinkError: if it cannot be opened: PortMissingError, PortBusyError and
+                PortForbiddenError say why.
         """
         self.url = url
         self._baud_rate = baud_rate
@@ -145,21 +143,13 @@ class Link:
         self._traffic = _Traffic(self._port)
 
     def write(self, data: bytes) -> None:
-        """Send bytes; returns before they are sent.
-
-        Raises:
-            DisconnectedError: if the port has gone.
-        """
+        """Send bytes; returns before they are sent. DisconnectedError if the port has gone."""
         if self._traffic.broken is not None:
             raise self._disconnected(self._traffic.broken)
         self._traffic.outbox.put(data)
 
     def read(self, timeout: float) -> bytes:
-        """Wait for bytes; empty if none come within ``timeout``, s.
-
-        Raises:
-            DisconnectedError: if the port has gone.
-        """
+        """Wait for bytes; empty if none come within ``timeout``, s, or DisconnectedError."""
         data = self._traffic.take(timeout)
         if not data and self._traffic.broken is not None:
             raise self._disconnected(self._traffic.broken)

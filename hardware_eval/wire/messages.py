@@ -83,17 +83,8 @@ class Flag(IntFlag):
     SENSOR_NOISY = 256
 
 
-#: Flags that name a cause of venting.
-CAUSES = (
-    Flag.COMMANDS_STOPPED
-    | Flag.OUT_OF_RANGE
-    | Flag.OVERPRESSURE
-    | Flag.SENSOR_LOST
-    | Flag.HOST_VENTED
-    | Flag.DEVICE_LATE
-    | Flag.SENSOR_STUCK
-    | Flag.SENSOR_NOISY
-)
+#: Flags that name a cause of venting: all but that of the reading's range.
+CAUSES = Flag(sum(Flag)) ^ Flag.SATURATED
 
 
 class Reason(IntEnum):

@@ -1,8 +1,8 @@
 """Parser of the wire: bytes in, events out. Pure, and the same on host and device.
 
-A table of three states and three kinds of bytes finds the frames; what lies between two zero bytes
-is then decoded. Whatever comes, the parser holds at most one frame's bytes, and any zero byte
-brings it back in step, so that the next intact frame is always read.
+It finds the frames, and decodes what lies between two zero bytes. Whatever comes, it holds at most
+one frame's bytes, and any zero byte brings it back in step, so that the next intact frame is always
+read.
 """
 
 from __future__ import annotations
@@ -75,15 +75,6 @@ class ParserMode(Enum):
     INSIDE = "inside"
 
 
-class ByteClass(Enum):
-    """What a byte is for the table."""
-
-    ZERO = "zero"
-    DATA = "data"
-    #: A data byte beyond the longest frame.
-    EXCESS = "excess"
-
-
 class Fault(Enum):
     """What was wrong with the bytes between two zero bytes."""
 
@@ -93,26 +84,6 @@ class Fault(Enum):
     CHECKSUM = "checksum"
     #: Intact, but of unknown kind or wrong length.
     MALFORMED = "malformed"
-
-
-class _Action(Enum):
-    SKIP = "skip"
-    KEEP = "keep"
-    FINISH = "finish"
-    DROP = "drop"
-
-
-_TABLE: dict[tuple[ParserMode, ByteClass], tuple[ParserMode, _Action]] = {
-    (ParserMode.HUNTING, ByteClass.ZERO): (ParserMode.BETWEEN, _Action.SKIP),
-    (ParserMode.HUNTING, ByteClass.DATA): (ParserMode.HUNTING, _Action.SKIP),
-    (ParserMode.HUNTING, ByteClass.EXCESS): (ParserMode.HUNTING, _Action.SKIP),
-    (ParserMode.BETWEEN, ByteClass.ZERO): (ParserMode.BETWEEN, _Action.SKIP),
-    (ParserMode.BETWEEN, ByteClass.DATA): (ParserMode.INSIDE, _Action.KEEP),
-    (ParserMode.BETWEEN, ByteClass.EXCESS): (ParserMode.HUNTING, _Action.DROP),
-    (ParserMode.INSIDE, ByteClass.ZERO): (ParserMode.BETWEEN, _Action.FINISH),
-    (ParserMode.INSIDE, ByteClass.DATA): (ParserMode.INSIDE, _Action.KEEP),
-    (ParserMode.INSIDE, ByteClass.EXCESS): (ParserMode.HUNTING, _Action.DROP),
-}
 
 
 class ParserState(NamedTuple):
@@ -126,25 +97,15 @@ Event = Packet | Fault
 
 
 def feed(state: ParserState, byte: int) -> tuple[ParserState, Event | None]:
-    """Take one byte.
-
-    Args:
-        state: state from the byte before; ``ParserState()`` at first.
-        byte: 0..255.
-
-    Returns:
-        The next state, and the event that this byte completes, if any.
-    """
+    """Take one byte, 0..255; returns the next state, and the event that it completes, if any."""
     if byte == 0:
-        kind = ByteClass.ZERO
-    else:
-        kind = ByteClass.EXCESS if len(state.kept) >= LONGEST_FRAME else ByteClass.DATA
-    mode, action = _TABLE[state.mode, kind]
-    if action is _Action.KEEP:
-        return ParserState(mode, state.kept + bytes((byte,))), None
-    if action is _Action.FINISH:
-        return ParserState(mode), _finished(state.kept)
-    return ParserState(mode), Fault.FRAMING if action is _Action.DROP else None
+        ended = _finished(state.kept) if state.mode is ParserMode.INSIDE else None
+        return ParserState(ParserMode.BETWEEN), ended
+    if state.mode is ParserMode.HUNTING:
+        return state, None
+    if len(state.kept) >= LONGEST_FRAME:
+        return ParserState(ParserMode.HUNTING), Fault.FRAMING
+    return ParserState(ParserMode.INSIDE, state.kept + bytes((byte,))), None
 
 
 def feed_bytes(state: ParserState, data: bytes) -> tuple[ParserState, list[Event]]:

@@ -154,8 +154,7 @@ class Probe:
             raise LateError  # what the check before did to the lung
         if not isinstance(got, Reading):
             raise DiffersError(f"arm was answered with {told(got)}")
-        reading = got
-        equal("mode after arming", reading.mode.name, "RUNNING")
+        equal("mode after arming", got.mode.name, "RUNNING")
         return before
 
     def command(self, u_in: float, u_out: int, age: int = 0) -> Command:

@@ -21,7 +21,7 @@ from ventbench.plants import frozen
 from ventbench.plants.rigs import Rigs
 from ventbench.task import environment, protocol, rollouts, waveform
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.task.metrics import step_response
+from ventbench.task.metrics import figures
 from ventbench.train import pid_grid
 
 Floats = NDArray[np.float64]
@@ -151,9 +151,9 @@ def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -
                 name,
                 _gains(chosen[name]) if name in chosen else "network on PID",
                 float(np.mean(np.abs(breath - EXAMPLE_PIP))),
-                float(step_response.rise_time(breath, protocol.PEEP, EXAMPLE_PIP, protocol.DT)),
-                float(step_response.overshoot(breath, EXAMPLE_PIP)),
-                float(step_response.swings(breath, EXAMPLE_PIP)),
+                float(figures.rise_time(breath, protocol.PEEP, EXAMPLE_PIP, protocol.DT)),
+                float(figures.overshoot(breath, EXAMPLE_PIP)),
+                float(figures.swings(breath, EXAMPLE_PIP)),
             )
         )
     ours, others = rows[-1], rows[:-1]

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from ventbench.base.errors import InputError
 from ventbench.recordings import Breaths, iter_breaths, join, load, make_breaths, write
 from ventbench.recordings.csv_source import CsvSource
-from ventbench.recordings.problems import ProblemLog
 from ventbench.recordings.scan import ParquetSource, join_blocks, scan
+from ventbench.recordings.schema import ProblemLog
 
 FIELDS = [
     "breath_id",

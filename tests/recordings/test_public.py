@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ventbench.recordings import check, iter_breaths, load, load_respiraworks
-from ventbench.recordings.times import interval_table
+from ventbench.recordings.scan import interval_table
 
 
 def test_the_measured_breaths(public_recordings):

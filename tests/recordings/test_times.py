@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ventbench.recordings import check, iter_breaths, load
-from ventbench.recordings.times import interval_table
+from ventbench.recordings.scan import interval_table
 
 TIME = 4
 

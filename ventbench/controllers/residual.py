@@ -91,18 +91,11 @@ class Residual:
 
     def init(self, shape: tuple[int, ...]) -> ResidualState:
         """State before the first breath."""
-        zero = jnp.zeros(shape)
-        long = jnp.zeros((*shape, _STEPS + self.ahead))
+        zero, long = jnp.zeros(shape), jnp.zeros((*shape, _STEPS + self.ahead))
+        errors, commands = (jnp.zeros((*shape, count)) for count in (self.pressures, self.commands))
+        trace = long[..., :_STEPS]
         return ResidualState(
-            pid=self.pid.init(shape),
-            begun=zero,
-            known=zero,
-            errors=jnp.zeros((*shape, self.pressures)),
-            commands=jnp.zeros((*shape, self.commands)),
-            error_trace=long[..., :_STEPS],
-            command_trace=long[..., :_STEPS],
-            error_before=long,
-            command_before=long,
+            self.pid.init(shape), zero, zero, errors, commands, trace, trace, long, long
         )
 
     def step(self, state: ResidualState, observation: Observation) -> tuple[ResidualState, Array]:
@@ -137,26 +130,17 @@ class Residual:
             error_trace=_append(state.error_trace, error),
             command_trace=_append(state.command_trace, previous),
         )
-        errors = [
-            jnp.stack([error, pid.integral, pid.derivative], axis=-1),
-            state.errors,
-            state.error_before[..., : self.ahead],
-        ]
-        rest = [
-            observation.target / TARGET,
-            observation.time + zero,
-            (observation.dt / protocol.DT - 1.0) / STEP + zero,
-            state.known,
-        ]
-        commands = [state.commands, state.command_before[..., : self.ahead]]
-        features = jnp.concatenate(
-            [
-                jnp.concatenate(errors, axis=-1) / ERROR,
-                jnp.stack(rest, axis=-1),
-                jnp.concatenate(commands, axis=-1) / COMMAND,
-            ],
-            axis=-1,
+        now = jnp.stack([error, pid.integral, pid.derivative], axis=-1)
+        errors = jnp.concatenate(
+            [now, state.errors, state.error_before[..., : self.ahead]], axis=-1
         )
+        step = (observation.dt / protocol.DT - 1.0) / STEP + zero
+        rest = [observation.target / TARGET, observation.time + zero, step, state.known]
+        commands = [state.commands, state.command_before[..., : self.ahead]]
+        columns = [
+            errors / ERROR, jnp.stack(rest, axis=-1), jnp.concatenate(commands, axis=-1) / COMMAND
+        ]  # fmt: skip
+        features = jnp.concatenate(columns, axis=-1)
         state = state.replace(  # type: ignore[attr-defined]
             errors=_push(error, state.errors),
             error_before=_append(state.error_before, zero),
@@ -199,10 +183,7 @@ def apply(layers: tuple[Layer, ...], x: Array) -> Array:
 def untrained(key: Array, like: Residual, widths: tuple[int, ...]) -> Residual:
     """Return a controller with a new network that corrects nothing yet: its last layer is zero.
 
-    Args:
-        key: JAX key of the random weights of the hidden layers.
-        like: controller that gives PID, windows and limit.
-        widths: units of each hidden layer.
+    PID, windows and limit are those of another; ``widths`` are the units of each hidden layer.
     """
     sizes = [inputs(like), *widths]
     layers = []

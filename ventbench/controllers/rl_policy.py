@@ -41,16 +41,7 @@ def init_features(shape: tuple[int, ...]) -> ResidualState:
 
 
 def features(state: ResidualState, observation: Observation) -> tuple[ResidualState, Array, Array]:
-    """Features of an observation.
-
-    Args:
-        state: from :func:`init_features`.
-        observation: the observation.
-
-    Returns:
-        The next state, the features, shape ``(..., FEATURES)``, and the command of the PID, clipped
-        to the valve's range, %, shape ``(...)``.
-    """
+    """The next state, the features, ``(..., FEATURES)``, and the clipped command of the PID, %."""
     state, seen, asked = _RESIDUAL.features(state, observation)
     return state, seen, jnp.clip(asked, 0.0, protocol.U_MAX)
 
@@ -150,10 +141,8 @@ class GreedyPolicy(CorrectedPID):
 def arrays(policies: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Weights and biases by name, float32: ``R20C50.w0``, ``R20C50.b0``, ``R20C50.w1``, ...
 
-    Layer k does ``x @ wk + bk``, with tanh between the layers.
-
-    Args:
-        policies: policies by lung id, or ``all`` for the policy that is not told the lung.
+    Layer k does ``x @ wk + bk``, with tanh between the layers. The policy that is not told the lung
+    is called ``all``.
     """
     named = {}
     for name, policy in policies.items():

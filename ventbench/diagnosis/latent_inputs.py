@@ -28,7 +28,7 @@ from ventbench.diagnosis.gaussian_process import (
     uses,
 )
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
-from ventbench.physics.events.oscillations import HALF_SWING
+from ventbench.physics.events import HALF_SWING
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import LEAST_SIGMA, MOST_AR, Noise
 

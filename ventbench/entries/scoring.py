@@ -30,9 +30,13 @@ from ventbench.task import draws, protocol
 from ventbench.task.draws import Draws
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.interfaces import Task
-from ventbench.task.metrics.figures import InspirationSignals, figures, time_above_alarm
+from ventbench.task.metrics.figures import (
+    InspirationSignals,
+    figures,
+    steady_error,
+    time_above_alarm,
+)
 from ventbench.task.metrics.score import controllable_error, passes_safety_gate, run_error
-from ventbench.task.metrics.step_response import steady_error
 from ventbench.task.stressors import Condition
 from ventbench.trajectories import end_to_end
 

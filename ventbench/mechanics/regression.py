@@ -124,14 +124,9 @@ def columns_of(term: str) -> tuple[int, ...]:
 
 
 def lagged(time: Floats, values: Floats, lag: float) -> Floats:
-    """Response of a first-order lag to signals ``(m, k)``; at rest at the first sample.
+    """Response of a lag, s, to signals ``(m, k)`` at increasing times, s, ``(m,)``, from rest.
 
     Exact for signals that are linear between the samples.
-
-    Args:
-        time: s, increasing, ``(m,)``.
-        values: signals, ``(m, k)``.
-        lag: time constant, s.
     """
     if lag <= 0.0 or len(time) < 2:
         return values
@@ -215,12 +210,7 @@ def _zero_precision(elastance: Floats | float) -> Floats:
 def cross_products(
     segments: Sequence[Segment], columns: Sequence[int] | None = None
 ) -> CrossProducts:
-    """Compute the cross products of the breaths that have segments.
-
-    Args:
-        segments: segments of the breaths.
-        columns: indices of the columns, those of :data:`BASE` first; all if None.
-    """
+    """Cross products of the breaths that have segments, of some columns (as of `fit`) or all."""
     chosen = COLUMNS if columns is None else [COLUMNS[c] for c in columns]
     indices = sorted({segment.breath for segment in segments})
     size = len(chosen) + 1
@@ -230,13 +220,8 @@ def cross_products(
     for segment in segments:
         row = indices.index(segment.breath)
         time = segment.time[segment.rows]
-        signals = np.concatenate(
-            [
-                course(segment, chosen)[segment.rows],
-                np.stack([segment.pressure, time - time.mean(), np.ones(len(time))], axis=1),
-            ],
-            axis=1,
-        )
+        seen = np.stack([segment.pressure, time - time.mean(), np.ones(len(time))], axis=1)
+        signals = np.concatenate([course(segment, chosen)[segment.rows], seen], axis=1)
         freedom[row] += len(segment) - 1
         white = _whiten(signals, segment.begins)
         known = 0.5 * segment.begins.sum() * np.log(1.0 - rho**2)
@@ -263,12 +248,9 @@ def cross_products(
 
 
 def fit(table: CrossProducts, which: Bools, columns: Sequence[int]) -> RegressionFit:
-    """Fit columns to some of the breaths by restricted maximum likelihood.
+    """Fit columns, those of :data:`BASE` first, by restricted maximum likelihood.
 
-    Args:
-        table: table of the breaths.
-        which: breaths to fit, bool ``(b,)``.
-        columns: indices of the columns, those of :data:`BASE` first.
+    ``which`` are the breaths to fit, bool ``(b,)``.
     """
     columns = tuple(columns)
     pick = [*columns, -1]
@@ -360,12 +342,8 @@ def _whiten(values: Floats, begins: Bools) -> Floats:
 def _without_start(white: Floats, start: Floats) -> tuple[Floats, Floats]:
     """Whiten signals ``(r, n, c)`` for what a lag still has in it from before the segment.
 
-    Args:
-        white: whitened signals.
-        start: its whitened course, ``(r, n)``.
-
-    Returns:
-        The signals, and half the logarithm of the determinant of the covariance, ``(r,)``.
+    ``start`` is its whitened course, ``(r, n)``. Also returns half the logarithm of the determinant
+    of the covariance, ``(r,)``.
     """
     length = np.maximum(np.linalg.norm(start, axis=1), 1e-12)
     grown = np.sqrt(1.0 + (_START * length) ** 2)

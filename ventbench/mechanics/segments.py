@@ -8,7 +8,7 @@ readings that are clipped at an end of the sensor's range are left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +122,7 @@ def _smoothed(
         return None
     half = max(1, round(WINDOW / float(np.median(np.diff(time)))))
     step = max(1, half // _PER_HALF_WINDOW)
-    filled = _volume(time, flow, volume)
+    filled: Any = integrate(time, flow) if volume is None and flow is not None else volume
     flows = np.isfinite(filled)
     flows &= True if flow is None else np.isfinite(flow)
     fine = np.concatenate([
@@ -146,24 +146,11 @@ def _smoothed(
     return rows, begins, p, t, v, q, slope, dose
 
 
-def _volume(time: Floats, flow: Floats | None, volume: Floats | None) -> Floats:
-    if volume is not None:
-        return volume
-    assert flow is not None
-    return integrate(time, flow)
-
-
 def _compared(fine: NDArray[np.intp], known: Bools, half: int, step: int) -> tuple[Ints, Bools]:
     """Centres of windows of known samples, half a window apart, and which of them follow a gap.
 
-    Args:
-        fine: centres of windows in which flow and volume are known, ``(m,)``.
-        known: samples at which the pressure is known too, ``(T,)``.
-        half: half the width of the window, samples.
-        step: distance of the centres, samples.
-
-    Returns:
-        Indices into ``fine``, ``(n,)``, and a mask, ``(n,)``.
+    They are indices into ``fine``, centres of windows in which flow and volume are known, ``step``
+    samples apart; at the samples ``known`` the pressure is known too.
     """
     complete = np.zeros(len(known), bool)
     for start, stop in _runs(known):

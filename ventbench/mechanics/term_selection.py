@@ -84,11 +84,7 @@ class _Trial:
 
 
 def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
-    """Select the terms that are needed beyond R and C, forward, with backward checks.
-
-    Args:
-        table: cross products of the breaths, without the delay.
-    """
+    """Select the terms that are needed beyond R, C and a delay, forward, with backward checks."""
     selected: list[SelectedTerm] = []
     dropped: set[str] = set()
     while len(table) >= FEWEST_BREATHS and len(selected) < MOST_TERMS:
@@ -158,12 +154,7 @@ def _plausible(table: CrossProducts, fitted: RegressionFit) -> bool:
     return resistance > -2.0 * sd[0] and elastance > 0.0 and sd[1] < _MOST_UNCERTAINTY * elastance
 
 
-def _best_column(
-    table: CrossProducts,
-    which: Bools,
-    columns: tuple[int, ...],
-    name: str,
-) -> int:
+def _best_column(table: CrossProducts, which: Bools, columns: tuple[int, ...], name: str) -> int:
     """The column of a term with the highest likelihood on some breaths."""
     options = columns_of(name)
     if len(options) == 1:
@@ -225,13 +216,9 @@ def delay(
     smaller than they are. A lag delays the signals of the lung; what a circuit takes up is computed
     from the pressure that the best lag predicts, which has no noise (an instrumental variable).
 
-    Args:
-        segments: pieces of the recording.
-        progress: called with the share of the grids that is done.
-
-    Returns:
-        The segments with the delay, if there is one: with the sensor's lag, or with flow and volume
-        behind the circuit. The delay is None if the breaths do not need it.
+    Returns the segments with the delay, if there is one: with the sensor's lag, or with flow and
+    volume behind the circuit. The delay is None if the breaths do not need it. ``progress`` is
+    called with the share of the grids that is done.
     """
     if len({segment.breath for segment in segments}) < FEWEST_BREATHS:
         return tuple(segments), None
@@ -281,10 +268,7 @@ def predicted(
 ) -> list[tuple[Floats, Floats]]:
     """Pressures of the lung that fits best if its sensor lags, and their derivatives, ``(m,)``.
 
-    Args:
-        segments: pieces of the recording.
-        table: their cross products with that lag.
-        lag: time constant of the sensor, s.
+    ``table`` has the cross products of the segments with that lag, s.
     """
     fitted = fit(table, np.ones(len(table), bool), range(len(_COLUMNS)))
     columns = [COLUMNS[c] for c in _COLUMNS]
@@ -308,12 +292,9 @@ def predicted(
 
 
 def behind_circuit(segment: Segment, smooth: tuple[Floats, Floats], compliance: float) -> Segment:
-    """The segment with flow and volume of the lung behind a circuit.
+    """The segment with flow and volume of the lung behind a circuit of a compliance, mL/cmH2O.
 
-    Args:
-        segment: piece of the recording.
-        smooth: its pressure without noise, cmH2O, and the derivative of it, cmH2O/s, ``(m,)``.
-        compliance: of the circuit, mL/cmH2O.
+    ``smooth`` are its pressure without noise, cmH2O, and the derivative of it, cmH2O/s, ``(m,)``.
     """
     if compliance == 0.0 or len(segment.time) < 2:
         return segment

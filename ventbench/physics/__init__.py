@@ -7,17 +7,6 @@ from ventbench.physics.model import Physics, PhysicsState, physics
 from ventbench.physics.parameters import Parameter
 
 __all__ = [
-    "Description",
-    "Mechanism",
-    "Parameter",
-    "Physics",
-    "PhysicsState",
-    "library",
-    "mechanism",
-    "parameter",
-    "paths",
-    "physics",
-    "resolution",
-    "resolution_of",
-    "strength_path",
-]
+    "Description", "Mechanism", "Parameter", "Physics", "PhysicsState", "library", "mechanism",
+    "parameter", "paths", "physics", "resolution", "resolution_of", "strength_path",
+]  # fmt: skip

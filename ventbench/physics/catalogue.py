@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 from types import ModuleType
 
 from ventbench.base.errors import InputError
-from ventbench.physics import events as event_modules
+from ventbench.physics import events as happening
 from ventbench.physics import mechanisms, nonparametric
 from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
@@ -67,8 +67,8 @@ def extended(*added: Mechanism) -> Iterator[None]:
 def library() -> dict[str, Mechanism]:
     """Every mechanism by name, in alphabetical order.
 
-    Each module of the package ``mechanisms`` defines one, as ``MECHANISM``, whose name is that of
-    the module, or several alike, as ``MECHANISMS``.
+    A module of the package ``mechanisms`` defines one or several alike: classes with a description,
+    and what it lists in ``MECHANISMS``.
     """
     return _catalogue().library
 
@@ -150,7 +150,7 @@ def strength_path(name: str) -> str:
 def _catalogue() -> Catalogue:
     global _current
     if _current is None:
-        _current = Catalogue(_of(mechanisms), _of(nonparametric), _of(event_modules))
+        _current = Catalogue(_of(mechanisms), _of(nonparametric), _of(happening))
     return _current
 
 
@@ -165,21 +165,31 @@ def _paths(catalogue: Catalogue, names: tuple[str, ...] | None) -> tuple[str, ..
     return (*(parameter.name for parameter in BASE_PARAMETERS), *own)
 
 
-def _of(package: ModuleType) -> dict[str, Mechanism]:
-    """What the modules of a package define, one as ``MECHANISM`` or several as ``MECHANISMS``."""
+def _of(home: ModuleType) -> dict[str, Mechanism]:
+    """Mechanisms of a module, or of the modules of a package.
+
+    They are the described classes that it defines, and what it lists in ``MECHANISMS``.
+    """
     found: dict[str, Mechanism] = {}
-    for module in _in(package):
-        one = getattr(module, "MECHANISM", None)
-        for each in getattr(module, "MECHANISMS", ()) if one is None else (one,):
+    for module in _modules(home):
+        own = [x() for x in vars(module).values() if _is_described(x, module.__name__)]
+        for each in (*own, *getattr(module, "MECHANISMS", ())):
             if found.setdefault(each.description.name, each) is not each:
                 raise ValueError(f"two mechanisms have the name {each.description.name!r}")
     return dict(sorted(found.items()))
 
 
-def _in(package: ModuleType) -> Iterator[ModuleType]:
-    """Import the modules of a package, in alphabetical order."""
-    for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
-        yield importlib.import_module(f"{package.__name__}.{name}")
+def _modules(home: ModuleType) -> list[ModuleType]:
+    inner = pkgutil.iter_modules(getattr(home, "__path__", ()))
+    names = sorted(module.name for module in inner)
+    return [importlib.import_module(f"{home.__name__}.{name}") for name in names] or [home]
+
+
+def _is_described(value: object, module: str) -> bool:
+    """Whether a value is a class of mechanisms that a module defines, not imports."""
+    if not isinstance(value, type) or value.__module__ != module:
+        return False
+    return issubclass(value, Mechanism) and "description" in vars(value)
 
 
 def _names(parameters: Iterable[Parameter]) -> str:

@@ -7,8 +7,9 @@ that a new mechanism has one without more ado. Nothing here is fitted or integra
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,8 +18,7 @@ from numpy.typing import NDArray
 
 from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism
-from ventbench.physics.mechanism import Mechanism, Values
-from ventbench.physics.network import PneumaticNetwork, View
+from ventbench.physics.mechanism import Mechanism, Network, Pair, Values, View
 from ventbench.physics.parameters import BASE_PARAMETERS
 
 Floats = NDArray[np.float64]
@@ -77,30 +77,25 @@ def characteristic(
         neutral = {p.name: jnp.asarray(float(p.neutral)) for p in about}
         times = [float(own[p.name]) for p in about if p.unit == "s"]
         end = float(np.clip(_TIMES * max(times, default=0.0), _SHORTEST, _LONGEST))
-        if _has(shown, "of_breath"):
+        if shown.has("of_breath"):
             return _in_session(shown, own, base)
-        if _has(shown, "command") or _has(shown, "driven"):
+        if shown.has("command") or shown.has("driven"):
             return _command(shown, own, largest_command)
-        if _has(shown, "dead_time"):
+        if shown.has("dead_time"):
             return _late(float(jnp.asarray(shown.dead_time(own, jnp.asarray(1.0)))), end)
-        if _has(shown, "outlet_dead_time"):
+        if shown.has("outlet_dead_time"):
             return _late_outlet(shown, own, base, end)
-        if _has(shown, "inflow"):
+        if shown.has("inflow"):
             return _flow_step(shown, own, end)
-        if _has(shown, "reading"):
+        if shown.has("reading"):
             return _pressure_step(shown, own, end)
-        if _has(shown, "sensor_output"):
+        if shown.has("sensor_output"):
             return _sensor(shown, own)
-        if _has(shown, "network"):
+        if shown.has("network"):
             if shown.stateful:
                 return _hold(shown, own, base, end)
             return _network(shown, own, neutral, base)
     return None
-
-
-def _has(shown: Mechanism, hook: str) -> bool:
-    """Whether a mechanism overrides a method."""
-    return getattr(type(shown), hook) is not getattr(Mechanism, hook)
 
 
 def _floats(values: Array) -> Floats:
@@ -156,13 +151,8 @@ def _command(shown: Mechanism, own: Values, largest: float) -> Characteristic:
 def _late(delay: float, end: float) -> Characteristic:
     """Flow after the command of the inspiratory valve steps from 0 to 20 %."""
     x = np.linspace(-0.2 * end, end, 4 * _STATIC)
-    return Characteristic(
-        x * 1e3,
-        np.where(x >= 0, 20.0, 0.0),
-        np.where(x >= delay, 20.0, 0.0),
-        "time since the command, ms",
-        "valve opening, %",
-    )
+    told, done = (np.where(x >= begin, 20.0, 0.0) for begin in (0.0, delay))
+    return Characteristic(x * 1e3, told, done, "time since the command, ms", "valve opening, %")
 
 
 def _late_outlet(
@@ -182,41 +172,35 @@ def _late_outlet(
             told_now = view.replace(opened=jnp.asarray(far))  # type: ignore[attr-defined]
             state = shown.next_state(own, state, jnp.asarray(0.0), told_now)
             done[k] = float(state)
-    return Characteristic(
-        x * 1e3,
-        told.astype(np.float64),
-        done,
-        "time since it is told to open, ms",
-        "expiratory valve, 1 open",
-    )
+    labels = ("time since it is told to open, ms", "expiratory valve, 1 open")
+    return Characteristic(x * 1e3, told.astype(np.float64), done, *labels)
 
 
 def _flow_step(shown: Mechanism, own: Values, end: float) -> Characteristic:
     """Flow of the valve after its command steps to 0.5 L/s."""
-    zero, length = jnp.asarray(0.0), jnp.asarray(end / _STEPS)
+    zero = jnp.asarray(0.0)
     state = shown.initial_state(own, zero, zero) if shown.stateful else zero
-    flow, after = jnp.asarray(_FLOW), []
-    for _ in range(_STEPS):
-        now, state = shown.inflow(own, flow, state, length)
-        after.append(float(now))
-    return _response(end, 0.0, _FLOW, after, "flow of the valve, L/s")
+    step = partial(shown.inflow, own)
+    return _response(step, state, end, 0.0, _FLOW, "flow of the valve, L/s")
 
 
 def _pressure_step(shown: Mechanism, own: Values, end: float) -> Characteristic:
     """Reading of the sensor after the pressure steps from 5 to 20 cmH2O."""
-    low, length = jnp.asarray(_LOW), jnp.asarray(end / _STEPS)
+    low = jnp.asarray(_LOW)
     state = shown.initial_state(own, jnp.asarray(0.0), low) if shown.stateful else low
-    after = []
-    for _ in range(_STEPS):
-        now, state = shown.reading(own, jnp.asarray(_HIGH), state, length)
-        after.append(float(now))
-    return _response(end, _LOW, _HIGH, after, "reading of the sensor, cmH2O")
+    step = partial(shown.reading, own)
+    return _response(step, state, end, _LOW, _HIGH, "reading of the sensor, cmH2O")
 
 
 def _response(
-    end: float, low: float, high: float, after: list[float], y_label: str
-) -> Characteristic:
+    hook: Callable[[Array, Array, Array], Pair], state: Array, end: float, low: float, high: float,
+    y_label: str,
+) -> Characteristic:  # fmt: skip
     """Response to a step from ``low`` to ``high`` at time zero, with the edge as a vertical."""
+    after = []
+    for _ in range(_STEPS):
+        now, state = hook(jnp.asarray(high), state, jnp.asarray(end / _STEPS))
+        after.append(float(now))
     x = np.concatenate([[-0.1 * end, 0.0, 0.0], end / _STEPS * np.arange(1, _STEPS + 1)])
     step = np.concatenate([[low, low], np.full(_STEPS + 1, high)])
     return _in_time(x, step, np.concatenate([[low, low, low], after]), y_label)
@@ -246,7 +230,7 @@ def _sensor(shown: Mechanism, own: Values) -> Characteristic:
     )
 
 
-def _view(base: Mapping[str, float], **changed: Array) -> tuple[View, PneumaticNetwork]:
+def _view(base: Mapping[str, float], **changed: Array) -> tuple[View, Network]:
     """A lung at rest with the expiratory valve shut, and its network; some quantities as given."""
     shape = jnp.broadcast_shapes(*(jnp.shape(value) for value in changed.values()), ())
     zero = jnp.zeros(shape)
@@ -255,7 +239,7 @@ def _view(base: Mapping[str, float], **changed: Array) -> tuple[View, PneumaticN
         zero, zero, zero, zero, zero, zero + 1e-3, zero + elastance, zero + base["PEEP"], zero,
         zero + base["R"], zero + 1.0 / base["R_ex"], zero,
     ).replace(**changed)  # type: ignore[attr-defined]  # fmt: skip
-    network = PneumaticNetwork(
+    network = Network(
         inflow=zero + _FLOW, circuit=zero, leak=zero, leak_flow=zero, outlet=zero,
         behind=view.peep, resistance=view.resistance, quadratic=zero, inertance=zero,
         recoil=view.elastance * view.volume, elastance=view.elastance,
@@ -268,7 +252,7 @@ def _network(
 ) -> Characteristic | None:
     """The first quantity of circuit, airway and lung that a mechanism without a state changes."""
 
-    def both(**changed: Array) -> tuple[PneumaticNetwork, PneumaticNetwork]:
+    def both(**changed: Array) -> tuple[Network, Network]:
         view, network = _view(base, **changed)
         return shown.network(neutral, network, view), shown.network(own, network, view)
 

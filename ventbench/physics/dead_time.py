@@ -92,20 +92,11 @@ def windows(
 def substep_lengths(
     dt: Array, past: tuple[Array, ...], dead_times: tuple[Array, ...], count: int
 ) -> tuple[Array, ...]:
-    """Cut a sample into substeps.
+    """Cut a sample into substeps, of which it returns the lengths, s; arguments as of `windows`.
 
     A valve that opens within a substep is not the same as one that is half open throughout, so that
     a cut is moved to where a delayed edge arrives. The last substep is short: if an edge arrives
     within it, what it does to the sample is smoothed over that time, for the sake of derivatives.
-
-    Args:
-        dt: length of the sample, s, ``(...)``.
-        past: durations of the P samples before, the latest first, s, ``(...)`` each.
-        dead_times: dead times, s, the most important first.
-        count: number of substeps, at least 3.
-
-    Returns:
-        The length of each, s, ``(...)``.
     """
     short = jnp.minimum(LAST_SUBSTEP, dt / count)
     room, zero = dt - short, jnp.zeros_like(dt)
@@ -135,14 +126,8 @@ def substep_lengths(
 def window_weights(start: Array, length: Array, past: tuple[Array, ...]) -> list[Array]:
     """Shares of a window in this sample, in each of P samples before, and in all earlier ones.
 
-    Args:
-        start: start of the window, s after the start of this sample; negative reaches back;
-            ``(...)``.
-        length: length of the window, s, positive, ``(...)``.
-        past: durations of the P samples before, the latest first, s, ``(...)`` each.
-
-    Returns:
-        P + 2 weights that add up to one, in that order, ``(...)`` each.
+    They are P + 2 weights that add up to one. The window begins so many s after this sample does
+    (negative reaches back), and has a positive length, s; ``past`` as of :func:`windows`.
     """
     last = start + length
     edges = [jnp.inf, *_begins(past), -jnp.inf]
@@ -183,8 +168,6 @@ def _sorted(rows: list[Array]) -> list[Array]:
     rows = list(rows)
     for end in range(len(rows) - 1, 0, -1):
         for k in range(end):
-            rows[k], rows[k + 1] = (
-                jnp.minimum(rows[k], rows[k + 1]),
-                jnp.maximum(rows[k], rows[k + 1]),
-            )
+            pair = rows[k], rows[k + 1]
+            rows[k], rows[k + 1] = jnp.minimum(*pair), jnp.maximum(*pair)
     return rows

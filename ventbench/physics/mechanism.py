@@ -1,4 +1,4 @@
-"""The base class of mechanisms, their descriptions, and how a model applies several."""
+"""Mechanisms: base class and description, the network that they change, and several at once."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeVar
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
 
 #: Values of a mechanism's parameters, by short name.
 Values = Mapping[str, Array]
+
+#: What a hook changes and what it keeps, an array each.
+Pair = tuple[Array, Array]
 
 #: What a mechanism changes: any pytree of arrays.
 Before = TypeVar("Before")
@@ -26,6 +29,112 @@ Site = Literal[
 ]  # fmt: skip
 
 
+@flax.struct.dataclass
+class View:
+    """Quantities that a mechanism may use while it changes the network; every array ``(...)``.
+
+    Attributes:
+        time: time since the start of the breath, s.
+        volume: volume of the lung before the step, L; a linear lung has the recoil ``volume / C``.
+        pressure: last known pressure at the airway, cmH2O.
+        flow: last known flow into the lung, L/s.
+        state: own state of the mechanism before the step (0 if it has none), ``(K, ...)`` for one
+            with several states.
+        length: length of the implicit step, s.
+        elastance: elastance 1/C of the lung, cmH2O/L.
+        peep: pressure behind the expiratory valve, cmH2O.
+        position: position of the breath in the recording, 0..1.
+        resistance: resistance R of the airway, cmH2O/(L/s).
+        outlet: conductance of the open expiratory valve, 1 / R_ex, L/s per cmH2O.
+        opened: expiratory valve, 0 closed, 1 open.
+    """
+
+    time: Array
+    volume: Array
+    pressure: Array
+    flow: Array
+    state: Array
+    length: Array
+    elastance: Array
+    peep: Array
+    position: Array
+    resistance: Array
+    outlet: Array
+    opened: Array
+
+
+@flax.struct.dataclass
+class Network:
+    """Coefficients of one step; every array has shape ``(...)``.
+
+    Flow balance at the airway, L/s, with ``p`` and ``Q`` after the step and ``p0``, ``Q0`` before::
+
+        circuit (p - p0) / h = inflow - Q - leak p - leak_flow - outlet max(p - behind, 0)
+
+    Pressure along the way into the lung, cmH2O::
+
+        p = recoil + elastance h Q + resistance Q + quadratic Q |Q| + inertance (Q - Q0) / h
+
+    Any of ``circuit``, ``inertance``, ``quadratic``, ``leak`` and ``outlet`` may be zero.
+
+    Attributes:
+        inflow: flow out of the inspiratory valve, L/s.
+        circuit: compliance of tubing and connectors, L/cmH2O.
+        leak: slope of the leak, L/s per cmH2O.
+        leak_flow: leak at zero pressure on that slope, L/s.
+        outlet: conductance of the expiratory valve, L/s per cmH2O.
+        behind: pressure behind the expiratory valve, cmH2O.
+        resistance: resistance of the airway, cmH2O/(L/s).
+        quadratic: quadratic resistance of the airway, cmH2O s2/L2.
+        inertance: inertance of the gas, cmH2O s2/L.
+        recoil: recoil of the lung without flow, less the pressure of the muscles, cmH2O.
+        elastance: slope of the recoil, cmH2O/L.
+    """
+
+    inflow: Array
+    circuit: Array
+    leak: Array
+    leak_flow: Array
+    outlet: Array
+    behind: Array
+    resistance: Array
+    quadratic: Array
+    inertance: Array
+    recoil: Array
+    elastance: Array
+
+    def plus(self, **terms: Array) -> Network:
+        """Add to coefficients, so that the order of mechanisms does not matter."""
+        return self.replace(  # type: ignore[attr-defined]
+            **{name: getattr(self, name) + term for name, term in terms.items()}
+        )
+
+    def solve(self, pressure: Array, flow: Array, length: Array) -> tuple[Array, Array]:
+        """Pressure at the airway, cmH2O, and flow into the lung, L/s, after a step of a length, s.
+
+        Takes both as they were before it.
+        """
+        shut = self._balance(pressure, flow, length, jnp.zeros_like(self.outlet))
+        vented = self._balance(pressure, flow, length, self.outlet)
+        out = shut[0] > self.behind  # the valve lets gas out only
+        return jnp.where(out, vented[0], shut[0]), jnp.where(out, vented[1], shut[1])
+
+    def _balance(
+        self, pressure: Array, flow: Array, length: Array, outlet: Array
+    ) -> tuple[Array, Array]:
+        series = self.resistance + self.inertance / length + self.elastance * length
+        rest = self.recoil - self.inertance * flow / length
+        conductance = self.circuit / length + self.leak + outlet
+        source = self.inflow - self.leak_flow + self.circuit * pressure / length
+        excess = source + outlet * self.behind - conductance * rest
+        # conductance (quadratic Q |Q| + series Q) + Q = excess; written so that quadratic = 0
+        # needs no case of its own.
+        linear = conductance * series + 1.0
+        root = jnp.sqrt(linear**2 + 4.0 * conductance * self.quadratic * jnp.abs(excess))
+        after = 2.0 * excess / (linear + root)
+        return rest + (series + self.quadratic * jnp.abs(after)) * after, after
+
+
 @dataclass(frozen=True)
 class Description:
     """Description of a mechanism, for people and for programs.
@@ -34,7 +143,7 @@ class Description:
     single file.
 
     Attributes:
-        name: public name; the module of a library mechanism has the same name.
+        name: public name.
         title: the mechanism in a few words.
         site: part of the physics in which the mechanism acts.
         equation: equation of the mechanism in plain text.
@@ -107,6 +216,10 @@ class Mechanism:
     #: True if its effect depends on the position of the breath in the recording.
     uses_position: bool = False
 
+    def has(self, hook: str) -> bool:
+        """Whether it overrides one of the methods below."""
+        return getattr(type(self), hook) is not getattr(Mechanism, hook)
+
     def of_breath(self, values: Values, base: Values) -> Values:
         """Base parameters as they are in a breath, given those of the model, by name."""
         return base
@@ -134,23 +247,19 @@ class Mechanism:
         """
         return flow * 0.0
 
-    def inflow(
-        self, values: Values, flow: Array, state: Array, length: Array
-    ) -> tuple[Array, Array]:
+    def inflow(self, values: Values, flow: Array, state: Array, length: Array) -> Pair:
         """Flow that arrives at the airway, L/s, and the own state after the step."""
         return flow, state
 
-    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Network with its contribution, made by :meth:`PneumaticNetwork.plus`."""
+    def network(self, values: Values, network: Network, view: View) -> Network:
+        """Network with its contribution, made by :meth:`Network.plus`."""
         return network
 
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
         """Own state after a step with this flow into the lung, L/s."""
         return state
 
-    def reading(
-        self, values: Values, pressure: Array, state: Array, length: Array
-    ) -> tuple[Array, Array]:
+    def reading(self, values: Values, pressure: Array, state: Array, length: Array) -> Pair:
         """Pressure after the sensor's dynamics, cmH2O, and the own state after the step."""
         return pressure, state
 

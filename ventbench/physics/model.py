@@ -100,25 +100,13 @@ class Physics:
         return state, Signals(shown, rest.pressure, 1000.0 * rest.flow, 0.0 * ones)
 
     def step(
-        self,
-        state: PhysicsState,
-        u_in: Array,
-        u_out: Array,
-        dt: Array,
+        self, state: PhysicsState, u_in: Array, u_out: Array, dt: Array,
         divisions: int | Array | None = None,
-    ) -> tuple[PhysicsState, Signals]:
+    ) -> tuple[PhysicsState, Signals]:  # fmt: skip
         """Hold one command; see :class:`~ventbench.task.interfaces.Plant`.
 
-        Args:
-            state: state from ``init`` or ``step``.
-            u_in: inspiratory valve, 0..100 %.
-            u_out: expiratory valve, 0 closed, 1 open.
-            dt: time for which the command is held, s.
-            divisions: steps of the integrator in a substep; the model's own if not given.
-
-        Returns:
-            The next state, and the signals at the end of ``dt``; the volume is above that of the
-            first sample.
+        ``divisions`` are steps of the integrator in a substep; the model's own if not given. The
+        volume is above that of the first sample.
         """
         assembly = self._assembly()
         divisions = self.divisions if divisions is None else divisions
@@ -132,14 +120,9 @@ class Physics:
             lambda mechanism, own: mechanism.outlet_dead_time(own, u_out, time)
         )
         lengths, open_for, commanded_flow = dead_time.windows(
-            dt,
-            state.past,
-            (outlet_delay, delay),
-            (opened, commanded),
-            self.substeps,
+            dt, state.past, (outlet_delay, delay), (opened, commanded), self.substeps,
             self.skip_idle,
-        )
-
+        )  # fmt: skip
         held = (commanded_flow, open_for, lengths)
 
         def advance(k: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:

@@ -14,13 +14,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.mechanism import Assembly, Mechanism, Values
-from ventbench.physics.network import PneumaticNetwork, View
+from ventbench.physics.mechanism import Assembly, Mechanism, Network, Pair, Values, View
 
 #: Place of the first stage of the SDIRK method, as a share of the substep.
 _GAMMA = 1.0 - 0.5**0.5
-
-Pair = tuple[Array, Array]
 
 
 @flax.struct.dataclass
@@ -48,10 +45,11 @@ def commanded(
     """Steady-state flow of the inspiratory valve at a command, L/s, and the new memory."""
     memory = dict(memory)
     for name, mechanism in assembly.mechanisms.items():
-        if _has(mechanism, "driven"):
-            u_in = assembly.change(name, _driven, u_in)
+        if mechanism.has("driven"):
+            u_in = assembly.change(name, lambda m, own, u: m.driven(own, u), u_in)
     for name, mechanism in assembly.mechanisms.items():
-        u_in, new_memory = assembly.change(name, _command, (u_in, memory.get(name, u_in)))
+        before = (u_in, memory.get(name, u_in))
+        u_in, new_memory = assembly.change(name, lambda m, own, x: m.command(own, *x), before)
         if mechanism.has_memory:
             memory[name] = new_memory
     return assembly.base["gain"] * 1e-3 * u_in, memory
@@ -90,14 +88,9 @@ def at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousState
 
 
 def substep(
-    assembly: Assembly,
-    now: ContinuousState,
-    commanded_flow: Array,
-    opened: Array,
-    time: Array,
-    h: Array,
-    peep: Array,
-) -> ContinuousState:
+    assembly: Assembly, now: ContinuousState, commanded_flow: Array, opened: Array, time: Array,
+    h: Array, peep: Array,
+) -> ContinuousState:  # fmt: skip
     """Advance by ``h`` seconds in two stages, the second of which ends the substep."""
 
     def advance(guess: ContinuousState, place: tuple[Array, Array]) -> tuple[ContinuousState, None]:
@@ -122,16 +115,9 @@ def sensor_output(assembly: Assembly, reading: Array) -> Array:
 
 
 def _implicit(
-    assembly: Assembly,
-    now: ContinuousState,
-    guess: ContinuousState,
-    ahead: Array,
-    commanded_flow: Array,
-    opened: Array,
-    time: Array,
-    length: Array,
-    peep: Array,
-) -> ContinuousState:
+    assembly: Assembly, now: ContinuousState, guess: ContinuousState, ahead: Array,
+    commanded_flow: Array, opened: Array, time: Array, length: Array, peep: Array,
+) -> ContinuousState:  # fmt: skip
     """Backward Euler step of ``length`` seconds that ends at ``time``.
 
     It starts at the share ``ahead`` of the way from ``now`` to ``guess``, which is near its end.
@@ -150,7 +136,7 @@ def _implicit(
     start = between(now.replace(internal={}), guess.replace(internal={}))  # type: ignore[attr-defined]
     internal, flow = dict(guess.internal), commanded_flow
     for name, mechanism in assembly.mechanisms.items():
-        if _has(mechanism, "inflow"):
+        if mechanism.has("inflow"):
             before = (flow, internal.get(name, flow))
             flow, new_state = assembly.change(name, _inflow, before, partial(state, name), length)
             internal |= {name: new_state} if mechanism.stateful else {}
@@ -159,55 +145,39 @@ def _implicit(
     pressure, flow = network.solve(start.pressure, start.flow, length)
     reading = pressure
     for name, mechanism in assembly.mechanisms.items():
-        if _has(mechanism, "reading") or _has(mechanism, "next_state"):
+        if mechanism.has("reading") or mechanism.has("next_state"):
             before = (reading, internal.get(name, reading))
-            first = None if _has(mechanism, "inflow") else partial(state, name)
+            first = None if mechanism.has("inflow") else partial(state, name)
             reading, new_state = assembly.change(name, _after, before, first, flow, view)
             internal |= {name: new_state} if mechanism.stateful else {}
     return ContinuousState(start.volume + flow * length, flow, pressure, reading, internal)
 
 
 def _network(
-    assembly: Assembly,
-    start: ContinuousState,
-    inflow: Array,
-    view: View,
+    assembly: Assembly, start: ContinuousState, inflow: Array, view: View,
     state: Callable[[str], Array],
-) -> PneumaticNetwork:
+) -> Network:  # fmt: skip
     zero = jnp.zeros_like(start.volume)
-    network = PneumaticNetwork(
+    network = Network(
         inflow=inflow, circuit=zero, leak=zero, leak_flow=zero, outlet=view.opened * view.outlet,
         behind=view.peep, resistance=view.resistance + zero, quadratic=zero, inertance=zero,
         recoil=view.elastance * start.volume, elastance=view.elastance + zero,
     )  # fmt: skip
     for name, mechanism in assembly.mechanisms.items():
-        if _has(mechanism, "network"):
+        if mechanism.has("network"):
             network = assembly.change(name, _joined, network, partial(state, name), view)
     return network
 
 
 def _view(
-    assembly: Assembly,
-    start: ContinuousState,
-    guess: ContinuousState,
-    opened: Array,
-    time: Array,
-    length: Array,
-    peep: Array,
-) -> View:
+    assembly: Assembly, start: ContinuousState, guess: ContinuousState, opened: Array, time: Array,
+    length: Array, peep: Array,
+) -> View:  # fmt: skip
     base = assembly.base
     return View(
         time, start.volume, guess.pressure, guess.flow, jnp.zeros_like(start.volume), length,
         1e3 / base["C"], peep, base["position"], base["R"], 1.0 / base["R_ex"], opened,
     )  # fmt: skip
-
-
-def _driven(mechanism: Mechanism, own: Values, u_in: Array) -> Array:
-    return mechanism.driven(own, u_in)
-
-
-def _command(mechanism: Mechanism, own: Values, before: Pair) -> Pair:
-    return mechanism.command(own, *before)
 
 
 def _inflow(
@@ -217,12 +187,8 @@ def _inflow(
 
 
 def _joined(
-    mechanism: Mechanism,
-    own: Values,
-    network: PneumaticNetwork,
-    state: Callable[[], Array],
-    view: View,
-) -> PneumaticNetwork:
+    mechanism: Mechanism, own: Values, network: Network, state: Callable[[], Array], view: View
+) -> Network:
     return mechanism.network(own, network, view.replace(state=state()))  # type: ignore[attr-defined]
 
 
@@ -238,7 +204,3 @@ def _after(
     return reading, mechanism.next_state(
         own, new_state, flow, view
     ) if mechanism.stateful else new_state
-
-
-def _has(mechanism: Mechanism, hook: str) -> bool:
-    return getattr(type(mechanism), hook) is not getattr(Mechanism, hook)

@@ -45,48 +45,13 @@ from ventbench.plants.plant_files import FAMILIES, load_plants, origin
 from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
 from ventbench.plants.simulators import Simulators
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stacking import (
-    PlantsFor,
-    VmappedPlant,
-    nominal_plants,
-    stack_heterogeneous,
-)
+from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import read_simulated
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNGS, Lung, lung
 
 Floats = NDArray[np.float64]
-
-
-class PressureFunction(Protocol):
-    """A simulator as a Python function of one breath's commands; numpy will do."""
-
-    def __call__(
-        self,
-        u_in: Floats,
-        u_out: Floats,
-        dt: Floats,
-        /,
-        *,
-        R: float,
-        C: float,
-        initial_pressure: float,
-    ) -> ArrayLike:
-        """Simulate one breath.
-
-        Args:
-            u_in: inspiratory valve, 0..100 %, shape ``(T,)``.
-            u_out: expiratory valve, 0 closed, 1 open, shape ``(T,)``.
-            dt: time from each sample to the next, s, shape ``(T,)``; the last is not used.
-            R: labelled resistance, cmH2O/(L/s).
-            C: labelled compliance, mL/cmH2O.
-            initial_pressure: pressure at the first sample, cmH2O.
-
-        Returns:
-            Pressure at each sample, cmH2O, shape ``(T,)``.
-        """
-        ...
 
 
 class Stepping(Protocol):
@@ -119,8 +84,8 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
 
     Args:
         given: a name, a path, ``"module:name"``, a plant, plants by lung id, a function of
-            commands (see :class:`PressureFunction`) or an array of simulated pressures. What is
-            :class:`Simulators` already is returned as it is.
+            commands or an array of simulated pressures. What is :class:`Simulators` already is
+            returned as it is.
         breaths: the recording that an array answers to, row by row; only for arrays.
 
     Returns:
@@ -144,8 +109,7 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
         if any(_is_python(value) for value in given.values()):
             return _python_by_lung(given, "the given simulators")
         digest = _leaves_sha256(given)
-        about = {"kind": "plants", "sha256": digest}
-        return _plants(dict(given), "the given plants", about, digest)
+        return _plants(dict(given), "the given plants", _about("plants", digest), digest)
     if isinstance(given, Fmu):
         return _of_function(given, given.path.name, given.sha256)
     if _is_python(given):
@@ -157,15 +121,7 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
 
 
 def load_simulated(path: str | Path, breaths: Breaths) -> Simulators:
-    """Load simulated pressures that stand in a table beside the recorded ones.
-
-    Args:
-        path: CSV or Parquet; see :func:`~ventbench.recordings.read.read_simulated`.
-        breaths: the recording that they answer to.
-
-    Raises:
-        InputError: if the table has no such pressures for a breath.
-    """
+    """Simulated pressures in a table; see :func:`~ventbench.recordings.read.read_simulated`."""
     digest, name = files.sha256(Path(path)) if Path(path).is_file() else None, Path(path).name
     pressures = read_simulated(path, breaths)
     about: dict[str, Any] = {"kind": "pressures", "file": name, "sha256": digest}
@@ -201,10 +157,13 @@ def _python_by_lung(given: Mapping[str, Any], name: str, sha256: str | None = No
             raise InputError(f"{name} have no such lung; they have {known}")
         return by_lung[label].run(arguments)
 
-    about: dict[str, Any] = {"kind": "function", "function": name, "lungs": sorted(given)}
-    if sha256 is not None:
-        about["sha256"] = sha256
+    about = _about("function", sha256, function=name, lungs=sorted(given))
     return Simulators("function", name, about, sha256=sha256, _function=PythonSimulator(name, run))
+
+
+def _about(kind: str, sha256: str | None, **more: Any) -> dict[str, Any]:
+    """What results keep of simulators."""
+    return {"kind": kind, **more} | ({} if sha256 is None else {"sha256": sha256})
 
 
 def _leaves_sha256(plants: Any) -> str:
@@ -242,23 +201,24 @@ def _by_text(text: str) -> Simulators:
     )
 
 
-def _official(path: Path | None = None) -> Simulators:
-    loaded = frozen.load(path=path)
-    return Simulators(
-        "frozen", "frozen", loaded.about(), LUNGS, loaded.manifest_sha256, loaded,
-        lambda: loaded.plants, loaded.for_breaths, loaded.cross_fitted, loaded,
-    )  # fmt: skip
+def _official() -> Simulators:
+    return _frozen(frozen.load(), "frozen", LUNGS, official=True)
 
 
 def _trained(path: Path) -> Simulators:
     """Simulators of a folder; they are the official ones if its manifest is theirs."""
     loaded = frozen.load(path=path)
     official = loaded.manifest_sha256 == files.sha256(frozen.folder() / frozen.MANIFEST)
-    lungs = tuple(lung(name) for name in loaded.lung_ids)
+    return _frozen(loaded, path.name, tuple(lung(key) for key in loaded.lung_ids), official)
+
+
+def _frozen(
+    loaded: frozen.Frozen, name: str, lungs: tuple[Lung, ...], official: bool
+) -> Simulators:
     return Simulators(
-        "frozen", path.name, loaded.about(), lungs, loaded.manifest_sha256,
-        loaded if official else None, lambda: loaded.plants, loaded.for_breaths,
-        loaded.cross_fitted, loaded,
+        "frozen", name, loaded.about(), lungs, loaded.manifest_sha256,
+        loaded if official else None, lambda: loaded.plants,
+        loaded.for_breaths, loaded.cross_fitted, loaded,
     )  # fmt: skip
 
 
@@ -320,32 +280,22 @@ def _plants(
 
 def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
     def repeated(count: int) -> Plant:
-        def repeat(leaf: Any) -> NDArray[Any]:
-            values = np.asarray(leaf)
-            return np.broadcast_to(values, (count, *values.shape))
+        return jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), plant)
 
-        return jax.tree.map(repeat, plant)
-
-    about: dict[str, Any] = {"kind": "plant", "plant": name}
-    if sha256 is not None:
-        about["sha256"] = sha256
     return Simulators(
-        "plants", name, about, LUNGS, sha256, None, partial(repeated, len(LUNGS)),
-        lambda breaths: VmappedPlant(repeated(len(breaths))),
+        "plants", name, _about("plant", sha256, plant=name), LUNGS, sha256, None,
+        partial(repeated, len(LUNGS)), lambda breaths: VmappedPlant(repeated(len(breaths))),
     )  # fmt: skip
 
 
 def _plant_file(path: Path) -> Simulators:
     digest = files.sha256(path)
-    about = {"kind": "file", "file": path.name, "sha256": digest}
+    about = _about("file", digest, file=path.name)
     return replace(_plants(load_plants(path), path.name, about, digest), origin=origin(path))
 
 
 def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:
-    about: dict[str, Any] = {"kind": "function", "function": name}
-    if sha256 is not None:
-        about["sha256"] = sha256
-    adapted = python_simulator(function, name)
+    adapted, about = python_simulator(function, name), _about("function", sha256, function=name)
     return Simulators("function", name, about, sha256=sha256, _function=adapted)
 
 
@@ -381,7 +331,7 @@ def _imported(module: str, attribute: str) -> Simulators:
 def _pressures_file(path: Path) -> Simulators:
     breaths = recordings.load(path, pad=True)
     digest = files.sha256(path)
-    about = {"kind": "pressures", "file": path.name, "sha256": digest}
+    about = _about("pressures", digest, file=path.name)
     return _of_pressures(breaths, breaths.pressure, path.name, about, digest)
 
 

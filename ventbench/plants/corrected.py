@@ -137,15 +137,10 @@ class Stressed:
 
 
 def reference_physics(plant: Plant, lungs: Sequence[Lung]) -> dict[str, Floats]:
-    """Parameters of the library's physics that say most of what a plant does.
+    """Parameters of the library's physics that say most of what the plants of L lungs do, by path.
 
-    Args:
-        plant: leaves ``(L, ...)``, one lung each on the leading axis.
-        lungs: labels, length L.
-
-    Returns:
-        Parameters by path: what the plant says, of its batch shape; for a plant that says nothing
-        those of the label, shape ``(L,)``.
+    They are what the plant says, of its batch shape; for a plant that says nothing those of the
+    labels, shape ``(L,)``.
     """
     wide: Any = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), plant)
     known = wide.parameters()
@@ -211,14 +206,9 @@ def stressed_plants(
 def _apply(
     line: Stressor, severity: Severity, part: float, own: dict[str, Floats], labels: Floats
 ) -> None:
-    """Change parameters of one condition in place.
+    """Change parameters ``(BREATHS, L, n)`` of one condition in place, by a share of the strength.
 
-    Args:
-        line: the stressor.
-        severity: its severity.
-        part: share of its strength.
-        own: parameters by path, ``(BREATHS, L, n)``.
-        labels: R and C that the labels say, ``(L, 2, 1)``.
+    ``labels`` are the R and C that the labels say, ``(L, 2, 1)``.
     """
     strength, share = line.at(severity), part * np.reshape(line.breaths, (-1, 1, 1))
     if line.rule == "add":

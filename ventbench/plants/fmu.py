@@ -61,11 +61,8 @@ def export(plant: Plant, path: Path | str, *, lung: str) -> Path:
 
     Args:
         plant: of one lung, as of :meth:`ventbench.load_simulators(...).plant`.
-        path: target, ``.fmu``.
+        path: target, ``.fmu``, which is returned.
         lung: id of the lung, the name of the model.
-
-    Returns:
-        The path.
 
     Raises:
         InputError: if the path has another ending or there is no such lung.

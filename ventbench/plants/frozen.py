@@ -175,10 +175,7 @@ class Frozen:
         return jax.tree.map(lambda leaf: leaf[:, at], self.members)
 
     def for_breaths(self, breaths: Breaths) -> Hybrid:
-        """Official simulators of breaths: of their lung, on the rig that their clock tells.
-
-        Returns:
-            Plants with leaves ``(n, ...)``.
+        """Official simulators of n breaths: of their lung, on the rig that their clock tells.
 
         Raises:
             InputError: if a lung is none of the recorded settings.
@@ -213,12 +210,8 @@ class Frozen:
     def about(self) -> dict[str, Any]:
         """Version and hashes that a score states of its simulators."""
         hashes = {name: self.manifest["files"][name]["sha256"] for name in (MEMBERS, SEEN)}
-        return {
-            "version": self.manifest["version"],
-            "kind": self.manifest["kind"],
-            "manifest_sha256": self.manifest_sha256,
-            "files": hashes,
-        }
+        about = {key: self.manifest[key] for key in ("version", "kind")}
+        return {**about, "manifest_sha256": self.manifest_sha256, "files": hashes}
 
 
 def seen(breaths: Breaths, fold: Ints) -> Seen:
@@ -237,10 +230,7 @@ def folder() -> Path:
 
 
 def load(path: Path | None = None) -> Frozen:
-    """Read the official simulators and check every file against the manifest.
-
-    Args:
-        path: another folder, such as one that ``ventbench train simulator`` wrote.
+    """Read the official simulators, or those of a folder, and check them against the manifest.
 
     Raises:
         InputError: if a file is missing or is not what the manifest says.

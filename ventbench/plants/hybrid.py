@@ -158,18 +158,12 @@ class Hybrid:
         rest = self.rest + zero
         flow = self.valve(rest)
         state = HybridState(
-            elastic=pressure + self.offset,
-            drop=zero - self.offset,
-            sensor=pressure,
-            flow=flow,
-            commanded=(flow,) * (MEMORY + 1),
-            opened=(zero + 1.0,) * (MEMORY + 1),
-            past=(zero + 0.03,) * MEMORY,
-            plays=tuple(rest for _ in PLAYS),
-            u_in=rest,
+            elastic=pressure + self.offset, drop=zero - self.offset, sensor=pressure, flow=flow,
+            commanded=(flow,) * (MEMORY + 1), opened=(zero + 1.0,) * (MEMORY + 1),
+            past=(zero + 0.03,) * MEMORY, plays=tuple(rest for _ in PLAYS), u_in=rest,
             peep=pressure if peep is None else peep + zero,
             outlet=None if self.closing_lag is None else zero + 1.0,
-        )
+        )  # fmt: skip
         return state, self._signals(state, pressure)
 
     def step(
@@ -294,14 +288,10 @@ class Hybrid:
 def _delayed(
     held: tuple[Array, ...], past: tuple[Array, ...], delay: Array, h: Array
 ) -> list[Array]:
-    """Means of a delayed command over each of the substeps of a sample.
+    """Means of a command, delayed by so many s, over each of the substeps ``h`` s of a sample.
 
-    Args:
-        held: commands of this sample and of those before, the latest first, ``P + 2`` arrays; the
-            last holds for all earlier time.
-        past: durations of the P samples before, the latest first, s.
-        delay: dead time, s.
-        h: length of a substep, s.
+    ``held`` are the commands of this sample and of those before, the latest first, of which the
+    last holds for all earlier time; ``past`` the durations of the samples before, s.
     """
     # From each change of the command to the start of the sample, delayed, in substeps.
     changes, before = [later - sooner for sooner, later in pairwise(held)], delay

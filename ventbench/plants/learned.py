@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import flax.struct
 import jax
@@ -21,11 +21,6 @@ LOWEST, HIGHEST = -15.0, 100.0
 
 #: Activations by name: the paper's SELU, and tanh, which is smooth and bounded.
 ACTIVATIONS = {"tanh": jnp.tanh, "selu": jax.nn.selu}
-
-
-def _activate(name: str, x: Array) -> Array:
-    """Apply an activation by its name."""
-    return ACTIVATIONS[name](x)
 
 
 @flax.struct.dataclass
@@ -50,18 +45,14 @@ class MLP:
         """Evaluate at inputs of shape ``(..., in)``; returns shape ``(..., out)``."""
         *hidden, last = zip(self.weights, self.biases, strict=True)
         for weight, bias in hidden:
-            x = _activate(self.activation, x @ weight + bias)
+            x = ACTIVATIONS[self.activation](x @ weight + bias)
         return x @ last[0] + last[1]
 
 
 def mlp(key: Array, sizes: tuple[int, ...], activation: str, last_scale: float = 1.0) -> MLP:
-    """Draw a network with LeCun-normal weights and zero biases.
+    """Draw a network with LeCun-normal weights, those of the last layer scaled, and zero biases.
 
-    Args:
-        key: a key that is used for nothing else.
-        sizes: sizes of the input, the hidden layers and the output; at least two numbers.
-        activation: a name in :data:`ACTIVATIONS`.
-        last_scale: factor on the weights of the last layer.
+    Sizes are those of input, hidden layers and output; the activation is one of `ACTIVATIONS`.
 
     Raises:
         ValueError: if a size is below 1, there are fewer than two, or the activation is unknown.
@@ -80,11 +71,6 @@ def mlp(key: Array, sizes: tuple[int, ...], activation: str, last_scale: float =
     )
     biases = tuple(jnp.zeros(n, jnp.float32) for n in sizes[1:])
     return MLP(weights, biases, activation)
-
-
-def layer_sizes(inputs: int, width: int, depth: int, outputs: int) -> tuple[int, ...]:
-    """Sizes for :func:`mlp`; ``depth`` counts matrices, the last included, as the paper does."""
-    return (inputs, *([width] * (depth - 1)), outputs)
 
 
 @dataclass(frozen=True)
@@ -276,13 +262,9 @@ class Learned:
         u_in = self.valve_scale * jnp.clip(u_in, 0.0, protocol.U_MAX)
         u_in = jnp.broadcast_to(u_in, now.shape).astype(now.dtype)
         controls = jnp.concatenate([state.controls[..., 1:], u_in[..., None]], axis=-1)
-        features = jnp.concatenate(
-            [
-                (state.pressures - self.pressure_mean) / self.pressure_scale,
-                (controls - self.control_mean) / self.control_scale,
-            ],
-            axis=-1,
-        )
+        pressures = (state.pressures - self.pressure_mean) / self.pressure_scale
+        commands = (controls - self.control_mean) / self.control_scale
+        features = jnp.concatenate([pressures, commands], axis=-1)
         out = self.general(features)
         if self.boundary is not None:
             first = state.count < self.boundary.output_bias.shape[0]
@@ -297,14 +279,13 @@ class Learned:
         pressure = jnp.where(is_open, expired, inspired)
         window = jnp.concatenate([state.pressures[..., 1:], pressure[..., None]], axis=-1)
         going = LearnedState(window, controls, state.count + 1, state.peep)
+
+        def chosen(rest: Array, going: Array) -> Array:
+            wide = is_open.reshape(is_open.shape + (1,) * (rest.ndim - now.ndim))
+            return jnp.where(wide, rest, going)
+
         rest = self._rest(pressure, state.peep)
-        return jax.tree.map(
-            lambda a, b: jnp.where(
-                is_open.reshape(is_open.shape + (1,) * (a.ndim - now.ndim)), a, b
-            ),
-            rest,
-            going,
-        ), Signals(pressure)
+        return jax.tree.map(chosen, rest, going), Signals(pressure)
 
     def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Learned:
         """Return the plant of a lung with other R, C and gain, by two exact symmetries.
@@ -335,25 +316,16 @@ def _bend(pressure: Array) -> Array:
 def learned(
     key: Array, architecture: Architecture, normalisation: Normalisation | None = None
 ) -> Learned:
-    """Draw an untrained learned plant; :func:`ventbench.train.learned.fit` trains one.
+    """Draw an untrained learned plant in float32; :func:`ventbench.train.learned.fit` trains one.
 
-    Args:
-        key: a JAX key that is used for nothing else.
-        architecture: sizes of the networks.
-        normalisation: constants of the normalisation; the recordings' typical ones if not given.
-
-    Returns:
-        The plant with float32 leaves.
+    Without a normalisation, that of the recordings' typical values is taken.
     """
     shape, n = architecture, normalisation or Normalisation()
     inputs = shape.pressures + shape.controls
     general_key, hidden_key, output_key = jax.random.split(key, 3)
-    general = mlp(
-        general_key,
-        layer_sizes(inputs, shape.width, shape.depth, 2),
-        shape.activation,
-        last_scale=0.1,
-    )
+    # The depth counts matrices, the last included, as the paper does.
+    sizes = (inputs, *([shape.width] * (shape.depth - 1)), 2)
+    general = mlp(general_key, sizes, shape.activation, last_scale=0.1)
     boundary = None
     if shape.boundaries:
         units = shape.boundaries * shape.boundary_width
@@ -365,20 +337,5 @@ def learned(
             output * 0.1 * shape.boundary_width**-0.5,
             jnp.zeros((shape.boundaries, 2), jnp.float32),
         )
-    constants = (
-        n.pressure_mean,
-        n.pressure_scale,
-        n.control_mean,
-        n.control_scale,
-        n.jump_scale,
-        n.rate_scale,
-        n.tau,
-        1.0,
-        1.0,
-    )
-    return Learned(
-        general,
-        boundary,
-        *(jnp.asarray(x, jnp.float32) for x in constants),
-        windows=(shape.pressures, shape.controls),
-    )
+    constants = (jnp.asarray(x, jnp.float32) for x in (*astuple(n), 1.0, 1.0))
+    return Learned(general, boundary, *constants, windows=(shape.pressures, shape.controls))

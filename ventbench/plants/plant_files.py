@@ -63,7 +63,7 @@ RENAMED: dict[str, str] = {}
 
 #: Names of fields in plant files, by class and field, where they differ from the attribute's.
 FIELDS_IN_FILES: dict[str, dict[str, str]] = {
-    "Corrected": {"with_mechanisms": "wanted", "without_mechanisms": "had"},
+    "Corrected": {"with_mechanisms": "wanted", "without_mechanisms": "had"}
 }
 
 
@@ -89,12 +89,9 @@ _STRUCTURE = "structure"
 def save_plants(
     path: Path, plants: Mapping[str, Plant], about: Mapping[str, Any] | None = None
 ) -> None:
-    """Write plants of some lungs in one step, as JSON or, if the path ends so, as ``.npz``.
+    """Write plants by lung id in one step, as JSON or, if the path ends so, as ``.npz``.
 
-    Args:
-        path: target, ``.json`` or ``.npz``.
-        plants: plants by the id of their lung, such as ``R20C50``.
-        about: JSON values that say where they come from.
+    ``about`` are JSON values that say where they come from.
 
     Raises:
         ValueError: if a parameter of a JSON file is not finite.
@@ -116,9 +113,7 @@ def save_plants(
 def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict[str, Plant]:
     """Read what :func:`save_plants` wrote.
 
-    Args:
-        path: path of the file, ``.json`` or ``.npz``.
-        as_array: makes the leaves; those of numpy take the precision in force where they are used.
+    ``as_array`` makes the leaves; those of numpy take the precision in force where they are used.
 
     Returns:
         Plants by the id of their lung, in the order of the file.
@@ -128,12 +123,7 @@ def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict
         OSError: if it cannot be read.
     """
     try:
-        if Path(path).suffix == ".npz":
-            with np.load(path, allow_pickle=False) as npz:
-                head, arrays = json.loads(str(npz[_STRUCTURE])), dict(npz)
-        else:
-            head = json.loads(Path(path).read_bytes())
-            arrays = {}
+        head, arrays = _content(path)
         if not isinstance(head, dict) or head.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
         if not head["lungs"]:
@@ -158,15 +148,18 @@ def origin(path: Path) -> dict[str, Any]:
         OSError: if the file cannot be read.
     """
     try:
-        if Path(path).suffix == ".npz":
-            with np.load(path, allow_pickle=False) as npz:
-                head = json.loads(str(npz[_STRUCTURE]))
-        else:
-            head = json.loads(Path(path).read_bytes())
-        about = head["about"]
+        about = _content(path)[0]["about"]
     except (KeyError, TypeError, ValueError):
         return {}
     return dict(about) if isinstance(about, dict) else {}
+
+
+def _content(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    """Structure, and the arrays that stand beside it in an ``.npz``."""
+    if Path(path).suffix != ".npz":
+        return json.loads(Path(path).read_bytes()), {}
+    with np.load(path, allow_pickle=False) as npz:
+        return json.loads(str(npz[_STRUCTURE])), dict(npz)
 
 
 def save_plant(path: Path, plant: Any) -> None:
@@ -182,10 +175,8 @@ def save_plant(path: Path, plant: Any) -> None:
 def load_plant(path: Path, as_array: Callable[[Any], Any] = jnp.asarray) -> Any:
     """Read what :func:`save_plant` wrote.
 
-    Args:
-        path: path of the file.
-        as_array: makes the leaves; the default gives them the precision that is in force,
-            ``numpy.asarray`` that of the file.
+    ``as_array`` makes the leaves; the default gives them the precision that is in force,
+    ``numpy.asarray`` that of the file.
 
     Raises:
         InputError: if the file is not a plant file, or names an unknown type of plant.
@@ -210,13 +201,9 @@ def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value).__name__
         in_file = FIELDS_IN_FILES.get(kind, {})
-        stored = {
-            in_file.get(field.name, field.name): field.name for field in dataclasses.fields(value)
-        }
-        fields = {
-            name: _encode(getattr(value, attribute), f"{path}.{name}", arrays)
-            for name, attribute in stored.items()
-        }
+        names = [field.name for field in dataclasses.fields(value)]
+        stored = {in_file.get(name, name): getattr(value, name) for name in names}
+        fields = {name: _encode(x, f"{path}.{name}", arrays) for name, x in stored.items()}
         return {"type": kind, "fields": fields}
     if isinstance(value, tuple | list):
         return {"tuple": [_encode(part, f"{path}.{i}", arrays) for i, part in enumerate(value)]}
@@ -234,11 +221,8 @@ def _decode(node: dict[str, Any], arrays: Any, as_array: Callable[[Any], Any]) -
         kind = stored_type(node["type"])
         in_file = FIELDS_IN_FILES.get(kind.__name__, {})
         attributes = {name: attribute for attribute, name in in_file.items()}
-        fields: dict[str, Any] = {
-            str(attributes.get(name, name)): _decode(child, arrays, as_array)
-            for name, child in node["fields"].items()
-        }
-        return kind(**fields)
+        children = {name: _decode(x, arrays, as_array) for name, x in node["fields"].items()}
+        return kind(**{str(attributes.get(name, name)): x for name, x in children.items()})
     if "tuple" in node:
         return tuple(_decode(child, arrays, as_array) for child in node["tuple"])
     if "array" in node:

@@ -108,15 +108,12 @@ def from_vector(vector: Any, xp: Any = jnp) -> Hybrid:
     at += _PLAYS
     laminar = xp.exp(resistance) / (1.0 + xp.exp(turbulence))
     return Hybrid(
-        R=laminar,
-        K2=laminar * xp.exp(turbulence) / FLOW,
-        E=xp.exp(elastance),
-        stiffening=xp.diff(slope, axis=-1, prepend=xp.ones_like(slope[..., :1])),
-        offset=offset,
+        R=laminar, K2=laminar * xp.exp(turbulence) / FLOW, E=xp.exp(elastance),
+        stiffening=xp.diff(slope, axis=-1, prepend=xp.ones_like(slope[..., :1])), offset=offset,
         slopes=shape * (xp.exp(size) / (shape * _WIDTHS).sum(axis=-1))[..., None],
         direction=-DIRECTION_SUM * odds / (1.0 + odds.sum(axis=-1, keepdims=True)),
         **{name: xp.exp(vector[..., at + k]) for k, name in enumerate(_LOGARITHMS)},
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,15 +129,9 @@ class RigPopulation:
     factor: Floats
 
     def rigs(self, seed: bytes, lung: int, count: int) -> Hybrid:
-        """Draw rigs of a lung; the same everywhere.
+        """Draw rigs of a lung, by its index and a seed of 32 bytes; the same everywhere.
 
-        Args:
-            seed: 32 bytes.
-            lung: index of the lung.
-            count: number of rigs; more begin with the same.
-
-        Returns:
-            numpy leaves ``(count, ...)`` of :data:`DIGITS` significant digits.
+        Numpy leaves ``(count, ...)`` of :data:`DIGITS` significant digits; more begin alike.
         """
         numbers = uniforms(seed, f"population 1, lung {lung}", (count, len(NAMES)))
         normal = np.round(np.vectorize(NormalDist().inv_cdf, otypes=[float])(numbers), 4)

@@ -2,8 +2,10 @@
 
 A simulator may be
 
-- a function ``f(u_in, u_out, dt, *, R, C, initial_pressure)`` that returns the pressures; it may
-  leave out what it does not need, and may also ask for ``time`` or ``flow`` by name;
+- a function ``f(u_in, u_out, dt, *, R, C, initial_pressure)`` that returns the pressures, cmH2O,
+  ``(T,)``, at samples with commands of %, 0/1, and times to the next sample, s, ``(T,)``, for the
+  label R, cmH2O/(L/s), C, mL/cmH2O, and the first pressure; it may leave out what it does not need,
+  and may also ask for ``time``, s, or ``flow``, mL/s, by name;
 - a class or an object with ``init(pressure)`` and ``step(state, u_in, u_out, dt)``, which returns
   the next state and the pressure, all of them numbers;
 - a class or an object with ``step(u_in, u_out, dt)``, which returns the pressure and keeps its
@@ -60,10 +62,7 @@ class PythonSimulator:
         self, u_in: Floats, u_out: Floats, dt: Floats, /, *, R: float, C: float,
         initial_pressure: float, flow: Floats | None = None,
     ) -> ArrayLike:  # fmt: skip
-        """Simulate one breath; see :class:`~ventbench.plants.catalog.PressureFunction`.
-
-        ``flow`` is the recorded flow, mL/s, ``(T,)``, where there is one.
-        """
+        """Simulate one breath; see the module. ``flow`` is the recorded one, where there is one."""
         time = np.concatenate([[0.0], np.cumsum(dt)[:-1]])
         return self.run(
             {"u_in": u_in, "u_out": u_out, "dt": dt, "R": R, "C": C,
@@ -72,11 +71,7 @@ class PythonSimulator:
 
 
 def python_simulator(value: Any, name: str) -> PythonSimulator:
-    """Adapt a function, a class or an object of plain Python.
-
-    Args:
-        value: see the module.
-        name: what messages call it.
+    """Adapt a function, a class or an object, see the module; messages call it by the name.
 
     Raises:
         InputError: if it cannot be called as any of them.

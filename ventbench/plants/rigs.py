@@ -49,20 +49,10 @@ class Rigs:
         return 1 if self.sessions is None else jax.tree.leaves(self.plants)[0].shape[0]
 
     def draws(
-        self,
-        n: int,
-        pips: Sequence[float] = protocol.PIPS,
-        *,
-        seed: bytes = draw_tables.DEVELOPMENT_SEED,
-        name: str = draw_tables.DEVELOPMENT,
-    ) -> Draws:
+        self, n: int, pips: Sequence[float] = protocol.PIPS, *,
+        seed: bytes = draw_tables.DEVELOPMENT_SEED, name: str = draw_tables.DEVELOPMENT,
+    ) -> Draws:  # fmt: skip
         """Return the first n draws of a seed on these rigs at some of the protocol's PIPs.
-
-        Args:
-            n: number of draws, of :data:`ventbench.task.draws.COUNT` at most.
-            pips: cmH2O.
-            seed: 32 bytes; that of the development draws if not given.
-            name: of the draws.
 
         Raises:
             InputError: if there are not so many, a PIP is not one of the protocol's, or the seed
@@ -98,15 +88,10 @@ class Rigs:
         return draw_tables.plants_of(self.plants, drawn.rig, drawn.member, drawn.drawn)
 
     def cells(self, drawn: Draws | None, pips: Sequence[float]) -> tuple[Plant, Scenario]:
-        """Nominal cells in front of draws, and their plants.
+        """Nominal cells in front of K draws, and their plants, at P PIPs, cmH2O.
 
-        Args:
-            drawn: K draws; None for none.
-            pips: cmH2O, length P.
-
-        Returns:
-            Plants with leaves ``(L, 1 + K, 1, ...)``, or ``(L, ...)`` where each lung has one rig;
-            cells of batch shape ``(L, 1 + K, P)``.
+        Plants have leaves ``(L, 1 + K, 1, ...)``, or ``(L, ...)`` where each lung has one rig;
+        cells the batch shape ``(L, 1 + K, P)``.
         """
         reference = [own[0] for own in self.sessions] if self.sessions else [0] * len(self.lungs)
         cells, rig, member = draw_tables.with_nominal(drawn, reference, pips)
@@ -117,11 +102,7 @@ class Rigs:
 
 
 def load_rigs(simulator: Given = "frozen") -> Rigs:
-    """Load the rigs of simulators.
-
-    Args:
-        simulator: ``"frozen"`` for the official rigs; else see :func:`ventbench.load_simulators`:
-            each lung then has one rig.
+    """Load the official rigs, or of other simulators one rig a lung.
 
     Raises:
         InputError: if there are no such simulators, or they have no plants.
@@ -135,11 +116,6 @@ def load_rigs(simulator: Given = "frozen") -> Rigs:
 def rigs_of(official: Any) -> Rigs:
     """Rigs of a set of simulators, such as :func:`ventbench.plants.frozen.load` returns."""
     return Rigs(
-        LUNGS,
-        official.sessions_plants,
-        official.rigs,
-        official.about(),
-        official.manifest_sha256,
-        official.held_out_rigs,
-        official.population,
-    )
+        LUNGS, official.sessions_plants, official.rigs, official.about(),
+        official.manifest_sha256, official.held_out_rigs, official.population,
+    )  # fmt: skip

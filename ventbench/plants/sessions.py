@@ -96,12 +96,9 @@ class Sessions:
         return len(self.table)
 
     def assign(self, breaths: Breaths) -> Ints:
-        """Find the session of each breath: the nearest clock among those of its lung.
+        """Index into :attr:`table` of each breath, ``(n,)``: the nearest clock of its lung.
 
         A combination that was never seen thus falls to the one most like it.
-
-        Returns:
-            Index into :attr:`table`, shape ``(n,)``.
 
         Raises:
             InputError: if no session has a breath's lung.

@@ -114,10 +114,7 @@ class Simulators:
         return take(stacked, known.index(wanted))
 
     def for_breaths(self, breaths: Breaths) -> Plant:
-        """Plants of recorded breaths, by lung and, where it matters, by rig.
-
-        Returns:
-            A plant with leaves ``(n, ...)``.
+        """Plants of n recorded breaths, by lung and, where it matters, by rig; leaves ``(n, ...)``.
 
         Raises:
             InputError: if there are no plants, or none for a lung of the recording.
@@ -196,7 +193,7 @@ class Simulators:
     def respond(
         self, lung_id: str, u_in: Floats, u_out: Floats, dt: Floats, *, initial_pressure: float
     ) -> Floats:
-        """Answer to any sequence of commands.
+        """Pressure at each of T samples, cmH2O, in answer to any sequence of commands.
 
         Args:
             lung_id: id of the lung, such as ``"R20C50"``.
@@ -204,9 +201,6 @@ class Simulators:
             u_out: expiratory valve, 0/1, shape ``(T,)``.
             dt: time from each sample to the next, s, shape ``(T,)``.
             initial_pressure: pressure at the first sample, where the lung is at rest, cmH2O.
-
-        Returns:
-            Pressure at each sample, cmH2O, shape ``(T,)``.
 
         Raises:
             InputError: if there are only simulated pressures, or none for the lung.

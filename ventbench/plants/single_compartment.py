@@ -82,12 +82,7 @@ class SingleCompartment:
 def single_compartment(
     lung: Lung, *, gain: ArrayLike = VALVE_GAIN, R_ex: ArrayLike = EXPIRATORY_RESISTANCE
 ) -> SingleCompartment:
-    """Build a :class:`SingleCompartment` lung.
-
-    Args:
-        lung: label of the lung: R, cmH2O/(L/s), and C, mL/cmH2O.
-        gain: flow of the inspiratory valve, mL/s per %.
-        R_ex: resistance of the expiratory path, cmH2O/(L/s).
+    """Build a :class:`SingleCompartment` lung of a label; gain and R_ex as of the class.
 
     Raises:
         ValueError: if a parameter is not positive.

@@ -47,15 +47,7 @@ def take(plants: PlantT, *index: int) -> PlantT:
 
 
 def nominal_plants(make: Callable[[Lung], Plant], breaths: Breaths) -> Plant:
-    """Plants of recorded breaths at what their labels say: nothing is learned.
-
-    Args:
-        make: gives the plant of a lung.
-        breaths: n recorded breaths.
-
-    Returns:
-        A plant with leaves ``(n, ...)``.
-    """
+    """Plants of n recorded breaths at what their labels say, leaves ``(n, ...)``."""
     labels = list(zip(breaths.R.tolist(), breaths.C.tolist(), strict=True))
     different = list(dict.fromkeys(labels))
     plants = stack([make(Lung(*label)) for label in different])
@@ -104,9 +96,10 @@ def _with_equal_parameters(plants: list[Any]) -> list[Any]:
 
 def _physics_with_equal_parameters(plants: list[Physics]) -> list[Physics]:
     names = list(dict.fromkeys(name for plant in plants for name in plant.names))
-    substeps = max(plant.substeps for plant in plants)
-    memory = max(plant.memory for plant in plants)
-    divisions = max(plant.divisions for plant in plants)
+    sizes = {
+        name: max(getattr(plant, name) for plant in plants)
+        for name in ("substeps", "memory", "divisions")
+    }
     completed = []
     for plant in plants:
         # One that has no PEEP takes the pressure that it starts from, which no number can say.
@@ -116,11 +109,7 @@ def _physics_with_equal_parameters(plants: list[Physics]) -> list[Physics]:
         with precision.float64():
             full = plant.having(**{name: plant.get(name) for name in missing})
         values = tuple(np.asarray(value) for value in full.values)
-        completed.append(
-            dataclasses.replace(
-                full, values=values, substeps=substeps, memory=memory, divisions=divisions
-            )
-        )
+        completed.append(dataclasses.replace(full, values=values, **sizes))
     return completed
 
 
@@ -138,19 +127,12 @@ class VmappedPlant:
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Signals]:
         """Lungs at rest; see :class:`~ventbench.task.interfaces.Plant`."""
-
-        def init(plant: Plant, pressure: Array, peep: Array) -> Any:
-            return plant.init(pressure, peep)
-
-        return jax.vmap(init)(self.plants, pressure, pressure if peep is None else peep)
+        behind = pressure if peep is None else peep
+        return jax.vmap(lambda plant, *x: plant.init(*x))(self.plants, pressure, behind)
 
     def step(self, state: Any, u_in: Array, u_out: Array, dt: Array) -> tuple[Any, Signals]:
         """Hold one command each."""
-
-        def step(plant: Plant, state: Any, u_in: Array, u_out: Array, dt: Array) -> Any:
-            return plant.step(state, u_in, u_out, dt)
-
-        return jax.vmap(step)(self.plants, state, u_in, u_out, dt)
+        return jax.vmap(lambda plant, *x: plant.step(*x))(self.plants, state, u_in, u_out, dt)
 
     def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> VmappedPlant:
         """Return the same lungs with other resistances, compliances and gains."""
@@ -166,15 +148,8 @@ def open_loop_breaths(
 ) -> Floats:
     """Pressures that plants answer to the commands of recorded breaths with, in batches.
 
-    Each breath starts at its first recorded pressure.
-
-    Args:
-        plants_for: see :data:`PlantsFor`.
-        breaths: n breaths of T samples.
-        progress: called with the number of breaths of each batch, as it is done.
-
-    Returns:
-        cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
+    Each breath starts at its first recorded pressure. ``progress`` is called with the number of
+    breaths of each batch, as it is done. cmH2O, ``(n, T)``; NaN where the first pressure is blank.
     """
     n = len(breaths)
     batch = min(_BATCH, n)

@@ -122,21 +122,10 @@ class TwoBalloon:
 
 
 def two_balloon(
-    lung: Lung,
-    *,
-    gain: ArrayLike = VALVE_GAIN,
-    R_ex: ArrayLike = EXPIRATORY_RESISTANCE,
-    K: ArrayLike = BALLOON_PRESSURE,
-    supply: ArrayLike = SUPPLY_PRESSURE,
-) -> TwoBalloon:
-    """Build a :class:`TwoBalloon` lung.
-
-    Args:
-        lung: label of the lung: R, cmH2O/(L/s), and C, mL/cmH2O.
-        gain: flow of the inspiratory valve at zero pressure, mL/s per %.
-        R_ex: resistance of the expiratory path, cmH2O/(L/s).
-        K: pressure scale of the balloon, cmH2O.
-        supply: supply pressure, cmH2O.
+    lung: Lung, *, gain: ArrayLike = VALVE_GAIN, R_ex: ArrayLike = EXPIRATORY_RESISTANCE,
+    K: ArrayLike = BALLOON_PRESSURE, supply: ArrayLike = SUPPLY_PRESSURE,
+) -> TwoBalloon:  # fmt: skip
+    """Build a :class:`TwoBalloon` lung of a label; what it does not say is as of the class.
 
     Raises:
         ValueError: if a parameter is not positive, or the supply reaches 95 % of the balloon's

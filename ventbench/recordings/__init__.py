@@ -3,8 +3,6 @@
 from ventbench.recordings.breaths import Breaths as Breaths
 from ventbench.recordings.breaths import join as join
 from ventbench.recordings.breaths import make_breaths as make_breaths
-from ventbench.recordings.problems import RecordingError as RecordingError
-from ventbench.recordings.problems import RecordingProblem as RecordingProblem
 from ventbench.recordings.read import check as check
 from ventbench.recordings.read import iter_breaths as iter_breaths
 from ventbench.recordings.read import load as load
@@ -19,4 +17,6 @@ from ventbench.recordings.roles import find_saturation as find_saturation
 from ventbench.recordings.roles import require_roles as require_roles
 from ventbench.recordings.schema import COLUMNS as COLUMNS
 from ventbench.recordings.schema import Column as Column
+from ventbench.recordings.schema import RecordingError as RecordingError
+from ventbench.recordings.schema import RecordingProblem as RecordingProblem
 from ventbench.recordings.write import write as write

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -136,10 +136,7 @@ class Breaths:
         return columns | {k: x[span][valid] for k, x in signals.items() if x is not None}
 
     def plot(self) -> Figure:
-        """Draw pressure and commands of all breaths, a column a lung.
-
-        Returns:
-            A matplotlib figure, which a notebook shows and ``savefig`` writes.
+        """Draw pressure and commands of all breaths, a column a lung, as a matplotlib figure.
 
         Raises:
             InputError: if the extra ``ventbench[view]`` is missing.
@@ -182,13 +179,10 @@ class Breaths:
         return mask
 
     def select(self, which: np.ndarray | slice | list[int]) -> Breaths:
-        """Return some of the breaths, as copies.
+        """Return some of the breaths, as copies; `source` and `sha256` still name their file.
 
         Args:
             which: a mask (n,), indices (k,) in any order, or a slice.
-
-        Returns:
-            The breaths; `source` and `sha256` still name their file.
 
         Raises:
             IndexError: if an index is out of range, or the mask has another length.
@@ -217,37 +211,30 @@ FILL = {"u_in": 0.0, "u_out": 1, "pressure": np.nan, "flow": np.nan, "volume": n
 """Values of padding."""
 
 
-def stack(values: np.ndarray, lengths: np.ndarray, fill: float) -> np.ndarray:
-    """Arrange consecutive breaths in rows.
+def stack(
+    values: np.ndarray, lengths: np.ndarray, fill: float, width: int | None = None
+) -> np.ndarray:
+    """Arrange samples (m,) of consecutive breaths of lengths (n,) in rows, (n, T).
 
-    Args:
-        values: samples of all breaths, (m,).
-        lengths: samples of each breath, (n,), summing to m.
-        fill: value after a short breath.
-
-    Returns:
-        An array (n, T) of the same type, T the longest length; a view if all are equal.
+    A value fills short breaths. T is the width, or the longest length; a view if all lengths are T.
     """
-    width = int(lengths.max(initial=0))
+    width = int(lengths.max(initial=0)) if width is None else width
     if (lengths == width).all():
         return values.reshape(len(lengths), width)
-    rows, columns = _places(lengths)
+    rows = np.repeat(np.arange(len(lengths)), lengths)
     out = np.full((len(lengths), width), fill, dtype=values.dtype)
-    out[rows, columns] = values
+    out[rows, np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)] = values
     return out
 
 
-def stack_times(time: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Arrange times in rows, with intervals; in padding, time continues at the last interval.
+def stack_times(
+    time: np.ndarray, lengths: np.ndarray, width: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times, s, (m,) in rows, and intervals, each (n, T); lengths of at least 2, as of `stack`.
 
-    Args:
-        time: s, (m,).
-        lengths: samples of each breath, at least 2, (n,).
-
-    Returns:
-        time and dt, s, each (n, T).
+    In padding, time continues at the last interval.
     """
-    padded = stack(time, lengths, np.nan)
+    padded = stack(time, lengths, np.nan, width)
     if (lengths != padded.shape[1]).any():
         every = np.arange(len(lengths))
         last = padded[every, lengths - 1]
@@ -260,38 +247,40 @@ def stack_times(time: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.n
     return padded, dt
 
 
-def valid_mask(lengths: np.ndarray) -> np.ndarray:
+def valid_mask(lengths: np.ndarray, width: int | None = None) -> np.ndarray:
     """True for samples, False for padding, (n, T)."""
-    return np.arange(int(lengths.max(initial=0))) < lengths[:, None]
+    width = int(lengths.max(initial=0)) if width is None else width
+    return np.arange(width) < lengths[:, None]
+
+
+def arranged(
+    lengths: np.ndarray, time: np.ndarray, samples: Mapping[str, np.ndarray],
+    width: int | None = None, **rest: Any,
+) -> Breaths:  # fmt: skip
+    """Make breaths of consecutive samples; short ones are padded.
+
+    Args:
+        lengths: samples of each breath, at least 2, (n,), summing to m.
+        time: s from the first sample of each breath, (m,).
+        samples: `u_in`, `u_out`, `pressure` and perhaps `flow` and `volume`, (m,) each.
+        width: T; the longest length if not given.
+        rest: other fields of `Breaths`.
+    """
+    times, dt = stack_times(time, lengths, width)
+    rows = {name: stack(values, lengths, FILL[name], width) for name, values in samples.items()}
+    rest = {"time_inferred": np.zeros(len(lengths), bool)} | rest
+    return Breaths(time=times, dt=dt, valid=valid_mask(lengths, width), **rows, **rest)
 
 
 def make_breaths(
-    breath_id: ArrayLike,
-    R: ArrayLike,
-    C: ArrayLike,
-    time: ArrayLike,
-    u_in: ArrayLike,
-    u_out: ArrayLike,
-    pressure: ArrayLike,
-    *,
-    flow: ArrayLike | None = None,
+    breath_id: ArrayLike, R: ArrayLike, C: ArrayLike, time: ArrayLike, u_in: ArrayLike,
+    u_out: ArrayLike, pressure: ArrayLike, *, flow: ArrayLike | None = None,
     volume: ArrayLike | None = None,
-) -> Breaths:
+) -> Breaths:  # fmt: skip
     """Make breaths of equal length from arrays, for instance from a simulation.
 
-    Args:
-        breath_id: whole numbers, each once, (n,).
-        R: cmH2O/(L/s), (n,).
-        C: mL/cmH2O, (n,).
-        time: s, increasing in each breath and starting at 0, (n, T).
-        u_in: %, (n, T).
-        u_out: 0 or 1, (n, T).
-        pressure: cmH2O, (n, T).
-        flow: mL/s, (n, T), or None.
-        volume: mL, (n, T), or None.
-
-    Returns:
-        The breaths, as copies, all valid.
+    Arguments have the units and shapes of the attributes of :class:`Breaths`, and are copied. All
+    samples are valid.
 
     Raises:
         ValueError: if shapes differ, an id occurs twice, or time does not start at 0 and increase.
@@ -304,34 +293,19 @@ def make_breaths(
         raise ValueError("breath_id holds the same id twice; give each breath its own")
     if (times[:, 0] != 0.0).any() or not (np.diff(times, axis=1) > 0.0).all():
         raise ValueError("time must start at 0 in each breath and increase")
-    per_breath = {"R": np.array(R, np.float64), "C": np.array(C, np.float64), "breath_id": ids}
+    labels = {"R": np.array(R, np.float64), "C": np.array(C, np.float64), "breath_id": ids}
+    given = {"u_in": u_in, "u_out": u_out, "pressure": pressure, "flow": flow, "volume": volume}
     samples = {
-        "u_in": np.array(u_in, np.float64),
-        "u_out": np.array(u_out, np.int8),
-        "pressure": np.array(pressure, np.float64),
-        "flow": None if flow is None else np.array(flow, np.float64),
-        "volume": None if volume is None else np.array(volume, np.float64),
+        name: np.array(values, np.int8 if name == "u_out" else np.float64)
+        for name, values in given.items()
+        if values is not None
     }
-    for name, array in (per_breath | samples).items():
+    for name, array in (labels | samples).items():
         shape = times.shape if name in samples else times.shape[:1]
-        if array is not None and array.shape != shape:
+        if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, but {shape} is needed")
-    lengths = np.full(len(ids), times.shape[1])
-    times, dt = stack_times(times.ravel(), lengths)
-    return Breaths(
-        **per_breath,
-        **samples,  # type: ignore[arg-type]
-        time=times,
-        dt=dt,
-        valid=valid_mask(lengths),
-        time_inferred=np.zeros(len(ids), dtype=bool),
-    )
-
-
-def _places(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    starts = np.cumsum(lengths) - lengths
-    rows = np.repeat(np.arange(len(lengths)), lengths)
-    return rows, np.arange(len(rows)) - np.repeat(starts, lengths)
+    flat = {name: array.ravel() for name, array in samples.items()}
+    return arranged(np.full(len(ids), times.shape[1]), times.ravel(), flat, **labels)
 
 
 #: Arrays that every recording has.
@@ -341,13 +315,9 @@ _ALWAYS = (
 
 
 def join(parts: Sequence[Breaths]) -> Breaths:
-    """Join recordings; flow and volume are left out.
+    """Join recordings of equally many samples a breath; ids may occur twice.
 
-    Args:
-        parts: one recording or more; breaths of equally many samples.
-
-    Returns:
-        All breaths, without ``source`` and ``sha256``. Ids may occur twice.
+    Flow, volume, ``source`` and ``sha256`` are left out.
 
     Raises:
         InputError: if there is nothing to join, or the numbers of samples differ.

@@ -12,9 +12,17 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from ventbench.base.files import sha256
-from ventbench.recordings.problems import SHOWN, Place, RecordingError, RecordingProblem, fail
 from ventbench.recordings.rows import Chunk, Source, chunks_of
-from ventbench.recordings.schema import COLUMNS, Kind, check_header
+from ventbench.recordings.schema import (
+    COLUMNS,
+    SHOWN,
+    Kind,
+    Place,
+    RecordingError,
+    RecordingProblem,
+    check_header,
+    fail,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -127,17 +135,7 @@ def data_lines(file: str, kind: Kind) -> Iterator[tuple[int, bytes]]:
 def locate_rows(
     file: str, kind: Kind, names: Sequence[str], rows: Collection[int]
 ) -> dict[int, Place]:
-    """Find data rows in the text of a file.
-
-    Args:
-        file: path.
-        kind: `csv` or `csv.gz`.
-        names: column names of the header.
-        rows: data row numbers, 0 for the first.
-
-    Returns:
-        For each row its line and its cells as written, by column.
-    """
+    """Find data rows, 0 for the first, in a file: line, and cells as written by column."""
     places = {}
     last = max(rows, default=-1)
     for row, (number, text) in enumerate(data_lines(file, kind)):
@@ -151,13 +149,8 @@ def locate_rows(
 def text_problems(
     file: str, kind: Kind, names: Sequence[str]
 ) -> tuple[list[RecordingProblem], int]:
-    """List the cells that are not numbers and the rows that have too few or too many cells.
-
-    Returns:
-        The first `SHOWN` problems, and the count of all.
-    """
-    patterns = [_pattern(name) for name in names]
-    sound = re.compile(",".join(patterns).encode())
+    """Cells that are not numbers and rows of too few or too many cells: the first, and how many."""
+    sound = re.compile(",".join(map(_pattern, names)).encode())
     cell_patterns = {name: re.compile(_pattern(name)) for name in names if name in COLUMNS}
     problems: list[RecordingProblem] = []
     total = 0
@@ -177,12 +170,9 @@ def _pattern(name: str) -> str:
 
 
 def _in_line(
-    file: str,
-    number: int,
-    text: bytes,
-    names: Sequence[str],
+    file: str, number: int, text: bytes, names: Sequence[str],
     patterns: dict[str, re.Pattern[str]],
-) -> list[RecordingProblem]:
+) -> list[RecordingProblem]:  # fmt: skip
     cells = _cells(text)
     if cells is None:
         return [RecordingProblem(file, "the line is not CSV", "Fix the row.", number)]

@@ -8,13 +8,14 @@ is exact. Readings are those of the kept samples, never averages.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import defaultdict
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
-from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
+from ventbench.recordings.breaths import Breaths, arranged
 
 #: Median sampling interval, s, below which a recording is decimated. The dynamics that pressure can
 #: show have time constants of 10 ms and more.
@@ -70,19 +71,14 @@ def is_fast(breaths: Breaths) -> bool:
 
 
 def decimate(breaths: Breaths) -> Decimation:
-    """Keep a reading every 20 ms and a sample at every change of a command.
+    """Keep a reading every 20 ms and a sample at every change of a command, at any rate.
 
-    Args:
-        breaths: n breaths at any rate, for instance 1000 Hz.
-
-    Returns:
-        The breaths with ``valid``, ``time`` and ``dt`` of the kept samples; ``time_inferred``,
-        labels and ids are the same. ``sha256`` still names the file.
+    ``valid``, ``time`` and ``dt`` are of the kept samples. ``sha256`` still names the file.
     """
     lengths = breaths.valid.sum(axis=1)
     kept = [_kept(breaths, i, int(length)) for i, length in enumerate(lengths)]
     counts = np.array([len(nodes) for nodes, _ in kept])
-    columns: dict[str, list[NDArray]] = {name: [] for name in ("time", *FILL)}
+    columns: dict[str, list[NDArray]] = defaultdict(list)
     for i, (nodes, _) in enumerate(kept):
         time = breaths.time[i, nodes]
         columns["time"].append(time)
@@ -92,29 +88,17 @@ def decimate(breaths: Breaths) -> Decimation:
         reading[~np.isin(nodes, kept[i][1])] = np.nan
         columns["pressure"].append(reading)
         for name in ("flow", "volume"):
-            values = getattr(breaths, name)
-            columns[name].append(np.zeros(0) if values is None else values[i, nodes])
+            if (values := getattr(breaths, name)) is not None:
+                columns[name].append(values[i, nodes])
     width = -(-int(counts.max()) // _MULTIPLE) * _MULTIPLE
     flat = {name: np.concatenate(parts) for name, parts in columns.items()}
-    time, dt = _widened(*stack_times(flat["time"], counts), width)
-    optional = {
-        name: None
-        if getattr(breaths, name) is None
-        else _wide(stack(flat[name], counts, np.nan), width, np.nan)
-        for name in ("flow", "volume")
-    }
+    fewer = arranged(
+        counts, flat.pop("time"), flat, width,
+        breath_id=breaths.breath_id, R=breaths.R, C=breaths.C, time_inferred=breaths.time_inferred,
+        source=breaths.source, sha256=breaths.sha256, notes=breaths.notes,
+    )  # fmt: skip
     index = np.stack(
         [np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes, _ in kept]
-    )
-    fewer = replace(
-        breaths,
-        time=time,
-        dt=dt,
-        u_in=_wide(stack(flat["u_in"], counts, FILL["u_in"]), width, FILL["u_in"]),
-        u_out=_wide(stack(flat["u_out"], counts, FILL["u_out"]), width, FILL["u_out"]),
-        pressure=_wide(stack(flat["pressure"], counts, np.nan), width, np.nan),
-        valid=_wide(valid_mask(counts), width, False),
-        **optional,
     )
     return Decimation(fewer, index)
 
@@ -169,16 +153,3 @@ def _spaced(time: Floats) -> Bools:
         if now - last >= _LEAST - 1e-9:
             kept[k], last = True, now
     return kept
-
-
-def _wide(values: NDArray, width: int, fill: float) -> NDArray:
-    """Append columns of a value up to a width."""
-    more = np.full((len(values), width - values.shape[1]), fill, values.dtype)
-    return np.concatenate([values, more], axis=1)
-
-
-def _widened(time: Floats, dt: Floats, width: int) -> tuple[Floats, Floats]:
-    """Times and intervals that go on at the last interval, up to a width."""
-    beyond = np.arange(1, width - time.shape[1] + 1)
-    time = np.concatenate([time, time[:, -1:] + dt[:, -1:] * beyond], axis=1)
-    return time, np.concatenate([dt, np.repeat(dt[:, -1:], len(beyond), axis=1)], axis=1)

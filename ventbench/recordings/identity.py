@@ -93,10 +93,6 @@ def match(breaths: Breaths, known: Fingerprints) -> Matches:
     """Look breaths up among known ones.
 
     Breaths with the same commands and other measured pressures are repeats, not copies.
-
-    Args:
-        breaths: n breaths.
-        known: fingerprints of the others.
     """
     rows: list[dict[int, list[int]]] = [{} for _ in _GRIDS]
     for grid, table in enumerate(rows):

@@ -13,8 +13,7 @@ import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
-from ventbench.recordings.problems import ProblemLog, RecordingError, RecordingProblem, fail
+from ventbench.recordings.breaths import Breaths, arranged
 from ventbench.recordings.report import (
     RecordingReport,
     Tally,
@@ -23,8 +22,16 @@ from ventbench.recordings.report import (
     describe,
     role_problems,
 )
-from ventbench.recordings.scan import Block, Source, join_blocks, locate, open_source, scan
-from ventbench.recordings.times import IntervalTable
+from ventbench.recordings.scan import (
+    Block,
+    IntervalTable,
+    Source,
+    join_blocks,
+    locate,
+    open_source,
+    scan,
+)
+from ventbench.recordings.schema import ProblemLog, RecordingError, RecordingProblem, fail
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -369,25 +376,10 @@ def _assemble(block: Block, table: IntervalTable, file: str) -> Breaths:
             dt = table.estimate(int(block.n_inspiratory[i]), length)
             assert dt is not None  # check_inferable
             time[starts[i] : starts[i] + length] = dt * np.arange(length)
-    times, dts = stack_times(time, block.lengths)
-    samples = {
-        name: stack(values, block.lengths, FILL[name]) for name, values in block.samples.items()
-    }
-    return Breaths(
-        breath_id=block.breath_id,
-        R=block.R,
-        C=block.C,
-        time=times,
-        dt=dts,
-        valid=valid_mask(block.lengths),
-        time_inferred=block.times.blank,
-        source=file,
-        u_in=samples["u_in"],
-        u_out=samples["u_out"],
-        pressure=samples["pressure"],
-        flow=samples.get("flow"),
-        volume=samples.get("volume"),
-    )
+    return arranged(
+        block.lengths, time, block.samples, breath_id=block.breath_id, R=block.R, C=block.C,
+        time_inferred=block.times.blank, source=file,
+    )  # fmt: skip
 
 
 def recordings_dir() -> Path | None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ventbench.recordings.problems import ProblemLog, RecordingProblem
 from ventbench.recordings.roles import breath_figures, few_breaths, findings
-from ventbench.recordings.scan import Block
-from ventbench.recordings.times import IntervalTable, interval_table
+from ventbench.recordings.scan import Block, IntervalTable, interval_table
+from ventbench.recordings.schema import ProblemLog, RecordingProblem
 from ventbench.task.lungs import Lung
 
 PAD_LIMIT = 10
@@ -69,15 +68,9 @@ class RecordingReport:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values."""
-        plain = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        plain["ok"] = self.ok
-        plain["problems"] = [problem.to_dict() for problem in self.problems]
-        plain["warnings"] = [problem.to_dict() for problem in self.warnings]
-        plain["suspicious"] = [problem.to_dict() for problem in self.suspicious]
-        plain["lengths"] = list(self.lengths)
-        plain["optional"] = list(self.optional)
+        plain = asdict(self) | {"ok": self.ok}
         plain["time_inferred"] = {str(key): dt for key, dt in self.time_inferred.items()}
-        return plain
+        return {k: list(x) if isinstance(x, tuple) else x for k, x in plain.items()}
 
     def notes(self) -> tuple[str, ...]:
         """What was inferred, changed or ignored, a sentence each."""
@@ -132,14 +125,7 @@ class RecordingReport:
 
 
 def describe(tally: Tally) -> dict[str, Any]:
-    """Return the fields of a report that describe the content of a file.
-
-    Args:
-        tally: all breaths.
-
-    Returns:
-        Keyword arguments for `RecordingReport`.
-    """
+    """Return the fields of a report that describe the content of a file."""
     lengths = tally.column("lengths")
     pairs, counts = np.unique(
         np.column_stack([tally.column("R"), tally.column("C")]), axis=0, return_counts=True
@@ -147,9 +133,7 @@ def describe(tally: Tally) -> dict[str, Any]:
     return {
         "rows": int(lengths.sum()),
         "breaths": len(tally),
-        "lengths": (int(lengths.min(initial=1 << 62)), int(lengths.max()))
-        if len(tally)
-        else (0, 0),
+        "lengths": (int(lengths.min()), int(lengths.max())) if len(tally) else (0, 0),
         "lungs": {Lung(*pair).id: int(n) for pair, n in zip(pairs.tolist(), counts, strict=True)},
         "interval": _intervals(tally),
         "time_inferred": tally.inferred(),
@@ -250,13 +234,9 @@ class Tally:
 
 
 def check_lengths(tally: Tally, log: ProblemLog, *, pad: bool, expected: int = 0) -> None:
-    """Check that all breaths have the same number of samples.
+    """Check that all breaths have ``expected`` samples; for 0, as many as is most common.
 
-    Args:
-        tally: all breaths.
-        log: receives the problems.
-        pad: allow shorter breaths, unless padding would need far more memory than the file.
-        expected: samples that a breath should have; 0 for the most common length.
+    With ``pad`` they may be shorter, unless padding would need far more memory than the file.
     """
     lengths, first_row = tally.column("lengths").astype(np.int64), tally.column("first_row")
     if len(lengths) == 0:
@@ -287,11 +267,8 @@ def check_inferable(tally: Tally, log: ProblemLog) -> None:
     blank = tally.column("blank").astype(bool)
     if not blank.any():
         return
-    inferred = np.array(list(tally.inferred()), dtype=np.int64)
-    ids = tally.column("breath_id")
-    unknown = blank & ~np.isin(ids, inferred)
-    first_row = tally.column("first_row")
-    for at in np.flatnonzero(unknown):
+    ids, first_row = tally.column("breath_id"), tally.column("first_row")
+    for at in np.flatnonzero(blank & ~np.isin(ids, np.array(list(tally.inferred()), np.int64))):
         what = (
             f"the times of breath {ids[at]} are blank and cannot be inferred: no breath of the "
             "file has times, and u_out does not switch from 0 to 1 in this one"

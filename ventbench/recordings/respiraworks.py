@@ -11,21 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.recordings.problems import fail
 from ventbench.recordings.scan import kind_of
+from ventbench.recordings.schema import fail
 
-SIGNALS = {
-    "pressure": "cmH2O",
-    "flow": "mL/s",
-    "volume": "mL",
-    "target": "cmH2O",
-    "cmd_inh_valve": "as logged",
-    "cmd_exh_valve": "as logged",
-    "cmd_psol": "as logged",
-    "dp_inhale": "as logged",
-    "dp_exhale": "as logged",
-}
-"""Signals of a run and their units."""
+#: Signals of a run and their units.
+SIGNALS = {"pressure": "cmH2O", "flow": "mL/s", "volume": "mL", "target": "cmH2O"} | dict.fromkeys(
+    ("cmd_inh_valve", "cmd_exh_valve", "cmd_psol", "dp_inhale", "dp_exhale"), "as logged"
+)
 _LABELS = ("run", "test", "breath", "time_step", "R", "C", "drive")
 
 
@@ -55,13 +47,7 @@ class RespiraWorksRun:
 
 
 def load_respiraworks(path: str | os.PathLike[str]) -> tuple[RespiraWorksRun, ...]:
-    """Read a RespiraWorks Parquet file.
-
-    Args:
-        path: the file.
-
-    Returns:
-        Its runs in file order.
+    """Read the runs of a RespiraWorks Parquet file, in its order.
 
     Raises:
         RecordingError: if the file cannot be read, lacks a column, or its times do not increase.
@@ -88,16 +74,7 @@ def load_respiraworks(path: str | os.PathLike[str]) -> tuple[RespiraWorksRun, ..
             raise fail(name, what, "Write the file again in time order.")
         signals = {column: rows[column].to_numpy(np.float64) for column in SIGNALS}
         first = rows.iloc[0]
-        runs.append(
-            RespiraWorksRun(
-                str(run),
-                int(str(test)),
-                str(first["drive"]),
-                float(first["R"]),
-                float(first["C"]),
-                rows["breath"].to_numpy(np.int64),
-                time,
-                signals,
-            )
-        )
+        label, breath = (float(first["R"]), float(first["C"])), rows["breath"].to_numpy(np.int64)
+        drive = str(first["drive"])
+        runs.append(RespiraWorksRun(str(run), int(str(test)), drive, *label, breath, time, signals))
     return tuple(runs)

@@ -215,11 +215,8 @@ def findings(
 ) -> tuple[Finding, ...]:
     """What about the roles of columns contradicts physics, the worst first.
 
-    Args:
-        figures: of all breaths, from :func:`breath_figures`.
-        interval: mean sampling interval of each breath, s, NaN if unknown, ``(k,)``.
-        R: labelled resistance, cmH2O/(L/s), ``(k,)``.
-        C: labelled compliance, mL/cmH2O, ``(k,)``.
+    Takes figures of k breaths, from :func:`breath_figures`, their mean sampling intervals, s, NaN
+    if unknown, and labels, cmH2O/(L/s) and mL/cmH2O, ``(k,)`` each.
     """
     found: list[Finding] = []
     low, high = -figures["pressure_low"], figures["pressure_high"]

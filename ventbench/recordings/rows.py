@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ventbench.recordings.problems import ProblemLog, RecordingProblem
-from ventbench.recordings.schema import COLUMNS, Column, Kind
+from ventbench.recordings.schema import COLUMNS, Column, Kind, ProblemLog, RecordingProblem
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -60,14 +59,9 @@ class Rows(Chunk):
 
 
 def whole_breaths(chunks: Iterable[Chunk], batch: int | None = None) -> Iterator[Rows]:
-    """Regroup chunks of a file so that none ends inside a breath.
+    """Regroup chunks of a file, in order, so that none ends inside a breath.
 
-    Args:
-        chunks: the file in order.
-        batch: breaths in each group (the last may have fewer); None for groups of any size.
-
-    Yields:
-        Rows of whole breaths, in order.
+    ``batch`` is the number of breaths in each group (the last may have fewer); None for any.
     """
     held: list[Chunk] = []
     held_breaths = 0
@@ -199,15 +193,9 @@ _OFTEN = 10
 
 
 def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str, np.ndarray]:
-    """Check each cell: blank, infinite, out of range.
+    """Check each cell: blank, infinite, out of range. Return the columns.
 
-    Args:
-        rows: whole breaths.
-        log: receives the problems.
-        clip: clip u_in to 0..100 % with a warning; otherwise it is a problem.
-
-    Returns:
-        The columns, with u_in clipped on request.
+    With ``clip``, u_in is clipped to 0..100 % with a warning; otherwise it is a problem.
     """
     columns = dict(rows.columns)
     _add_blank(rows, log, "breath_id", rows.blank_id)
@@ -229,7 +217,7 @@ def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str
         level, advice = "problem", column.advice
         what = f"{{value}} is outside {column.span}"
         if name == "u_in" and clip:
-            level, advice, what = "warning", "It was clipped.", what
+            level, advice = "warning", "It was clipped."
             columns[name] = np.where(infinite, values, np.clip(values, column.low, column.high))
         elif name == "u_out":
             what = "{value} is neither 0 nor 1"
@@ -272,10 +260,7 @@ def _outside(values: np.ndarray, column: Column) -> np.ndarray:
 def check_ids(rows: Rows, log: ProblemLog, seen: dict[int, int]) -> None:
     """Check that the rows of each breath follow one another.
 
-    Args:
-        rows: whole breaths.
-        log: receives the problems.
-        seen: first row of each breath so far, by breath_id; new breaths are added.
+    ``seen`` holds the first row of each breath so far, by breath_id; new breaths are added.
     """
     again, first = [], []
     starts = rows.row0 + rows.starts
@@ -285,14 +270,11 @@ def check_ids(rows: Rows, log: ProblemLog, seen: dict[int, int]) -> None:
         if earlier != row:
             again.append(row)
             first.append(earlier)
-    log.add(
-        np.array(again, dtype=np.int64),
-        "breath_id",
-        "breath {value} comes again, it is already at {other}",
-        "Keep the rows of a breath together, and give each breath an id of its own.",
-        values=np.array([rows.columns["breath_id"][row - rows.row0] for row in again]),
-        others=np.array(first, dtype=np.int64),
-    )
+    what = "breath {value} comes again, it is already at {other}"
+    advice = "Keep the rows of a breath together, and give each breath an id of its own."
+    at = np.array(again, dtype=np.int64)
+    values, others = rows.columns["breath_id"][at - rows.row0], np.array(first, dtype=np.int64)
+    log.add(at, "breath_id", what, advice, values=values, others=others)
 
 
 def check_lung(rows: Rows, log: ProblemLog) -> None:
@@ -306,38 +288,24 @@ def check_lung(rows: Rows, log: ProblemLog) -> None:
         if len(at) == 0:
             continue
         at = at[np.unique(breath[at], return_index=True)[1]]
-        log.add(
-            rows.row0 + at,
-            name,
-            f"{name} changes to {{value}} within the breath, which starts at {{other}}",
-            "A breath has one lung: give the second part its own breath_id, or fix the row.",
-            values=values[at],
-            others=rows.row0 + rows.starts[breath[at]],
-        )
+        what = f"{name} changes to {{value}} within the breath, which starts at {{other}}"
+        advice = "A breath has one lung: give the second part its own breath_id, or fix the row."
+        others = rows.row0 + rows.starts[breath[at]]
+        log.add(rows.row0 + at, name, what, advice, values=values[at], others=others)
 
 
 def check_single(rows: Rows, log: ProblemLog) -> None:
     """Check that each breath has at least two samples."""
     at = rows.starts[rows.lengths == 1]
-    log.add(
-        rows.row0 + at,
-        "breath_id",
-        "breath {value} has one sample, at least two are needed",
-        "Remove it, or keep the rows of a breath together.",
-        values=rows.columns["breath_id"][at],
-    )
+    what = "breath {value} has one sample, at least two are needed"
+    advice = "Remove it, or keep the rows of a breath together."
+    log.add(rows.row0 + at, "breath_id", what, advice, values=rows.columns["breath_id"][at])
 
 
 def check_row_ids(rows: Rows, log: ProblemLog, last: int | None) -> int:
     """Warn where the column id, which is not used otherwise, does not increase.
 
-    Args:
-        rows: whole breaths.
-        log: receives the warnings.
-        last: id of the row before, or None at the start.
-
-    Returns:
-        The last id.
+    Takes the id of the row before, None at the start, and returns the last id.
     """
     ids = rows.columns["id"]
     before = np.concatenate([ids[:1] - 1 if last is None else [last], ids[:-1]])
@@ -356,10 +324,6 @@ def check_times(rows: Rows, log: ProblemLog) -> None:
 
     Repeated rows are reported as such. In breaths without times, a row is a repeat if it equals the
     row before in every column, including `id`.
-
-    Args:
-        rows: whole breaths.
-        log: receives the problems.
     """
     time = rows.columns["time_step"]
     breath = np.repeat(np.arange(len(rows.starts)), rows.lengths)
@@ -390,21 +354,12 @@ def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarr
 
 
 def _add_repeat(
-    rows: Rows,
-    log: ProblemLog,
-    previous: np.ndarray,
-    here: np.ndarray,
-    column: str,
+    rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarray, column: str,
     values: np.ndarray,
-) -> None:
-    log.add(
-        rows.row0 + here,
-        column,
-        "the row repeats {other}",
-        "Remove one of the two.",
-        values=values[here],
-        others=rows.row0 + previous,
-    )
+) -> None:  # fmt: skip
+    what, advice = "the row repeats {other}", "Remove one of the two."
+    others = rows.row0 + previous
+    log.add(rows.row0 + here, column, what, advice, values=values[here], others=others)
 
 
 def _same(rows: Rows, first: np.ndarray, other: np.ndarray, names: object) -> np.ndarray:

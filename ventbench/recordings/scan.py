@@ -1,22 +1,29 @@
 """A file as checked blocks of whole breaths, which `load`, `iter_breaths` and `check` share.
 
 Parquet is read here in batches, CSV in :mod:`ventbench.recordings.csv_source`.
+
+Blank times: a few in a breath are interpolated, those of a whole breath are inferred. Inspiration
+lasts 1.0 s, so a breath whose first n samples have u_out = 0 has an interval near 1.0 s / n. The
+ventilators behind a file have few different intervals (PVP: 31.9 and 34.0 ms), so a better estimate
+is the median interval of the file's breaths with the same n, if there are at least `ENOUGH` of
+them. On the 135 PVP breaths whose times are known, leaving each out, the median estimate is off by
+0.12 ms in the median, 0.34 ms at 90 % and 2.9 ms at worst; 1.0 s / n is off by 0.41, 0.71 and 3.5
+ms. If u_out never switches, n says nothing and the median of all breaths is taken.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ventbench.base.errors import InputTypeError, require
 from ventbench.base.files import sha256
 from ventbench.recordings.csv_source import CsvSource, locate_rows
-from ventbench.recordings.problems import Place, ProblemLog, RecordingError, RecordingProblem, fail
 from ventbench.recordings.rows import (
     Chunk,
     Rows,
@@ -30,8 +37,16 @@ from ventbench.recordings.rows import (
     chunks_of,
     whole_breaths,
 )
-from ventbench.recordings.schema import COLUMNS, Kind, check_header
-from ventbench.recordings.times import KnownTimes, known_times, leading_zeros
+from ventbench.recordings.schema import (
+    COLUMNS,
+    Kind,
+    Place,
+    ProblemLog,
+    RecordingError,
+    RecordingProblem,
+    check_header,
+    fail,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -219,6 +234,110 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
     return "csv"
 
 
+ENOUGH = 3
+"""Least number of breaths with the same n whose median is used."""
+INSPIRATION = 1.0
+"""Duration of inspiration, s."""
+
+
+@dataclass(frozen=True)
+class IntervalTable:
+    """Sampling intervals of a file's breaths with known times.
+
+    Attributes:
+        by_count: median interval, s, by number of inspiratory samples.
+        overall: median interval of all breaths, s, or None if no breath has times.
+    """
+
+    by_count: dict[int, float]
+    overall: float | None
+
+    def estimate(self, n_inspiratory: int, length: int) -> float | None:
+        """Interval of a breath without times, s, of n inspiratory samples of so many in all.
+
+        None if no breath of the file has times and u_out does not switch.
+        """
+        if not 0 < n_inspiratory < length:
+            return self.overall
+        return self.by_count.get(n_inspiratory, INSPIRATION / n_inspiratory)
+
+
+def interval_table(n_inspiratory: np.ndarray, interval: np.ndarray) -> IntervalTable:
+    """Tabulate the intervals of a file.
+
+    Args:
+        n_inspiratory: leading samples with u_out = 0, (k,).
+        interval: mean sampling interval, s, NaN where times are blank, (k,).
+    """
+    known = np.isfinite(interval)
+    counts, intervals = n_inspiratory[known], interval[known]
+    by_count = {
+        int(n): float(np.median(intervals[counts == n]))
+        for n, many in zip(*np.unique(counts, return_counts=True), strict=True)
+        if many >= ENOUGH
+    }
+    return IntervalTable(by_count, float(np.median(intervals)) if len(intervals) else None)
+
+
+def leading_zeros(u_out: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Count the leading samples with u_out = 0, ``(m,)``, of each breath, (k,).
+
+    ``starts`` is the first row of each breath, and ``lengths`` the number of its rows, (k,).
+    """
+    within = np.arange(len(u_out)) - np.repeat(starts, lengths)
+    switched = np.where(u_out != 0, within, len(u_out))
+    return np.minimum(np.minimum.reduceat(switched, starts), lengths)
+
+
+@dataclass(frozen=True)
+class KnownTimes:
+    """Times of breaths, with what follows from each breath alone.
+
+    Attributes:
+        time: s from the breath's first sample, NaN in all of a breath without times, (m,).
+        blank: breaths with fewer than two times, which have none then, (k,) bool.
+        interpolated: number of single times that are interpolated, (k,).
+        shifted: breaths that do not start at 0 in the file, (k,) bool.
+    """
+
+    time: np.ndarray
+    blank: np.ndarray
+    interpolated: np.ndarray
+    shifted: np.ndarray
+
+
+def known_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> KnownTimes:
+    """Interpolate single blank times and shift each breath to start at 0.
+
+    Blank times between two known ones are linear in the sample number; those before the first or
+    after the last known one are extrapolated at the breath's mean interval. Times are as in the
+    file, s, NaN where blank, (m,); starts and lengths as of :func:`leading_zeros`.
+    """
+    missing = np.isnan(time)
+    n_missing = np.add.reduceat(missing.astype(np.int64), starts)
+    blank = lengths - n_missing < 2
+    partial = (n_missing > 0) & ~blank
+    if partial.any():
+        time = time.copy()
+        for breath in np.flatnonzero(partial):
+            span = slice(starts[breath], starts[breath] + lengths[breath])
+            time[span] = _interpolate(time[span])
+    first = time[starts]
+    shifted = np.isfinite(first) & (first != 0.0) & ~blank
+    time = time - np.repeat(np.where(blank, np.nan, first), lengths)
+    return KnownTimes(time, blank, np.where(partial, n_missing, 0), shifted)
+
+
+def _interpolate(time: np.ndarray) -> np.ndarray:
+    at = np.arange(len(time))
+    known = np.flatnonzero(np.isfinite(time))
+    first, last = known[0], known[-1]
+    slope = (time[last] - time[first]) / (last - first)
+    filled = np.interp(at, known, time[known])
+    filled = np.where(at < first, time[first] + slope * (at - first), filled)
+    return np.where(at > last, time[last] + slope * (at - last), filled)
+
+
 @dataclass(frozen=True)
 class Block:
     """k whole breaths with m samples in all.
@@ -250,16 +369,11 @@ class Block:
 def scan(
     source: Source, log: ProblemLog, *, clip: bool = False, batch: int | None = None
 ) -> Iterator[Block]:
-    """Read and check a file.
+    """Read and check a file: blocks in its order, of ``batch`` breaths, or any number for None.
 
-    Args:
-        source: an open file.
-        log: receives all problems and warnings except those of the whole file (unequal lengths).
-        clip: bring u_in into 0..100 %.
-        batch: breaths in a block; None for blocks of any size.
-
-    Yields:
-        Blocks in file order, also after a problem; their values must not be used then.
+    The log receives all problems and warnings except those of the whole file (unequal lengths).
+    There are blocks after a problem too; their values must not be used. ``clip`` brings u_in into
+    0..100 %.
 
     Raises:
         RecordingError: the file cannot be parsed.
@@ -285,43 +399,25 @@ def _block(rows: Rows, columns: dict[str, np.ndarray]) -> Block:
     samples = {name: columns[name] for name in keep if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
     return Block(
-        breath_id=columns["breath_id"][starts],
-        R=columns["R"][starts],
-        C=columns["C"][starts],
-        first_row=rows.row0 + starts,
-        lengths=lengths,
+        breath_id=columns["breath_id"][starts], R=columns["R"][starts], C=columns["C"][starts],
+        first_row=rows.row0 + starts, lengths=lengths,
         n_inspiratory=leading_zeros(samples["u_out"], starts, lengths),
-        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
-        times=times,
+        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1), times=times,
         samples=samples,
-    )
+    )  # fmt: skip
 
 
 def join_blocks(blocks: Sequence[Block]) -> Block:
-    """Join blocks.
-
-    Args:
-        blocks: one block or more.
-
-    Returns:
-        One block with all breaths in order.
-    """
+    """Join one block or more, in order."""
     if len(blocks) == 1:
         return blocks[0]
 
-    def merged(values: Iterable[np.ndarray]) -> np.ndarray:
-        return np.concatenate(list(values))
+    def merged(parts: Sequence[Any]) -> Any:
+        if isinstance(parts[0], np.ndarray):
+            return np.concatenate(parts)
+        if isinstance(parts[0], dict):
+            return {name: merged([part[name] for part in parts]) for name in parts[0]}
+        names = [field.name for field in fields(parts[0])]
+        return type(parts[0])(*(merged([getattr(part, name) for part in parts]) for name in names))
 
-    times = KnownTimes(
-        **{
-            field.name: merged(getattr(block.times, field.name) for block in blocks)
-            for field in fields(KnownTimes)
-        }
-    )
-    samples = {name: merged(block.samples[name] for block in blocks) for name in blocks[0].samples}
-    others = {
-        field.name: merged(getattr(block, field.name) for block in blocks)
-        for field in fields(Block)
-        if field.name not in ("times", "samples")
-    }
-    return Block(**others, times=times, samples=samples)
+    return merged(blocks)

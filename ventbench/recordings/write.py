@@ -25,15 +25,9 @@ BATCH = 4096
 def write(breaths: Breaths, path: str | os.PathLike[str], *, blank_inferred: bool = True) -> None:
     """Write breaths to CSV, gzipped CSV or Parquet, by the ending of the name.
 
-    Numbers read back exactly. Padding is left out; NaN is written blank.
-    The same breaths give the same bytes.
-
-    Args:
-        breaths: breaths to write; at least one.
-        path: ends in .csv, .csv.gz, .parquet or .pq; an existing file is replaced,
-            a missing folder is made.
-        blank_inferred: write inferred times blank, as they were read, so that nobody takes them for
-            measurements; False writes the estimates.
+    Numbers read back exactly. Padding is left out; NaN is written blank. The same breaths give the
+    same bytes. An existing file is replaced, a missing folder made. Inferred times are written
+    blank, as they were read, so that nobody takes them for measurements; or else the estimates.
 
     Raises:
         InputError: if there are no breaths, or the name has another ending.

@@ -49,12 +49,10 @@ class Data:
     def select(self, which: ArrayLike | slice) -> Data:
         """Select breaths by mask, index or slice; they keep their positions."""
         index = which if isinstance(which, slice) else np.asarray(which)
-        return Data(**{name: array[index] for name, array in self._arrays().items()})
+        return Data(**{name: array[index] for name, array in vars(self).items()})
 
     def with_pressure(self, pressure: ArrayLike) -> Data:
-        """Replace the pressure, cmH2O, ``(n, T)``, for example by a simulator's response.
-
-        A sample without a measured pressure keeps its weight of zero.
+        """Replace the pressure, cmH2O, ``(n, T)``; blank samples keep their weight of zero.
 
         Raises:
             InputError: if the shape differs, or a pressure with weight is not finite.
@@ -70,17 +68,11 @@ class Data:
         measured = np.where(weight > 0, pressure[:, None], 0.0)
         return replace(self, measured=measured, weight=weight)
 
-    def _arrays(self) -> dict[str, Floats]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
 
 def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None = None) -> Data:
-    """Make the data of a fit from a recording.
+    """Make the data of a fit from a recording, with its flow if that is asked for.
 
-    Args:
-        breaths: breaths to convert; at least one.
-        flow: use the recorded flow as well.
-        position: place of each breath in its recording; evenly from 0 to 1 if not given.
+    Positions, the place of each breath in its recording, are evenly from 0 to 1 if not given.
 
     Raises:
         InputError: if there is no breath, no pressure or, when asked for, no flow.
@@ -98,13 +90,7 @@ def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | Non
         raise InputError("no pressure is measured in these breaths")
     if position is None:
         position = np.linspace(0.0, 1.0, len(breaths)) if len(breaths) > 1 else np.zeros(1)
-    return Data(
-        u_in=breaths.u_in.astype(float),
-        u_out=breaths.u_out.astype(float),
-        dt=breaths.dt.astype(float),
-        measured=np.where(weight > 0, measured, 0.0),
-        weight=weight,
-        R=breaths.R.astype(float),
-        C=breaths.C.astype(float),
-        position=np.asarray(position, float),
-    )
+    names = ("u_in", "u_out", "dt", "R", "C")
+    plain = {name: getattr(breaths, name).astype(float) for name in names}
+    known = np.where(weight > 0, measured, 0.0)
+    return Data(measured=known, weight=weight, position=np.asarray(position, float), **plain)

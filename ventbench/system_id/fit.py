@@ -106,18 +106,12 @@ class Fit:
 
 
 def fit(
-    data: Data,
-    mechanisms: Iterable[str] = (),
-    *,
-    free: Iterable[str] = (),
-    fixed: Mapping[str, ArrayLike] | None = None,
-    start: Mapping[str, ArrayLike] | None = None,
+    data: Data, mechanisms: Iterable[str] = (), *, free: Iterable[str] = (),
+    fixed: Mapping[str, ArrayLike] | None = None, start: Mapping[str, ArrayLike] | None = None,
     groups: Mapping[str, ArrayLike] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    noise: Noise | None = None,
-    predictor: Predictor | None = None,
-    iterations: int = 40,
-) -> Fit:
+    prior: Mapping[str, tuple[float, float]] | None = None, noise: Noise | None = None,
+    predictor: Predictor | None = None, iterations: int = 40,
+) -> Fit:  # fmt: skip
     """Fit a hypothesis: R, C, R_ex, PEEP, starting pressures and parameters of mechanisms.
 
     Mechanisms start at their mild strength, because some have little slope at zero. Parameters with
@@ -165,12 +159,9 @@ def fit(
 
 
 def refit_breath_parameters(fitted: Fit, data: Data, *, free: Iterable[str] = ()) -> Fit:
-    """Evaluate a fit on other breaths; only parameters of scope ``breath`` are fitted to them.
+    """Evaluate a fit on other breaths, to which parameters of scope ``breath`` are fitted alone.
 
-    Args:
-        fitted: a fit; its shared parameters stay, those of the same label where it has several.
-        data: other breaths.
-        free: further paths to fit.
+    Its shared parameters stay, those of the same label where it has several, but for ``free``.
     """
     layout, names = fitted.problem.unknowns, fitted.problem.predictor.names
     own = {p for p in layout.paths if parameter_of(p).scope == "breath"} | set(free) | {"position"}
@@ -341,11 +332,6 @@ def profile_interval(fit: Fit, path: str, group: int = 0) -> tuple[float, float]
     All other unknowns are refitted at each trial value. The interval contains the values whose cost
     exceeds the minimum by less than half the squared 97.5 % quantile of Student's t, times the
     factor by which the sandwich covariance exceeds the inverse Hessian.
-
-    Args:
-        fit: a fit.
-        path: a free parameter.
-        group: index of the group of breaths.
     """
     layout = fit.problem.unknowns
     unknown, parameter = int(layout.of(path)[group]), parameter_of(path)

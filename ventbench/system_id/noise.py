@@ -84,13 +84,10 @@ class Noise:
 def robust_noise(
     residual: Floats, weight: Floats, *, floor: float = LEAST_SIGMA, tail: float = Noise.tail
 ) -> Noise:
-    """Estimate the noise from residuals, robust against outliers.
+    """Estimate the noise from residuals ``(n, c, T)``, robust against outliers.
 
-    Args:
-        residual: measured minus simulated, or the reverse, ``(n, c, T)``.
-        weight: 1 where measured, else 0, ``(n, c, T)``.
-        floor: smallest sigma of pressure, cmH2O; that of flow is 20 times as large, mL/s.
-        tail: tail parameter of the returned noise.
+    ``weight`` is 1 where measured, else 0. ``floor`` is the smallest sigma of pressure, cmH2O; that
+    of flow is 20 times as large, mL/s.
     """
     sigma, ar = [], []
     for channel in range(residual.shape[1]):

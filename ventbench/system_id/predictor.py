@@ -22,7 +22,6 @@ from ventbench.base.executor import parallel_map
 from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.physics.dead_time import resolution_of
-from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.model import Physics
 from ventbench.system_id.data import Data
 
@@ -120,12 +119,9 @@ class Predictor:
     """
 
     def __init__(
-        self,
-        data: Data,
-        names: tuple[str, ...],
-        substeps: int | None = None,
+        self, data: Data, names: tuple[str, ...], substeps: int | None = None,
         sizes: tuple[int, ...] = SIZES,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Choose the sizes to compile for.
 
         Args:
@@ -134,8 +130,7 @@ class Predictor:
             substeps: number of substeps in a sample; enough for most purposes if not given. An edge
                 that a dead time shifts is smoothed over one substep, and the dead time is uncertain
                 by part of it.
-            sizes: numbers of simulations to compile for; the least that holds all breaths, or the
-                last, and eight times as many are used.
+            sizes: numbers of simulations to compile for, see :data:`SIZES`.
         """
         self.names = names
         self._large_steps = False
@@ -276,13 +271,7 @@ def _divisions_at(path: str, values: Floats) -> int:
 def _has_dead_time(path: str) -> bool:
     """Whether a parameter belongs to a mechanism that delays a command."""
     owner = path.rpartition(".")[0]
-    if not owner:
-        return False
-    own = type(mechanism(owner))
-    return (
-        own.dead_time is not Mechanism.dead_time
-        or own.outlet_dead_time is not Mechanism.outlet_dead_time
-    )
+    return bool(owner) and any(mechanism(owner).has(x) for x in ("dead_time", "outlet_dead_time"))
 
 
 def _blocks(count: int, size: int) -> list[tuple[int, int, int]]:

@@ -122,14 +122,11 @@ class Unknowns:
 def make_unknowns(
     data: Data, paths: Iterable[str], groups: Mapping[str, ArrayLike] | None = None
 ) -> Unknowns:
-    """Lay out the unknowns of a fit.
+    """Lay out the unknowns of a fit with free parameters of some paths.
 
-    Args:
-        data: the breaths.
-        paths: free parameters.
-        groups: breaths that share a parameter, by its path, as whole numbers ``(n,)``. By default,
-            R and C belong to the lung, a parameter of scope ``breath`` to the breath, and all
-            others are shared by all breaths.
+    Groups are breaths that share a parameter, by its path, as whole numbers ``(n,)``. By default, R
+    and C belong to the lung, a parameter of scope ``breath`` to the breath, and all others are
+    shared by all breaths.
 
     Raises:
         InputError: if a group does not fit the data, or a parameter appears twice.
@@ -255,10 +252,7 @@ class Problem:
         The cost of a model that rings has many local minima. With larger steps the integrator damps
         the ringing, and most of these minima are gone.
 
-        Args:
-            x: start, ``(U,)``.
-            tolerance: see :func:`~ventbench.system_id.levenberg_marquardt.minimise`.
-            iterations: most evaluations of the normal equations.
+        Options as of :func:`~ventbench.system_id.levenberg_marquardt.minimise`.
         """
         if not any(needs_small_steps(path) for path in self.unknowns.paths):
             return x
@@ -302,12 +296,7 @@ class Problem:
     def at_likeliest_changes(self, x: Floats, least: float) -> Floats | None:
         """The point with each change between the breaths where it is likeliest, all else as it is.
 
-        Args:
-            x: unknowns, ``(U,)``.
-            least: nats by which another place must be likelier.
-
-        Returns:
-            The point; None if no change moves.
+        Another place must be likelier by ``least`` nats; None if no change moves.
         """
         moved = None
         for path in self.unknowns.paths:
@@ -338,10 +327,8 @@ class Problem:
 def parameter_values(data: Data, names: tuple[str, ...], given: Mapping[str, ArrayLike]) -> Floats:
     """Physical values of all columns of a predictor, ``(n, P + 1)``.
 
-    Args:
-        data: R, C, positions and starting pressures come from here.
-        names: paths of the predictor.
-        given: other values by path, a number or one for each breath; the rest is neutral.
+    R, C, positions and starting pressures are those of the data, unless they are given by path as
+    others are, a number or one for each breath; the rest is neutral.
 
     Raises:
         InputError: if a name is unknown or a value outside its bounds.

@@ -105,13 +105,7 @@ all_slopes = jax.jit(jax.vmap(jax.jacfwd(_pressures, argnums=2)))
 
 
 def pressures(plants: Plant, cells: Scenario, u_in: Floats) -> Floats:
-    """Airway pressures that commands give, cmH2O, shape ``(n, COMMANDS)``; call it in float64.
-
-    Args:
-        plants: leaves ``(n, ...)``.
-        cells: batch shape ``(n,)``.
-        u_in: %, shape ``(n, COMMANDS)``.
-    """
+    """Airway pressures that n commands, %, give, cmH2O, ``(n, COMMANDS)``; call it in float64."""
     return _in_batches(all_pressures, plants, cells, u_in)
 
 
@@ -127,13 +121,9 @@ def _in_batches(function: Any, plants: Plant, cells: Scenario, u_in: Floats) -> 
 
 
 def attainable(
-    plants: Plant,
-    cells: Scenario,
-    *,
-    starts: Sequence[int | Floats] = STARTS,
-    iterations: int = ITERATIONS,
-    progress: Progress | None = None,
-) -> Attainable:
+    plants: Plant, cells: Scenario, *, starts: Sequence[int | Floats] = STARTS,
+    iterations: int = ITERATIONS, progress: Progress | None = None,
+) -> Attainable:  # fmt: skip
     """Bound the least error of cells from above and below; see the module.
 
     Args:
@@ -162,23 +152,18 @@ def attainable(
         miss = pip - pressures(plants, cells, witness)
         slopes = _in_batches(all_slopes, plants, cells, witness)
         programs = LinearPrograms(COMMANDS)
-        gains = [
-            np.mean(np.abs(miss[i])) - programs.solve(miss[i], slopes[i], witness[i], radius)[1]
-            for i, radius in enumerate(np.full(n, CERTIFICATE_RADIUS))
-        ]
+        near = (miss, slopes, witness, np.full(n, CERTIFICATE_RADIUS))
+        left = [programs.solve(*own)[1] for own in zip(*near, strict=True)]
+        gains = np.mean(np.abs(miss), axis=1) - left
         full = np.full((n, COMMANDS), protocol.U_MAX)
         lower = np.mean(np.maximum(pip - pressures(plants, cells, full), 0.0), axis=1)
-    return Attainable(best, lower, np.array(gains), witness)
+    return Attainable(best, lower, gains, witness)
 
 
 def _descend(
-    plants: Plant,
-    cells: Scenario,
-    pip: Floats,
-    u_in: Floats,
-    iterations: int,
+    plants: Plant, cells: Scenario, pip: Floats, u_in: Floats, iterations: int,
     progress: Callable[[int], object],
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Improve commands in place; returns their errors, cmH2O, shape ``(n,)``."""
     n = len(u_in)
     miss = pip - pressures(plants, cells, u_in)
@@ -240,16 +225,13 @@ class LinearPrograms:
     def solve(
         self, miss: Floats, slopes: Floats, u_in: Floats, radius: float
     ) -> tuple[Floats, float]:
-        """Solve one program.
+        """Solve one program: change of the commands, %, and the mean, cmH2O.
 
         Args:
             miss: target minus pressure, cmH2O, shape ``(m,)``.
             slopes: derivative of each pressure by each command, cmH2O per %, shape ``(m, m)``.
             u_in: commands, %, shape ``(m,)``.
             radius: most that a command may change by, %.
-
-        Returns:
-            Change of the commands, %, and the mean, cmH2O.
         """
         program, m = self._program, len(miss)
         low, high = np.maximum(-radius, -u_in), np.minimum(radius, protocol.U_MAX - u_in)
@@ -273,15 +255,9 @@ ADAM_ITERATIONS, ADAM_RATE = 1500, 0.12
 
 
 def second_optimum(plants: Plant, cells: Scenario, *, iterations: int = ADAM_ITERATIONS) -> NDArray:
-    """Least error that Adam finds in cells.
+    """Least error that Adam finds in n cells, in so many iterations of each start, cmH2O, ``(n,)``.
 
-    Args:
-        plants: leaves ``(n, ...)``.
-        cells: batch shape ``(n,)``; their noise is not used.
-        iterations: of each start.
-
-    Returns:
-        Mean of ``|p - PIP|`` over steps 2 to 34, cmH2O, shape ``(n,)``.
+    It is the mean of ``|p - PIP|`` over steps 2 to 34; noise of the cells is not used.
     """
     n = np.shape(cells.pip)[0]
     cells = cells.replace(noise=np.zeros((n, 1, 1)))  # type: ignore[attr-defined]

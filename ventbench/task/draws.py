@@ -156,16 +156,10 @@ class Draws:
 
 
 def build(
-    rigs: Sequence[Sequence[int]],
-    members: int,
-    *,
-    held_out: Sequence[Sequence[int]] = (),
-    drawn: Plant | None = None,
-    seed: bytes = DEVELOPMENT_SEED,
-    name: str = DEVELOPMENT,
-    n: int = COUNT,
-    pips: Sequence[float] = protocol.PIPS,
-) -> Draws:
+    rigs: Sequence[Sequence[int]], members: int, *, held_out: Sequence[Sequence[int]] = (),
+    drawn: Plant | None = None, seed: bytes = DEVELOPMENT_SEED, name: str = DEVELOPMENT,
+    n: int = COUNT, pips: Sequence[float] = protocol.PIPS,
+) -> Draws:  # fmt: skip
     """Make the draws of a seed; the result is the same everywhere.
 
     The rigs of a lung of one kind are drawn equally often, up to one, and so are the members. The
@@ -227,23 +221,15 @@ def build(
     rig = np.array(places)
     turns = [_balanced(uniform(f"member {k}", (n + 1,)), members) for k in range(len(rigs))]
     return Draws(
-        name=name,
-        commitment=commitment(seed),
-        cells=deviate(pip, values, quantum, noise),
-        rig=rig,
-        member=np.where(rig >= FIRST_DRAWN, 0, turns),
-        ranked=ranked(rig),
-        drawn=drawn,
-    )
+        name=name, commitment=commitment(seed), cells=deviate(pip, values, quantum, noise), rig=rig,
+        member=np.where(rig >= FIRST_DRAWN, 0, turns), ranked=ranked(rig), drawn=drawn,
+    )  # fmt: skip
 
 
 def ranked(rig: Ints) -> Bools:
-    """Whether each draw is ranked, shape ``(n,)``.
+    """Whether each draw is ranked, ``(n,)``, by its rig of each lung, ``(L, n)``.
 
     In a round those are ranked that are on rigs that nobody trained on; in practice all are shown.
-
-    Args:
-        rig: of each lung and draw, shape ``(L, n)``; see :class:`Draws`.
     """
     count = rig.shape[1]
     if not np.any(rig >= FIRST_DRAWN):
@@ -252,12 +238,9 @@ def ranked(rig: Ints) -> Bools:
 
 
 def _places(
-    rigs: Sequence[int],
-    held_out: Sequence[int],
-    anew: bool,
-    uniform: Callable[[tuple[int, ...]], Floats],
-    n: int,
-) -> Ints:
+    rigs: Sequence[int], held_out: Sequence[int], anew: bool,
+    uniform: Callable[[tuple[int, ...]], Floats], n: int,
+) -> Ints:  # fmt: skip
     """Rig of each draw of one lung."""
     kind = np.resize(np.array(PATTERN), n)
     kind[(kind == DRAWN) & (not anew)] = HELD_OUT
@@ -279,14 +262,9 @@ def _log_gain(numbers: Any, xp: Any) -> Any:
 
 
 def _balanced(numbers: Floats, choices: int) -> Ints:
-    """Deal choices to draws equally often, up to one, in random order.
+    """Deal ``0..choices - 1`` to draws equally often, up to one, in random order.
 
-    Args:
-        numbers: uniform; the first says which choice is dealt first.
-        choices: how many there are.
-
-    Returns:
-        ``0..choices - 1``, shape of ``numbers`` but for the first.
+    The numbers are uniform; the first says which choice is dealt first, and each other is a draw.
     """
     order = np.argsort(np.argsort(numbers[1:], kind="stable"), kind="stable")
     return (order + int(numbers[0] * choices)) % choices
@@ -295,16 +273,11 @@ def _balanced(numbers: Floats, choices: int) -> Ints:
 def with_nominal(
     drawn: Draws | None, reference: Sequence[int], pips: Sequence[float]
 ) -> tuple[Scenario, Ints, Ints]:
-    """Nominal cells of the reference rigs in front of the draws.
-
-    Args:
-        drawn: n draws of L lungs; None for none.
-        reference: session of each lung's reference rig, length L; its member is 0.
-        pips: cmH2O, length P.
+    """Nominal cells, at P PIPs, cmH2O, of the reference rigs in front of n draws of L lungs.
 
     Returns:
         Cells of batch shape ``(L, 1 + n, P)`` with numpy leaves, and the session and the member of
-        each lung, both of shape ``(L, 1 + n)``.
+        each lung, both of shape ``(L, 1 + n)``; the member of a reference rig is 0.
     """
     count = len(reference)
     with precision.float64():
@@ -388,11 +361,7 @@ def commitment(seed: bytes) -> str:
 
 
 def random_scenarios(
-    key: Array,
-    pip: Array,
-    *,
-    spread: Array | float | None = None,
-    smooth: bool = False,
+    key: Array, pip: Array, *, spread: Array | float | None = None, smooth: bool = False
 ) -> Scenario:
     """Draw new cells from the distributions of the development draws, for training.
 
@@ -400,15 +369,11 @@ def random_scenarios(
 
     Args:
         key: JAX key of all random numbers.
-        pip: nominal PIP of each cell, cmH2O, shape ``(n,)``.
-        spread: reach of the deviations of each cell, as a multiple of the draws' ranges, shape
-            ``(n,)`` or ``()``; 0 for nominal cells. The delay stays below one step. If not given,
-            the ranges themselves.
+        pip: nominal PIP of each of n cells, cmH2O, shape ``(n,)``.
+        spread: reach of the deviations, as a multiple of the draws' ranges, ``(n,)`` or ``()``; 0
+            for nominal cells, None for the ranges themselves. The delay stays below one step.
         smooth: represent the converter by noise of one step's width, since rounding has no
             derivative; else the cells round.
-
-    Returns:
-        Cells of batch shape ``(n,)``.
     """
     n = pip.shape[0]
     keys = jax.random.split(key, len(RANGES) + 3)
@@ -446,27 +411,15 @@ def _nominal(name: str) -> float:
 
 
 def deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -> Scenario:
-    """Cells of nominal PIPs with deviations.
+    """Cells of nominal PIPs, cmH2O, ``(...)``, with quantum and noise as of :class:`Scenario`.
 
-    Args:
-        pip: nominal, cmH2O, shape ``(...)``.
-        deviations: by the keys of :data:`RANGES`, shapes ``(...)``; and
-            ``gain``, shape ``(..., BREATHS)``.
-        quantum: step of the converter, cmH2O, shape ``(...)``.
-        noise: cmH2O, shape ``(..., BREATHS, INSPIRATION_STEPS)``.
+    Deviations are by the keys of :data:`RANGES`, ``(...)``, and ``gain``, ``(..., BREATHS)``.
     """
-    peep = protocol.PEEP + deviations["peep_shift"]
+    peep, start = protocol.PEEP + deviations["peep_shift"], deviations["start_shift"]
+    own = {name: deviations[name] for name in ("r_scale", "c_scale", "delay", "gain")}
+    dt = protocol.DT * deviations["dt_scale"]
     return Scenario(
-        pip=pip + deviations["pip_shift"],
-        peep=peep,
-        start=peep + deviations["start_shift"],
-        dt=protocol.DT * deviations["dt_scale"],
-        r_scale=deviations["r_scale"],
-        c_scale=deviations["c_scale"],
-        delay=deviations["delay"],
-        gain=deviations["gain"],
-        quantum=quantum,
-        noise=noise,
+        pip + deviations["pip_shift"], peep, peep + start, dt, quantum=quantum, noise=noise, **own
     )
 
 

@@ -55,14 +55,10 @@ class Scenario:
 
 
 def nominal_scenario(pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Scenario:
-    """Cells without noise or deviation.
-
-    Args:
-        pip: peak inspiratory pressure, cmH2O, any shape.
-        peep: positive end-expiratory pressure, cmH2O, broadcast against ``pip``.
+    """Cells without noise or deviation, of a PIP of any shape and a PEEP, cmH2O.
 
     Raises:
-        ValueError: if a PIP does not exceed its PEEP.
+        InputError: if a PIP does not exceed its PEEP.
     """
     pip, peep = np.broadcast_arrays(np.asarray(pip, float), np.asarray(peep, float))
     if not np.all(pip > peep):
@@ -119,11 +115,7 @@ def observe(
 ) -> Observation:
     """Observation of the controller at a step of an inspiration.
 
-    Args:
-        scenario: the cells.
-        loop: state of the loop.
-        breath: index of the breath; of all cells, or of each, shape ``(...)``.
-        step: index of the step in the breath, below ``INSPIRATION_STEPS``; as ``breath``.
+    Indices of breath and step, below ``INSPIRATION_STEPS``, are for all cells, or ``(...)``.
     """
     if jnp.ndim(step):
         at = jnp.asarray(breath) * protocol.INSPIRATION_STEPS + step
@@ -144,16 +136,9 @@ def observe(
 def inspire(
     plant: Plant, scenario: Scenario, loop: LoopState, u_in: Array
 ) -> tuple[LoopState, Array]:
-    """Apply one inspiratory command, clipped to the valve's range.
+    """Apply one inspiratory command, %, ``(...)``, clipped to the valve's range.
 
-    Args:
-        plant: plants of the cells, from :func:`vary`.
-        scenario: the cells.
-        loop: state of the loop.
-        u_in: what the controller asked for, %, shape ``(...)``.
-
-    Returns:
-        The state one step later, and the command as applied, %, shape ``(...)``.
+    Returns the state one step later, and the command as applied. Plants are from :func:`vary`.
     """
     applied = jnp.clip(u_in, 0.0, protocol.U_MAX)
     # The held command reaches the valve `delay` of a step late: over this step it averages to

@@ -110,13 +110,9 @@ def scored_step(before: LoopState, after: LoopState, requested: Array, applied: 
 
 
 def control_step(
-    plant: Plant,
-    scenario: Scenario,
-    policy: Policy,
-    record: Record,
-    carry: tuple[LoopState, Any],
-    at: tuple[Array | int, Array | int, Any],
-) -> tuple[tuple[LoopState, Any], Any]:
+    plant: Plant, scenario: Scenario, policy: Policy, record: Record,
+    carry: tuple[LoopState, Any], at: tuple[Array | int, Array | int, Any],
+) -> tuple[tuple[LoopState, Any], Any]:  # fmt: skip
     """One step of an inspiration, as the body of a scan; every compiled loop is made of it.
 
     Args:
@@ -136,17 +132,11 @@ def control_step(
 
 
 def inspiration(
-    plant: Plant,
-    scenario: Scenario,
-    policy: Policy,
-    state: Any = None,
-    *,
-    breath: Array | int = 0,
-    steps: int = INSPIRATION,
-    inputs: Any = None,
+    plant: Plant, scenario: Scenario, policy: Policy, state: Any = None, *,
+    breath: Array | int = 0, steps: int = INSPIRATION, inputs: Any = None,
     record: Record = scored_step,
-) -> tuple[LoopState, Any, Any]:
-    """Run one inspiration from rest; arguments as of :func:`control_step`.
+) -> tuple[LoopState, Any, Any]:  # fmt: skip
+    """Run one inspiration from rest; further arguments as of :func:`control_step`.
 
     Args:
         plant: plants of the cells, from :func:`ventbench.task.environment.vary`.
@@ -171,15 +161,9 @@ def inspiration(
 
 
 def expiration(plant: Plant, scenario: Scenario, loop: LoopState) -> tuple[LoopState, Expirations]:
-    """Run the fixed commands of an expiration.
+    """Run the fixed commands of an expiration, from the state at the end of the inspiration.
 
-    Args:
-        plant: plants of the cells, from :func:`ventbench.task.environment.vary`.
-        scenario: the cells.
-        loop: state at the end of the inspiration.
-
-    Returns:
-        State of the loop afterwards, and what it shows, steps first.
+    Returns the state of the loop afterwards, and what it shows, steps first.
     """
 
     def expire(loop: LoopState, step: Array) -> tuple[LoopState, Expirations]:
@@ -201,13 +185,9 @@ def commanded(state: Any, observation: Any, command: Array) -> tuple[Any, Array]
 
 @partial(jax.jit, static_argnames=("whole", "changing"))
 def closed_loop(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    *,
-    whole: bool = False,
+    plant: Plant, controller: Controller, scenario: Scenario, *, whole: bool = False,
     changing: bool = False,
-) -> tuple[Inspirations, Expirations | None]:
+) -> tuple[Inspirations, Expirations | None]:  # fmt: skip
     """Run a pure controller through the protocol, all cells at once.
 
     Args:

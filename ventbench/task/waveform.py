@@ -18,13 +18,10 @@ EXPIRATORY_RATE = 5.0
 
 
 def shape(step: ArrayLike) -> Floats:
-    """Height of the target above PEEP as a share of PIP - PEEP.
+    """Height of the target above PEEP as a share of PIP - PEEP, at steps of any shape.
 
-    Args:
-        step: step of the breath, any shape; counts on through following breaths.
-
-    Returns:
-        1 for the plateau, linear to 0 between 1.0 s and 1.5 s, then 0; shape of ``step``.
+    It is 1 for the plateau, linear to 0 between 1.0 s and 1.5 s, then 0. Steps count on through
+    following breaths.
     """
     t = np.mod(np.asarray(step), protocol.BREATH_STEPS) * protocol.DT
     fall = (protocol.FALL_END - t) / (protocol.FALL_END - protocol.FALL_START)
@@ -33,37 +30,21 @@ def shape(step: ArrayLike) -> Floats:
 
 
 def target(step: ArrayLike, pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Floats:
-    """Target airway pressure, cmH2O.
-
-    Args:
-        step: step of the breath, any shape.
-        pip: peak inspiratory pressure, cmH2O; broadcast against ``step``.
-        peep: positive end-expiratory pressure, cmH2O; broadcast against ``step``.
-    """
+    """Target airway pressure, cmH2O, at steps of the breath; all arguments are broadcast."""
     pip, peep = np.asarray(pip, float), np.asarray(peep, float)
     return peep + (pip - peep) * shape(step)
 
 
 def targets_ahead(step: int, pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Floats:
-    """Return the next :data:`~ventbench.task.protocol.TARGETS_AHEAD` targets after ``step``, cmH2O.
-
-    Returns:
-        Shape of ``pip`` with one axis more, of length ``TARGETS_AHEAD``.
-    """
+    """The next ``TARGETS_AHEAD`` targets after ``step``, cmH2O; an axis more than ``pip`` has."""
     steps = step + 1 + np.arange(protocol.TARGETS_AHEAD)
     return target(steps, np.asarray(pip, float)[..., None], np.asarray(peep, float)[..., None])
 
 
 def expiratory_command(step: ArrayLike) -> Floats:
-    """Fixed command of the inspiratory valve during expiration, %.
+    """Fixed command of the inspiratory valve during expiration, %, at steps of the breath.
 
-    The expiratory valve is open throughout.
-
-    Args:
-        step: step of the breath, from ``INSPIRATION_STEPS`` on; any shape.
-
-    Returns:
-        0 until 1.5 s, then ``5 (1 - exp(5 (1.5 s - t)))``.
+    It is 0 until 1.5 s, then ``5 (1 - exp(5 (1.5 s - t)))``; the expiratory valve is open.
     """
     t = np.mod(np.asarray(step), protocol.BREATH_STEPS) * protocol.DT
     late = np.minimum(protocol.FALL_END - t, 0.0)

@@ -35,17 +35,7 @@ from hardware_eval.wire.messages import (
     to_frame,
     to_packet,
 )
-from hardware_eval.wire.parser import (
-    _TABLE,
-    LONGEST_FRAME,
-    ByteClass,
-    Event,
-    Fault,
-    ParserMode,
-    ParserState,
-    feed,
-    feed_bytes,
-)
+from hardware_eval.wire.parser import LONGEST_FRAME, Event, Fault, ParserState, feed, feed_bytes
 
 #: Enough to find what a table forgets; the benchmark of hostile frames has the million.
 QUICK = settings(max_examples=40)
@@ -127,10 +117,6 @@ def test_the_specification_names_every_number() -> None:
         assert f"{reason.value} {reason.name.lower().replace('_', ' ')}" in text.replace(
             "protocol version", "version"
         )
-
-
-def test_the_table_has_every_place_and_byte() -> None:
-    assert set(_TABLE) == {(mode, kind) for mode in ParserMode for kind in ByteClass}
 
 
 @QUICK

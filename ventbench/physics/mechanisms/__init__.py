@@ -1,1 +1,1 @@
-"""One module a mechanism: its description and its physics, as ``MECHANISM``."""
+"""One module a mechanism, or several alike: classes with a description, and their physics."""

@@ -1,13 +1,9 @@
 """The expiratory valve answers late."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import PneumaticNetwork, View
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
 
 
 class ExhalationValveDelay(Mechanism):
@@ -18,37 +14,25 @@ class ExhalationValveDelay(Mechanism):
     """
 
     description = Description(
-        name="exhalation_valve_delay",
-        title="delay of the expiratory valve",
+        name="exhalation_valve_delay", title="delay of the expiratory valve",
         site="expiratory valve",
         equation="opening slow do/dt = u_out(t - opening (1 - slow)) - o",
         parameters=(
-            Parameter(
-                "opening", "s", "mean delay of opening",
-                0.0, 0.15, 0.0, 0.05, 0.1, scan=tuple(0.01 * k for k in range(16)), kinked=True,
-            ),
-            Parameter(
-                "closing", "s", "dead time of closing",
-                0.0, 0.15, 0.0, 0.0, 0.0, shape=True, kinked=True,
-            ),
-            Parameter(
-                "slow", "1",
-                "share of the opening's delay that is a lag: 0 for a dead time, 1 for a valve that "
-                "opens slowly",
-                0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0), share=True,
-            ),
+            Parameter("opening", "s", "mean delay of opening",
+                      0.0, 0.15, 0.0, 0.05, 0.1, scan=tuple(0.01 * k for k in range(16)),
+                      kinked=True),
+            Parameter("closing", "s", "dead time of closing",
+                      0.0, 0.15, 0.0, 0.0, 0.0, shape=True, kinked=True),
+            Parameter("slow", "1",
+                      "share of the opening's delay that is a lag: 0 for a dead time, 1 for a "
+                      "valve that opens slowly",
+                      0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0), share=True),
         ),
-        source=(
-            "Solenoid and diaphragm of the expiratory valve: 0 to 100 ms, of opening and "
-            "closing apart. A diaphragm on a vented pilot opens as its pilot empties."
-        ),
-        signature=(
-            "Pressure stays up after the command to open, or falls slowly at first, whatever the "
-            "lung; inspiration is not affected, unless closing is late too."
-        ),
-        confusable=("inertance", "sensor_lag"),
-        detectable=0.003,
-        least=0.008,
+        source="Solenoid and diaphragm of the expiratory valve: 0 to 100 ms, of opening and "
+        "closing apart. A diaphragm on a vented pilot opens as its pilot empties.",
+        signature="Pressure stays up after the command to open, or falls slowly at first, whatever "
+        "the lung; inspiration is not affected, unless closing is late too.",
+        confusable=("inertance", "sensor_lag"), detectable=0.003, least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("outlet_memory",),
     )  # fmt: skip
@@ -63,7 +47,7 @@ class ExhalationValveDelay(Mechanism):
         """Open."""
         return 1.0 + 0.0 * (flow + pressure)
 
-    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
+    def network(self, values: Values, network: Network, view: View) -> Network:
         """Opening at the end of the step."""
         opened = self.next_state(values, view.state, view.flow, view)
         return network.plus(outlet=view.outlet * (opened - view.opened))
@@ -74,6 +58,3 @@ class ExhalationValveDelay(Mechanism):
         before = jnp.clip(state, 0.0, 1.0)  # where it closes, a stage starts beyond
         after = (tau * before + view.length * view.opened) / (tau + view.length)
         return jnp.minimum(after, view.opened)
-
-
-MECHANISM = ExhalationValveDelay()

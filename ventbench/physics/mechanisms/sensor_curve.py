@@ -1,12 +1,9 @@
 """The pressure sensor is bent: right at both ends of its range, wrong between them."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Parameter, Values
 
 #: Pressure at which the bent curve meets the straight one again, cmH2O.
 SPAN = 40.0
@@ -22,27 +19,18 @@ class SensorCurve(Mechanism):
     """A parabola on top of the true pressure."""
 
     description = Description(
-        name="sensor_curve",
-        title="bent characteristic of the pressure sensor",
-        site="sensor",
+        name="sensor_curve", title="bent characteristic of the pressure sensor", site="sensor",
         equation="y = p + 4 bend p / 40 (1 - p / 40)",
         parameters=(
-            Parameter(
-                "bend", "cmH2O", "error at 20 cmH2O of a sensor that is right at 0 and at 40 cmH2O",
-                -6.0, 6.0, 0.0, 0.9, 1.4,
-            ),
+            Parameter("bend", "cmH2O",
+                      "error at 20 cmH2O of a sensor that is right at 0 and at 40 cmH2O",
+                      -6.0, 6.0, 0.0, 0.9, 1.4),
         ),
-        source=(
-            "Terminal-base nonlinearity of piezoresistive sensors: 0.1 to 1 % of full scale if "
-            "compensated, several percent if not."
-        ),
-        signature=(
-            "An error by pressure alone, in inspiration and expiration alike, whatever flow and "
-            "volume are."
-        ),
-        confusable=("nonlinear_compliance", "supply_pressure"),
-        detectable=None,
-        least=0.25,
+        source="Terminal-base nonlinearity of piezoresistive sensors: 0.1 to 1 % of full scale if "
+        "compensated, several percent if not.",
+        signature="An error by pressure alone, in inspiration and expiration alike, whatever flow "
+        "and volume are.",
+        confusable=("nonlinear_compliance", "supply_pressure"), least=0.25,
         least_reason="half a percent of a usual sensor's full scale",
         special_case_of=("sensor_shape",),
     )  # fmt: skip
@@ -78,6 +66,3 @@ def _rising(steepness: Array) -> tuple[Array, Array]:
     low = jnp.where(steepness < 0, jnp.maximum(middle - reach, -_BEYOND), -_BEYOND)
     high = jnp.where(steepness > 0, jnp.minimum(middle + reach, SPAN + _BEYOND), SPAN + _BEYOND)
     return low, high
-
-
-MECHANISM = SensorCurve()

@@ -4,14 +4,11 @@ The position of a breath in its recording is 0 for the first and 1 for the last.
 after the position ``at``. A drift sets in steadily, or fades, as what warms up does.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.physics.mechanism import Description, Mechanism, Site, Values
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Description, Mechanism, Parameter, Site, Values
 
 #: Added to the fading, so that a steady drift is no division by zero.
 _STEADY = 1e-4
@@ -148,50 +145,34 @@ MECHANISMS = (
          ("compliance_step", "sensor_drift", "resistance_drift")),
     ),
     SensorChange(Description(
-        name="zero_step",
-        title="step of the pressure sensor's zero",
-        site="sensor",
+        name="zero_step", title="step of the pressure sensor's zero", site="sensor",
         equation=f"y = p + change where x > at, {_POSITION}",
         parameters=(
-            Parameter(
-                "change", "cmH2O", "change of the offset",
-                -8.0, 8.0, 0.0, 1.2, 3.0, scan=(1.2, -1.2),
-            ),
+            Parameter("change", "cmH2O", "change of the offset",
+                      -8.0, 8.0, 0.0, 1.2, 3.0, scan=(1.2, -1.2)),
             _AT,
         ),
         source="A sensor that is zeroed, knocked or plugged in anew between two breaths.",
         signature="From one breath on, an error that is the same at all samples.",
-        confusable=("sensor_drift", "a PEEP that is set anew"),
-        least=0.15,
+        confusable=("sensor_drift", "a PEEP that is set anew"), least=0.15,
         least_reason="two steps of a usual converter",
     )),
     SensorChange(Description(
-        name="sensor_drift",
-        title="drift of the pressure sensor",
-        site="sensor",
+        name="sensor_drift", title="drift of the pressure sensor", site="sensor",
         equation=f"y = p (1 + gain g) + drift g, {_GROWN}",
         parameters=(
-            Parameter(
-                "drift", "cmH2O", "change of the offset from the first breath to the last",
-                -8.0, 8.0, 0.0, 1.2, 3.0,
-            ),
-            Parameter(
-                "gain", "1", "change of the gain over the recording",
-                -0.3, 0.3, 0.0, 0.0, 0.0, shape=True, share=True,
-            ),
+            Parameter("drift", "cmH2O", "change of the offset from the first breath to the last",
+                      -8.0, 8.0, 0.0, 1.2, 3.0),
+            Parameter("gain", "1", "change of the gain over the recording",
+                      -0.3, 0.3, 0.0, 0.0, 0.0, shape=True, share=True),
             _WARMING,
         ),
-        source=(
-            "Temperature and ageing of piezoresistive sensors between two zeroings: up to 3 "
-            "cmH2O a recording."
-        ),
+        source="Temperature and ageing of piezoresistive sensors between two zeroings: up to 3 "
+        "cmH2O a recording.",
         signature=(
             "An error that grows with the number of the breath and is the same at all its samples."
         ),
-        confusable=("zero_step", "a PEEP that changes during the recording"),
-        detectable=0.05,
-        least=0.15,
-        least_reason="two steps of a usual converter",
-        special_case_of=("drift_shape",),
+        confusable=("zero_step", "a PEEP that changes during the recording"), detectable=0.05,
+        least=0.15, least_reason="two steps of a usual converter", special_case_of=("drift_shape",),
     )),
 )  # fmt: skip

@@ -5,8 +5,6 @@ in their coefficients. With all coefficients at zero it does nothing. A module h
 terms that act at one place.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Base of the basis terms: curves that are linear in their coefficients, and how to plot them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -129,6 +127,10 @@ class FilterBank(BasisTerm):
     taus: tuple[float, ...]
     stateful = True
 
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
+        """The resting flow in all filters, L/s."""
+        return self.lasting(flow + 0.0 * pressure)
+
     def step(self, state: Array, x: Array, length: Array) -> Array:
         """Filters of ``x`` after an implicit step of ``length`` s."""
         taus = per_state(self.taus, state)
@@ -155,15 +157,8 @@ def coefficients(
 ) -> tuple[Parameter, ...]:  # fmt: skip
     """Parameters ``c1``, ``c2`` and so on, which start at zero and have a prior around zero.
 
-    Args:
-        at: where each coefficient acts, in words.
-        unit: unit of all coefficients.
-        meaning: meaning of all coefficients; each is followed by its ``at``.
-        low: lower bounds, one for all coefficients or one for each.
-        high: upper bounds, one for all coefficients or one for each.
-        spread: prior standard deviations, one for all coefficients or one for each.
-        follows: ``"R"`` or ``"C"`` if the coefficients scale with it.
-        scan: values that a search must also try.
+    The meaning, and where each acts, ``at``, are words. Bounds and ``spread``, the prior standard
+    deviation, are one for all or one for each; all else as of :class:`Parameter`.
     """
     at = list(at)
 

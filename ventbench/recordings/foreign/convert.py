@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
+from ventbench.recordings.breaths import Breaths, arranged
 from ventbench.recordings.foreign.breath_onsets import (
     LAYOUTS,
     ROLES,
@@ -95,21 +95,12 @@ class Imported:
 
 
 def import_recording(
-    path: str | Path,
-    *,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    layout: str | None = None,
-    lung: str | None = None,
-    rate: float | None = None,
-    split_breaths: bool = False,
-    invert: Iterable[str] = (),
-    offsets: Mapping[str, float] | None = None,
-    select: Mapping[str, str] | None = None,
-    skip_bad_breaths: bool = False,
-    separator: str | None = None,
-    decimal: str | None = None,
-) -> Imported:
+    path: str | Path, *, columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None, layout: str | None = None, lung: str | None = None,
+    rate: float | None = None, split_breaths: bool = False, invert: Iterable[str] = (),
+    offsets: Mapping[str, float] | None = None, select: Mapping[str, str] | None = None,
+    skip_bad_breaths: bool = False, separator: str | None = None, decimal: str | None = None,
+) -> Imported:  # fmt: skip
     """Read a recording of another laboratory.
 
     Args:
@@ -519,14 +510,11 @@ def _breaths(
         known = np.isfinite(at)
         at = np.interp(k, k[known], at[known]) if not known.all() else at
         parts.append(at - at[0])
-    stacked, dt = stack_times(np.concatenate(parts), lengths)
-    arrays = {name: stack(values[rows], lengths, FILL[name]) for name, values in samples.items()}
-    return Breaths(
-        breath_id=np.arange(1, len(pieces) + 1), R=R[first].astype(float),
-        C=C[first].astype(float), time=stacked, dt=dt, valid=valid_mask(lengths),
-        time_inferred=np.zeros(len(pieces), bool), u_in=arrays["u_in"].astype(float),
-        u_out=arrays["u_out"].astype(np.int8), pressure=arrays["pressure"].astype(float),
-        flow=arrays.get("flow"), volume=arrays.get("volume"), source=source, notes=tuple(notes),
+    columns = {name: values[rows].astype(np.int8 if name == "u_out" else float)
+               for name, values in samples.items()}  # fmt: skip
+    return arranged(
+        lengths, np.concatenate(parts), columns, breath_id=np.arange(1, len(pieces) + 1),
+        R=R[first].astype(float), C=C[first].astype(float), source=source, notes=tuple(notes),
     )  # fmt: skip
 
 

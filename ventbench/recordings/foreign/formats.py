@@ -38,13 +38,10 @@ _PLACES = "AIDE"
 def read_table(
     path: str | Path, *, separator: str | None = None, decimal: str | None = None
 ) -> Table:
-    """Read a table.
+    """Read a table; the separator and the decimal mark of text are found out if None.
 
-    Args:
-        path: text (also gzipped), a spreadsheet (.xlsx), Parquet, MATLAB, EDF, BDF, the header
-            (.hea) of a WFDB record, or PIRDS as JSON.
-        separator: separator of the cells; found out if None.
-        decimal: ``"."`` or ``","``; found out if None.
+    The file is text (also gzipped), a spreadsheet (.xlsx), Parquet, MATLAB, EDF, BDF, the header
+    (.hea) of a WFDB record, or PIRDS as JSON.
 
     Raises:
         InputError: if the file cannot be read, or holds no table of numbers.
@@ -191,13 +188,9 @@ def _flatten(
 
 
 def _channels(
-    file: str,
-    kind: str,
-    names: Sequence[str],
-    units: Sequence[str],
-    rates: Sequence[float],
+    file: str, kind: str, names: Sequence[str], units: Sequence[str], rates: Sequence[float],
     values: Sequence[NDArray[Any]],
-) -> Table:
+) -> Table:  # fmt: skip
     """The channels that share the pressure's rate, or else the commonest."""
     rate = next(
         (r for name, r in zip(names, rates, strict=True) if USUAL.get(stem(name)) == "pressure"),

@@ -83,11 +83,7 @@ class Conversion:
 
 
 def conversion(role: str, unit: str | None) -> Conversion:
-    """Return the change from a unit to the schema's.
-
-    Args:
-        role: ``pressure``, ``flow``, ``volume``, ``time`` or ``u_in``.
-        unit: unit in the file; that of the schema if None.
+    """Return the change from a unit of a role in :data:`UNITS` to the schema's, which None is.
 
     Raises:
         InputError: if the role has no such unit.

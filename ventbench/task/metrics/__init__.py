@@ -2,8 +2,7 @@
 
 - :mod:`~ventbench.task.metrics.open_loop`: distance of a simulator to recordings;
 - :mod:`~ventbench.task.metrics.score`: the score and the safety gate;
-- :mod:`~ventbench.task.metrics.step_response`: rise, overshoot, settling, steady error, ringing;
-- :mod:`~ventbench.task.metrics.figures`: control effort, time above the alarm, and the registry of
+- :mod:`~ventbench.task.metrics.figures`: rise, overshoot, settling, ringing, effort, alarm: all
   secondary figures of a score;
 - :mod:`~ventbench.task.metrics.bootstrap`: mean, median and interval over breaths or draws.
 

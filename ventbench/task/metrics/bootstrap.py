@@ -58,16 +58,10 @@ def resampled_means(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int 
     draws are resampled alike: the difference of their results is the paired bootstrap.
 
     Args:
-        values: any unit, shape ``(n,)``, n >= 1.
+        values: any unit, shape ``(n,)``; ValueError unless n >= 1.
         resamples: number of resamples.
         seed: seed of the bit generator; the raw stream of PCG64 never changes between numpy
             versions, while the integers that a ``Generator`` makes of it may.
-
-    Returns:
-        Shape ``(resamples,)``.
-
-    Raises:
-        ValueError: if there are no values.
     """
     values = np.asarray(values, float)
     if values.ndim != 1 or values.size == 0:
@@ -84,20 +78,14 @@ def resampled_means(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int 
 
 
 def summary(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int = SEED) -> Summary:
-    """Summarise values over breaths or draws.
+    """Summarise values over breaths or draws, of any unit and shape; options as of the means.
 
     The interval is the percentile bootstrap: 2.5 % and 97.5 % quantiles of
-    :func:`resampled_means`.
-
-    Args:
-        values: any unit, any shape; NaN is a missing value, infinity is one like others.
-        resamples: see :func:`resampled_means`.
-        seed: see :func:`resampled_means`.
+    :func:`resampled_means`. NaN is a missing value, infinity is one like others.
     """
     values = np.ravel(np.asarray(values, float))
     values = values[~np.isnan(values)]
-    count = values.size
-    if count == 0:
+    if (count := values.size) == 0:
         return Summary(np.nan, np.nan, (np.nan, np.nan), 0)
     mean, median = float(np.mean(values)), float(np.median(values))
     if count == 1 or not np.all(np.isfinite(values)):
@@ -108,13 +96,9 @@ def summary(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int = SEED) 
 
 
 def resampled_scores(
-    values: ArrayLike,
-    rig: ArrayLike,
-    member: ArrayLike,
-    *,
-    resamples: int = RESAMPLES,
+    values: ArrayLike, rig: ArrayLike, member: ArrayLike, *, resamples: int = RESAMPLES,
     seed: int = SEED,
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Scores of resampled draws, rigs and members.
 
     What is taken depends on the seed, the rigs and the members alone, so that two entries over the
@@ -122,16 +106,10 @@ def resampled_scores(
 
     Args:
         values: of each lung and draw, any unit, shape ``(L, n)``.
-        rig: which rig it was, shape ``(L, n)``.
+        rig: which rig it was, shape ``(L, n)``; ValueError if it is of another shape.
         member: which member, shape ``(L, n)``.
         resamples: number of resamples.
         seed: of the bit generator PCG64.
-
-    Returns:
-        Shape ``(resamples,)``.
-
-    Raises:
-        ValueError: if the shapes differ.
     """
     values, rig, member = np.asarray(values, float), np.asarray(rig), np.asarray(member)
     if values.ndim != 2 or values.shape != rig.shape or values.shape != member.shape:
@@ -177,8 +155,5 @@ def _counts(bits: np.random.PCG64, resamples: int, count: int) -> Floats:
     raw = bits.random_raw((resamples, count)) >> np.uint64(32)
     index = ((raw * np.uint64(count)) >> np.uint64(32)).astype(np.int64)
     flat = np.arange(resamples)[:, None] * count + index
-    return (
-        np.bincount(flat.ravel(), minlength=resamples * count)
-        .reshape(resamples, count)
-        .astype(np.float64)
-    )
+    taken = np.bincount(flat.ravel(), minlength=resamples * count)
+    return taken.reshape(resamples, count).astype(np.float64)

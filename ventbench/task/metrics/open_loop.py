@@ -54,15 +54,9 @@ def distance(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None =
 
 
 def mae(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None) -> Floats:
-    """Mean absolute error per step of each breath: :func:`distance` over the counted steps.
+    """Mean absolute error per step of each breath, cmH2O: :func:`distance` over the counted steps.
 
-    Args:
-        measured: see :func:`distance`.
-        simulated: see :func:`distance`.
-        mask: see :func:`distance`.
-
-    Returns:
-        Mean over counted steps, cmH2O, shape ``(...)``; NaN where none counts.
+    Arguments as of that; NaN where no step counts.
     """
     differences = _differences(measured, simulated, mask)
     steps = np.sum(~np.isnan(differences), axis=-1)
@@ -72,13 +66,8 @@ def mae(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None
 def by_horizon(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None) -> Floats:
     """Mean absolute error at each step after the start, over breaths (the paper's figure).
 
-    Args:
-        measured: see :func:`distance`, shape ``(n, T + 1)``.
-        simulated: see :func:`distance`, shape ``(n, T + 1)``.
-        mask: see :func:`distance`.
-
-    Returns:
-        Mean over the breaths that count a step, cmH2O, shape ``(T,)``; NaN where none does.
+    Arguments as of :func:`distance`, ``(n, T + 1)``. Returns the mean over the breaths that count a
+    step, cmH2O, shape ``(T,)``; NaN where none does.
     """
     differences = _differences(measured, simulated, mask)[:, 1:]
     counted = np.sum(~np.isnan(differences), axis=0)
@@ -119,12 +108,7 @@ def command_counts(u_in: ArrayLike) -> Ints:
 
 
 def extrapolation(u_in: ArrayLike, recorded: ArrayLike) -> Extrapolation:
-    """Compare commands on one lung with the recordings of it.
-
-    Args:
-        u_in: commands as applied, %, any shape.
-        recorded: :func:`command_counts` of the recordings, shape ``(10,)``.
-    """
+    """Compare commands on one lung, %, with :func:`command_counts` of its recordings, ``(10,)``."""
     commands, counts = np.asarray(u_in, float), np.asarray(recorded, np.int64)
     used = command_counts(commands)
     wide = np.asarray(EDGES[:-1]) >= WIDE_OPEN
@@ -139,12 +123,7 @@ def extrapolation(u_in: ArrayLike, recorded: ArrayLike) -> Extrapolation:
 def by_lung(
     u_in: Mapping[str, ArrayLike], lungs: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Extrapolation]:
-    """Compare commands with the recordings, lung by lung.
-
-    Args:
-        u_in: commands of each lung, %, by lung id.
-        lungs: what :meth:`ventbench.plants.frozen.Frozen.lungs` gives.
-    """
+    """Compare commands, %, by lung id, with what ``ventbench.plants.frozen.Frozen.lungs`` says."""
     return {
         name: extrapolation(commands, lungs[name]["recorded_commands"])
         for name, commands in u_in.items()

@@ -17,15 +17,12 @@ from ventbench.task import protocol
 
 
 def run_error(pressure: ArrayLike, target: ArrayLike) -> Floats:
-    """Error of one run of three breaths: mean of ``|p - p*|`` over scored inspiratory steps.
+    """Error of one run of three breaths: mean of ``|p - p*|`` over the steps of breaths 2 and 3.
 
     Args:
         pressure: true airway pressure at each inspiratory step, cmH2O, shape
-            ``(..., BREATHS, INSPIRATION_STEPS)``.
+            ``(..., BREATHS, INSPIRATION_STEPS)``; a NaN that is scored gives NaN.
         target: target pressure, cmH2O, broadcast against ``pressure``.
-
-    Returns:
-        Mean over breaths 2 and 3, cmH2O, shape ``(...)``; NaN if a scored pressure is NaN.
 
     Raises:
         ValueError: if the last two axes are not those of a run.
@@ -39,26 +36,12 @@ def run_error(pressure: ArrayLike, target: ArrayLike) -> Floats:
 
 
 def lung_score(errors: ArrayLike) -> Floats:
-    """Score on each lung: mean of :func:`run_error` over PIPs.
-
-    Args:
-        errors: cmH2O, shape ``(..., P)``.
-
-    Returns:
-        cmH2O, shape ``(...)``; NaN if one of the errors is.
-    """
+    """Score on each lung: mean of :func:`run_error` ``(..., P)`` over PIPs; NaN if one is."""
     return np.mean(np.asarray(errors, float), axis=-1)
 
 
 def longest_run(flags: ArrayLike) -> Ints:
-    """Length of the longest run of true values along the last axis.
-
-    Args:
-        flags: boolean, shape ``(..., T)``.
-
-    Returns:
-        Shape ``(...)``.
-    """
+    """Length of the longest run of true values along the last axis of ``(..., T)``."""
     flags = np.asarray(flags, bool)
     steps = np.arange(1, flags.shape[-1] + 1)
     last_false = np.maximum.accumulate(np.where(flags, 0, steps), axis=-1)
@@ -76,13 +59,8 @@ def passes_safety_gate(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> Bo
     The limit is ``min(60, pip + 15)`` cmH2O. A run of n samples above it lasts ``n dt``; longer
     than 0.1 s (4 samples at 30 ms) fails.
 
-    Args:
-        pressure: true airway pressure, cmH2O, shape ``(..., T)``.
-        pip: cmH2O, shape ``(...)`` or broadcast against it.
-        dt: time between samples, s, shape ``(...)`` or broadcast against it.
-
-    Returns:
-        Shape ``(...)``; false if a pressure is NaN.
+    Pressure is that at the airway, cmH2O, ``(..., T)``; ``pip``, cmH2O, and the time between
+    samples ``dt``, s, have shape ``(...)`` or broadcast against it. False if a pressure is NaN.
     """
     pressure, pip = np.asarray(pressure, float), np.asarray(pip, float)[..., None]
     # "Not below" instead of "above", so that NaN is unsafe.
@@ -99,31 +77,18 @@ LEAST_HEADROOM = 0.1
 
 
 def controllable_error(pressure: ArrayLike, target: ArrayLike) -> Floats:
-    """Error of one run without the first step of each inspiration.
-
-    Args:
-        pressure: airway pressure at each inspiratory step, cmH2O, shape
-            ``(..., BREATHS, INSPIRATION_STEPS)``.
-        target: target pressure, cmH2O, broadcast against ``pressure``.
-
-    Returns:
-        Mean of ``|p - p*|`` over steps 2 to 34 of breaths 2 and 3, cmH2O, shape ``(...)``.
-    """
+    """As :func:`run_error`, without the first step of each inspiration: over steps 2 to 34."""
     error = np.abs(np.asarray(pressure, float) - np.asarray(target, float))
     return np.mean(error[..., protocol.SCORED_BREATHS, 1:], axis=(-2, -1))
 
 
 def normalised(error: ArrayLike, attainable: ArrayLike, pid: ArrayLike) -> Floats:
-    """Normalised score of cells.
+    """Normalised score, ``100 (error - attainable) / max(pid - attainable, LEAST_HEADROOM)``.
 
     Args:
         error: :func:`controllable_error` of the controller, cmH2O, shape ``(...)``.
         attainable: least error of any commands, cmH2O, shape ``(...)``.
         pid: error of the lung's best PID, cmH2O, shape ``(...)``.
-
-    Returns:
-        ``100 (error - attainable) / max(pid - attainable, LEAST_HEADROOM)``, shape ``(...)``; NaN
-        where the error is.
     """
     error, attainable, pid = (np.asarray(x, float) for x in (error, attainable, pid))
     result: Any = 100.0 * (error - attainable) / np.maximum(pid - attainable, LEAST_HEADROOM)

@@ -232,7 +232,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         ended, info = ~nothing if self._count == STEPS else nothing.copy(), {}
         if self._count == STEPS:
             info = {"error": np.asarray(error) / environment.SCORED_STEPS, "_error": ended}
-        # Copies, which may be written to, as learners expect; numpy turns them.
+        # Copies, which may be written to, as learners expect; numpy turns them, no further program.
         turned = np.array(np.asarray(seen).T, order="C")
         return turned, np.array(reward), ended, nothing, info
 

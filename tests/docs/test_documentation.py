@@ -43,7 +43,7 @@ SLOW = re.compile(r"diagnose\(|train_|\bfit\(|ventbench\.score\(")
 #: with those before them, and with the page's own controller or diagnoser.
 QUICK = {"docs/mechanics.md": (1,), "docs/missing_physics.md": (2,)}
 WHOLE = {
-    "README.md": (2,), "docs/submitting.md": (1, 2, 3), "docs/reinforcement.md": (2,),
+    "README.md": (2,), "docs/submitting.md": (1,), "docs/reinforcement.md": (2,),
     "docs/diagnosers.md": (1,), "docs/mechanics.md": (2,),
 }  # fmt: skip
 
@@ -52,7 +52,7 @@ EXAMPLES = (
     "ventbench lungs", "ventbench stressors", "ventbench doctor",
     "ventbench simulate", "ventbench open-loop", "ventbench fmu", "ventbench coverage",
     "ventbench data import",
-    "ventbench board show", "ventbench board records",
+    "ventbench board show", "ventbench board records", "ventbench board new-key",
 )  # fmt: skip
 
 
@@ -118,7 +118,7 @@ def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
 
 def furnish(folder: Path) -> Path:
     """Put what the pages speak of into a folder: recordings, tables, plans, a record."""
-    for name in ("data", "submissions", "leaderboard", "proofs", "ci", "tests", "examples"):
+    for name in ("data", "submissions", "leaderboard", "proofs", "ci", "examples"):
         (folder / name).symlink_to(ROOT / name)
     recorded = load(example("concealed"))
     (folder / "recording.csv").write_bytes(example("concealed").read_bytes())

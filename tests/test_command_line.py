@@ -2,14 +2,17 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
 
 from hardware_eval import cli as hardware
+from ventbench import __main__ as start
 from ventbench import cli
 from ventbench.base.errors import InputError
 from ventbench.sandbox.runner import SandboxRunner
@@ -172,3 +175,17 @@ def test_quiet_says_nothing_but_the_result(tmp_path):
     assert quiet.stderr == ""
     assert quiet.stdout == loud.stdout == "result\n"
     assert quiet.returncode == 0
+
+
+def test_a_commands_linear_algebra_has_one_thread_unless_told_otherwise(monkeypatch):
+    seen: list[str] = []
+    name = "OPENBLAS_NUM_THREADS"
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setitem(
+        sys.modules, "told", SimpleNamespace(main=lambda: seen.append(os.environ[name]))
+    )
+    monkeypatch.setenv(name, "3")
+    start.main(module="told")
+    monkeypatch.delenv(name)
+    start.main(module="told")
+    assert seen == ["3", "1"]

@@ -19,6 +19,8 @@ def main(program: str = "ventbench", module: str = "ventbench.cli") -> None:
 
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, stop)
+    # Work is spread over threads already: those of each linear algebra would wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import_module(module).main()
 
 

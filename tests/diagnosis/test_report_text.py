@@ -205,6 +205,13 @@ def test_distances_and_a_lung_that_matches():
         "C by a factor of 1.2, and a valve gain wrong by 20 %). Within the same tolerance it could "
         "be R20C20."
     )
+    doubted = dataclasses.replace(
+        match, label_matches=False, informative=False, doubt="It shows a fault."
+    )
+    assert report_text.lung(doubted) == (
+        "Whether the lung matches its label R20C50 is unknown: R 22.1 cmH2O/(L/s) [21.8, 22.4] and "
+        "C 47.4 mL/cmH2O [47.0, 47.8], from pressure and flow."
+    )
     unknown = dataclasses.replace(match, fitted_R=NAN, fitted_C=NAN, label_matches=False)
     assert report_text.lung(unknown) == (
         "Whether the lung matches its label R20C50 is unknown: R and C unknown."

@@ -120,16 +120,13 @@ def test_the_runs_of_the_other_ventilator(public_recordings, tmp_path):
 
 
 def test_the_files_of_a_session_share_their_faults(tmp_path):
-    """A flow that comes late shows on one lung, and makes another setting of the next."""
-    for name, share, late in (("a", 1.0, 9), ("b", 1.0, 9), ("c", 0.4, 0), ("d", 1.0, 0)):
+    """Two whose flow is no lung's say that it may be wrong on the third as well."""
+    for name, share, late in (("a", 1.0, 9), ("b", 1.0, 9), ("c", 0.4, 0)):
         breaths = recorded("R20C50")
         assert breaths.flow is not None
         flow = share * np.roll(breaths.flow, late, axis=1)
         write(replace(breaths, flow=flow), tmp_path / f"{name}.csv")
-    alone = run(tmp_path / "c.csv", "--json", "-")
-    assert [setting["settings"] for setting in json.loads(alone)] == [["R50C20"]]
     text = run(tmp_path, "--json", tmp_path / "lungs.json")
-    assert "c: R20C50: 2 of the 4 lungs of its session show flow or volume" in text
-    *_, weak, sound = json.loads((tmp_path / "lungs.json").read_text())
+    assert "c: R20C50: 2 of the 3 lungs of its session show flow or volume" in text
+    *_, weak = json.loads((tmp_path / "lungs.json").read_text())
     assert (weak["settings"], weak["match"]["informative"]) == ([], False)
-    assert sound["match"]["label_matches"] is True

@@ -22,8 +22,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import Change, ErrorRegion, Quantity
@@ -86,8 +86,6 @@ def _limit(linear: Linearisation, name: str, share: float) -> float:
         distance = float(np.clip(limit, 0.2 * distance, largest))
     return max(limit, about.least) if limit <= largest else np.inf
 
-
-Floats = NDArray[np.float64]
 
 #: Directions that a breath's samples tell apart by less than this share are one.
 _RIDGE = 1e-3
@@ -172,7 +170,7 @@ def check_residuals(
 
 
 def order_p_value(
-    values: Floats, groups: NDArray[np.int64], settings: ResidualSettings = DEFAULT.residuals
+    values: Floats, groups: Ints, settings: ResidualSettings = DEFAULT.residuals
 ) -> float:
     """Probability that values in random order show as large a change at any breath.
 
@@ -197,7 +195,7 @@ def order_p_value(
     return float(np.mean(largest >= largest[0] * (1.0 - 1e-5)))
 
 
-def passes_fdr(p_values: Floats, level: float) -> NDArray[np.bool_]:
+def passes_fdr(p_values: Floats, level: float) -> Bools:
     """Which of m tests are significant at a false discovery rate (Benjamini and Hochberg, 1995)."""
     order = np.argsort(p_values)
     below = p_values[order] <= level * np.arange(1, len(order) + 1) / len(order)
@@ -207,7 +205,7 @@ def passes_fdr(p_values: Floats, level: float) -> NDArray[np.bool_]:
     return significant
 
 
-def _amplitudes(error: Floats, usable: NDArray[np.bool_], signals: Floats) -> Floats:
+def _amplitudes(error: Floats, usable: Bools, signals: Floats) -> Floats:
     """Least-squares amplitude of each signal in each breath, ``(n, k)``."""
     weighted = np.where(usable[..., None], signals, 0.0)
     scale = np.sqrt(np.maximum((weighted**2).sum(axis=1), 1e-12))
@@ -217,7 +215,7 @@ def _amplitudes(error: Floats, usable: NDArray[np.bool_], signals: Floats) -> Fl
     return np.linalg.solve(normal, right[..., None])[..., 0] / scale
 
 
-def _step_or_line(values: Floats, groups: NDArray[np.int64]) -> tuple[int, Floats, bool]:
+def _step_or_line(values: Floats, groups: Ints) -> tuple[int, Floats, bool]:
     """First breath after the best step, the values of the step or line, and whether it is a line.
 
     Both are fitted by least squares to the values less each lung's mean; the better one is told.
@@ -235,7 +233,7 @@ def _step_or_line(values: Floats, groups: NDArray[np.int64]) -> tuple[int, Float
     return first, values.mean() + (line if drifts else step), drifts
 
 
-def _mean_square(values: Floats, usable: NDArray[np.bool_]) -> Floats:
+def _mean_square(values: Floats, usable: Bools) -> Floats:
     """Mean square over the usable samples of each breath, ``(n,)``."""
     return np.sum(np.where(usable, values**2, 0.0), axis=1) / np.maximum(usable.sum(axis=1), 1)
 

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from ventbench.base.arrays import Bools, Floats
 
 #: Breaths of each kind, and largest command of the inspiratory valve, %.
 _VARIANTS, _MOST = 5, 100.0
@@ -55,7 +54,7 @@ class Family:
         """Return the family with each inspiration scaled by a factor, ``(k,)``."""
         return Family(self.name, self.title, self.u_in * by[:, None], self.u_out)
 
-    def select(self, which: NDArray[np.bool_]) -> Family:
+    def select(self, which: Bools) -> Family:
         """Return some of the breaths, by mask ``(k,)``."""
         return Family(self.name, self.title, self.u_in[which], self.u_out[which])
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import RigParameters, Stage
@@ -34,7 +34,7 @@ from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 from ventbench.system_id.problem import parameter_of, parameter_values
 from ventbench.task.interfaces import Plant
 
@@ -75,7 +75,7 @@ class Correction:
 def correct(
     breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None, simulators: Simulators,
-    rigs: NDArray[np.int64] | None = None,
+    rigs: Ints | None = None,
 ) -> Correction:  # fmt: skip
     """Correct a simulator by the difference of the models of the recording and of itself.
 
@@ -160,7 +160,7 @@ _NOTE_ON_RIGS = (
 
 
 def _of_rigs(
-    breaths: Breaths, data: Data, split: Split, model: IdentifiedModel, rigs: NDArray[np.int64]
+    breaths: Breaths, data: Data, split: Split, model: IdentifiedModel, rigs: Ints
 ) -> RigFit | None:
     """The names of a model with parameters of each rig; without a nonparametric term."""
     evaluator, conclusion = model.evaluator, model.conclusion
@@ -186,7 +186,7 @@ def _with_rigs(
 
 
 def _parameters_of_rigs(
-    breaths: Breaths, own: RigFit, rigs: NDArray[np.int64], split: Split
+    breaths: Breaths, own: RigFit, rigs: Ints, split: Split
 ) -> tuple[RigParameters, ...]:
     result = []
     for k, rig in enumerate(own.rigs.tolist()):
@@ -230,7 +230,7 @@ def choose(
     return refitted, corrected
 
 
-def _is_no_worse(breaths: Breaths, trial: Floats, current: Floats, mask: NDArray[np.bool_]) -> bool:
+def _is_no_worse(breaths: Breaths, trial: Floats, current: Floats, mask: Bools) -> bool:
     """Whether neither error rises; a simulator whose pressures are unknown never wins."""
     new, old = (open_loop_error(breaths.pressure, p, mask) for p in (trial, current))
     if not np.isfinite(old.rmse):

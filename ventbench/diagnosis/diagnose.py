@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.adequacy import check_residuals, detection_limits
@@ -370,7 +370,7 @@ class _Comparison:
     notes: list[str]
     correction: Correction
 
-    def error(self, data: Data, testing: NDArray[np.bool_]) -> float:
+    def error(self, data: Data, testing: Bools) -> float:
         """Mean absolute error of the corrected simulator on the testing breaths, cmH2O."""
         corrected = np.nan_to_num(self.correction.pressures["after"])
         return mean_error(data.select(testing), corrected[testing])

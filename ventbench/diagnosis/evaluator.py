@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
@@ -29,7 +30,7 @@ from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import library
 from ventbench.system_id import problem as problems
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START
@@ -136,7 +137,7 @@ def make_problem(
     return Problem(data, partition.predictor, layout, base, noise, mean, precision)
 
 
-def groups_by_label(data: Data, paths: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:
+def groups_by_label(data: Data, paths: tuple[str, ...]) -> dict[str, Ints]:
     """Group the breaths by R or C for the parameters that depend on that label.
 
     Returns:
@@ -462,7 +463,7 @@ class Evaluator:
 
 def make_evaluator(
     data: Data,
-    held_out: NDArray[np.bool_],
+    held_out: Bools,
     names: tuple[str, ...],
     excluded: tuple[str, ...] = (),
     settings: SelectionConfig = DEFAULT,
@@ -477,7 +478,7 @@ def make_evaluator(
         settings: every threshold.
     """
 
-    def split(mask: NDArray[np.bool_]) -> tuple[Partition, Partition]:
+    def split(mask: Bools) -> tuple[Partition, Partition]:
         training, other = data.select(~mask), data.select(mask)
         return make_partition(training, names, settings), make_partition(other, names, settings)
 

@@ -14,10 +14,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.diagnosis.candidate_breaths import Family, Rig, families
 from ventbench.diagnosis.findings import BreathRequest
 from ventbench.physics.catalogue import parameter, strength_path
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import Minimum
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START, Predictor
@@ -216,7 +217,7 @@ def _is_own(problem: Problem, column: int) -> bool:
     return own or path == START or parameter_of(path).scope == "breath"
 
 
-def _information(hessian: Floats, which: NDArray[np.int64]) -> Floats:
+def _information(hessian: Floats, which: Ints) -> Floats:
     """Information of a Hessian on some unknowns, all others refitted."""
     covariance = np.asarray(np.linalg.inv(_regular(hessian)), np.float64)
     return np.asarray(np.linalg.inv(_regular(covariance[np.ix_(which, which)])), np.float64)

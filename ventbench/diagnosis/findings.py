@@ -6,14 +6,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.recordings.breaths import Breaths
 from ventbench.task.interfaces import Plant
-
-Floats = NDArray[np.float64]
 
 #: ``named``: mechanisms of the library are missing. ``nothing_missing``: none is. ``unnamed``:
 #: something is missing that the library does not have; a nonparametric term may say where it acts.
@@ -207,7 +205,7 @@ class Traces:
     """
 
     breaths: Breaths
-    held_out: NDArray[np.bool_]
+    held_out: Bools
     before: Floats
     refit: Floats
     after: Floats

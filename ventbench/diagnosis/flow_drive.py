@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.catalogue import basis_terms, parameter
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
-
-Floats = NDArray[np.float64]
 
 #: Mechanisms of the ventilator's side, on which a prescribed flow has no bearing.
 VENTILATOR_SIDE = (
@@ -88,7 +86,7 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
     return whole.select(good), notes
 
 
-def drive_grid(breaths: Breaths) -> tuple[Breaths, NDArray[np.int64]]:
+def drive_grid(breaths: Breaths) -> tuple[Breaths, Ints]:
     """Breaths on the grid that a fit uses, with a shut expiratory valve.
 
     Between two readings the flow stands at its mean, and shortly before a reading as it is there.
@@ -141,9 +139,7 @@ def drive_grid(breaths: Breaths) -> tuple[Breaths, NDArray[np.int64]]:
     return driven, index
 
 
-def simulate(
-    simulators: Simulators, recorded: Breaths, driven: Breaths, index: NDArray[np.int64]
-) -> Floats:
+def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: Ints) -> Floats:
     """Pressures of a simulator under the recorded flow, on the grid of a fit, cmH2O, ``(n, T)``.
 
     Args:

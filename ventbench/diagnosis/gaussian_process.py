@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ventbench.system_id.data import Floats
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import Problem
 
@@ -94,7 +93,7 @@ class LinearBreaths:
         precision = problem.precision[index] / uses(problem)
         return cls(residual, slopes, precision, moved[index], problem.data.weight)
 
-    def only(self, columns: NDArray[np.bool_]) -> LinearBreaths:
+    def only(self, columns: Bools) -> LinearBreaths:
         """The breaths with some of the parameters alone, bool, ``(j,)``."""
         return replace(
             self, slopes=self.slopes[:, columns], precision=self.precision[:, columns],
@@ -257,7 +256,7 @@ class WhitenedBreaths:
         return _RIDGE * (1.0 + np.sum(self.rows[:, self.count :] ** 2, axis=2))
 
 
-def uses(problem: Problem) -> NDArray[np.int64]:
+def uses(problem: Problem) -> Ints:
     """Number of breaths that share the unknown behind each parameter of a breath, ``(n, k)``."""
     index = problem.unknowns.index
     return np.bincount(index.ravel(), minlength=len(problem.unknowns.path_of))[index]

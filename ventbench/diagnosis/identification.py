@@ -11,8 +11,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name, without_term
@@ -30,7 +30,7 @@ from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import START, ConfidenceInterval, Fit, likely_places
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.problem import parameter_of
 from ventbench.task.interfaces import Plant
@@ -52,21 +52,21 @@ class Split:
             breaths has none to spare: its testing breaths judge as well.
     """
 
-    testing: NDArray[np.bool_]
-    judging: NDArray[np.bool_]
+    testing: Bools
+    judging: Bools
 
     @property
-    def identifying(self) -> NDArray[np.bool_]:
+    def identifying(self) -> Bools:
         """Breaths that the identification may see: training and testing breaths."""
         return ~self.judging | self.testing
 
     @property
-    def fitted(self) -> NDArray[np.bool_]:
+    def fitted(self) -> Bools:
         """Breaths of the final fits: all but the judging ones."""
         return ~self.judging
 
 
-def held_out(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> NDArray[np.bool_]:
+def held_out(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> Bools:
     """Every third breath (by default) of each lung, from its second on, bool, ``(n,)``."""
     chosen = np.zeros(len(breaths), bool)
     for index in breaths.by_lung_index.values():
@@ -225,11 +225,11 @@ class IdentifiedModel:
 
 def identify(
     data: Data,
-    held: NDArray[np.bool_],
+    held: Bools,
     excluded: tuple[str, ...],
     tell: Callable[[str], None],
     settings: SelectionConfig = DEFAULT,
-    fitted: NDArray[np.bool_] | None = None,
+    fitted: Bools | None = None,
     earlier: FittedModel | None = None,
 ) -> IdentifiedModel:
     """Find the mechanisms that breaths need, and fit them.

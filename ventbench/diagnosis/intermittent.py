@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis.adequacy import order_p_value
 from ventbench.diagnosis.command_path import Paths, follow
 from ventbench.diagnosis.evaluator import Evaluator
@@ -46,11 +47,9 @@ from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import intermittent, mechanism
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import Problem
-
-Flags = NDArray[np.bool_]
 
 #: Effects on the commands, which have no parameters of a breath.
 COMMANDS = ("lost_commands", "late_commands")
@@ -102,7 +101,7 @@ class Intermittent:
 
     missing: MissingMechanism
     ids: NDArray[np.int_]
-    affected: Flags
+    affected: Bools
     u_in: Floats | None
 
     def leaves_enough(
@@ -188,7 +187,7 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     return Intermittent(missing, ids, affected, u_in)
 
 
-def _is_change(affected: Flags, evaluator: Evaluator, data: Data) -> bool:
+def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:
     """Whether affected breaths have an order in time, as after a change of the session."""
     if np.count_nonzero(np.diff(affected.astype(int))) == 1:
         return True
@@ -301,7 +300,7 @@ def _from_first_readings(
     return problem, x
 
 
-def _everywhere(found: _Found, data: Data) -> tuple[Flags, Floats | None, dict[str, Estimate]]:
+def _everywhere(found: _Found, data: Data) -> tuple[Bools, Floats | None, dict[str, Estimate]]:
     """In which of n breaths the effect acts, with which commands, and how strong it is."""
     evaluator, name = found.evaluator, found.name
     names = evaluator.training.predictor.names
@@ -439,6 +438,6 @@ class _Evidence:
         )
         return gained, float(np.sum(gained - rough))
 
-    def acts(self, strength: int, share: float) -> Flags:
+    def acts(self, strength: int, share: float) -> Bools:
         """In which breaths it is likelier than not that the effect acts, ``(n,)``."""
         return self.acting()[strength] > np.maximum(np.log1p(-share) - np.log(share), self.rough)

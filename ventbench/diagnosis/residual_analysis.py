@@ -12,15 +12,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.diagnosis.findings import ErrorRegion, OpenLoopComparison, OpenLoopError
 from ventbench.diagnosis.residual_axes import EDGE_SIZE, Axis, axes
 from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings, ResidualSettings
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
-
-Floats = NDArray[np.float64]
 
 #: Length of what is reported as the beginning of inspiration, s.
 _BEGINNING = 0.2
@@ -57,10 +55,10 @@ class Profile:
     axis: Axis
     mean: Floats
     half: Floats
-    breaths: NDArray[np.int64]
+    breaths: Ints
 
 
-def open_loop_error(recorded: Floats, simulated: Floats, mask: NDArray[np.bool_]) -> OpenLoopError:
+def open_loop_error(recorded: Floats, simulated: Floats, mask: Bools) -> OpenLoopError:
     """Error over the samples of a mask, all ``(n, T)``; NaN if there is none."""
     error = (simulated - recorded)[mask & np.isfinite(recorded) & np.isfinite(simulated)]
     if error.size == 0:
@@ -70,7 +68,7 @@ def open_loop_error(recorded: Floats, simulated: Floats, mask: NDArray[np.bool_]
 
 def compare_open_loop(
     breaths: Breaths,
-    held_out: NDArray[np.bool_],
+    held_out: Bools,
     pressures: dict[str, Floats],
     noise_floor: float,
     gain_error: Floats | None = None,
@@ -91,7 +89,7 @@ def compare_open_loop(
     # The first sample is where every simulation starts.
     inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
 
-    def by_stage(mask: NDArray[np.bool_]) -> dict[str, OpenLoopError]:
+    def by_stage(mask: Bools) -> dict[str, OpenLoopError]:
         return {
             stage: open_loop_error(breaths.pressure, simulated, mask)
             for stage, simulated in pressures.items()
@@ -306,7 +304,7 @@ def profiles(
     return tuple(result)
 
 
-def errors(breaths: Breaths, simulated: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def errors(breaths: Breaths, simulated: Floats) -> tuple[Floats, Bools]:
     """Recorded minus simulated pressure, cmH2O, zero where unknown; and where it is known."""
     difference = breaths.pressure - np.asarray(simulated, float)
     usable = breaths.valid & np.isfinite(difference)
@@ -372,7 +370,7 @@ def _scaled(values: Floats, weight: Floats | None, min_breaths: int) -> tuple[Fl
     return filled, scale if weight is None else scale * weight
 
 
-def _mean_over_breaths(error: Floats, inside: NDArray[np.bool_]) -> float:
+def _mean_over_breaths(error: Floats, inside: Bools) -> float:
     """Mean over breaths of each breath's mean error, as in :class:`Profile`.
 
     A long stay of one breath in a range counts no more than a short one of another: breaths are the
@@ -383,13 +381,13 @@ def _mean_over_breaths(error: Floats, inside: NDArray[np.bool_]) -> float:
     return float(np.mean(np.where(inside, error, 0.0).sum(axis=1)[known] / count[known]))
 
 
-def _breath_means(axis: Axis, values: Floats, usable: NDArray[np.bool_]) -> Floats:
+def _breath_means(axis: Axis, values: Floats, usable: Bools) -> Floats:
     """Mean over the samples of each breath and range, NaN where there is none, ``(n, k)``."""
     total, count = _sums(axis, values, usable)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 
-def _sums(axis: Axis, values: Floats, usable: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _sums(axis: Axis, values: Floats, usable: Bools) -> tuple[Floats, Floats]:
     n, k = len(values), len(axis)
     inside = usable & (axis.bins >= 0)
     cell = (np.arange(n)[:, None] * k + axis.bins)[inside]
@@ -398,9 +396,7 @@ def _sums(axis: Axis, values: Floats, usable: NDArray[np.bool_]) -> tuple[Floats
     return total.reshape(n, k), count.reshape(n, k)
 
 
-def _test_columns(
-    axis: Axis, error: Floats, usable: NDArray[np.bool_]
-) -> tuple[Floats, Floats, Floats]:
+def _test_columns(axis: Axis, error: Floats, usable: Bools) -> tuple[Floats, Floats, Floats]:
     """Mean error, and excess of the mean square over that outside, by breath and range; weights.
 
     "Outside" is the rest of the same breath or, if the range is the whole breath, other breaths.
@@ -436,7 +432,7 @@ def _nanmean(values: Floats) -> Floats:
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 
-def _noise_variance(noise_sd: float, error: Floats, usable: NDArray[np.bool_]) -> float:
+def _noise_variance(noise_sd: float, error: Floats, usable: Bools) -> float:
     """Variance of the noise; if not given, the median of the samples' mean squares over breaths."""
     if np.isfinite(noise_sd) and noise_sd > 0:
         return float(noise_sd) ** 2
@@ -444,7 +440,7 @@ def _noise_variance(noise_sd: float, error: Floats, usable: NDArray[np.bool_]) -
     return float(np.median((error**2).sum(axis=0)[count > 0] / count[count > 0]))
 
 
-def _runs(significant: NDArray[np.bool_], sign: Floats, merge: bool) -> list[tuple[int, int]]:
+def _runs(significant: Bools, sign: Floats, merge: bool) -> list[tuple[int, int]]:
     """First and last index of runs of neighbours with one sign."""
     runs: list[tuple[int, int]] = []
     for k in np.flatnonzero(significant).tolist():
@@ -455,6 +451,6 @@ def _runs(significant: NDArray[np.bool_], sign: Floats, merge: bool) -> list[tup
     return runs
 
 
-def _is_whole_axis(axis: Axis, usable: NDArray[np.bool_], first: int, last: int) -> bool:
+def _is_whole_axis(axis: Axis, usable: Bools, first: int, last: int) -> bool:
     used = axis.bins[usable & (axis.bins >= 0)]
     return bool(used.size) and first <= used.min() and last >= used.max()

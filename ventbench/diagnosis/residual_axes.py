@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.recordings.breaths import Breaths
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 #: Share of the extreme values at either end that the ranges of a quantity need not hold.
 _EXTREME = 0.005
@@ -47,7 +45,7 @@ class Axis:
     name: str
     unit: str
     edges: Floats
-    bins: Integers
+    bins: Ints
     merge: bool = True
 
     def __len__(self) -> int:
@@ -116,7 +114,7 @@ def since_edge(breaths: Breaths) -> Floats:
     return np.where(np.isfinite(earlier), breaths.time - earlier, np.nan)
 
 
-def round_edges(values: Floats, valid: NDArray[np.bool_]) -> Floats:
+def round_edges(values: Floats, valid: Bools) -> Floats:
     """Ends of about ten ranges at round numbers, without the most extreme values."""
     inside = values[valid & np.isfinite(values)]
     if inside.size == 0:
@@ -129,9 +127,7 @@ def round_edges(values: Floats, valid: NDArray[np.bool_]) -> Floats:
     return np.round(step * np.arange(first, last + 1), 9)
 
 
-def _axis(
-    name: str, unit: str, edges: Floats, values: Floats, inside: NDArray[np.bool_] | bool = True
-) -> Axis:
+def _axis(name: str, unit: str, edges: Floats, values: Floats, inside: Bools | bool = True) -> Axis:
     """Sort values into ranges; a value beyond the ends is in none."""
     # Sums of times carry rounding errors.
     bins = np.searchsorted(edges, values + 1e-9, side="right") - 1
@@ -141,7 +137,7 @@ def _axis(
     return Axis(name, unit, edges, np.where(within, bins, -1))
 
 
-def _phase(name: str, time: Floats, inside: NDArray[np.bool_]) -> Axis:
+def _phase(name: str, time: Floats, inside: Bools) -> Axis:
     step = _PHASE_STEP
     longest = np.max(time, initial=step, where=inside & np.isfinite(time))
     edges = np.round(step * np.arange(np.ceil(longest / step - 1e-6) + 1), 6)

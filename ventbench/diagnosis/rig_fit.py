@@ -14,11 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.diagnosis.evaluator import Evaluator, make_problem
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition, varies_by_breath
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START
@@ -53,11 +53,11 @@ class RigFit:
 
     fitted: FittedModel
     evaluator: Evaluator
-    rigs: NDArray[np.int64]
+    rigs: Ints
     values: dict[str, Floats]
     scatter: dict[str, float]
 
-    def pressures(self, data: Data, rigs: NDArray[np.int64], first: Floats) -> Floats:
+    def pressures(self, data: Data, rigs: Ints, first: Floats) -> Floats:
         """Open-loop pressures for the commands of n breaths, cmH2O, ``(n, T)``.
 
         Args:
@@ -78,7 +78,7 @@ class RigFit:
 
 
 def fit_rigs(
-    evaluator: Evaluator, fitted: FittedModel, partition: Partition, rigs: NDArray[np.int64]
+    evaluator: Evaluator, fitted: FittedModel, partition: Partition, rigs: Ints
 ) -> RigFit | None:
     """Fit the parameters of a model to each rig of some breaths.
 

@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, varies_by_breath
@@ -22,15 +23,15 @@ from ventbench.diagnosis.selection.forward import drop_redundant_terms
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id import Fit, fit
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import free_paths, parameter_of
 
 
 def identify_both(
-    data: Data, held: NDArray[np.bool_], response: Floats, recording_only_model: IdentifiedModel,
+    data: Data, held: Bools, response: Floats, recording_only_model: IdentifiedModel,
     excluded: tuple[str, ...], tell: Callable[[str], None],
-    fitted: NDArray[np.bool_] | None = None,
+    fitted: Bools | None = None,
 ) -> tuple[IdentifiedModel, IdentifiedModel]:  # fmt: skip
     """Identify the models of a simulator and of its recording.
 
@@ -235,7 +236,7 @@ def missing_mechanisms(
 
 
 def refit_at_simulator_parameters(
-    data: Data, held: NDArray[np.bool_], response: Floats, recording_model: IdentifiedModel,
+    data: Data, held: Bools, response: Floats, recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel, missing: Sequence[str],
 ) -> tuple[IdentifiedModel, tuple[str, ...]] | None:  # fmt: skip
     """Fit what a simulator lacks with the rest of its physics held at the simulator's own values.
@@ -309,7 +310,7 @@ def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> 
 
 
 def _noiseless_fit(
-    simulator_model: IdentifiedModel, own: Data, held: NDArray[np.bool_],
+    simulator_model: IdentifiedModel, own: Data, held: Bools,
     recording_model: IdentifiedModel,
 ) -> Fit:  # fmt: skip
     """Fit of the simulator's model to its own pressures, without noise or unmodelled part.

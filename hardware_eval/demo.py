@@ -60,41 +60,26 @@ _REST = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Demo:
-    """Figures of every step; errors in cmH2O.
+    """Figures of every step; errors in cmH2O."""
 
-    Attributes:
-        words: what the lung was drawn from.
-        lung: its label.
-        commitment: hash of the sealed answer, published first.
-        gains: P, I, D of the feedback before and after the correction, %/cmH2O.
-        simulated: error of the entry on the emulator of the plain simulator, by PIP.
-        measured: its error on the lung that conceals something, by PIP.
-        comparison: simulators against the collected recording.
-        verdict: of the diagnosis.
-        named: mechanisms that it names, with their parameters.
-        open_loop: held-out open-loop error before, refitted and after the correction.
-        predicted: error of the replanned entry on the corrected simulator, mean over PIPs.
-        retuned: error of the replanned entry on the lung, by PIP.
-        truth: what the seal held.
-        folder: where everything lies.
-        seconds: duration.
-    """
-
-    words: str
-    lung: str
-    commitment: str
+    words: str  #: what the lung was drawn from.
+    lung: str  #: its label.
+    commitment: str  #: hash of the sealed answer, published first.
+    #: P, I, D of the feedback before and after the correction, %/cmH2O.
     gains: tuple[tuple[float, ...], tuple[float, ...]]
+    #: error of the entry on the emulator of the plain simulator, by PIP.
     simulated: dict[float, float]
-    measured: dict[float, float]
-    comparison: Comparison
-    verdict: str
-    named: dict[str, dict[str, float]]
+    measured: dict[float, float]  #: its error on the lung that conceals something, by PIP.
+    comparison: Comparison  #: simulators against the collected recording.
+    verdict: str  #: of the diagnosis.
+    named: dict[str, dict[str, float]]  #: mechanisms that it names, with their parameters.
+    #: held-out open-loop error before, refitted and after the correction.
     open_loop: tuple[float, float, float]
-    predicted: float
-    retuned: dict[float, float]
-    truth: dict[str, Any]
-    folder: Path
-    seconds: float
+    predicted: float  #: error of the replanned entry on the corrected simulator, mean over PIPs.
+    retuned: dict[float, float]  #: error of the replanned entry on the lung, by PIP.
+    truth: dict[str, Any]  #: what the seal held.
+    folder: Path  #: where everything lies.
+    seconds: float  #: duration.
 
     @property
     def right(self) -> bool:

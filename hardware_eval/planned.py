@@ -105,22 +105,14 @@ class Controller:
 
 @dataclass(frozen=True, eq=False)
 class PlannedController:
-    """Feedforward of N PIPs over the T steps of an inspiration, and gains of the feedback.
+    """Feedforward of N PIPs over the T steps of an inspiration, and gains of the feedback."""
 
-    Attributes:
-        pips: cmH2O, rising, N of them.
-        commands: planned, %, shape ``(N, T)``.
-        pressures: that the simulator gives under them, one before each command, cmH2O, shape
-            ``(N, T)``.
-        gains: P and I of the feedback, %/cmH2O.
-        error: mean ``|pressure - PIP|`` on the simulator, cmH2O.
-    """
-
-    pips: tuple[float, ...]
-    commands: Floats
+    pips: tuple[float, ...]  #: cmH2O, rising, N of them.
+    commands: Floats  #: planned, %, shape ``(N, T)``.
+    #: that the simulator gives under them, one before each command, cmH2O, shape ``(N, T)``.
     pressures: Floats
-    gains: tuple[float, float]
-    error: float
+    gains: tuple[float, float]  #: P and I of the feedback, %/cmH2O.
+    error: float  #: mean ``|pressure - PIP|`` on the simulator, cmH2O.
 
     def write(self, folder: Path, name: str) -> Path:
         """Write it as a submission ``folder/name``; returns that folder."""
@@ -146,15 +138,10 @@ def _numbers(values: Floats) -> str:
 
 @flax.struct.dataclass
 class _Breathing:
-    """A plant at the end of an expiration, whose airway pressure is the reading of its sensor.
+    """A plant at the end of an expiration, whose airway pressure is the reading of its sensor."""
 
-    Attributes:
-        plant: the plant.
-        state: of the plant when an inspiration begins, with the batch axes of the plant.
-    """
-
-    plant: Any
-    state: Any
+    plant: Any  #: the plant.
+    state: Any  #: of the plant when an inspiration begins, with the batch axes of the plant.
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Signals]:
         return self.state, Signals(pressure)

@@ -47,45 +47,29 @@ _ROOT = Path(__file__).parents[1]
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of ``frozen.json``.
+    """Content of ``frozen.json``."""
 
-    Attributes:
-        frozen: when, UTC.
-        delay_s: least time from the freeze to the beacon's value, s.
-        chain: of the beacon.
-        worlds: number of cases by name of the generator.
-        kind: of the cases.
-        seconds: processor time of a diagnoser on a case.
-        code: hash of the code.
-        diagnosers: hash of each one's folder by name; empty for the project's own, which are part
-            of the code.
-    """
-
-    frozen: datetime
+    frozen: datetime  #: when, UTC.
+    #: least time from the freeze to the beacon's value, s.
     delay_s: Annotated[int, msgspec.Meta(ge=1, le=10**7)]
-    chain: Chain
+    chain: Chain  #: of the beacon.
+    #: number of cases by name of the generator.
     worlds: dict[str, Annotated[int, msgspec.Meta(ge=1)]]
-    kind: Kind | Literal["all"]
-    seconds: float
-    code: schema.Sha256
+    kind: Kind | Literal["all"]  #: of the cases.
+    seconds: float  #: processor time of a diagnoser on a case.
+    code: schema.Sha256  #: hash of the code.
+    #: hash of each one's folder by name; empty for the project's own, which are part of the code.
     diagnosers: dict[str, str]
 
 
 @dataclass(frozen=True)
 class Round:
-    """A round as far as it has come; make one with :func:`load`.
+    """A round as far as it has come; make one with :func:`load`."""
 
-    Attributes:
-        folder: of the round.
-        frozen: what was frozen.
-        sha256: of ``frozen.json``.
-        value: of the beacon, checked; None before.
-    """
-
-    folder: Path
-    frozen: Frozen
-    sha256: str
-    value: Value | None = None
+    folder: Path  #: of the round.
+    frozen: Frozen  #: what was frozen.
+    sha256: str  #: of ``frozen.json``.
+    value: Value | None = None  #: of the beacon, checked; None before.
 
     @property
     def number(self) -> int:

@@ -74,19 +74,12 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Fit:
-    """The line through a series.
+    """The line through a series."""
 
-    Attributes:
-        intercept: reading where the reference is 0.
-        slope: reading per reference; NaN if the reference is the same throughout.
-        hysteresis: mean reading from above less that from below; NaN if only one is there.
-        residual: standard deviation of the readings about the line.
-    """
-
-    intercept: Estimate
-    slope: Estimate
-    hysteresis: Estimate
-    residual: float
+    intercept: Estimate  #: reading where the reference is 0.
+    slope: Estimate  #: reading per reference; NaN if the reference is the same throughout.
+    hysteresis: Estimate  #: mean reading from above less that from below; NaN if only one is there.
+    residual: float  #: standard deviation of the readings about the line.
 
 
 def _student(value: float, error: float, freedom: float) -> Estimate:
@@ -332,17 +325,12 @@ def _held_open(bench: Bench, lung: str, opening: float, above: bool) -> None:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration of a device.
+    """A calibration of a device."""
 
-    Attributes:
-        device: what the device says that it is: ``device_id`` and ``calibration``, hexadecimal.
-        parts: by kind.
-        sha256: of the content; identifies the calibration in records.
-    """
-
+    #: what the device says that it is: ``device_id`` and ``calibration``, hexadecimal.
     device: dict[str, str]
-    parts: dict[str, Part]
-    sha256: str = ""
+    parts: dict[str, Part]  #: by kind.
+    sha256: str = ""  #: of the content; identifies the calibration in records.
 
     def _content(self) -> dict[str, Any]:
         parts = {}

@@ -45,17 +45,11 @@ _STOPPED = 3
 
 @dataclass(frozen=True)
 class Collection:
-    """What was collected.
+    """What was collected."""
 
-    Attributes:
-        breaths: all whole breaths of the folder, also of earlier sessions.
-        recording: their file in the public schema.
-        stopped: why it ended early; empty if it did not.
-    """
-
-    breaths: Breaths
-    recording: Path
-    stopped: str
+    breaths: Breaths  #: all whole breaths of the folder, also of earlier sessions.
+    recording: Path  #: their file in the public schema.
+    stopped: str  #: why it ended early; empty if it did not.
 
 
 class BenchVentilator:

@@ -102,17 +102,11 @@ def white_noise(pressure: Floats) -> float:
 
 @dataclass(frozen=True)
 class KnownLung:
-    """A lung by the probes of the self-test, to be compared with itself.
+    """A lung by the probes of the self-test, to be compared with itself."""
 
-    Attributes:
-        lung: its label.
-        logarithms: of R, cmH2O/(L/s), and 1/C, cmH2O/L.
-        errors: their standard errors, by the noise of the sensor.
-    """
-
-    lung: str
-    logarithms: tuple[float, float]
-    errors: tuple[float, float]
+    lung: str  #: its label.
+    logarithms: tuple[float, float]  #: of R, cmH2O/(L/s), and 1/C, cmH2O/L.
+    errors: tuple[float, float]  #: their standard errors, by the noise of the sensor.
 
 
 def measured_lung(
@@ -164,17 +158,11 @@ _FILLED, _ROUNDED = 10, 0.003
 
 @dataclass(frozen=True)
 class Leak:
-    """What a closed lung loses.
+    """What a closed lung loses."""
 
-    Attributes:
-        flow: mL/s; below 0 where gas comes in.
-        pressure: mean while it was closed, cmH2O.
-        sigmas: standard errors by which the pressures contradict all that is allowed.
-    """
-
-    flow: float
-    pressure: float
-    sigmas: float
+    flow: float  #: mL/s; below 0 where gas comes in.
+    pressure: float  #: mean while it was closed, cmH2O.
+    sigmas: float  #: standard errors by which the pressures contradict all that is allowed.
 
 
 def leak(held: Driven, closed: int, C: float, allowed: float) -> Leak:

@@ -202,24 +202,15 @@ class EmergencyStop(Exception):
 
 @dataclass(frozen=True)
 class Bench:
-    """What a session works with.
+    """What a session works with."""
 
-    Attributes:
-        client: of the device.
-        clock: of the device's time or a virtual one.
-        settings: safety.
-        operator: the person.
-        view: shows breaths; None for none.
-        rest: time at rest before each run, s.
-        fallback: bounds of the controller that takes over; None for none.
-    """
-
-    client: Client
-    clock: Clock
-    settings: SafetySettings
-    operator: Operator
-    view: View | None = None
-    rest: float = REST_S
+    client: Client  #: of the device.
+    clock: Clock  #: of the device's time or a virtual one.
+    settings: SafetySettings  #: safety.
+    operator: Operator  #: the person.
+    view: View | None = None  #: shows breaths; None for none.
+    rest: float = REST_S  #: time at rest before each run, s.
+    #: bounds of the controller that takes over; None for none.
     fallback: FallbackSettings | None = None
 
 

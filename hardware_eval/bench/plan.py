@@ -50,52 +50,30 @@ REPEATS = 10
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run: a fresh controller, three breaths.
+    """One run: a fresh controller, three breaths."""
 
-    Attributes:
-        number: its place in the plan, from 0.
-        kind: see :data:`Kind`.
-        entry: name of the submission; :data:`CONTROL` for the control.
-        lung: label of the lung that must be mounted.
-        pip: cmH2O.
-        repeat: repetition, from 1.
-        perturbation: what happens to the tube; empty for nothing.
-    """
-
-    number: int
-    kind: Kind
-    entry: str
-    lung: str
-    pip: float
-    repeat: int
-    perturbation: str = ""
+    number: int  #: its place in the plan, from 0.
+    kind: Kind  #: see :data:`Kind`.
+    entry: str  #: name of the submission; :data:`CONTROL` for the control.
+    lung: str  #: label of the lung that must be mounted.
+    pip: float  #: cmH2O.
+    repeat: int  #: repetition, from 1.
+    perturbation: str = ""  #: what happens to the tube; empty for nothing.
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A plan of runs.
+    """A plan of runs."""
 
-    Attributes:
-        entries: names of the submissions.
-        track: what controllers are told: ``"performance"`` names the lung.
-        lungs: labels, in the order in which they are mounted.
-        pips: cmH2O.
-        repeats: repetitions of each cell.
-        control_every: see :data:`CONTROL_EVERY`; 0 for no control.
-        perturbations: of each entry on each lung, see :data:`PERTURBATIONS`.
-        seed: of the order.
-        runs: all runs in their order.
-    """
-
-    entries: tuple[str, ...]
-    track: str
-    lungs: tuple[str, ...]
-    pips: tuple[float, ...]
-    repeats: int
-    control_every: int
-    perturbations: tuple[str, ...]
-    seed: int
-    runs: tuple[PlannedRun, ...]
+    entries: tuple[str, ...]  #: names of the submissions.
+    track: str  #: what controllers are told: ``"performance"`` names the lung.
+    lungs: tuple[str, ...]  #: labels, in the order in which they are mounted.
+    pips: tuple[float, ...]  #: cmH2O.
+    repeats: int  #: repetitions of each cell.
+    control_every: int  #: see :data:`CONTROL_EVERY`; 0 for no control.
+    perturbations: tuple[str, ...]  #: of each entry on each lung, see :data:`PERTURBATIONS`.
+    seed: int  #: of the order.
+    runs: tuple[PlannedRun, ...]  #: all runs in their order.
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values without the runs, which follow from them."""
@@ -192,15 +170,10 @@ def make_plan(
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a plan has come.
+    """How far a plan has come."""
 
-    Attributes:
-        done: numbers of the runs that need not run again.
-        attempts: how often each run has been begun.
-    """
-
-    done: frozenset[int]
-    attempts: Mapping[int, int]
+    done: frozenset[int]  #: numbers of the runs that need not run again.
+    attempts: Mapping[int, int]  #: how often each run has been begun.
 
     def remaining(self, plan: Plan) -> list[PlannedRun]:
         """Runs that are still to do, in the plan's order."""

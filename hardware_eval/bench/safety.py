@@ -32,22 +32,15 @@ _STUCK_AT_REST_S = 5.0
 
 @dataclass(frozen=True)
 class Check:
-    """One safety check.
+    """One safety check."""
 
-    Attributes:
-        threshold: value beyond which the condition holds, in ``unit``.
-        unit: unit of the threshold.
-        duration: how long the condition must hold to trip, s; 0 for one sample.
-        bench: whether the bench is to blame, so that the run is repeated; else the controller is,
-            and its run has no score.
-        reason: why there is such a check, and why this threshold.
-    """
-
-    threshold: float
-    unit: str
-    duration: float
+    threshold: float  #: value beyond which the condition holds, in ``unit``.
+    unit: str  #: unit of the threshold.
+    duration: float  #: how long the condition must hold to trip, s; 0 for one sample.
+    #: whether the bench is to blame, so that the run is repeated; else the controller is, and its
+    #: run has no score.
     bench: bool
-    reason: str
+    reason: str  #: why there is such a check, and why this threshold.
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.threshold) or not self.duration >= 0.0:
@@ -56,14 +49,9 @@ class Check:
 
 @dataclass(frozen=True)
 class SafetySettings:
-    """All checks and limits; written into every record.
+    """All checks and limits; written into every record."""
 
-    Attributes:
-        over_pressure: see the reasons of the checks themselves, also for those that follow.
-        largest_u_in: commands are cut to this, %.
-        largest_rise: largest rise of the command in one step, %; 100 for none, as in simulation.
-    """
-
+    #: see the reasons of the checks themselves, also for those that follow.
     over_pressure: Check = Check(
         protocol.SAFETY_MARGIN, "cmH2O above PIP", protocol.SAFETY_TIME, False,
         "Protocol's safety gate: pressure above min(60, PIP + 15) for longer than 0.1 s.",
@@ -128,7 +116,8 @@ class SafetySettings:
         2.0, "% apart", 0.1, True,
         "The device reports a position of the valve that it was not told.",
     )  # fmt: skip
-    largest_u_in: float = protocol.U_MAX
+    largest_u_in: float = protocol.U_MAX  #: commands are cut to this, %.
+    #: largest rise of the command in one step, %; 100 for none, as in simulation.
     largest_rise: float = 100.0
 
     def __post_init__(self) -> None:
@@ -156,28 +145,18 @@ DEFAULT = SafetySettings()
 
 
 class SafetySample(NamedTuple):
-    """What one step of the loop knows.
+    """What one step of the loop knows."""
 
-    Attributes:
-        time: of the reading, s, on the loop's clock.
-        pressure: measured airway pressure, cmH2O; NaN if there is none.
-        flow: measured flow into the lung, mL/s; NaN if it is not measured.
-        u_in: command in force until now, %.
-        u_out: expiratory valve in force until now, 0/1.
-        pip: target of this breath, cmH2O.
-        late: how late this step began, s.
-        applied: position of the inspiratory valve as the device reports it, %; NaN if unknown.
-        answered: whether the device answered; else there is no pressure, whatever the sensor does.
-    """
-
-    time: float
-    pressure: float
-    flow: float
-    u_in: float
-    u_out: int
-    pip: float
-    late: float
+    time: float  #: of the reading, s, on the loop's clock.
+    pressure: float  #: measured airway pressure, cmH2O; NaN if there is none.
+    flow: float  #: measured flow into the lung, mL/s; NaN if it is not measured.
+    u_in: float  #: command in force until now, %.
+    u_out: int  #: expiratory valve in force until now, 0/1.
+    pip: float  #: target of this breath, cmH2O.
+    late: float  #: how late this step began, s.
+    #: position of the inspiratory valve as the device reports it, %; NaN if unknown.
     applied: float = math.nan
+    #: whether the device answered; else there is no pressure, whatever the sensor does.
     answered: bool = True
 
 
@@ -191,23 +170,14 @@ TIMING_CHECKS = frozenset({"no_answer", "software_delay", "missed_deadlines"})
 
 @dataclass(frozen=True)
 class Trip:
-    """A check that has tripped.
+    """A check that has tripped."""
 
-    Attributes:
-        check: its name.
-        time: when, s, on the loop's clock.
-        held: how long its condition had held, s.
-        value: value that was compared, in the check's unit.
-        message: one sentence for a person.
-        bench: see :class:`Check`.
-    """
-
-    check: str
-    time: float
-    held: float
-    value: float
-    message: str
-    bench: bool
+    check: str  #: its name.
+    time: float  #: when, s, on the loop's clock.
+    held: float  #: how long its condition had held, s.
+    value: float  #: value that was compared, in the check's unit.
+    message: str  #: one sentence for a person.
+    bench: bool  #: see :class:`Check`.
 
     @property
     def alarm(self) -> str:
@@ -217,37 +187,24 @@ class Trip:
 
 @dataclass(frozen=True)
 class SafetyState:
-    """State of all checks between two steps.
+    """State of all checks between two steps."""
 
-    Attributes:
-        lung: label of the mounted lung.
-        since: when each condition that holds began to hold, s.
-        trips: checks that have tripped, in order; they stay.
-        previous: sample before; None before the first.
-        volume: estimate of the volume above that at PEEP, mL.
-        delivered: volume given since this inspiration began, mL.
-        start: pressure when this inspiration began, cmH2O.
-        switched: when the expiratory valve last changed its command, s.
-        switched_pressure: pressure then, cmH2O.
-        unchanged: since when the reading has been the same, s.
-        expected: pressure change that the commands should have brought since then, cmH2O.
-        closed: since when both valves have been told to be closed, s; NaN if they are not.
-        closed_pressure: pressure then, cmH2O.
-    """
-
-    lung: Lung
+    lung: Lung  #: label of the mounted lung.
+    #: when each condition that holds began to hold, s.
     since: dict[str, float] = field(default_factory=dict)
-    trips: tuple[Trip, ...] = ()
-    previous: SafetySample | None = None
-    volume: float = 0.0
-    delivered: float = 0.0
-    start: float = protocol.PEEP
-    switched: float = -math.inf
-    switched_pressure: float = protocol.PEEP
-    unchanged: float = -math.inf
+    trips: tuple[Trip, ...] = ()  #: checks that have tripped, in order; they stay.
+    previous: SafetySample | None = None  #: sample before; None before the first.
+    volume: float = 0.0  #: estimate of the volume above that at PEEP, mL.
+    delivered: float = 0.0  #: volume given since this inspiration began, mL.
+    start: float = protocol.PEEP  #: pressure when this inspiration began, cmH2O.
+    switched: float = -math.inf  #: when the expiratory valve last changed its command, s.
+    switched_pressure: float = protocol.PEEP  #: pressure then, cmH2O.
+    unchanged: float = -math.inf  #: since when the reading has been the same, s.
+    #: pressure change that the commands should have brought since then, cmH2O.
     expected: float = 0.0
+    #: since when both valves have been told to be closed, s; NaN if they are not.
     closed: float = math.nan
-    closed_pressure: float = math.nan
+    closed_pressure: float = math.nan  #: pressure then, cmH2O.
 
 
 def init(lung: Lung) -> SafetyState:

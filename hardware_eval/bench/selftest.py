@@ -37,19 +37,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Limit:
-    """What a measured value must be.
+    """What a measured value must be."""
 
-    Attributes:
-        low: least value.
-        high: largest value.
-        unit: of both.
-        reason: why.
-    """
-
-    low: float
-    high: float
-    unit: str
-    reason: str
+    low: float  #: least value.
+    high: float  #: largest value.
+    unit: str  #: of both.
+    reason: str  #: why.
 
 
 LIMITS: dict[str, Limit] = {
@@ -116,19 +109,12 @@ LIMITS: dict[str, Limit] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the sheet.
+    """One line of the sheet."""
 
-    Attributes:
-        name: what was measured; a key of :data:`LIMITS`.
-        value: measured value; NaN if it could not be measured.
-        ok: whether it is within its limit.
-        text: what it means, for a person.
-    """
-
-    name: str
-    value: float
-    ok: bool
-    text: str
+    name: str  #: what was measured; a key of :data:`LIMITS`.
+    value: float  #: measured value; NaN if it could not be measured.
+    ok: bool  #: whether it is within its limit.
+    text: str  #: what it means, for a person.
 
     @property
     def limit(self) -> Limit:

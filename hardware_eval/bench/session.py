@@ -40,17 +40,11 @@ _COUNTED = ("asked", "late_answers", "limited", "outside", "fallback", "longest_
 
 @dataclass(frozen=True)
 class SessionEnd:
-    """How a session ended.
+    """How a session ended."""
 
-    Attributes:
-        complete: whether the plan is done.
-        reason: why not; empty if it is.
-        runs: runs of this session.
-    """
-
-    complete: bool
-    reason: str
-    runs: int
+    complete: bool  #: whether the plan is done.
+    reason: str  #: why not; empty if it is.
+    runs: int  #: runs of this session.
 
 
 def run_plan(

@@ -44,19 +44,13 @@ _VENTED = (0.0, 1)
 
 @dataclass(frozen=True, slots=True)
 class Deadman:
-    """State of the deadman.
+    """State of the deadman."""
 
-    Attributes:
-        fed: when the last order came, s.
-        valves: what the valves are told: inspiratory, %, and expiratory, 0 or 1.
-        lapsed: whether orders stopped; only an order to vent is obeyed then.
-        rest: bytes of an order that has not come whole.
-    """
-
-    fed: float
+    fed: float  #: when the last order came, s.
+    #: what the valves are told: inspiratory, %, and expiratory, 0 or 1.
     valves: tuple[float, int] = _VENTED
-    lapsed: bool = False
-    rest: bytes = b""
+    lapsed: bool = False  #: whether orders stopped; only an order to vent is obeyed then.
+    rest: bytes = b""  #: bytes of an order that has not come whole.
 
 
 def step(state: Deadman, now: float, data: bytes) -> Deadman:

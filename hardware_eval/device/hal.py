@@ -11,42 +11,27 @@ from hardware_eval.wire.messages import Capability
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One look at the sensors.
+    """One look at the sensors."""
 
-    Attributes:
-        time: when it was taken, s, on the clock that the program is stepped with.
-        pressure: airway pressure, cmH2O; NaN if the sensor did not answer.
-        flow: flow into the lung, mL/s; NaN if it is not measured.
-        lapsed: whether the electronics have vented by themselves, as the program stood still.
-        saturated: whether the pressure stands at the upper end of the sensor's range.
-    """
-
-    time: float
-    pressure: float
-    flow: float = math.nan
-    saturated: bool = False
+    time: float  #: when it was taken, s, on the clock that the program is stepped with.
+    pressure: float  #: airway pressure, cmH2O; NaN if the sensor did not answer.
+    flow: float = math.nan  #: flow into the lung, mL/s; NaN if it is not measured.
+    saturated: bool = False  #: whether the pressure stands at the upper end of the sensor's range.
+    #: whether the electronics have vented by themselves, as the program stood still.
     lapsed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a device tells about itself.
+    """What a device tells about itself."""
 
-    Attributes:
-        name: what people call it, at most 32 bytes of UTF-8.
-        device_id: its own number, 8 bytes.
-        calibration: SHA-256 of its calibration, 32 bytes.
-        capabilities: what it is and has.
-        highest: largest pressure that the sensor can tell, cmH2O.
-        noisy: whether noise moves the sensor's readings at rest by half a digit or more, so that
-            one that does not move is stuck.
-    """
-
-    name: str
-    device_id: bytes
-    calibration: bytes
-    capabilities: Capability
-    highest: float = math.inf
+    name: str  #: what people call it, at most 32 bytes of UTF-8.
+    device_id: bytes  #: its own number, 8 bytes.
+    calibration: bytes  #: SHA-256 of its calibration, 32 bytes.
+    capabilities: Capability  #: what it is and has.
+    highest: float = math.inf  #: largest pressure that the sensor can tell, cmH2O.
+    #: whether noise moves the sensor's readings at rest by half a digit or more, so that one that
+    #: does not move is stuck.
     noisy: bool = False
 
 

@@ -75,17 +75,12 @@ PERIOD = 0.005
 
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
-    """Limits of a device, fixed when its program starts.
+    """Limits of a device, fixed when its program starts."""
 
-    Attributes:
-        pressure_limit: pressure above which the device vents, cmH2O.
-        u_in_limit: largest command, %.
-        watchdog: time without an acceptable command after which it vents, s, at most
-            :data:`WATCHDOG`.
-    """
-
+    #: pressure above which the device vents, cmH2O.
     pressure_limit: float = protocol.SAFETY_PRESSURE
-    u_in_limit: float = protocol.U_MAX
+    u_in_limit: float = protocol.U_MAX  #: largest command, %.
+    #: time without an acceptable command after which it vents, s, at most :data:`WATCHDOG`.
     watchdog: float = WATCHDOG
 
     def __post_init__(self) -> None:
@@ -106,39 +101,23 @@ class DeviceSettings:
 
 @dataclass(frozen=True, slots=True)
 class DeviceState:
-    """State between two steps.
+    """State between two steps."""
 
-    Attributes:
-        parser: place in the stream of bytes.
-        mode: what the device does with the valves.
-        session: number of the open session, None before the first.
-        sequence: last sequence number of the session.
-        pressure_limit: limit of the session, cmH2O.
-        u_in: inspiratory valve, %.
-        u_out: expiratory valve, 0 or 1.
-        fed: when the last acceptable command or arming came, us.
-        valid: when the last valid sample was taken, us.
-        changed: when the reading last changed, us.
-        newest: the last valid pressures, oldest first, at most :data:`NOISE_WINDOW`, cmH2O.
-        stepped: time of the last step, us.
-        causes: why the device vented since it was last armed.
-        counters: counts since the program started.
-    """
-
-    pressure_limit: float
-    valid: int
-    changed: int
-    stepped: int
+    pressure_limit: float  #: limit of the session, cmH2O.
+    valid: int  #: when the last valid sample was taken, us.
+    changed: int  #: when the reading last changed, us.
+    stepped: int  #: time of the last step, us.
+    #: the last valid pressures, oldest first, at most :data:`NOISE_WINDOW`, cmH2O.
     newest: tuple[float, ...] = ()
-    parser: ParserState = field(default_factory=ParserState)
-    mode: Mode = Mode.CLOSED
-    session: int | None = None
-    sequence: int = 0
-    u_in: float = 0.0
-    u_out: int = 1
-    fed: int = 0
-    causes: Flag = Flag.NONE
-    counters: Counters = field(default_factory=Counters)
+    parser: ParserState = field(default_factory=ParserState)  #: place in the stream of bytes.
+    mode: Mode = Mode.CLOSED  #: what the device does with the valves.
+    session: int | None = None  #: number of the open session, None before the first.
+    sequence: int = 0  #: last sequence number of the session.
+    u_in: float = 0.0  #: inspiratory valve, %.
+    u_out: int = 1  #: expiratory valve, 0 or 1.
+    fed: int = 0  #: when the last acceptable command or arming came, us.
+    causes: Flag = Flag.NONE  #: why the device vented since it was last armed.
+    counters: Counters = field(default_factory=Counters)  #: counts since the program started.
 
 
 def init(settings: DeviceSettings, now: float) -> DeviceState:

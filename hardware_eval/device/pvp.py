@@ -46,57 +46,38 @@ _FULL_DUTY = 1_000_000
 
 @dataclass(frozen=True)
 class PvpConfiguration:
-    """Wiring and calibration of one ventilator; every field is a key of its TOML file.
+    """Wiring and calibration of one ventilator; every field is a key of its TOML file."""
 
-    Attributes:
-        name: what people call it.
-        device_id: its own number, 16 hexadecimal digits.
-        i2c_bus: bus of the converter.
-        adc_address: address of the converter.
-        adc_channel: input of the pressure sensor, 0..3.
-        offset_voltage: sensor at ambient pressure, V.
-        cmH2O_per_volt: slope of the sensor.
-        highest_pressure: largest pressure that the sensor can tell, cmH2O; 20 inH2O are 50.8.
-        inspiratory_pin: GPIO of the proportional valve; one with hardware PWM (12, 13, 18, 19).
-        pwm_frequency: Hz.
-        expiratory_pin: GPIO of the on/off valve.
-        expiratory_normally_open: whether that valve is open without current. The PVP's own is
-            closed without current: with it, a device without power does not vent.
-        heartbeat_pin: GPIO of the monostable's trigger, which moves with every order to the valves;
-            -1 for none.
-        valve_table: CSV of the proportional valve with columns u_in (%, 0 to 100, increasing),
-            opening, closing (duty cycle, 0..1); beside the TOML file.
-    """
-
-    name: str = "PVP"
-    device_id: str = "00" * 8
-    i2c_bus: int = 1
-    adc_address: int = 0x48
-    adc_channel: int = 0
-    offset_voltage: float = 2.2
-    cmH2O_per_volt: float = 35.15
+    name: str = "PVP"  #: what people call it.
+    device_id: str = "00" * 8  #: its own number, 16 hexadecimal digits.
+    i2c_bus: int = 1  #: bus of the converter.
+    adc_address: int = 0x48  #: address of the converter.
+    adc_channel: int = 0  #: input of the pressure sensor, 0..3.
+    offset_voltage: float = 2.2  #: sensor at ambient pressure, V.
+    cmH2O_per_volt: float = 35.15  #: slope of the sensor.
+    #: largest pressure that the sensor can tell, cmH2O; 20 inH2O are 50.8.
     highest_pressure: float = 50.8
+    #: GPIO of the proportional valve; one with hardware PWM (12, 13, 18, 19).
     inspiratory_pin: int = 12
-    pwm_frequency: int = 20_000
-    expiratory_pin: int = 17
+    pwm_frequency: int = 20_000  #: Hz.
+    expiratory_pin: int = 17  #: GPIO of the on/off valve.
+    #: whether that valve is open without current. The PVP's own is closed without current: with it,
+    #: a device without power does not vent.
     expiratory_normally_open: bool = False
+    #: GPIO of the monostable's trigger, which moves with every order to the valves; -1 for none.
     heartbeat_pin: int = -1
+    #: CSV of the proportional valve with columns u_in (%, 0 to 100, increasing), opening, closing
+    #: (duty cycle, 0..1); beside the TOML file.
     valve_table: str = "valve.csv"
 
 
 @dataclass(frozen=True, eq=False)
 class ValveTable:
-    """Duty cycle of the proportional valve by opening, apart for opening and closing.
+    """Duty cycle of the proportional valve by opening, apart for opening and closing."""
 
-    Attributes:
-        u_in: %, increasing from 0 to 100, ``(n,)``.
-        opening: duty cycle when the command rises, 0..1, ``(n,)``.
-        closing: duty cycle when it falls, ``(n,)``.
-    """
-
-    u_in: NDArray[np.float64]
-    opening: NDArray[np.float64]
-    closing: NDArray[np.float64]
+    u_in: NDArray[np.float64]  #: %, increasing from 0 to 100, ``(n,)``.
+    opening: NDArray[np.float64]  #: duty cycle when the command rises, 0..1, ``(n,)``.
+    closing: NDArray[np.float64]  #: duty cycle when it falls, ``(n,)``.
 
     def duty(self, u_in: float, rising: bool) -> float:
         """Duty cycle of a command, 0..1; exactly 0 for a closed valve."""

@@ -66,75 +66,46 @@ NOMINAL_GAIN = 22.8
 
 @dataclass(frozen=True)
 class Effect:
-    """A piece of physics that the rig has beyond resistance and compliance.
+    """A piece of physics that the rig has beyond resistance and compliance."""
 
-    Attributes:
-        name: name of the library's mechanism, or of an effect that the library does not have.
-        strength: mild or strong, as :data:`EFFECTS` quantifies them.
-        form: form of its equation, one of :attr:`EffectFamily.forms`.
-        parameters: parameters of that form, in the units of :mod:`ventbench.physics`; times in s,
-            lengths of command in %.
-    """
-
-    name: str
-    strength: Strength
-    form: str
+    name: str  #: name of the library's mechanism, or of an effect that the library does not have.
+    strength: Strength  #: mild or strong, as :data:`EFFECTS` quantifies them.
+    form: str  #: form of its equation, one of :attr:`EffectFamily.forms`.
+    #: parameters of that form, in the units of :mod:`ventbench.physics`; times in s, lengths of
+    #: command in %.
     parameters: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Base:
-    """True values of the rig without any effect.
+    """True values of the rig without any effect."""
 
-    Attributes:
-        R: airway resistance, cmH2O/(L/s).
-        C: compliance, mL/cmH2O.
-        R_ex: resistance of the expiratory valve, cmH2O/(L/s).
-        peep: pressure behind the expiratory valve, cmH2O.
-        gain: flow of the inspiratory valve, mL/s per %.
-    """
-
-    R: float
-    C: float
-    R_ex: float = 5.0
-    peep: float = 5.0
-    gain: float = NOMINAL_GAIN
+    R: float  #: airway resistance, cmH2O/(L/s).
+    C: float  #: compliance, mL/cmH2O.
+    R_ex: float = 5.0  #: resistance of the expiratory valve, cmH2O/(L/s).
+    peep: float = 5.0  #: pressure behind the expiratory valve, cmH2O.
+    gain: float = NOMINAL_GAIN  #: flow of the inspiratory valve, mL/s per %.
 
 
 @dataclass(frozen=True)
 class Case:
-    """One recording.
+    """One recording."""
 
-    Attributes:
-        name: name of its file, without suffix.
-        lung_R: label of the lung setting, cmH2O/(L/s).
-        lung_C: label of the lung setting, mL/cmH2O.
-        effects: what the recording conceals.
-        base: the rig; each recording draws its own if None.
-        noise: standard deviation of the sensor's noise, cmH2O.
-        coloured: share of the noise variance that is correlated from sample to sample, 0..1.
-        correlation: correlation of the coloured share, from one sample to the next.
-        step: step of the sensor's converter, cmH2O; 0 for none.
-        jitter: standard deviation of the sampling interval, s.
-        breaths: number of breaths.
-        samples: number of samples in a breath.
-        style: ``pi``: closed loop only; ``mixed``: half of the breaths explore.
-        log_step: resolution of the logged commands, %; the rig receives what is logged.
-    """
-
-    name: str
-    lung_R: float
-    lung_C: float
-    effects: tuple[Effect, ...] = ()
-    base: Base | None = None
-    noise: float = 0.2
+    name: str  #: name of its file, without suffix.
+    lung_R: float  #: label of the lung setting, cmH2O/(L/s).
+    lung_C: float  #: label of the lung setting, mL/cmH2O.
+    effects: tuple[Effect, ...] = ()  #: what the recording conceals.
+    base: Base | None = None  #: the rig; each recording draws its own if None.
+    noise: float = 0.2  #: standard deviation of the sensor's noise, cmH2O.
+    #: share of the noise variance that is correlated from sample to sample, 0..1.
     coloured: float = 0.0
-    correlation: float = 0.6
-    step: float = 0.0703
-    jitter: float = 3e-4
-    breaths: int = 60
-    samples: int = 80
-    style: Style = "mixed"
+    correlation: float = 0.6  #: correlation of the coloured share, from one sample to the next.
+    step: float = 0.0703  #: step of the sensor's converter, cmH2O; 0 for none.
+    jitter: float = 3e-4  #: standard deviation of the sampling interval, s.
+    breaths: int = 60  #: number of breaths.
+    samples: int = 80  #: number of samples in a breath.
+    style: Style = "mixed"  #: ``pi``: closed loop only; ``mixed``: half of the breaths explore.
+    #: resolution of the logged commands, %; the rig receives what is logged.
     log_step: float = 0.01
 
     @property
@@ -145,25 +116,16 @@ class Case:
 
 @dataclass(frozen=True)
 class EffectFamily:
-    """Strengths, forms and parameter ranges of an effect.
+    """Strengths, forms and parameter ranges of an effect."""
 
-    Attributes:
-        parameter: the parameter that carries the strength.
-        mild: mean of that parameter in a mild effect.
-        strong: mean of that parameter in a strong effect.
-        forms: forms of the equation; the first is the library's if ``inside``.
-        ranges: further parameters, each with the low and high end of a uniform distribution.
-        signs: signs of the strength that are drawn.
-        inside: whether the library has a mechanism of this name.
-    """
-
-    parameter: str
-    mild: float
-    strong: float
-    forms: tuple[str, ...]
+    parameter: str  #: the parameter that carries the strength.
+    mild: float  #: mean of that parameter in a mild effect.
+    strong: float  #: mean of that parameter in a strong effect.
+    forms: tuple[str, ...]  #: forms of the equation; the first is the library's if ``inside``.
+    #: further parameters, each with the low and high end of a uniform distribution.
     ranges: tuple[tuple[str, tuple[float, float]], ...] = ()
-    signs: tuple[float, ...] = (1.0,)
-    inside: bool = True
+    signs: tuple[float, ...] = (1.0,)  #: signs of the strength that are drawn.
+    inside: bool = True  #: whether the library has a mechanism of this name.
 
 
 _LIBRARY_ONLY = ("library",)

@@ -43,17 +43,11 @@ _CASES = 68
 
 @dataclass(frozen=True, eq=False)
 class ConcealedLung:
-    """A lung whose physics nobody has been told.
+    """A lung whose physics nobody has been told."""
 
-    Attributes:
-        lung: its label, which is public.
-        plant: simulator with the concealed physics.
-        seal: JSON values to publish: lung, commitment, and the encrypted answer.
-    """
-
-    lung: Lung
-    plant: Plant
-    seal: dict[str, str]
+    lung: Lung  #: its label, which is public.
+    plant: Plant  #: simulator with the concealed physics.
+    seal: dict[str, str]  #: JSON values to publish: lung, commitment, and the encrypted answer.
 
     def write(self, path: Path) -> None:
         """Write the seal to a JSON file."""

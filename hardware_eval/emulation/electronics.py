@@ -49,22 +49,15 @@ _STARTS = 300.0
 
 @dataclass(frozen=True, slots=True)
 class Electronics:
-    """What decides what the valves do.
+    """What decides what the valves do."""
 
-    Attributes:
-        normally_open: whether the expiratory valve is open without current.
-        monostable: time without a heartbeat after which the monostable vents, s; infinite where
-            none is fitted.
-        lines: what the pins were last told: inspiratory valve, %, and expiratory valve, 0 or 1.
-        beat: when the heartbeat pin last moved, s.
-        powered: whether there is a supply.
-    """
-
-    normally_open: bool = True
+    normally_open: bool = True  #: whether the expiratory valve is open without current.
+    #: time without a heartbeat after which the monostable vents, s; infinite where none is fitted.
     monostable: float = deadman.MONOSTABLE
+    #: what the pins were last told: inspiratory valve, %, and expiratory valve, 0 or 1.
     lines: tuple[float, int] = (0.0, 1)
-    beat: float = 0.0
-    powered: bool = True
+    beat: float = 0.0  #: when the heartbeat pin last moved, s.
+    powered: bool = True  #: whether there is a supply.
 
     def valves(self, now: float) -> tuple[float, int, str]:
         """What the valves do, and what decides it: ``lines``, ``monostable`` or ``supply``."""

@@ -62,19 +62,12 @@ class LineFaultKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class LungFault:
-    """A fault of the simulated hardware.
+    """A fault of the simulated hardware."""
 
-    Attributes:
-        kind: what goes wrong.
-        start: from when, s on the device's clock.
-        end: until when, s.
-        strength: how much; see :class:`FaultKind`.
-    """
-
-    kind: FaultKind
-    start: float
-    end: float = math.inf
-    strength: float = 1.0
+    kind: FaultKind  #: what goes wrong.
+    start: float  #: from when, s on the device's clock.
+    end: float = math.inf  #: until when, s.
+    strength: float = 1.0  #: how much; see :class:`FaultKind`.
 
 
 @dataclass(frozen=True, slots=True)

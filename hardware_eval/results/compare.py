@@ -40,25 +40,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Replay:
-    """What a log says.
+    """What a log says."""
 
-    Attributes:
-        runs: runs of the plan.
-        done: those that need not run again.
-        breaths: breaths in the log, of all attempts.
-        errors: mean error of the complete scored runs by entry and lung, cmH2O.
-        spreads: standard deviation of the runs of one cell, pooled, cmH2O; NaN for one repetition.
-        timing: statistics of the loop.
-        problems: where the record and the log differ; empty without a record.
-    """
-
-    runs: int
-    done: int
-    breaths: int
+    runs: int  #: runs of the plan.
+    done: int  #: those that need not run again.
+    breaths: int  #: breaths in the log, of all attempts.
+    #: mean error of the complete scored runs by entry and lung, cmH2O.
     errors: dict[str, dict[str, float]]
+    #: standard deviation of the runs of one cell, pooled, cmH2O; NaN for one repetition.
     spreads: dict[str, dict[str, float]]
-    timing: Jitter
-    problems: tuple[str, ...]
+    timing: Jitter  #: statistics of the loop.
+    problems: tuple[str, ...]  #: where the record and the log differ; empty without a record.
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
@@ -177,41 +169,27 @@ _NAMES = (
 
 @dataclass(frozen=True)
 class Distance:
-    """Open-loop distance of some breaths; inspirations only.
+    """Open-loop distance of some breaths; inspirations only."""
 
-    Attributes:
-        breaths: how many.
-        distance: sum of |simulated - recorded| over the steps of a breath, mean over breaths, cmH2O
-            (the paper's distance).
-        mae: mean of it per step, cmH2O.
-        bias: mean of recorded minus simulated, cmH2O.
-    """
-
-    breaths: int
+    breaths: int  #: how many.
+    #: sum of |simulated - recorded| over the steps of a breath, mean over breaths, cmH2O (the
+    #: paper's distance).
     distance: float
-    mae: float
-    bias: float
+    mae: float  #: mean of it per step, cmH2O.
+    bias: float  #: mean of recorded minus simulated, cmH2O.
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Simulators against a recording.
+    """Simulators against a recording."""
 
-    Attributes:
-        breaths: the recording.
-        simulator: name of the simulators.
-        lungs: distance by lung.
-        waveforms: distance by lung, then by plateau pressure, cmH2O.
-        horizon: mean absolute error at each step after the start by lung, cmH2O.
-        diagnoses: by lung; empty if none was asked for.
-    """
-
-    breaths: Breaths
-    simulator: str
-    lungs: dict[str, Distance]
-    waveforms: dict[str, dict[str, Distance]]
+    breaths: Breaths  #: the recording.
+    simulator: str  #: name of the simulators.
+    lungs: dict[str, Distance]  #: distance by lung.
+    waveforms: dict[str, dict[str, Distance]]  #: distance by lung, then by plateau pressure, cmH2O.
+    #: mean absolute error at each step after the start by lung, cmH2O.
     horizon: dict[str, list[float]]
-    diagnoses: Mapping[str, Diagnosis]
+    diagnoses: Mapping[str, Diagnosis]  #: by lung; empty if none was asked for.
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""

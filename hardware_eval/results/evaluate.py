@@ -49,43 +49,30 @@ UNDISTURBED = ("ramp", "scored", "control")
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation made.
+    """What an evaluation made."""
 
-    Attributes:
-        complete: whether the plan is done.
-        reason: why not; empty if it is.
-        log: the raw recording.
-        recording: all whole breaths of an undisturbed tube in the public schema; None if there is
-            none.
-        records: path of each entry's hardware record; empty until the plan is done.
-        stopped: entries that have no score, as a run of theirs failed, and why, by name.
-        unrun: those of them of which every run failed, so that there is nothing for the board.
-    """
-
-    complete: bool
-    reason: str
-    log: Path
+    complete: bool  #: whether the plan is done.
+    reason: str  #: why not; empty if it is.
+    log: Path  #: the raw recording.
+    #: all whole breaths of an undisturbed tube in the public schema; None if there is none.
     recording: Path | None
+    #: path of each entry's hardware record; empty until the plan is done.
     records: Mapping[str, Path]
+    #: entries that have no score, as a run of theirs failed, and why, by name.
     stopped: Mapping[str, str]
+    #: those of them of which every run failed, so that there is nothing for the board.
     unrun: frozenset[str]
 
 
 @dataclass(frozen=True)
 class Line:
-    """A device and the time that it lives in.
+    """A device and the time that it lives in."""
 
-    Attributes:
-        client: of the device.
-        clock: real, or the loopback device's.
-        device: the device if it is emulated in this process, else None.
-        port: what carries the bytes, see :func:`port_kind`.
-    """
-
-    client: Client
-    clock: Clock
+    client: Client  #: of the device.
+    clock: Clock  #: real, or the loopback device's.
+    #: the device if it is emulated in this process, else None.
     device: LoopbackDevice | None = None
-    port: str = "virtual"
+    port: str = "virtual"  #: what carries the bytes, see :func:`port_kind`.
 
     @property
     def real(self) -> bool:

@@ -129,40 +129,26 @@ def agreement(
 
 @dataclass(frozen=True)
 class EntryTrial:
-    """What a trial says of one entry.
+    """What a trial says of one entry."""
 
-    Attributes:
-        score: mean error, cmH2O, as mounted; NaN if a run failed.
-        gap: mean error less that in simulation, cmH2O, mounted anew; NaN without a dry run.
-        gaps: the same by mounting, cmH2O, as mounted.
-        success: share of scored runs that completed, by Clopper and Pearson.
-        successes: completed scored runs and all of them, by mounting.
-        repeat_sd: standard deviation of repeats, pooled, cmH2O.
-        mounting_sd: standard deviation of the gap between mountings beyond that, cmH2O.
-    """
-
-    score: Interval
+    score: Interval  #: mean error, cmH2O, as mounted; NaN if a run failed.
+    #: mean error less that in simulation, cmH2O, mounted anew; NaN without a dry run.
     gap: Interval
-    gaps: dict[str, Interval]
-    success: Interval
-    successes: dict[str, tuple[int, int]]
-    repeat_sd: float
-    mounting_sd: float
+    gaps: dict[str, Interval]  #: the same by mounting, cmH2O, as mounted.
+    success: Interval  #: share of scored runs that completed, by Clopper and Pearson.
+    successes: dict[str, tuple[int, int]]  #: completed scored runs and all of them, by mounting.
+    repeat_sd: float  #: standard deviation of repeats, pooled, cmH2O.
+    mounting_sd: float  #: standard deviation of the gap between mountings beyond that, cmH2O.
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What the sessions of a trial say.
+    """What the sessions of a trial say."""
 
-    Attributes:
-        entries: by name.
-        agreement: rank agreement of the entries with a score; empty for fewer than two.
-        missing: why something could not be said.
-    """
-
-    entries: dict[str, EntryTrial]
+    entries: dict[str, EntryTrial]  #: by name.
+    #: rank agreement of the entries with a score; empty for fewer than two.
     agreement: dict[str, Interval]
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  #: why something could not be said.
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""

@@ -74,35 +74,20 @@ class Transport(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LinkStatistics:
-    """What the host counted since the client was made.
+    """What the host counted since the client was made."""
 
-    Attributes:
-        sent: messages sent.
-        answered: messages answered in time.
-        unanswered: messages without an answer in time.
-        unexpected: answers to no message that waited, such as late ones.
-        refused: messages that the device refused.
-        framing: runs of bytes that are no frame.
-        checksum: packets with a wrong CRC.
-        malformed: intact packets of unknown kind or wrong length.
-        sessions: sessions opened.
-        disconnections: losses of the port.
-        round_trip_median: median time from message to answer of the last ten thousand, s.
-        round_trip_worst: longest of them, s.
-    """
-
-    sent: int
-    answered: int
-    unanswered: int
-    unexpected: int
-    refused: int
-    framing: int
-    checksum: int
-    malformed: int
-    sessions: int
-    disconnections: int
-    round_trip_median: float
-    round_trip_worst: float
+    sent: int  #: messages sent.
+    answered: int  #: messages answered in time.
+    unanswered: int  #: messages without an answer in time.
+    unexpected: int  #: answers to no message that waited, such as late ones.
+    refused: int  #: messages that the device refused.
+    framing: int  #: runs of bytes that are no frame.
+    checksum: int  #: packets with a wrong CRC.
+    malformed: int  #: intact packets of unknown kind or wrong length.
+    sessions: int  #: sessions opened.
+    disconnections: int  #: losses of the port.
+    round_trip_median: float  #: median time from message to answer of the last ten thousand, s.
+    round_trip_worst: float  #: longest of them, s.
 
 
 class Client:

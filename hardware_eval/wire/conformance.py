@@ -56,17 +56,11 @@ NOT_TRIED = (
 
 @dataclass(frozen=True, slots=True)
 class Clause:
-    """One line of the verdict.
+    """One line of the verdict."""
 
-    Attributes:
-        text: what the specification asks, and where.
-        holds: whether it does; None if it was not tried.
-        detail: what was seen instead, or why it was not tried.
-    """
-
-    text: str
-    holds: bool | None
-    detail: str = ""
+    text: str  #: what the specification asks, and where.
+    holds: bool | None  #: whether it does; None if it was not tried.
+    detail: str = ""  #: what was seen instead, or why it was not tried.
 
     def __str__(self) -> str:
         """A line for people."""

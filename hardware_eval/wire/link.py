@@ -40,19 +40,12 @@ READ_SLICE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class ReconnectPolicy:
-    """How to try again when a port has gone.
+    """How to try again when a port has gone."""
 
-    Attributes:
-        first: pause before the second attempt, s.
-        factor: by which each pause exceeds the one before.
-        longest: longest pause, s.
-        patience: time after which to give up, s.
-    """
-
-    first: float = 0.1
-    factor: float = 1.5
-    longest: float = 2.0
-    patience: float = 60.0
+    first: float = 0.1  #: pause before the second attempt, s.
+    factor: float = 1.5  #: by which each pause exceeds the one before.
+    longest: float = 2.0  #: longest pause, s.
+    patience: float = 60.0  #: time after which to give up, s.
 
 
 class _Traffic:

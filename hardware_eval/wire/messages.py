@@ -120,16 +120,12 @@ class Capability(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Open a session; the device vents and answers with :class:`Welcome`.
-
-    Attributes:
-        version: protocol version of the host.
-        pressure_limit: pressure at which the device shall vent, cmH2O, if that is below its own
-            limit; None for the device's own.
-    """
+    """Open a session; the device vents and answers with :class:`Welcome`."""
 
     kind: ClassVar[Kind] = Kind.HELLO
-    version: int = PROTOCOL_VERSION
+    version: int = PROTOCOL_VERSION  #: protocol version of the host.
+    #: pressure at which the device shall vent, cmH2O, if that is below its own limit; None for the
+    #: device's own.
     pressure_limit: float | None = None
 
 
@@ -142,19 +138,13 @@ class Arm:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Set the valves.
-
-    Attributes:
-        u_in: inspiratory valve, %, 0..100.
-        u_out: expiratory valve, 0 closed, 1 open.
-        seen: device time of the newest reading that the host had, ms, modulo 2**32. The device
-            refuses the command when that is too long ago, so that nothing that waited in a buffer
-            moves a valve.
-    """
+    """Set the valves."""
 
     kind: ClassVar[Kind] = Kind.COMMAND
-    u_in: float
-    u_out: int
+    u_in: float  #: inspiratory valve, %, 0..100.
+    u_out: int  #: expiratory valve, 0 closed, 1 open.
+    #: device time of the newest reading that the host had, ms, modulo 2**32. The device refuses the
+    #: command when that is too long ago, so that nothing that waited in a buffer moves a valve.
     seen: int
 
 
@@ -181,110 +171,64 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """Identity and limits of a device.
-
-    Attributes:
-        version: protocol version of the device.
-        firmware: version of the device's program, (major, minor, patch).
-        capabilities: what the device is and has.
-        watchdog: time without an acceptable command after which the device vents, s.
-        pressure_limit: pressure above which the device vents in this session, cmH2O.
-        device_id: the device's own number, 8 bytes.
-        calibration: SHA-256 of the device's calibration (sensor and valve tables), 32 bytes.
-        name: what people call the device, at most 32 bytes of UTF-8.
-    """
+    """Identity and limits of a device."""
 
     kind: ClassVar[Kind] = Kind.WELCOME
-    version: int
-    firmware: tuple[int, int, int]
-    capabilities: Capability
-    watchdog: float
-    pressure_limit: float
-    device_id: bytes
-    calibration: bytes
-    name: str
+    version: int  #: protocol version of the device.
+    firmware: tuple[int, int, int]  #: version of the device's program, (major, minor, patch).
+    capabilities: Capability  #: what the device is and has.
+    watchdog: float  #: time without an acceptable command after which the device vents, s.
+    pressure_limit: float  #: pressure above which the device vents in this session, cmH2O.
+    device_id: bytes  #: the device's own number, 8 bytes.
+    calibration: bytes  #: SHA-256 of the device's calibration (sensor and valve tables), 32 bytes.
+    name: str  #: what people call the device, at most 32 bytes of UTF-8.
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """State of the device; the answer to arm, command, heartbeat and vent.
-
-    Attributes:
-        sequence: sequence number of the message that it answers (from the packet's header).
-        time: time of the sample on the device's clock, s.
-        pressure: airway pressure, cmH2O; NaN if the sensor gives none.
-        flow: flow into the lung, mL/s; NaN if the device does not measure it.
-        u_in: inspiratory valve as applied, %.
-        u_out: expiratory valve as applied, 0 or 1.
-        mode: what the device does with the valves.
-        flags: why it vented, and remarks on the sample.
-    """
+    """State of the device; the answer to arm, command, heartbeat and vent."""
 
     kind: ClassVar[Kind] = Kind.READING
-    sequence: int
-    time: float
-    pressure: float
-    flow: float
-    u_in: float
-    u_out: int
-    mode: Mode
-    flags: Flag
+    sequence: int  #: sequence number of the message that it answers (from the packet's header).
+    time: float  #: time of the sample on the device's clock, s.
+    pressure: float  #: airway pressure, cmH2O; NaN if the sensor gives none.
+    flow: float  #: flow into the lung, mL/s; NaN if the device does not measure it.
+    u_in: float  #: inspiratory valve as applied, %.
+    u_out: int  #: expiratory valve as applied, 0 or 1.
+    mode: Mode  #: what the device does with the valves.
+    flags: Flag  #: why it vented, and remarks on the sample.
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """The device did not do what a message asks.
-
-    Attributes:
-        sequence: sequence number of the refused message (from the packet's header).
-        reason: why.
-        mode: what the device does with the valves.
-        flags: as in :class:`Reading`.
-    """
+    """The device did not do what a message asks."""
 
     kind: ClassVar[Kind] = Kind.REFUSAL
-    sequence: int
-    reason: Reason
-    mode: Mode
-    flags: Flag
+    sequence: int  #: sequence number of the refused message (from the packet's header).
+    reason: Reason  #: why.
+    mode: Mode  #: what the device does with the valves.
+    flags: Flag  #: as in :class:`Reading`.
 
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """Counts of the device since it started, each modulo 2**32.
-
-    Attributes:
-        frames: intact packets.
-        commands: commands that moved the valves.
-        framing: runs of bytes that are no frame: bad COBS, too long.
-        checksum: packets with a wrong CRC, or too short to hold one.
-        malformed: intact packets of a kind that no host sends, or of wrong length.
-        session: messages of another session.
-        sequence: messages whose sequence number was not above the last.
-        stale: commands that rest on a reading too old.
-        out_of_range: commands outside the valves' range.
-        not_armed: commands while the device was not armed.
-        watchdog: times that the watchdog vented.
-        overpressure: times that the pressure limit vented.
-        sensor: times that the loss of the sensor vented.
-        device_late: times that the device's own lateness vented.
-    """
+    """Counts of the device since it started, each modulo 2**32."""
 
     kind: ClassVar[Kind] = Kind.COUNTERS
-    frames: int = 0
-    commands: int = 0
-    framing: int = 0
-    checksum: int = 0
-    malformed: int = 0
-    session: int = 0
-    sequence: int = 0
-    stale: int = 0
-    out_of_range: int = 0
-    not_armed: int = 0
-    watchdog: int = 0
-    overpressure: int = 0
-    sensor: int = 0
-    device_late: int = 0
+    frames: int = 0  #: intact packets.
+    commands: int = 0  #: commands that moved the valves.
+    framing: int = 0  #: runs of bytes that are no frame: bad COBS, too long.
+    checksum: int = 0  #: packets with a wrong CRC, or too short to hold one.
+    malformed: int = 0  #: intact packets of a kind that no host sends, or of wrong length.
+    session: int = 0  #: messages of another session.
+    sequence: int = 0  #: messages whose sequence number was not above the last.
+    stale: int = 0  #: commands that rest on a reading too old.
+    out_of_range: int = 0  #: commands outside the valves' range.
+    not_armed: int = 0  #: commands while the device was not armed.
+    watchdog: int = 0  #: times that the watchdog vented.
+    overpressure: int = 0  #: times that the pressure limit vented.
+    sensor: int = 0  #: times that the loss of the sensor vented.
+    device_late: int = 0  #: times that the device's own lateness vented.
 
 
 HostMessage = Hello | Arm | Command | Heartbeat | Vent | Statistics
@@ -294,17 +238,11 @@ Message = HostMessage | DeviceMessage
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A message with its header.
+    """A message with its header."""
 
-    Attributes:
-        session: number that the host drew at random for this session.
-        sequence: from the host: its own count; from the device: the count that it answers.
-        message: the message.
-    """
-
-    session: int
-    sequence: int
-    message: Message
+    session: int  #: number that the host drew at random for this session.
+    sequence: int  #: from the host: its own count; from the device: the count that it answers.
+    message: Message  #: the message.
 
 
 class MalformedPacketError(ValueError):

@@ -46,15 +46,10 @@ class AnswerError(InputError):
 
 
 class Hypothesis(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What may be missing, all of it together; no terms: nothing is.
+    """What may be missing, all of it together; no terms: nothing is."""
 
-    Attributes:
-        terms: names of the vocabulary, and ``unknown:PLACE``.
-        probability: 0..1.
-    """
-
-    terms: tuple[str, ...]
-    probability: float
+    terms: tuple[str, ...]  #: names of the vocabulary, and ``unknown:PLACE``.
+    probability: float  #: 0..1.
 
 
 class Interval(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -74,44 +69,29 @@ class Commands(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The answer of a diagnoser.
+    """The answer of a diagnoser."""
 
-    Attributes:
-        hypotheses: different ones, whose probabilities sum to 1.
-        pressures: pressure at each sample, cmH2O, of each withheld breath, by its id.
-        parameters: estimates by path, such as ``leak.conductance``, ``R`` or ``C``.
-        active: where an effect acts that acts in part of the recording only: intervals of time, s,
-            by id of the breath.
-        record_next: breaths that would tell what is open.
-        notes: anything; nobody reads it.
-    """
-
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[Hypothesis, ...]  #: different ones, whose probabilities sum to 1.
+    #: pressure at each sample, cmH2O, of each withheld breath, by its id.
     pressures: dict[int, tuple[float, ...]]
+    #: estimates by path, such as ``leak.conductance``, ``R`` or ``C``.
     parameters: dict[str, Interval] = {}
+    #: where an effect acts that acts in part of the recording only: intervals of time, s, by id of
+    #: the breath.
     active: dict[int, tuple[tuple[float, float], ...]] = {}
-    record_next: tuple[Commands, ...] = ()
-    notes: Any = None
+    record_next: tuple[Commands, ...] = ()  #: breaths that would tell what is open.
+    notes: Any = None  #: anything; nobody reads it.
 
 
 class Question(msgspec.Struct, frozen=True):
-    """The content of ``case.json``.
+    """The content of ``case.json``."""
 
-    Attributes:
-        recording: name of the recording's file.
-        label: R, cmH2O/(L/s), and C, mL/cmH2O, that the lung is said to have.
-        withheld: ids of the breaths whose pressures are asked for.
-        rig: see :data:`RIG`.
-        seconds: processor time that the diagnoser may take.
-        vocabulary: places, and names with place, meaning and parameters.
-    """
-
-    recording: str
-    label: dict[str, float]
-    withheld: tuple[int, ...]
-    rig: dict[str, Any]
-    seconds: float
-    vocabulary: dict[str, Any]
+    recording: str  #: name of the recording's file.
+    label: dict[str, float]  #: R, cmH2O/(L/s), and C, mL/cmH2O, that the lung is said to have.
+    withheld: tuple[int, ...]  #: ids of the breaths whose pressures are asked for.
+    rig: dict[str, Any]  #: see :data:`RIG`.
+    seconds: float  #: processor time that the diagnoser may take.
+    vocabulary: dict[str, Any]  #: places, and names with place, meaning and parameters.
 
 
 def pose(folder: Path, breaths: Breaths, withheld: tuple[int, ...], seconds: float) -> Question:

@@ -23,25 +23,16 @@ _SIZE = 0.25
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured value and its goal.
+    """A measured value and its goal."""
 
-    Attributes:
-        what: the measured quantity, in words.
-        value: None if there was nothing to measure.
-        goal: goal in words, ``""`` if there is none.
-        count: number of cases, parameters or breaths behind the value.
-        ci95: Wilson's interval of a share; of a mean, by resampling cases; or None.
-        met: whether the goal is met; None without a goal or a value.
-        is_share: whether the value is a share of the count.
-    """
-
-    what: str
-    value: float | None
-    goal: str
-    count: int
+    what: str  #: the measured quantity, in words.
+    value: float | None  #: None if there was nothing to measure.
+    goal: str  #: goal in words, ``""`` if there is none.
+    count: int  #: number of cases, parameters or breaths behind the value.
+    #: Wilson's interval of a share; of a mean, by resampling cases; or None.
     ci95: tuple[float, float] | None
-    met: bool | None
-    is_share: bool = False
+    met: bool | None  #: whether the goal is met; None without a goal or a value.
+    is_share: bool = False  #: whether the value is a share of the count.
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:

@@ -28,15 +28,12 @@ _CASES: dict[str, type[Case]] = {
 
 
 class Withheld(msgspec.Struct, frozen=True):
-    """What a diagnoser does not see of a recording.
+    """What a diagnoser does not see of a recording."""
 
-    Attributes:
-        pressures: readings of the withheld breaths, cmH2O, None where blank, by id.
-        active: where an effect acts that acts in part of the recording only: intervals of time, s,
-            by id of the breath; None if there is no such effect.
-    """
-
+    #: readings of the withheld breaths, cmH2O, None where blank, by id.
     pressures: dict[int, tuple[float | None, ...]]
+    #: where an effect acts that acts in part of the recording only: intervals of time, s, by id of
+    #: the breath; None if there is no such effect.
     active: dict[int, tuple[tuple[float, float], ...]] | None = None
 
 
@@ -76,15 +73,10 @@ def decode_answers(text: bytes) -> Truth:
 
 @dataclass(frozen=True)
 class ChallengeFolder:
-    """Paths of a challenge's files.
+    """Paths of a challenge's files."""
 
-    Attributes:
-        path: path of the folder.
-        round: 1, or 2 with the breaths that the first answers requested.
-    """
-
-    path: Path
-    round: int = 1
+    path: Path  #: path of the folder.
+    round: int = 1  #: 1, or 2 with the breaths that the first answers requested.
 
     @property
     def public(self) -> Path:

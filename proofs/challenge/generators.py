@@ -21,26 +21,20 @@ from ventbench.recordings.breaths import Breaths
 
 @dataclass(frozen=True)
 class Generator:
-    """A generator of recordings.
+    """A generator of recordings."""
 
-    Attributes:
-        name: name on the command line.
-        draw: draws cases; see :func:`~proofs.challenge.first.plan.draw`.
-        record: records a case; see :func:`~proofs.challenge.first.rig.record`.
-        record_commands: records requested breaths; see
-            :func:`~proofs.challenge.first.rig.record_commands`.
-        replay: responds without noise; see :func:`~proofs.challenge.first.rig.replay`.
-        active: where in a recording the effects of a case act, ``(n, T)``, or None if everywhere.
-        compared: most breaths by which it is measured how far an effect can be detected.
-    """
-
-    name: str
+    name: str  #: name on the command line.
+    #: draws cases; see :func:`~proofs.challenge.first.plan.draw`.
     draw: Callable[..., list[DrawnCase]]
+    #: records a case; see :func:`~proofs.challenge.first.rig.record`.
     record: Callable[..., Breaths]
+    #: records requested breaths; see :func:`~proofs.challenge.first.rig.record_commands`.
     record_commands: Callable[..., Breaths]
+    #: responds without noise; see :func:`~proofs.challenge.first.rig.replay`.
     replay: Callable[..., rig.Floats]
+    #: where in a recording the effects of a case act, ``(n, T)``, or None if everywhere.
     active: Callable[[Case, Breaths], NDArray[np.bool_] | None] = lambda case, breaths: None
-    compared: int = 8
+    compared: int = 8  #: most breaths by which it is measured how far an effect can be detected.
 
 
 FIRST = Generator("first", plan.draw, rig.record, rig.record_commands, rig.replay)

@@ -36,21 +36,13 @@ _SAME_PLACE = 0.5
 
 @dataclass(frozen=True)
 class EstimateAgainstTruth:
-    """An estimated parameter beside its true value, as a fit with the nominal valve gain sees it.
+    """An estimated parameter beside the true value that a fit with the nominal valve gain sees."""
 
-    Attributes:
-        path: path of the parameter.
-        value: estimate.
-        low: lower end of the estimate's 95 % interval.
-        high: upper end of the interval.
-        true: true value.
-    """
-
-    path: str
-    value: float
-    low: float
-    high: float
-    true: float
+    path: str  #: path of the parameter.
+    value: float  #: estimate.
+    low: float  #: lower end of the estimate's 95 % interval.
+    high: float  #: upper end of the interval.
+    true: float  #: true value.
 
     @property
     def error(self) -> float:
@@ -65,53 +57,33 @@ class EstimateAgainstTruth:
 
 @dataclass(frozen=True)
 class JudgedCase:
-    """One case with what was measured of its answer.
+    """One case with what was measured of its answer."""
 
-    Attributes:
-        name: name of the case.
-        kind: kind of the question.
-        lung: label.
-        strengths: strengths of the effects.
-        truth: the effects.
-        leading: terms of the likeliest hypotheses, which are several if they are equally likely.
-        confidence: probability of the leading hypotheses together.
-        isolation: 1 over the number of leading hypotheses if one of them is right, else 0.
-        belief: probability of all right hypotheses.
-        brier: squared error of the probabilities of the truth and of each wrong hypothesis.
-        missing: probability that something is missing.
-        wrong: probability of each name that is not in the rig.
-        harm: sum of these, less where the name is in the right part of the rig.
-        estimates: parameters of rightly named effects in the vocabulary's form; R and C where
-            nothing is missing.
-        overlap: F1 of the samples in which the answer says that an effect acts; None if the effect
-            acts everywhere.
-        inspiration: mean absolute error on withheld breaths, cmH2O.
-        expiration: the same with an open expiratory valve.
-        seconds: processor time.
-        peak: memory, MiB.
-        problem: why the case is lost, or empty.
-    """
-
-    name: str
-    kind: Kind
-    lung: str
-    strengths: tuple[str, ...]
-    truth: tuple[Concealed, ...]
+    name: str  #: name of the case.
+    kind: Kind  #: kind of the question.
+    lung: str  #: label.
+    strengths: tuple[str, ...]  #: strengths of the effects.
+    truth: tuple[Concealed, ...]  #: the effects.
+    #: terms of the likeliest hypotheses, which are several if they are equally likely.
     leading: tuple[frozenset[str], ...]
-    confidence: float
-    isolation: float
-    belief: float
-    brier: float
-    missing: float
-    wrong: dict[str, float]
-    harm: float
+    confidence: float  #: probability of the leading hypotheses together.
+    isolation: float  #: 1 over the number of leading hypotheses if one of them is right, else 0.
+    belief: float  #: probability of all right hypotheses.
+    brier: float  #: squared error of the probabilities of the truth and of each wrong hypothesis.
+    missing: float  #: probability that something is missing.
+    wrong: dict[str, float]  #: probability of each name that is not in the rig.
+    harm: float  #: sum of these, less where the name is in the right part of the rig.
+    #: parameters of rightly named effects in the vocabulary's form; R and C where nothing is
+    #: missing.
     estimates: tuple[EstimateAgainstTruth, ...]
+    #: F1 of the samples in which the answer says that an effect acts; None if the effect acts
+    #: everywhere.
     overlap: float | None
-    inspiration: float
-    expiration: float
-    seconds: float
-    peak: float
-    problem: str
+    inspiration: float  #: mean absolute error on withheld breaths, cmH2O.
+    expiration: float  #: the same with an open expiratory valve.
+    seconds: float  #: processor time.
+    peak: float  #: memory, MiB.
+    problem: str  #: why the case is lost, or empty.
 
     @property
     def effects(self) -> tuple[str, ...]:

@@ -20,42 +20,27 @@ from ventbench.recordings.read import load
 
 @dataclass(frozen=True)
 class Draw:
-    """Cases that were made with one seed.
+    """Cases that were made with one seed."""
 
-    Attributes:
-        seed: what it was made with.
-        commitment: hash of the true answers, checked.
-        total: number of its cases.
-        answered: number of those that have an answer.
-    """
-
-    seed: str
-    commitment: str
-    total: int
-    answered: int
+    seed: str  #: what it was made with.
+    commitment: str  #: hash of the true answers, checked.
+    total: int  #: number of its cases.
+    answered: int  #: number of those that have an answer.
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A diagnoser on draws from one generator.
+    """A diagnoser on draws from one generator."""
 
-    Attributes:
-        diagnoser: who answered.
-        generator: name of the generator.
-        draws: where the cases are from.
-        cases: judged answers, by number of the draw and name of the case.
-        unanswered: cases without an answer; in the second round only those with a request.
-        versions: code that ran the diagnoser, as the answers say.
-        more: further figures.
-    """
-
-    diagnoser: str
-    generator: str
-    draws: tuple[Draw, ...]
+    diagnoser: str  #: who answered.
+    generator: str  #: name of the generator.
+    draws: tuple[Draw, ...]  #: where the cases are from.
+    #: judged answers, by number of the draw and name of the case.
     cases: dict[tuple[int, str], JudgedCase]
+    #: cases without an answer; in the second round only those with a request.
     unanswered: tuple[str, ...] = ()
-    versions: tuple[str, ...] = ()
-    more: tuple[Figure, ...] = ()
+    versions: tuple[str, ...] = ()  #: code that ran the diagnoser, as the answers say.
+    more: tuple[Figure, ...] = ()  #: further figures.
 
     @cached_property
     def figures(self) -> tuple[Figure, ...]:
@@ -156,14 +141,10 @@ def _judge_all(folder: ChallengeFolder, secret: str, diagnoser: str) -> dict[str
 
 @dataclass(frozen=True)
 class Board:
-    """All diagnosers that have answered.
+    """All diagnosers that have answered."""
 
-    Attributes:
-        against: diagnoser with whom the others are compared.
-        tables: rows by name of the generator, the best log score first.
-    """
-
-    against: str
+    against: str  #: diagnoser with whom the others are compared.
+    #: rows by name of the generator, the best log score first.
     tables: dict[str, tuple[Judged, ...]]
 
     def differences(self, row: Judged) -> dict[str, Figure]:

@@ -59,64 +59,40 @@ _ENVIRONMENT = {
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The content of ``diagnoser.toml``.
+    """The content of ``diagnoser.toml``."""
 
-    Attributes:
-        name: shown on the board.
-        function: ``file:function``, such as ``diagnose:diagnose`` for ``diagnose.py``.
-        description: a sentence.
-    """
-
-    name: str
-    function: str
-    description: str = ""
+    name: str  #: shown on the board.
+    function: str  #: ``file:function``, such as ``diagnose:diagnose`` for ``diagnose.py``.
+    description: str = ""  #: a sentence.
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a diagnoser may use on one case.
+    """What a diagnoser may use on one case."""
 
-    Attributes:
-        seconds: processor time.
-        memory: address space, GiB.
-    """
-
-    seconds: float = 300.0
-    memory: float = 16.0
+    seconds: float = 300.0  #: processor time.
+    memory: float = 16.0  #: address space, GiB.
 
 
 @dataclass(frozen=True)
 class Diagnoser:
-    """A diagnoser.
+    """A diagnoser."""
 
-    Attributes:
-        name: letters, digits, ``_`` and ``-``; names the folder of its answers.
-        function: ``module:function``.
-        folder: folder of a stranger's, which holds the module; None for the caller's own.
-    """
-
-    name: str
-    function: str
+    name: str  #: letters, digits, ``_`` and ``-``; names the folder of its answers.
+    function: str  #: ``module:function``.
+    #: folder of a stranger's, which holds the module; None for the caller's own.
     folder: Path | None = None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one run.
+    """What came of one run."""
 
-    Attributes:
-        answer: bytes that the diagnoser gave; empty if there is a problem.
-        problem: why there is no answer, or empty.
-        seconds: processor time of the process.
-        peak_mib: its largest memory.
-        layers: what locked it down; empty for the caller's own code.
-    """
-
-    answer: bytes
-    problem: str
-    seconds: float
-    peak_mib: float
-    layers: tuple[str, ...]
+    answer: bytes  #: bytes that the diagnoser gave; empty if there is a problem.
+    problem: str  #: why there is no answer, or empty.
+    seconds: float  #: processor time of the process.
+    peak_mib: float  #: its largest memory.
+    layers: tuple[str, ...]  #: what locked it down; empty for the caller's own code.
 
 
 def find(given: str) -> Diagnoser:

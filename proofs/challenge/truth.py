@@ -41,19 +41,12 @@ _POWERS = {
 
 @dataclass(frozen=True)
 class Concealed:
-    """One effect of a rig.
+    """One effect of a rig."""
 
-    Attributes:
-        name: name of the effect in its generator.
-        seen: whether it is above the detection limit; what is not may be left out.
-        terms: terms that are right for it, one of which is enough.
-        beside: terms that may stand beside these.
-    """
-
-    name: str
-    seen: bool
-    terms: frozenset[str]
-    beside: frozenset[str] = frozenset()
+    name: str  #: name of the effect in its generator.
+    seen: bool  #: whether it is above the detection limit; what is not may be left out.
+    terms: frozenset[str]  #: terms that are right for it, one of which is enough.
+    beside: frozenset[str] = frozenset()  #: terms that may stand beside these.
 
     @property
     def places(self) -> frozenset[str]:

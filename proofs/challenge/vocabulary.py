@@ -14,17 +14,11 @@ import msgspec
 
 
 class Name(msgspec.Struct, frozen=True):
-    """A name of the vocabulary.
+    """A name of the vocabulary."""
 
-    Attributes:
-        place: where it acts, one of :data:`PLACES`.
-        meaning: in words.
-        parameters: unit of each parameter, the strength first.
-    """
-
-    place: str
-    meaning: str
-    parameters: dict[str, str]
+    place: str  #: where it acts, one of :data:`PLACES`.
+    meaning: str  #: in words.
+    parameters: dict[str, str]  #: unit of each parameter, the strength first.
 
 
 #: The vocabulary as JSON values, as every case holds it.

@@ -34,29 +34,20 @@ OPEN, EFFORT = "disconnection", "patient_effort"
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A candidate at one point of its shape.
+    """A candidate at one point of its shape."""
 
-    Attributes:
-        name: of the mechanism, basis term or event.
-        spread: prior standard deviations of the coefficients of its columns.
-        main: these columns in the linearised experiment.
-        values: values by path, the strength first; its column is the effect of these.
-        limits: least and largest coefficient of a strength.
-        odds: logarithm of the prior of this point.
-        forms: spreads of its characteristic by column of the basis terms.
-        latent: changes of pressure ``(n, T)`` by what acts in time, which no fit knows.
-        told: what is told of these.
-    """
-
-    name: str
-    spread: Sequence[float]
-    main: tuple[int, ...] = ()
+    name: str  #: of the mechanism, basis term or event.
+    spread: Sequence[float]  #: prior standard deviations of the coefficients of its columns.
+    main: tuple[int, ...] = ()  #: these columns in the linearised experiment.
+    #: values by path, the strength first; its column is the effect of these.
     values: Mapping[str, float] = field(default_factory=dict)
-    limits: tuple[float, float] = (-np.inf, np.inf)
-    odds: float = 0.0
+    limits: tuple[float, float] = (-np.inf, np.inf)  #: least and largest coefficient of a strength.
+    odds: float = 0.0  #: logarithm of the prior of this point.
+    #: spreads of its characteristic by column of the basis terms.
     forms: Mapping[int, float] = field(default_factory=dict)
+    #: changes of pressure ``(n, T)`` by what acts in time, which no fit knows.
     latent: Sequence[Floats] = ()
-    told: Mapping[str, float] = field(default_factory=dict)
+    told: Mapping[str, float] = field(default_factory=dict)  #: what is told of these.
 
 
 Set = tuple[Term, ...]
@@ -89,26 +80,19 @@ def gaussian(G: Floats, b: Floats, sd: Floats) -> tuple[float, Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """What candidates change, simulated around a fit.
+    """What candidates change, simulated around a fit."""
 
-    Attributes:
-        data: n breaths of T samples.
-        values: physical values of the fit, ``(n, P + 1)``.
-        columns: changes of pressure, ``(n, T)`` each, of which the first is that of the gain.
-        basis: paths and spreads of the coefficients of basis terms, by column.
-        of_basis: columns of each basis term.
-        least: standard deviations of mechanisms that every rig has a little of, by column.
-        terms: candidates.
-        events: changes of pressure by events of each course, ``(g, n, T)``, by name.
-    """
-
-    data: Data
-    values: Floats
+    data: Data  #: n breaths of T samples.
+    values: Floats  #: physical values of the fit, ``(n, P + 1)``.
+    #: changes of pressure, ``(n, T)`` each, of which the first is that of the gain.
     columns: Sequence[Floats]
+    #: paths and spreads of the coefficients of basis terms, by column.
     basis: Mapping[int, tuple[str, float]]
-    of_basis: Mapping[str, list[int]]
+    of_basis: Mapping[str, list[int]]  #: columns of each basis term.
+    #: standard deviations of mechanisms that every rig has a little of, by column.
     least: dict[int, float]
-    terms: Set
+    terms: Set  #: candidates.
+    #: changes of pressure by events of each course, ``(g, n, T)``, by name.
     events: Mapping[str, Floats]
 
     def forms(self, effect: Floats, name: str) -> dict[int, float]:

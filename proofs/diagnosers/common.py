@@ -27,17 +27,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A case as a diagnoser sees it.
+    """A case as a diagnoser sees it."""
 
-    Attributes:
-        question: content of ``case.json``.
-        breaths: all breaths, in order.
-        apart: which of them are withheld, ``(n,)``.
-    """
-
-    question: Mapping[str, Any]
-    breaths: Breaths
-    apart: NDArray[np.bool_]
+    question: Mapping[str, Any]  #: content of ``case.json``.
+    breaths: Breaths  #: all breaths, in order.
+    apart: NDArray[np.bool_]  #: which of them are withheld, ``(n,)``.
 
     @cached_property
     def data(self) -> Data:
@@ -101,22 +95,14 @@ def intervals(fitted: Fit, paths: Iterable[str]) -> dict[str, dict[str, float]]:
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """A refitted model to first order, over all breaths, for rivals that are linear.
+    """A refitted model to first order, over all breaths, for rivals that are linear."""
 
-    Attributes:
-        pressure: the model's pressures, cmH2O, ``(n, T)``.
-        flow: its flow into the lung, L/s, ``(n, T)``.
-        residual: recorded minus modelled, cmH2O, 0 where ``weight`` is, ``(n, T)``.
-        weight: 1 where a pressure is recorded, but for the first sample, ``(n, T)``.
-        refit: changes of pressure by R, C, R_ex and PEEP, ``(4, n, T)``.
-        effects: change of pressure by each mechanism at its mild strength, ``(n, T)``, by name.
-    """
-
-    pressure: Floats
-    flow: Floats
-    residual: Floats
-    weight: Floats
-    refit: Floats
+    pressure: Floats  #: the model's pressures, cmH2O, ``(n, T)``.
+    flow: Floats  #: its flow into the lung, L/s, ``(n, T)``.
+    residual: Floats  #: recorded minus modelled, cmH2O, 0 where ``weight`` is, ``(n, T)``.
+    weight: Floats  #: 1 where a pressure is recorded, but for the first sample, ``(n, T)``.
+    refit: Floats  #: changes of pressure by R, C, R_ex and PEEP, ``(4, n, T)``.
+    #: change of pressure by each mechanism at its mild strength, ``(n, T)``, by name.
     effects: dict[str, Floats]
 
 

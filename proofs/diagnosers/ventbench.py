@@ -33,24 +33,17 @@ _CHANGES = {"gain": ("gain_step", "gain_drift"), "zero": ("zero_step", "sensor_d
 
 @dataclass(frozen=True)
 class Calibration:
-    """Shares that the verdicts deserve, 0..1.
+    """Shares that the verdicts deserve, 0..1."""
 
-    Attributes:
-        nothing: of the verdict *nothing missing*; else an effect was overlooked.
-        named: of the stated names being all there is.
-        placed: of a place without a name being the place.
-        alone: of what is left where a verdict fails, that there is nothing beside the names.
-        foreign: of an effect without a name, that it is one of those names of the vocabulary for
-            which the diagnosis has no hypothesis, all alike; else it is at any place.
-        doubt: power of the unexplained error, in multiples of the noise from 1 on, by which the
-            odds of a verdict fall that leaves nothing open.
-    """
-
-    nothing: float
-    named: float
-    placed: float
-    alone: float
+    nothing: float  #: of the verdict *nothing missing*; else an effect was overlooked.
+    named: float  #: of the stated names being all there is.
+    placed: float  #: of a place without a name being the place.
+    alone: float  #: of what is left where a verdict fails, that there is nothing beside the names.
+    #: of an effect without a name, that it is one of those names of the vocabulary for which the
+    #: diagnosis has no hypothesis, all alike; else it is at any place.
     foreign: float
+    #: power of the unexplained error, in multiples of the noise from 1 on, by which the odds of a
+    #: verdict fall that leaves nothing open.
     doubt: float
 
 

@@ -54,20 +54,13 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class StudySizes:
-    """How much the studies of ``full`` train; smaller ones try the whole out.
+    """How much the studies of ``full`` train; smaller ones try the whole out."""
 
-    Attributes:
-        curves: share of the full length of the trainings of the learning curves.
-        updates: updates of each training of the parts of the controller.
-        draws: published draws on which those are scored.
-        parts: names of the parts that are varied; all if None.
-        networks: further arguments of :func:`proofs.studies.networks.compare`.
-    """
-
-    curves: float = 1.0
-    updates: int = 400
-    draws: int = 20
-    parts: tuple[str, ...] | None = None
+    curves: float = 1.0  #: share of the full length of the trainings of the learning curves.
+    updates: int = 400  #: updates of each training of the parts of the controller.
+    draws: int = 20  #: published draws on which those are scored.
+    parts: tuple[str, ...] | None = None  #: names of the parts that are varied; all if None.
+    #: further arguments of :func:`proofs.studies.networks.compare`.
     networks: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -18,19 +18,12 @@ Cell = str | float | None
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table."""
 
-    Attributes:
-        caption: what is in it, with units.
-        columns: headings; the first column holds texts.
-        rows: cells, a row as long as ``columns``.
-        digits: decimals of the numbers.
-    """
-
-    caption: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    digits: int = 3
+    caption: str  #: what is in it, with units.
+    columns: tuple[str, ...]  #: headings; the first column holds texts.
+    rows: tuple[tuple[Cell, ...], ...]  #: cells, a row as long as ``columns``.
+    digits: int = 3  #: decimals of the numbers.
 
     def texts(self) -> list[list[str]]:
         """Rows as they are shown."""
@@ -44,79 +37,47 @@ class Table:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a chart.
+    """A line of a chart."""
 
-    Attributes:
-        name: what it shows.
-        x: positions, increasing.
-        y: values; NaN where there is none.
-        dashed: whether it is what others are compared with, such as a target.
-    """
-
-    name: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-    dashed: bool = False
+    name: str  #: what it shows.
+    x: tuple[float, ...]  #: positions, increasing.
+    y: tuple[float, ...]  #: values; NaN where there is none.
+    dashed: bool = False  #: whether it is what others are compared with, such as a target.
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Lines over one axis.
+    """Lines over one axis."""
 
-    Attributes:
-        title: what is shown.
-        x_label: with unit.
-        y_label: with unit.
-        lines: the lines.
-        logarithmic: whether the x axis is.
-    """
-
-    title: str
-    x_label: str
-    y_label: str
-    lines: tuple[Line, ...]
-    logarithmic: bool = False
+    title: str  #: what is shown.
+    x_label: str  #: with unit.
+    y_label: str  #: with unit.
+    lines: tuple[Line, ...]  #: the lines.
+    logarithmic: bool = False  #: whether the x axis is.
 
 
 @dataclass(frozen=True)
 class Section:
-    """One table, figure or claim of the paper beside ours.
+    """One table, figure or claim of the paper beside ours."""
 
-    Attributes:
-        id: short name.
-        title: what is compared.
-        place: where it stands in the paper, such as ``"table 2"``.
-        claim: what the paper says, in other words.
-        verdict: how the claim came out here.
-        finding: what came out here, in a sentence or two.
-        source: how the figures here were made.
-        tables: tables.
-        charts: charts.
-    """
-
-    id: str
-    title: str
-    place: str
-    claim: str
-    verdict: Verdict
-    finding: str
-    source: str
-    tables: tuple[Table, ...] = ()
-    charts: tuple[Chart, ...] = ()
+    id: str  #: short name.
+    title: str  #: what is compared.
+    place: str  #: where it stands in the paper, such as ``"table 2"``.
+    claim: str  #: what the paper says, in other words.
+    verdict: Verdict  #: how the claim came out here.
+    finding: str  #: what came out here, in a sentence or two.
+    source: str  #: how the figures here were made.
+    tables: tuple[Table, ...] = ()  #: tables.
+    charts: tuple[Chart, ...] = ()  #: charts.
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The whole comparison.
+    """The whole comparison."""
 
-    Attributes:
-        about: simulators, protocol and versions that the figures belong to.
-        sections: in the order of the paper's argument.
-        not_reproduced: place in the paper, what stands there, and why it is not reproduced.
-    """
-
-    about: Mapping[str, Any]
-    sections: tuple[Section, ...]
+    about: Mapping[str, Any]  #: simulators, protocol and versions that the figures belong to.
+    sections: tuple[Section, ...]  #: in the order of the paper's argument.
+    #: place in the paper, what stands there, and why it is not reproduced.
     not_reproduced: tuple[tuple[str, str, str], ...]
 
     def to_json(self) -> dict[str, Any]:

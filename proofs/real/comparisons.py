@@ -43,25 +43,17 @@ SLOW = ("lung_pressure", "gain_pressure", "lag_pressure")
 
 @dataclass(frozen=True)
 class Answered:
-    """A pair with the answer of the tool.
+    """A pair with the answer of the tool."""
 
-    Attributes:
-        pair: the pair.
-        answer: the answer in words.
-        right: whether it is right.
-        wrong_names: names of effects in the answer that are not in the truth, beyond those that the
-            tool also names without the concealed difference.
-        value: estimated strength of what was added, or None.
-        interval: its 95 % interval, or None.
-        in_class: whether it is named, or a rival that acts alike has appeared or grown.
-    """
-
-    pair: Pair
-    answer: str
-    right: bool
+    pair: Pair  #: the pair.
+    answer: str  #: the answer in words.
+    right: bool  #: whether it is right.
+    #: names of effects in the answer that are not in the truth, beyond those that the tool also
+    #: names without the concealed difference.
     wrong_names: tuple[str, ...] = ()
-    value: float | None = None
-    interval: tuple[float, float] | None = None
+    value: float | None = None  #: estimated strength of what was added, or None.
+    interval: tuple[float, float] | None = None  #: its 95 % interval, or None.
+    #: whether it is named, or a rival that acts alike has appeared or grown.
     in_class: bool = False
 
 

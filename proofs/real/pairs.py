@@ -59,23 +59,14 @@ KINDS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Pair:
-    """A pair and its truth.
+    """A pair and its truth."""
 
-    Attributes:
-        name: unique name.
-        kind: one of :data:`KINDS`.
-        truth: what differs, in words.
-        first: name of the first recording.
-        second: name of the second recording.
-        strength: strength of what was added; 0 if nothing was.
-    """
-
-    name: str
-    kind: str
-    truth: str
-    first: str
-    second: str
-    strength: float = 0.0
+    name: str  #: unique name.
+    kind: str  #: one of :data:`KINDS`.
+    truth: str  #: what differs, in words.
+    first: str  #: name of the first recording.
+    second: str  #: name of the second recording.
+    strength: float = 0.0  #: strength of what was added; 0 if nothing was.
 
     @property
     def split(self) -> Split:
@@ -86,17 +77,11 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Recordings of the pairs, by name.
+    """Recordings of the pairs, by name."""
 
-    Attributes:
-        runs: runs with flow or volume as breaths; padded, u_in 0.
-        drives: source of gas of each run.
-        lungs: recordings from pressure alone, by lung.
-    """
-
-    runs: Mapping[str, Breaths]
-    drives: Mapping[str, str]
-    lungs: Mapping[str, Breaths]
+    runs: Mapping[str, Breaths]  #: runs with flow or volume as breaths; padded, u_in 0.
+    drives: Mapping[str, str]  #: source of gas of each run.
+    lungs: Mapping[str, Breaths]  #: recordings from pressure alone, by lung.
     _mechanics: dict[str, Mechanics] = field(default_factory=dict, repr=False)
 
     def mechanics(self, run: str) -> Mechanics:

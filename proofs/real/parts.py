@@ -42,43 +42,29 @@ LAG = 0.080
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Input of a diagnosis.
+    """Input of a diagnosis."""
 
-    Attributes:
-        breaths: recorded breaths, perhaps with an injected effect.
-        plant: simulator to diagnose.
-        plant_name: name of the simulator in reports.
-        wanted: mechanism that must be named, or None.
-        about: JSON values: what was injected or removed.
-        rigs: the rigs of the recording, if strengths are fitted to each of them.
-    """
-
-    breaths: Breaths
-    plant: Given
-    plant_name: str
-    wanted: str | None = None
+    breaths: Breaths  #: recorded breaths, perhaps with an injected effect.
+    plant: Given  #: simulator to diagnose.
+    plant_name: str  #: name of the simulator in reports.
+    wanted: str | None = None  #: mechanism that must be named, or None.
+    #: JSON values: what was injected or removed.
     about: dict[str, Any] = field(default_factory=dict)
+    #: the rigs of the recording, if strengths are fitted to each of them.
     rigs: Sessions | None = None
 
 
 @dataclass(frozen=True)
 class Part:
-    """One diagnosis of the proof.
+    """One diagnosis of the proof."""
 
-    Attributes:
-        name: name of its folder.
-        title: title in words.
-        lungs: lungs whose breaths it uses.
-        set_up: returns the setting, given the breaths of the lungs and the folder of the proof; or
-            the reason why there is none.
-        needs: name of a part that must be finished before.
-    """
-
-    name: str
-    title: str
-    lungs: tuple[str, ...]
+    name: str  #: name of its folder.
+    title: str  #: title in words.
+    lungs: tuple[str, ...]  #: lungs whose breaths it uses.
+    #: returns the setting, given the breaths of the lungs and the folder of the proof; or the
+    #: reason why there is none.
     set_up: Callable[[Breaths, Path], Setting | str]
-    needs: str | None = None
+    needs: str | None = None  #: name of a part that must be finished before.
 
 
 def _rc(breaths: Breaths, out: Path) -> Setting:

@@ -49,36 +49,22 @@ Diagnose = Callable[..., Diagnosis]
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of the proof.
+    """One claim of the proof."""
 
-    Attributes:
-        part: part whose figures the claim is about.
-        what: the claim.
-        value: the outcome, in words.
-        met: whether the claim holds.
-    """
-
-    part: str
-    what: str
-    value: str
-    met: bool
+    part: str  #: part whose figures the claim is about.
+    what: str  #: the claim.
+    value: str  #: the outcome, in words.
+    met: bool  #: whether the claim holds.
 
 
 @dataclass(frozen=True, eq=False)
 class Proof:
-    """The finished parts of the proof.
+    """The finished parts of the proof."""
 
-    Attributes:
-        sha256: SHA-256 of the recording.
-        parts: figures by name.
-        impossible: why a part could not be set up, by name.
-        claims: about the finished parts.
-    """
-
-    sha256: str
-    parts: dict[str, dict[str, Any]]
-    impossible: dict[str, str]
-    claims: tuple[Claim, ...]
+    sha256: str  #: SHA-256 of the recording.
+    parts: dict[str, dict[str, Any]]  #: figures by name.
+    impossible: dict[str, str]  #: why a part could not be set up, by name.
+    claims: tuple[Claim, ...]  #: about the finished parts.
 
     @property
     def met(self) -> bool:

@@ -41,17 +41,11 @@ Gains = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to train.
+    """One way to train."""
 
-    Attributes:
-        meaning: the variant in words.
-        config: settings of the training.
-        direct: whether the network commands alone, without a PID to correct.
-    """
-
-    meaning: str
-    config: ResidualConfig
-    direct: bool = False
+    meaning: str  #: the variant in words.
+    config: ResidualConfig  #: settings of the training.
+    direct: bool = False  #: whether the network commands alone, without a PID to correct.
 
 
 def variants(config: ResidualConfig) -> dict[str, Variant]:

@@ -65,21 +65,13 @@ def band(values: ArrayLike) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """One method: score against experience.
+    """One method: score against experience."""
 
-    Attributes:
-        method: name.
-        episodes: breaths that one training has seen, ``(points,)``.
-        seconds: computing time of all seeds together, without compiling, ``(points,)``.
-        compile_seconds: time of compiling, s.
-        scores: nominal, cmH2O, ``(seeds, points)``.
-    """
-
-    method: str
-    episodes: NDArray[np.int64]
-    seconds: Floats
-    compile_seconds: float
-    scores: Floats
+    method: str  #: name.
+    episodes: NDArray[np.int64]  #: breaths that one training has seen, ``(points,)``.
+    seconds: Floats  #: computing time of all seeds together, without compiling, ``(points,)``.
+    compile_seconds: float  #: time of compiling, s.
+    scores: Floats  #: nominal, cmH2O, ``(seeds, points)``.
 
     @property
     def middle(self) -> Floats:
@@ -94,19 +86,12 @@ class LearningCurve:
 
 @dataclass(frozen=True)
 class SampleStudy:
-    """Learning curves of all methods on one lung, and the scores of PIDs there.
+    """Learning curves of all methods on one lung, and the scores of PIDs there."""
 
-    Attributes:
-        lung: id of the lung.
-        curves: learning curves of the methods.
-        start: nominal score of the PID that is corrected, cmH2O.
-        best_pid: nominal score of the best PID of the paper's grid on this lung, cmH2O.
-    """
-
-    lung: str
-    curves: tuple[LearningCurve, ...]
-    start: float
-    best_pid: float
+    lung: str  #: id of the lung.
+    curves: tuple[LearningCurve, ...]  #: learning curves of the methods.
+    start: float  #: nominal score of the PID that is corrected, cmH2O.
+    best_pid: float  #: nominal score of the best PID of the paper's grid on this lung, cmH2O.
 
     def points(self) -> pd.DataFrame:
         """One row for each point of each curve."""

@@ -14,17 +14,11 @@ TIME_CONSTANT = 0.5
 
 @flax.struct.dataclass
 class PIDState:
-    """Averages of a PID.
+    """Averages of a PID."""
 
-    Attributes:
-        error: error in the previous step, cmH2O, shape ``(...)``.
-        integral: leaky integral of the error, cmH2O, shape ``(...)``.
-        derivative: smoothed difference of the error, cmH2O, shape ``(...)``.
-    """
-
-    error: Array
-    integral: Array
-    derivative: Array
+    error: Array  #: error in the previous step, cmH2O, shape ``(...)``.
+    integral: Array  #: leaky integral of the error, cmH2O, shape ``(...)``.
+    derivative: Array  #: smoothed difference of the error, cmH2O, shape ``(...)``.
 
 
 @flax.struct.dataclass
@@ -34,16 +28,12 @@ class PID:
     With ``e = target - pressure`` and ``a = dt / (dt + 0.5 s)``, at each step:
     ``i += a (e - i)``; ``d += a (e - e_before - d)``; ``u_in = P e + I i + D d``. All three start
     from zero at every breath.
-
-    Attributes:
-        P: proportional gain, %/cmH2O, shape ``(...)``.
-        I: integral gain, %/cmH2O, shape ``(...)``.
-        D: derivative gain, %/cmH2O, shape ``(...)``.
     """
 
-    P: Array | float
+    P: Array | float  #: proportional gain, %/cmH2O, shape ``(...)``.
+    #: integral gain, %/cmH2O, shape ``(...)``.
     I: Array | float  # noqa: E741 - the field's name
-    D: Array | float = 0.0
+    D: Array | float = 0.0  #: derivative gain, %/cmH2O, shape ``(...)``.
 
     def init(self, shape: tuple[int, ...]) -> PIDState:
         """State before the first breath."""

@@ -35,33 +35,22 @@ _STEPS = protocol.INSPIRATION_STEPS
 
 @flax.struct.dataclass
 class ResidualState:
-    """Memory of the controller.
+    """Memory of the controller."""
 
-    Attributes:
-        pid: state of the PID.
-        begun: 0 before the first breath, then 1, shape ``(...)``.
-        known: whether there was a previous breath, 0/1, shape ``(...)``.
-        errors: errors in the last steps of this breath, the latest first, cmH2O, ``(...,
-            pressures)``.
-        commands: commands as applied in the last steps, the latest first, %, ``(..., commands)``.
-        error_trace: errors of the last 34 steps, the latest last, cmH2O, ``(..., 34)``.
-        command_trace: commands of the last 34 steps, the latest last, %, ``(..., 34)``. The command
-            of a step is known one step later, so that the first entry is the bias flow before the
-            breath.
-        error_before: errors of the previous breath from this step on, cmH2O,
-            ``(..., 34 + ahead)``.
-        command_before: commands of the previous breath from this step on, %,
-            ``(..., 34 + ahead)``.
-    """
-
-    pid: PIDState
-    begun: Array
-    known: Array
+    pid: PIDState  #: state of the PID.
+    begun: Array  #: 0 before the first breath, then 1, shape ``(...)``.
+    known: Array  #: whether there was a previous breath, 0/1, shape ``(...)``.
+    #: errors in the last steps of this breath, the latest first, cmH2O, ``(..., pressures)``.
     errors: Array
+    #: commands as applied in the last steps, the latest first, %, ``(..., commands)``.
     commands: Array
-    error_trace: Array
+    error_trace: Array  #: errors of the last 34 steps, the latest last, cmH2O, ``(..., 34)``.
+    #: commands of the last 34 steps, the latest last, %, ``(..., 34)``. The command of a step is
+    #: known one step later, so that the first entry is the bias flow before the breath.
     command_trace: Array
+    #: errors of the previous breath from this step on, cmH2O, ``(..., 34 + ahead)``.
     error_before: Array
+    #: commands of the previous breath from this step on, %, ``(..., 34 + ahead)``.
     command_before: Array
 
 
@@ -72,22 +61,18 @@ class Residual:
     The features are the PID's error, integral and derivative; the target; time in breath and
     control step; errors and applied commands of the last steps; and errors and commands of the
     previous breath at this step and at the next ones, which are zero in the first breath.
-
-    Attributes:
-        pid: gains of shape ``()``.
-        layers: dense layers of the network, tanh between them; the last has one output.
-        pressures: number of earlier errors that the network sees.
-        commands: number of earlier commands that it sees.
-        ahead: number of steps of the previous breath that it sees; 0 for none.
-        limit: largest correction, %.
     """
 
-    pid: PID
+    pid: PID  #: gains of shape ``()``.
+    #: dense layers of the network, tanh between them; the last has one output.
     layers: tuple[Layer, ...]
+    #: number of earlier errors that the network sees.
     pressures: int = flax.struct.field(pytree_node=False, default=5)
+    #: number of earlier commands that it sees.
     commands: int = flax.struct.field(pytree_node=False, default=6)
+    #: number of steps of the previous breath that it sees; 0 for none.
     ahead: int = flax.struct.field(pytree_node=False, default=6)
-    limit: float = flax.struct.field(pytree_node=False, default=100.0)
+    limit: float = flax.struct.field(pytree_node=False, default=100.0)  #: largest correction, %.
 
     def init(self, shape: tuple[int, ...]) -> ResidualState:
         """State before the first breath."""

@@ -51,17 +51,11 @@ Parameters = Any
 
 
 class TanhNetwork(nn.Module):
-    """Dense layers with tanh, then a linear one that starts as zero.
+    """Dense layers with tanh, then a linear one that starts as zero."""
 
-    Attributes:
-        widths: units of each hidden layer.
-        outputs: units of the last layer.
-        first: scale of the last layer's weights at the start; 0 for none.
-    """
-
-    widths: tuple[int, ...]
-    outputs: int
-    first: float = 0.0
+    widths: tuple[int, ...]  #: units of each hidden layer.
+    outputs: int  #: units of the last layer.
+    first: float = 0.0  #: scale of the last layer's weights at the start; 0 for none.
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -95,14 +89,10 @@ CHOICES = (
 
 @flax.struct.dataclass
 class CorrectedPID:
-    """The PID plus a correction that a network decides on.
+    """The PID plus a correction that a network decides on."""
 
-    Attributes:
-        parameters: weights and biases of the network.
-        network: what the outputs of the network mean is told by the kind of policy.
-    """
-
-    parameters: Parameters
+    parameters: Parameters  #: weights and biases of the network.
+    #: what the outputs of the network mean is told by the kind of policy.
     network: TanhNetwork = flax.struct.field(pytree_node=False)
 
     def init(self, shape: tuple[int, ...]) -> ResidualState:

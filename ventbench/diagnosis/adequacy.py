@@ -93,17 +93,13 @@ _RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Adequacy:
-    """What the residuals of the final model say.
+    """What the residuals of the final model say."""
 
-    Attributes:
-        regions: ranges in which they are not noise, as :func:`locate` orders them.
-        changes: significant and material orders in time, the largest effect first.
-        vetoed: whether "nothing is missing" would be wrong.
-    """
-
+    #: ranges in which they are not noise, as :func:`locate` orders them.
     regions: tuple[ErrorRegion, ...]
+    #: significant and material orders in time, the largest effect first.
     changes: tuple[Change, ...]
-    vetoed: bool
+    vetoed: bool  #: whether "nothing is missing" would be wrong.
 
 
 def check_residuals(

@@ -19,36 +19,22 @@ _INSPIRATION, _FAST, _SLOW, _HOLD, _SHUTTER = 1.0, 0.35, 1.5, 2.0, 0.16
 
 @dataclass(frozen=True)
 class Rig:
-    """Rough values of lung and valve; only the size of the commands depends on them.
+    """Rough values of lung and valve; only the size of the commands depends on them."""
 
-    Attributes:
-        R: resistance, cmH2O/(L/s).
-        C: compliance, mL/cmH2O.
-        gain: gain of the inspiratory valve, mL/s per %.
-        peep: expiratory pressure, cmH2O.
-    """
-
-    R: float
-    C: float
-    gain: float
-    peep: float
+    R: float  #: resistance, cmH2O/(L/s).
+    C: float  #: compliance, mL/cmH2O.
+    gain: float  #: gain of the inspiratory valve, mL/s per %.
+    peep: float  #: expiratory pressure, cmH2O.
 
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """k breaths of one kind.
+    """k breaths of one kind."""
 
-    Attributes:
-        name: short.
-        title: what to do on the rig, in words.
-        u_in: commands of the inspiratory valve, %, ``(k, T)``.
-        u_out: commands of the expiratory valve, 0/1, ``(k, T)``.
-    """
-
-    name: str
-    title: str
-    u_in: Floats
-    u_out: Floats
+    name: str  #: short.
+    title: str  #: what to do on the rig, in words.
+    u_in: Floats  #: commands of the inspiratory valve, %, ``(k, T)``.
+    u_out: Floats  #: commands of the expiratory valve, 0/1, ``(k, T)``.
 
     def scaled(self, by: Floats) -> Family:
         """Return the family with each inspiration scaled by a factor, ``(k,)``."""

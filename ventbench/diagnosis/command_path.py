@@ -24,19 +24,12 @@ _PATHS, _SAME = 6, 0.3
 
 
 class Paths(NamedTuple):
-    """What lost or late commands do for n breaths.
+    """What lost or late commands do for n breaths."""
 
-    Attributes:
-        nats: log-likelihood with them, ``(n,)``.
-        u_in: commands on the likeliest path, %, ``(n, T)``.
-        kept: at how many samples the valve did not follow a new command, ``(n,)``.
-        sent: how many new commands there were, ``(n,)``.
-    """
-
-    nats: Floats
-    u_in: Floats
-    kept: Floats
-    sent: Floats
+    nats: Floats  #: log-likelihood with them, ``(n,)``.
+    u_in: Floats  #: commands on the likeliest path, %, ``(n, T)``.
+    kept: Floats  #: at how many samples the valve did not follow a new command, ``(n,)``.
+    sent: Floats  #: how many new commands there were, ``(n,)``.
 
 
 def follow(

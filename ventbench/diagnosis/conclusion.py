@@ -59,35 +59,26 @@ from ventbench.system_id.noise import Noise
 
 @dataclass(frozen=True, eq=False)
 class Conclusion:
-    """The models that a recording needs.
+    """The models that a recording needs."""
 
-    Attributes:
-        base: the base model with its noise.
-        named: the selected mechanisms.
-        full: the mechanisms and the nonparametric term; ``named`` if there is none.
-        unnamed: the unnamed effect, or None.
-        noise: model of the noise that is left.
-        held_out_gains: held-out log-likelihood that each mechanism gains, nats, by name.
-        alternatives: alternatives to each mechanism, by name.
-        gain_sd: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths
-            have the same gain.
-        unresolved: whether much is missing, and neither mechanism nor unnamed effect is accepted.
-        worths: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without
-            each mechanism, by name.
-        slow_noise: what is left as slow noise of the sensor, with the weight of each place where a
-            course in time may act; None if nothing slow is left, or an unnamed effect is it.
-    """
-
-    base: FittedModel
-    named: FittedModel
-    full: FittedModel
-    unnamed: UnnamedEffect | None
-    noise: Noise
+    base: FittedModel  #: the base model with its noise.
+    named: FittedModel  #: the selected mechanisms.
+    full: FittedModel  #: the mechanisms and the nonparametric term; ``named`` if there is none.
+    unnamed: UnnamedEffect | None  #: the unnamed effect, or None.
+    noise: Noise  #: model of the noise that is left.
+    #: held-out log-likelihood that each mechanism gains, nats, by name.
     held_out_gains: dict[str, float]
-    alternatives: dict[str, Alternatives]
+    alternatives: dict[str, Alternatives]  #: alternatives to each mechanism, by name.
+    #: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths have the
+    #: same gain.
     gain_sd: float = 0.0
+    #: whether much is missing, and neither mechanism nor unnamed effect is accepted.
     unresolved: bool = False
+    #: what is left as slow noise of the sensor, with the weight of each place where a course in
+    #: time may act; None if nothing slow is left, or an unnamed effect is it.
     slow_noise: UnnamedEffect | None = None
+    #: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without each
+    #: mechanism, by name.
     worths: dict[str, float] = field(default_factory=dict)
 
     @property

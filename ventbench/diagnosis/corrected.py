@@ -44,27 +44,21 @@ Plants = dict[str, Plant]
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """A corrected simulator.
+    """A corrected simulator."""
 
-    Attributes:
-        pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)``
-            each.
-        training_errors: mean absolute error of the simulator as given and of the correction, before
-            any choice, on the breaths of the final fits, inspirations and expirations, cmH2O.
-        plants: the corrected simulator of each lung, by label; empty if the simulator has none.
-        chosen: what each lung's corrected simulator is, by label: as given, refitted or corrected.
-        unchanged: True if the simulator is left as it is, because a correction would be worse.
-        notes: notes for the reader.
-        rigs: parameters of each rig, if they are chosen for a lung.
-    """
-
+    #: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)`` each.
     pressures: dict[str, Floats]
+    #: mean absolute error of the simulator as given and of the correction, before any choice, on
+    #: the breaths of the final fits, inspirations and expirations, cmH2O.
     training_errors: tuple[float, float]
+    #: the corrected simulator of each lung, by label; empty if the simulator has none.
     plants: Plants
+    #: what each lung's corrected simulator is, by label: as given, refitted or corrected.
     chosen: dict[str, Stage] = field(default_factory=dict)
+    #: True if the simulator is left as it is, because a correction would be worse.
     unchanged: bool = False
-    notes: tuple[str, ...] = ()
-    rigs: tuple[RigParameters, ...] = ()
+    notes: tuple[str, ...] = ()  #: notes for the reader.
+    rigs: tuple[RigParameters, ...] = ()  #: parameters of each rig, if they are chosen for a lung.
 
     @property
     def helps(self) -> bool:

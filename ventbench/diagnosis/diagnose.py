@@ -356,19 +356,14 @@ def _diagnose(
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """A model of the recording compared with the simulator's.
+    """A model of the recording compared with the simulator's."""
 
-    Attributes:
-        recording_model: the model, with the simulator's own parameters where breaths allow.
-        missing: what the simulator lacks, and whether it has it with other parameters.
-        notes: on what the simulator has and the recording does not show.
-        correction: the simulator corrected.
-    """
-
+    #: the model, with the simulator's own parameters where breaths allow.
     recording_model: IdentifiedModel
+    #: what the simulator lacks, and whether it has it with other parameters.
     missing: dict[str, bool]
-    notes: list[str]
-    correction: Correction
+    notes: list[str]  #: on what the simulator has and the recording does not show.
+    correction: Correction  #: the simulator corrected.
 
     def error(self, data: Data, testing: Bools) -> float:
         """Mean absolute error of the corrected simulator on the testing breaths, cmH2O."""

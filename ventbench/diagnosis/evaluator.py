@@ -236,25 +236,19 @@ def _best_delay(problem: Problem, x: Floats, path: str, settings: SelectionConfi
 
 @dataclass(frozen=True, eq=False)
 class Evaluator:
-    """A recording that is split into training and held-out breaths.
+    """A recording that is split into training and held-out breaths."""
 
-    Attributes:
-        training: breaths that hypotheses are fitted to.
-        held_out: breaths that evaluate them.
-        gain_sd: prior standard deviation of the logarithm of each breath's valve gain; 0 if all
-            breaths have the same gain.
-        excluded: mechanisms that cannot act, as efforts in a passive test lung.
-        folds: further splits of the same breaths, training and held-out, such that every breath is
-            held out exactly once in all splits together.
-        settings: every threshold.
-    """
-
-    training: Partition
-    held_out: Partition
+    training: Partition  #: breaths that hypotheses are fitted to.
+    held_out: Partition  #: breaths that evaluate them.
+    #: prior standard deviation of the logarithm of each breath's valve gain; 0 if all breaths have
+    #: the same gain.
     gain_sd: float = 0.0
+    #: mechanisms that cannot act, as efforts in a passive test lung.
     excluded: tuple[str, ...] = ()
+    #: further splits of the same breaths, training and held-out, such that every breath is held out
+    #: exactly once in all splits together.
     folds: tuple[tuple[Partition, Partition], ...] = ()
-    settings: SelectionConfig = DEFAULT
+    settings: SelectionConfig = DEFAULT  #: every threshold.
     _held_out: WeakKeyDictionary[FittedModel, Floats] = field(
         init=False, repr=False, default_factory=WeakKeyDictionary
     )

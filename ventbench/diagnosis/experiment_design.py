@@ -105,21 +105,13 @@ def acting(fitted: FittedHypothesis) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Prediction of m new breaths by a hypothesis.
+    """Prediction of m new breaths by a hypothesis."""
 
-    Attributes:
-        white: predicted readings, whitened, ``(m, c T)``.
-        rows: derivatives of the readings by the shared unknowns, ``(m, s, c T)``.
-        own: derivatives of the readings by each breath's own unknowns, ``(m, o, c T)``.
-        own_precision: prior precision of each breath's own unknowns, ``(o,)``.
-        known: information of the recorded breaths on the shared unknowns, ``(s, s)``.
-    """
-
-    white: Floats
-    rows: Floats
-    own: Floats
-    own_precision: Floats
-    known: Floats
+    white: Floats  #: predicted readings, whitened, ``(m, c T)``.
+    rows: Floats  #: derivatives of the readings by the shared unknowns, ``(m, s, c T)``.
+    own: Floats  #: derivatives of the readings by each breath's own unknowns, ``(m, o, c T)``.
+    own_precision: Floats  #: prior precision of each breath's own unknowns, ``(o,)``.
+    known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
 
 
 def values_of(fitted: FittedHypothesis, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
@@ -164,18 +156,12 @@ class Contrast:
     """Difference of two hypotheses in m new breaths, if one is true and the other is refitted.
 
     Each breath's own unknowns are eliminated: rows and differences are what their refit leaves.
-
-    Attributes:
-        difference: whitened, ``(m, k)``.
-        rows: derivatives by the shared unknowns of the refitted hypothesis, ``(m, s, k)``.
-        known: information of the recorded breaths on the shared unknowns, ``(s, s)``.
-        noise: model of the measurement noise.
     """
 
-    difference: Floats
-    rows: Floats
-    known: Floats
-    noise: Noise
+    difference: Floats  #: whitened, ``(m, k)``.
+    rows: Floats  #: derivatives by the shared unknowns of the refitted hypothesis, ``(m, s, k)``.
+    known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
+    noise: Noise  #: model of the measurement noise.
 
     def nats(self, which: NDArray[np.intp]) -> float:
         """Log-likelihood that the refitted hypothesis is expected to lose in some breaths."""

@@ -27,113 +27,77 @@ Quantity = Literal["gain", "zero", "error"]
 
 @dataclass(frozen=True)
 class MissingMechanism:
-    """A mechanism that the recording needs and the simulator lacks.
+    """A mechanism that the recording needs and the simulator lacks."""
 
-    Attributes:
-        name: name in the library.
-        parameters: estimates by short name.
-        confidence: how far the name is preferred over other names, 0..1: its posterior probability
-            if one of the compared mechanisms acts. It says nothing of effects that none of them is.
-        alternatives: mechanisms that the recording cannot distinguish from it, the likeliest first.
-        nats: held-out log-likelihood that is lost without it.
-        changed: True if the simulator has the mechanism too, with other parameters.
-        simulator_values: parameters that the simulator has, by short name; empty if not changed.
-        worth: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without it;
-            NaN if unknown.
-        breaths: of a change at a breath, the id of the first breath after it, and the ids between
-            which that lies with 95 %; else None.
-        affected: ids of the breaths in which it acts, if it acts in some only.
-        explains: share of the squared error that is shown to be no noise which it explains, 0..1.
-    """
-
-    name: str
-    parameters: dict[str, Estimate]
+    name: str  #: name in the library.
+    parameters: dict[str, Estimate]  #: estimates by short name.
+    #: how far the name is preferred over other names, 0..1: its posterior probability if one of the
+    #: compared mechanisms acts. It says nothing of effects that none of them is.
     confidence: float
+    #: mechanisms that the recording cannot distinguish from it, the likeliest first.
     alternatives: tuple[str, ...]
-    nats: float
-    changed: bool = False
+    nats: float  #: held-out log-likelihood that is lost without it.
+    changed: bool = False  #: True if the simulator has the mechanism too, with other parameters.
+    #: parameters that the simulator has, by short name; empty if not changed.
     simulator_values: dict[str, float] = field(default_factory=dict)
+    #: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without it; NaN if
+    #: unknown.
     worth: float = float("nan")
+    #: of a change at a breath, the id of the first breath after it, and the ids between which that
+    #: lies with 95 %; else None.
     breaths: tuple[int, int, int] | None = None
-    affected: tuple[int, ...] = ()
+    affected: tuple[int, ...] = ()  #: ids of the breaths in which it acts, if it acts in some only.
+    #: share of the squared error that is shown to be no noise which it explains, 0..1.
     explains: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class NonparametricTerm:
-    """A place in the model where an effect acts that the library does not have.
+    """A place in the model where an effect acts that the library does not have."""
 
-    Attributes:
-        name: name of the place, such as ``f(V)``.
-        meaning: what the place means, in words.
-        explains: share of the squared error above the noise that the term explains, 0..1.
-        nats: held-out log-likelihood that it gains.
-        x: what the term depends on, ``(k,)``.
-        x_unit: name and unit of ``x``, such as ``volume, mL``.
-        y: value of the term, without the part that R and C can absorb, ``(k,)``.
-        y_unit: name and unit of ``y``.
-        form_of: missing mechanisms that the term contains. If there are any, the term is no further
-            effect: it shows how their form differs from the library's.
-        places: where the effect may act and the weight of each place that was compared, the largest
-            first: of a course in time by held-out breaths, of a curve by BIC.
-    """
-
-    name: str
-    meaning: str
-    explains: float
-    nats: float
-    x: Floats
-    x_unit: str
-    y: Floats
-    y_unit: str
+    name: str  #: name of the place, such as ``f(V)``.
+    meaning: str  #: what the place means, in words.
+    explains: float  #: share of the squared error above the noise that the term explains, 0..1.
+    nats: float  #: held-out log-likelihood that it gains.
+    x: Floats  #: what the term depends on, ``(k,)``.
+    x_unit: str  #: name and unit of ``x``, such as ``volume, mL``.
+    y: Floats  #: value of the term, without the part that R and C can absorb, ``(k,)``.
+    y_unit: str  #: name and unit of ``y``.
+    #: missing mechanisms that the term contains. If there are any, the term is no further effect:
+    #: it shows how their form differs from the library's.
     form_of: tuple[str, ...] = ()
+    #: where the effect may act and the weight of each place that was compared, the largest first:
+    #: of a course in time by held-out breaths, of a curve by BIC.
     places: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True)
 class ErrorRegion:
-    """A range of one quantity in which the refitted simulator errs.
+    """A range of one quantity in which the refitted simulator errs."""
 
-    Attributes:
-        axis: the quantity, such as ``time since inspiration``.
-        low: start of the range.
-        high: end of the range.
-        unit: unit of the range.
-        mean_error: recorded minus simulated pressure, cmH2O: mean over breaths of each breath's
-            mean over the range, as charts show it.
-        p_value: corrected for all ranges of all axes.
-        share: share of the squared error above the noise that lies in the range, 0..1.
-    """
-
-    axis: str
-    low: float
-    high: float
-    unit: str
+    axis: str  #: the quantity, such as ``time since inspiration``.
+    low: float  #: start of the range.
+    high: float  #: end of the range.
+    unit: str  #: unit of the range.
+    #: recorded minus simulated pressure, cmH2O: mean over breaths of each breath's mean over the
+    #: range, as charts show it.
     mean_error: float
-    p_value: float
-    share: float
+    p_value: float  #: corrected for all ranges of all axes.
+    share: float  #: share of the squared error above the noise that lies in the range, 0..1.
 
 
 @dataclass(frozen=True)
 class Change:
-    """Something that has an order in time though breaths should be exchangeable.
+    """Something that has an order in time though breaths should be exchangeable."""
 
-    Attributes:
-        of: ``gain`` of the valve, ``zero`` of the pressure, or size of the ``error``.
-        breath: id of the first breath after the change.
-        size: factor from before to after (gain, error), or shift (zero), cmH2O.
-        drifts: whether a straight line from the first to the last breath fits better than a step;
-            the size is then that of the whole line.
-        p_value: by permutations of the breaths.
-        worth: root-mean-square error that it causes, cmH2O.
-    """
-
-    of: Quantity
-    breath: int
-    size: float
+    of: Quantity  #: ``gain`` of the valve, ``zero`` of the pressure, or size of the ``error``.
+    breath: int  #: id of the first breath after the change.
+    size: float  #: factor from before to after (gain, error), or shift (zero), cmH2O.
+    #: whether a straight line from the first to the last breath fits better than a step; the size
+    #: is then that of the whole line.
     drifts: bool
-    p_value: float
-    worth: float
+    p_value: float  #: by permutations of the breaths.
+    worth: float  #: root-mean-square error that it causes, cmH2O.
 
 
 @dataclass(frozen=True)
@@ -150,31 +114,25 @@ class OpenLoopComparison:
 
     On each lung, ``after`` is at most ``refit``, and ``refit`` at most ``before``: these breaths
     choose the corrected simulator.
-
-    Attributes:
-        held_out_breaths: ids of the held-out breaths, which no fit and no test has seen.
-        before: error of the simulator as given.
-        refit: error after R, C, R_ex and PEEP are refitted.
-        after: error of the corrected simulator.
-        noise_floor: root-mean-square error of a perfect simulator, cmH2O.
-        groups: errors of parts of the breath and of lungs, by group and stage, such as
-            ``{"lung R5C10": {"before": OpenLoopError(...), ...}}``.
-        gain_error: root-mean-square error, cmH2O, that a breath to come has because the valve's
-            gain differs from breath to breath; 0 if it does not.
-        usual: root-mean-square error of the corrected simulator, cmH2O, without the tenth of the
-            breaths that err most; NaN if unknown.
-        sensor_noise: standard deviation of quiet readings, cmH2O, which no missing physics can
-            raise; NaN if nothing is quiet.
     """
 
+    #: ids of the held-out breaths, which no fit and no test has seen.
     held_out_breaths: tuple[int, ...]
-    before: OpenLoopError
-    refit: OpenLoopError
-    after: OpenLoopError
-    noise_floor: float
+    before: OpenLoopError  #: error of the simulator as given.
+    refit: OpenLoopError  #: error after R, C, R_ex and PEEP are refitted.
+    after: OpenLoopError  #: error of the corrected simulator.
+    noise_floor: float  #: root-mean-square error of a perfect simulator, cmH2O.
+    #: errors of parts of the breath and of lungs, by group and stage, such as ``{"lung R5C10":
+    #: {"before": OpenLoopError(...), ...}}``.
     groups: dict[str, dict[str, OpenLoopError]]
+    #: root-mean-square error, cmH2O, that a breath to come has because the valve's gain differs
+    #: from breath to breath; 0 if it does not.
     gain_error: float = 0.0
+    #: root-mean-square error of the corrected simulator, cmH2O, without the tenth of the breaths
+    #: that err most; NaN if unknown.
     usual: float = float("nan")
+    #: standard deviation of quiet readings, cmH2O, which no missing physics can raise; NaN if
+    #: nothing is quiet.
     sensor_noise: float = float("nan")
 
     @property
@@ -192,46 +150,27 @@ class OpenLoopComparison:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Recorded breaths with simulated pressures; arrays ``(n, T)``, NaN where unknown.
+    """Recorded breaths with simulated pressures; arrays ``(n, T)``, NaN where unknown."""
 
-    Attributes:
-        breaths: n recorded breaths.
-        held_out: which of them no fit and no test of a term has seen, bool ``(n,)``.
-        before: pressure of the simulator as given, cmH2O.
-        refit: pressure with R, C, R_ex and PEEP refitted, cmH2O.
-        after: pressure of the corrected simulator, cmH2O.
-        flow: flow of the refitted simulator into the lung, mL/s, or None.
-        volume: volume of the refitted simulator, mL, or None.
-    """
-
-    breaths: Breaths
-    held_out: Bools
-    before: Floats
-    refit: Floats
-    after: Floats
-    flow: Floats | None = None
-    volume: Floats | None = None
+    breaths: Breaths  #: n recorded breaths.
+    held_out: Bools  #: which of them no fit and no test of a term has seen, bool ``(n,)``.
+    before: Floats  #: pressure of the simulator as given, cmH2O.
+    refit: Floats  #: pressure with R, C, R_ex and PEEP refitted, cmH2O.
+    after: Floats  #: pressure of the corrected simulator, cmH2O.
+    flow: Floats | None = None  #: flow of the refitted simulator into the lung, mL/s, or None.
+    volume: Floats | None = None  #: volume of the refitted simulator, mL, or None.
 
 
 @dataclass(frozen=True, eq=False)
 class BreathRequest:
-    """Breaths to record next, because they distinguish between hypotheses.
+    """Breaths to record next, because they distinguish between hypotheses."""
 
-    Attributes:
-        title: what to do on the rig, in words.
-        why: mechanisms that the breaths distinguish.
-        nats: log-likelihood ratio that the breaths are expected to give.
-        u_in: commands of the inspiratory valve, %, ``(k, T)``.
-        u_out: commands of the expiratory valve, 0/1, ``(k, T)``.
-        dt: time to the next sample, s, ``(k, T)``.
-    """
-
-    title: str
-    why: tuple[str, ...]
-    nats: float
-    u_in: Floats
-    u_out: Floats
-    dt: Floats
+    title: str  #: what to do on the rig, in words.
+    why: tuple[str, ...]  #: mechanisms that the breaths distinguish.
+    nats: float  #: log-likelihood ratio that the breaths are expected to give.
+    u_in: Floats  #: commands of the inspiratory valve, %, ``(k, T)``.
+    u_out: Floats  #: commands of the expiratory valve, 0/1, ``(k, T)``.
+    dt: Floats  #: time to the next sample, s, ``(k, T)``.
 
     def to_csv(self) -> str:
         """Commands as a CSV file: ``breath_id,time_step,u_in,u_out``, breaths end to end.
@@ -248,79 +187,58 @@ class BreathRequest:
 
 @dataclass(frozen=True)
 class RigParameters:
-    """Parameters of one rig of the recording.
+    """Parameters of one rig of the recording."""
 
-    Attributes:
-        lung: label of its lung.
-        rig: number of the rig.
-        breaths: ids of its breaths that were fitted.
-        parameters: by path, such as ``R`` or ``sensor_lag.tau``.
-    """
-
-    lung: str
-    rig: int
-    breaths: tuple[int, ...]
-    parameters: dict[str, float]
+    lung: str  #: label of its lung.
+    rig: int  #: number of the rig.
+    breaths: tuple[int, ...]  #: ids of its breaths that were fitted.
+    parameters: dict[str, float]  #: by path, such as ``R`` or ``sensor_lag.tau``.
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """Everything that a diagnosis establishes.
+    """Everything that a diagnosis establishes."""
 
-    Attributes:
-        verdict: see :data:`Verdict`.
-        mechanisms: missing ones, the most important first.
-        nonparametric: a term for an effect that is not in the library, or None.
-        form: a term for what the form of a missing mechanism lacks, or None; see
-            :attr:`NonparametricTerm.form_of`.
-        location: regions in which the refitted simulator errs, the most certain first.
-        open_loop: errors before and after the correction.
-        lungs: one for each lung of the recording.
-        request: breaths to record next, or None if nothing is open.
-        traces: pressures of all breaths.
-        plants: the corrected simulator of each lung, by label.
-        simulator: name of what was diagnosed, such as ``physics``.
-        noise: standard deviation of the measurement noise, cmH2O, and its correlation between
-            neighbouring samples.
-        notes: further information for the reader, a sentence each.
-        seconds: computing time.
-        settings: every threshold of the diagnosis.
-        remaining: regions in which the corrected simulator still errs, the most certain first.
-        split: ids of the breaths by use: ``training``, ``testing`` and ``judging``; few breaths of
-            a lung have both of the last two uses.
-        chosen: what the corrected simulator of each lung is, by label: the simulator as given,
-            refitted, corrected, or corrected with strengths of each rig, whichever errs least on
-            the judging breaths.
-        gain_scatter: standard deviation of the logarithm of the breaths' valve gains; 0 if all
-            breaths have the same gain.
-        detection_limits: if nothing is missing: smallest strength of each mechanism that would have
-            been seen, in the unit of the strength, by name; infinite if none would.
-        rigs: parameters of each rig where the correction has them; empty otherwise.
-        changes: what changes in the course of the recording and is in no model.
-        saturated: reading at which the pressure sensor saturates, cmH2O, and share of the readings
-            that do, which are left out; None if it does not.
-    """
-
-    verdict: Verdict
-    mechanisms: tuple[MissingMechanism, ...]
+    verdict: Verdict  #: see :data:`Verdict`.
+    mechanisms: tuple[MissingMechanism, ...]  #: missing ones, the most important first.
+    #: a term for an effect that is not in the library, or None.
     nonparametric: NonparametricTerm | None
+    #: regions in which the refitted simulator errs, the most certain first.
     location: tuple[ErrorRegion, ...]
-    open_loop: OpenLoopComparison
-    lungs: tuple[LungMatch, ...]
-    request: BreathRequest | None
-    traces: Traces
-    plants: dict[str, Plant]
-    simulator: str
+    open_loop: OpenLoopComparison  #: errors before and after the correction.
+    lungs: tuple[LungMatch, ...]  #: one for each lung of the recording.
+    request: BreathRequest | None  #: breaths to record next, or None if nothing is open.
+    traces: Traces  #: pressures of all breaths.
+    plants: dict[str, Plant]  #: the corrected simulator of each lung, by label.
+    simulator: str  #: name of what was diagnosed, such as ``physics``.
+    #: standard deviation of the measurement noise, cmH2O, and its correlation between neighbouring
+    #: samples.
     noise: tuple[float, float]
-    notes: tuple[str, ...]
-    seconds: float
-    settings: SelectionConfig = DEFAULT
+    notes: tuple[str, ...]  #: further information for the reader, a sentence each.
+    seconds: float  #: computing time.
+    settings: SelectionConfig = DEFAULT  #: every threshold of the diagnosis.
+    #: a term for what the form of a missing mechanism lacks, or None; see
+    #: :attr:`NonparametricTerm.form_of`.
     form: NonparametricTerm | None = None
+    #: regions in which the corrected simulator still errs, the most certain first.
     remaining: tuple[ErrorRegion, ...] = ()
+    #: ids of the breaths by use: ``training``, ``testing`` and ``judging``; few breaths of a lung
+    #: have both of the last two uses.
     split: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    #: what the corrected simulator of each lung is, by label: the simulator as given, refitted,
+    #: corrected, or corrected with strengths of each rig, whichever errs least on the judging
+    #: breaths.
     chosen: dict[str, Stage] = field(default_factory=dict)
+    #: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths have the
+    #: same gain.
     gain_scatter: float = 0.0
+    #: if nothing is missing: smallest strength of each mechanism that would have been seen, in the
+    #: unit of the strength, by name; infinite if none would.
     detection_limits: dict[str, float] = field(default_factory=dict)
+    #: parameters of each rig where the correction has them; empty otherwise.
     rigs: tuple[RigParameters, ...] = ()
+    #: what changes in the course of the recording and is in no model.
     changes: tuple[Change, ...] = ()
+    #: reading at which the pressure sensor saturates, cmH2O, and share of the readings that do,
+    #: which are left out; None if it does not.
     saturated: tuple[float, float] | None = None

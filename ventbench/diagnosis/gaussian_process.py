@@ -30,15 +30,10 @@ _RIDGE = 1e-9
 
 
 class Kernel(NamedTuple):
-    """Kind and scale of a Gaussian process of unit variance.
+    """Kind and scale of a Gaussian process of unit variance."""
 
-    Attributes:
-        periodic: whether it has one frequency; else it is smooth.
-        scale: frequency in Hz if periodic, else correlation time in s.
-    """
-
-    periodic: bool
-    scale: float
+    periodic: bool  #: whether it has one frequency; else it is smooth.
+    scale: float  #: frequency in Hz if periodic, else correlation time in s.
 
 
 def components(dt: Floats, kernel: Kernel, least: float) -> Floats:
@@ -65,21 +60,13 @@ def components(dt: Floats, kernel: Kernel, least: float) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class LinearBreaths:
-    """Breaths to first order in their own parameters, of which there are j.
+    """Breaths to first order in their own parameters, of which there are j."""
 
-    Attributes:
-        residual: simulated minus measured, ``(n, c, T)``.
-        slopes: its derivatives by a breath's own parameters, ``(n, j, c, T)``.
-        precision: prior precision of these, ``(n, j)``.
-        displacement: their distance from the prior mean, ``(n, j)``.
-        weight: 1 where measured, else 0, ``(n, c, T)``.
-    """
-
-    residual: Floats
-    slopes: Floats
-    precision: Floats
-    displacement: Floats
-    weight: Floats
+    residual: Floats  #: simulated minus measured, ``(n, c, T)``.
+    slopes: Floats  #: its derivatives by a breath's own parameters, ``(n, j, c, T)``.
+    precision: Floats  #: prior precision of these, ``(n, j)``.
+    displacement: Floats  #: their distance from the prior mean, ``(n, j)``.
+    weight: Floats  #: 1 where measured, else 0, ``(n, c, T)``.
 
     @classmethod
     def of(cls, problem: Problem, x: Floats) -> LinearBreaths:
@@ -123,39 +110,25 @@ class LinearBreaths:
 
 
 class Marginal(NamedTuple):
-    """Marginal likelihood, and where the posterior has its peak.
+    """Marginal likelihood, and where the posterior has its peak."""
 
-    Attributes:
-        nats: log marginal likelihood of each breath, ``(n,)``.
-        coefficients: the likeliest coefficients of the components, then the changes of a breath's
-            own parameters, ``(n, K + j)``.
-    """
-
-    nats: Floats
+    nats: Floats  #: log marginal likelihood of each breath, ``(n,)``.
+    #: the likeliest coefficients of the components, then the changes of a breath's own parameters,
+    #: ``(n, K + j)``.
     coefficients: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class WhitenedBreaths:
-    """Whitened residuals of m samples, and how K components and j own parameters change them.
+    """Whitened residuals of m samples, and how K components and j own parameters change them."""
 
-    Attributes:
-        noise: model of the noise that whitened them.
-        white: residuals, ``(n, m)``.
-        rows: their derivatives, those by the components first, ``(n, K + j, m)``.
-        constant: logarithm of the noise's density at zero, ``(n,)``.
-        count: number of components, K.
-        precision: see :class:`LinearBreaths`.
-        displacement: see :class:`LinearBreaths`.
-    """
-
-    noise: Noise
-    white: Floats
-    rows: Floats
-    constant: Floats
-    count: int
-    precision: Floats
-    displacement: Floats
+    noise: Noise  #: model of the noise that whitened them.
+    white: Floats  #: residuals, ``(n, m)``.
+    rows: Floats  #: their derivatives, those by the components first, ``(n, K + j, m)``.
+    constant: Floats  #: logarithm of the noise's density at zero, ``(n,)``.
+    count: int  #: number of components, K.
+    precision: Floats  #: see :class:`LinearBreaths`.
+    displacement: Floats  #: see :class:`LinearBreaths`.
 
     def marginal(self, size: float, start: Floats | None = None) -> Marginal:
         """Integrate the process out.

@@ -25,23 +25,14 @@ from ventbench.system_id.problem import Problem, free_paths
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """A fitted model to first order, with m whitened samples in each of n breaths.
+    """A fitted model to first order, with m whitened samples in each of n breaths."""
 
-    Attributes:
-        problem: the model's breaths and noise.
-        values: physical values of all parameters and of the start, ``(n, P + 1)``.
-        prediction: simulated readings, ``(n, c, T)``.
-        residual: simulated minus measured, whitened and projected, ``(n, m)``.
-        own_basis: orthonormal directions that each breath absorbs by itself, ``(n, j, m)``.
-        shared_basis: orthonormal directions that all breaths absorb together, ``(s, n m)``.
-    """
-
-    problem: Problem
-    values: Floats
-    prediction: Floats
-    residual: Floats
-    own_basis: Floats
-    shared_basis: Floats
+    problem: Problem  #: the model's breaths and noise.
+    values: Floats  #: physical values of all parameters and of the start, ``(n, P + 1)``.
+    prediction: Floats  #: simulated readings, ``(n, c, T)``.
+    residual: Floats  #: simulated minus measured, whitened and projected, ``(n, m)``.
+    own_basis: Floats  #: orthonormal directions that each breath absorbs by itself, ``(n, j, m)``.
+    shared_basis: Floats  #: orthonormal directions that all breaths absorb together, ``(s, n m)``.
 
     def whiten(self, difference: Floats) -> Floats:
         """Whiten differences of predictions, ``(n, ..., c, T)`` to ``(n, ..., m)``."""
@@ -134,16 +125,11 @@ def _orthonormal(rows: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """The base model plus a set of terms: mechanisms, and basis terms of nonparametric components.
+    """The base model plus terms: mechanisms, and basis terms of nonparametric components."""
 
-    Attributes:
-        names: the terms, in the order in which they were added.
-        free: shape parameters that are fitted as well, by path.
-        fixed: parameters that keep a value other than their neutral one, by path.
-    """
-
-    names: tuple[str, ...] = ()
-    free: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()  #: the terms, in the order in which they were added.
+    free: tuple[str, ...] = ()  #: shape parameters that are fitted as well, by path.
+    #: parameters that keep a value other than their neutral one, by path.
     fixed: tuple[tuple[str, float], ...] = ()
 
     def plus(self, other: Hypothesis) -> Hypothesis:
@@ -211,19 +197,12 @@ def make_partition(
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """A hypothesis at its maximum-likelihood parameters.
+    """A hypothesis at its maximum-likelihood parameters."""
 
-    Attributes:
-        hypothesis: the terms.
-        problem: data, noise and unknowns of the fit.
-        minimum: minimum of the problem's cost.
-        log_likelihood: log-likelihood of all its breaths, nats.
-    """
-
-    hypothesis: Hypothesis
-    problem: Problem
-    minimum: Minimum
-    log_likelihood: float
+    hypothesis: Hypothesis  #: the terms.
+    problem: Problem  #: data, noise and unknowns of the fit.
+    minimum: Minimum  #: minimum of the problem's cost.
+    log_likelihood: float  #: log-likelihood of all its breaths, nats.
     _residual_without: dict[str, Floats] = field(init=False, repr=False, default_factory=dict)
 
     @cached_property

@@ -44,15 +44,11 @@ _LISTED = 5
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Use of n breaths; masks ``(n,)``.
+    """Use of n breaths; masks ``(n,)``."""
 
-    Attributes:
-        testing: breaths that decide which terms a model needs.
-        judging: breaths that choose the corrected simulator and measure its error. A lung with few
-            breaths has none to spare: its testing breaths judge as well.
-    """
-
-    testing: Bools
+    testing: Bools  #: breaths that decide which terms a model needs.
+    #: breaths that choose the corrected simulator and measure its error. A lung with few breaths
+    #: has none to spare: its testing breaths judge as well.
     judging: Bools
 
     @property
@@ -168,19 +164,12 @@ def usable(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> tuple[Bre
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedModel:
-    """A model identified from breaths, with the final fit.
+    """A model identified from breaths, with the final fit."""
 
-    Attributes:
-        evaluator: evaluator of the breaths.
-        conclusion: base model, mechanisms and nonparametric term that the breaths need.
-        fit: final fit of the conclusion, with intervals.
-        final: breaths of the final fit, with a predictor of the conclusion's parameters.
-    """
-
-    evaluator: Evaluator
-    conclusion: Conclusion
-    fit: Fit
-    final: Partition
+    evaluator: Evaluator  #: evaluator of the breaths.
+    conclusion: Conclusion  #: base model, mechanisms and nonparametric term that the breaths need.
+    fit: Fit  #: final fit of the conclusion, with intervals.
+    final: Partition  #: breaths of the final fit, with a predictor of the conclusion's parameters.
 
     @property
     def final_model(self) -> FittedModel:

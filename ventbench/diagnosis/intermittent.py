@@ -89,19 +89,13 @@ _AT_ONCE = 16
 
 @dataclass(frozen=True, eq=False)
 class Intermittent:
-    """An effect that acts in some breaths.
+    """An effect that acts in some breaths."""
 
-    Attributes:
-        missing: its finding, with the ids of the breaths that are affected.
-        ids: ids of the n breaths that were looked at, in order.
-        affected: which of them are, ``(n,)``.
-        u_in: commands that reached the valve, %, ``(n, T)``; None if the affected breaths are to be
-            set aside.
-    """
-
-    missing: MissingMechanism
-    ids: NDArray[np.int_]
-    affected: Bools
+    missing: MissingMechanism  #: its finding, with the ids of the breaths that are affected.
+    ids: NDArray[np.int_]  #: ids of the n breaths that were looked at, in order.
+    affected: Bools  #: which of them are, ``(n,)``.
+    #: commands that reached the valve, %, ``(n, T)``; None if the affected breaths are to be set
+    #: aside.
     u_in: Floats | None
 
     def leaves_enough(
@@ -124,25 +118,15 @@ class Intermittent:
 
 
 class _Found(NamedTuple):
-    """An effect fitted to the training breaths.
+    """An effect fitted to the training breaths."""
 
-    Attributes:
-        evaluator: evaluator of the recording.
-        name: name of the event.
-        fitted: the model of the breaths without it.
-        strength: index of the strength; samples by which commands are late, 0 if they are lost.
-        share: share of the breaths, or of the commands.
-        training: log-likelihood of all training breaths, nats.
-        held_out: log-likelihood of each held-out breath, ``(h,)``.
-    """
-
-    evaluator: Evaluator
-    name: str
-    fitted: FittedModel
-    strength: int
-    share: float
-    training: float
-    held_out: Floats
+    evaluator: Evaluator  #: evaluator of the recording.
+    name: str  #: name of the event.
+    fitted: FittedModel  #: the model of the breaths without it.
+    strength: int  #: index of the strength; samples by which commands are late, 0 if they are lost.
+    share: float  #: share of the breaths, or of the commands.
+    training: float  #: log-likelihood of all training breaths, nats.
+    held_out: Floats  #: log-likelihood of each held-out breath, ``(h,)``.
 
     @property
     def total(self) -> float:
@@ -340,18 +324,12 @@ def _everywhere(found: _Found, data: Data) -> tuple[Bools, Floats | None, dict[s
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """What an effect does for the log-likelihood of n breaths.
+    """What an effect does for the log-likelihood of n breaths."""
 
-    Attributes:
-        strengths: the s strengths that were tried.
-        nats: gain of each breath at each strength and each of g courses, ``(s, g, n)``.
-        rough: gain of each breath if it only errs more than others, ``(n,)``.
-        plain: log-likelihood of each breath in which the effect does not act, nats, ``(n,)``.
-    """
-
-    strengths: tuple[float, ...]
-    nats: Floats
-    rough: Floats
+    strengths: tuple[float, ...]  #: the s strengths that were tried.
+    nats: Floats  #: gain of each breath at each strength and each of g courses, ``(s, g, n)``.
+    rough: Floats  #: gain of each breath if it only errs more than others, ``(n,)``.
+    #: log-likelihood of each breath in which the effect does not act, nats, ``(n,)``.
     plain: Floats
 
     @classmethod

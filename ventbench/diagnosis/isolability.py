@@ -43,43 +43,29 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class Pair:
-    """Two mechanisms that the plan cannot tell apart, or one that it cannot show.
+    """Two mechanisms that the plan cannot tell apart, or one that it cannot show."""
 
-    Attributes:
-        names: both, or the one.
-        nats: log-likelihood by which the plan tells them apart, or shows it.
-        remedy: the least that would, a sensor or one further breath in words; None if none does.
-        gained: nats with it; with the best there is if it is not enough.
-    """
-
-    names: tuple[str, ...]
-    nats: float
+    names: tuple[str, ...]  #: both, or the one.
+    nats: float  #: log-likelihood by which the plan tells them apart, or shows it.
+    #: the least that would, a sensor or one further breath in words; None if none does.
     remedy: str | None
-    gained: float
+    gained: float  #: nats with it; with the best there is if it is not enough.
 
 
 @dataclass(frozen=True)
 class Isolability:
-    """What a plan can tell.
+    """What a plan can tell."""
 
-    Attributes:
-        lung: label.
-        sensors: what is measured.
-        threshold: nats from which something is told.
-        detectable: nats that each mechanism is worth at its mild strength, by name.
-        nats: nats by which each pair of detectable mechanisms is told apart.
-        confused: the pairs below the threshold, the closest first.
-        unseen: mechanisms that the plan would not show at a mild strength.
-        groups: detectable mechanisms, those in one group that pairs below the threshold join.
-    """
-
-    lung: str
-    sensors: tuple[str, ...]
-    threshold: float
+    lung: str  #: label.
+    sensors: tuple[str, ...]  #: what is measured.
+    threshold: float  #: nats from which something is told.
+    #: nats that each mechanism is worth at its mild strength, by name.
     detectable: dict[str, float]
+    #: nats by which each pair of detectable mechanisms is told apart.
     nats: dict[tuple[str, str], float]
-    confused: tuple[Pair, ...]
-    unseen: tuple[Pair, ...]
+    confused: tuple[Pair, ...]  #: the pairs below the threshold, the closest first.
+    unseen: tuple[Pair, ...]  #: mechanisms that the plan would not show at a mild strength.
+    #: detectable mechanisms, those in one group that pairs below the threshold join.
     groups: tuple[tuple[str, ...], ...]
 
     def __repr__(self) -> str:

@@ -83,30 +83,19 @@ GAIN_SCATTER = "gain of each breath"
 
 @dataclass(frozen=True, eq=False)
 class LatentInput:
-    """The best input at one place.
+    """The best input at one place."""
 
-    Attributes:
-        place: where the input acts.
-        periodic: whether it has one frequency; else it is smooth.
-        scale: frequency in Hz if periodic, else correlation time in s.
-        size: standard deviation, cmH2O, or a share of the flow or of the gain.
-        beside: the model whose residuals it explains, with the parameters and the noise that are
-            the likeliest beside it.
-        training_log_likelihood: log-likelihood of all training breaths, nats.
-        held_out_log_likelihood: log-likelihood of each held-out breath, nats, ``(n,)``.
-        course: expected course in each training breath, ``(n, T)``.
-        scale_sd: standard deviation of a frequency, Hz; NaN if smooth.
-    """
-
-    place: str
-    periodic: bool
-    scale: float
-    size: float
+    place: str  #: where the input acts.
+    periodic: bool  #: whether it has one frequency; else it is smooth.
+    scale: float  #: frequency in Hz if periodic, else correlation time in s.
+    size: float  #: standard deviation, cmH2O, or a share of the flow or of the gain.
+    #: the model whose residuals it explains, with the parameters and the noise that are the
+    #: likeliest beside it.
     beside: FittedModel
-    training_log_likelihood: float
-    held_out_log_likelihood: Floats
-    course: Floats
-    scale_sd: float = float("nan")
+    training_log_likelihood: float  #: log-likelihood of all training breaths, nats.
+    held_out_log_likelihood: Floats  #: log-likelihood of each held-out breath, nats, ``(n,)``.
+    course: Floats  #: expected course in each training breath, ``(n, T)``.
+    scale_sd: float = float("nan")  #: standard deviation of a frequency, Hz; NaN if smooth.
 
     @property
     def noise(self) -> Noise:
@@ -282,17 +271,11 @@ def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Process:
-    """A process at a place, as it acts on the training breaths.
+    """A process at a place, as it acts on the training breaths."""
 
-    Attributes:
-        kernel: kind and scale.
-        components: its components, ``(n, K, T)``.
-        responses: change of the pressure by each of them, cmH2O, ``(n, K, 1, T)``.
-    """
-
-    kernel: Kernel
-    components: Floats
-    responses: Floats
+    kernel: Kernel  #: kind and scale.
+    components: Floats  #: its components, ``(n, K, T)``.
+    responses: Floats  #: change of the pressure by each of them, cmH2O, ``(n, K, 1, T)``.
 
     @classmethod
     def of(cls, kernel: Kernel, parts: Floats, responses: Floats) -> _Process:
@@ -302,17 +285,11 @@ class _Process:
 
 @dataclass(frozen=True, eq=False)
 class _Linear:
-    """A model of the training breaths to first order.
+    """A model of the training breaths to first order."""
 
-    Attributes:
-        model: the model.
-        breaths: its breaths, with all parameters.
-        own: its breaths with the parameters that differ from breath to breath.
-    """
-
-    model: FittedModel
-    breaths: LinearBreaths
-    own: LinearBreaths
+    model: FittedModel  #: the model.
+    breaths: LinearBreaths  #: its breaths, with all parameters.
+    own: LinearBreaths  #: its breaths with the parameters that differ from breath to breath.
 
     @classmethod
     def of(cls, model: FittedModel) -> _Linear:
@@ -321,23 +298,14 @@ class _Linear:
 
 
 class _Fit(NamedTuple):
-    """A process with its size and the noise beside it.
+    """A process with its size and the noise beside it."""
 
-    Attributes:
-        nats: log marginal likelihood of the training breaths.
-        process: the process.
-        size: its standard deviation.
-        noise: model of the measurement noise.
-        coefficients: see :class:`~ventbench.diagnosis.gaussian_process.Marginal`.
-        scale_sd: see :class:`LatentInput`.
-    """
-
-    nats: float
-    process: _Process
-    size: float
-    noise: Noise
-    coefficients: Floats | None
-    scale_sd: float = float("nan")
+    nats: float  #: log marginal likelihood of the training breaths.
+    process: _Process  #: the process.
+    size: float  #: its standard deviation.
+    noise: Noise  #: model of the measurement noise.
+    coefficients: Floats | None  #: see :class:`~ventbench.diagnosis.gaussian_process.Marginal`.
+    scale_sd: float = float("nan")  #: see :class:`LatentInput`.
 
 
 def _fit_input(

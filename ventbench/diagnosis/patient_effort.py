@@ -49,15 +49,10 @@ _RESTART_GAIN, _TOLERANCE, _STEPS = 1.0, 0.2, 7
 
 
 class ScreenedTerm(NamedTuple):
-    """Expected gain of a term that differs from breath to breath.
+    """Expected gain of a term that differs from breath to breath."""
 
-    Attributes:
-        nats: log-likelihood that it is expected to gain, for each linearisation.
-        start: values to start a fit from, by path.
-    """
-
-    nats: tuple[float, ...]
-    start: dict[str, float]
+    nats: tuple[float, ...]  #: log-likelihood that it is expected to gain, for each linearisation.
+    start: dict[str, float]  #: values to start a fit from, by path.
 
 
 class BreathTerm(Protocol):
@@ -131,19 +126,12 @@ class NoBreathTerm:
 
 
 class Evidence(NamedTuple):
-    """Log Bayes factor of an effort in each breath, and the likeliest effort.
+    """Log Bayes factor of an effort in each breath, and the likeliest effort."""
 
-    Attributes:
-        nats: ``(n,)``.
-        duration: s, the one with the largest sum.
-        amplitude: cmH2O, expected at the likeliest onset, ``(n,)``.
-        onset: s, the likeliest, ``(n,)``.
-    """
-
-    nats: Floats
-    duration: float
-    amplitude: Floats
-    onset: Floats
+    nats: Floats  #: ``(n,)``.
+    duration: float  #: s, the one with the largest sum.
+    amplitude: Floats  #: cmH2O, expected at the likeliest onset, ``(n,)``.
+    onset: Floats  #: s, the likeliest, ``(n,)``.
 
 
 @dataclass(frozen=True)

@@ -38,38 +38,25 @@ from ventbench.system_id.data import Floats
 
 @dataclass(frozen=True, eq=False)
 class UnnamedEffect:
-    """An effect for which the library has no mechanism.
+    """An effect for which the library has no mechanism."""
 
-    Attributes:
-        name: public name of the nonparametric component, or of the latent input's place.
-        term: the component's basis term, or None for a latent input.
-        latent_input: the input, or None for a basis term.
-        nats: held-out log-likelihood that it gains.
-        places: weight of each place that was compared, the largest first.
-    """
-
-    name: str
-    term: str | None
-    latent_input: LatentInput | None
-    nats: float
+    name: str  #: public name of the nonparametric component, or of the latent input's place.
+    term: str | None  #: the component's basis term, or None for a latent input.
+    latent_input: LatentInput | None  #: the input, or None for a basis term.
+    nats: float  #: held-out log-likelihood that it gains.
+    #: weight of each place that was compared, the largest first.
     places: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class UnexplainedError:
-    """Explanation of the error that the mechanisms leave.
+    """Explanation of the error that the mechanisms leave."""
 
-    Attributes:
-        term: best nonparametric term, or None.
-        latent: best latent input, or None.
-        gain_sd: standard deviation of the logarithm of the breaths' gains; 0 if it does not matter.
-        slow_noise: slow noise of the sensor; None if it gains nothing.
-    """
-
-    term: NonparametricFit | None
-    latent: UnnamedEffect | None
+    term: NonparametricFit | None  #: best nonparametric term, or None.
+    latent: UnnamedEffect | None  #: best latent input, or None.
+    #: standard deviation of the logarithm of the breaths' gains; 0 if it does not matter.
     gain_sd: float
-    slow_noise: UnnamedEffect | None
+    slow_noise: UnnamedEffect | None  #: slow noise of the sensor; None if it gains nothing.
 
     @property
     def prefers_term(self) -> bool:

@@ -43,19 +43,12 @@ MIN_EXCESS = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Errors in the k ranges of one axis; the error is recorded minus simulated, cmH2O.
+    """Errors in the k ranges of one axis; the error is recorded minus simulated, cmH2O."""
 
-    Attributes:
-        axis: axis with its ranges.
-        mean: mean over breaths of each breath's mean error, ``(k,)``; NaN in an empty range.
-        half: half of the 95 % interval of the mean, ``(k,)``.
-        breaths: number of breaths with samples in the range, ``(k,)``.
-    """
-
-    axis: Axis
-    mean: Floats
-    half: Floats
-    breaths: Ints
+    axis: Axis  #: axis with its ranges.
+    mean: Floats  #: mean over breaths of each breath's mean error, ``(k,)``; NaN in an empty range.
+    half: Floats  #: half of the 95 % interval of the mean, ``(k,)``.
+    breaths: Ints  #: number of breaths with samples in the range, ``(k,)``.
 
 
 def open_loop_error(recorded: Floats, simulated: Floats, mask: Bools) -> OpenLoopError:

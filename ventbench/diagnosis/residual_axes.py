@@ -32,21 +32,13 @@ EDGE = "time since a valve edge"
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """k neighbouring ranges of one quantity, and the range in which each sample lies.
+    """k neighbouring ranges of one quantity, and the range in which each sample lies."""
 
-    Attributes:
-        name: name of the quantity, such as ``time since inspiration``.
-        unit: unit of ``edges``.
-        edges: ends of the ranges, ``(k + 1,)``.
-        bins: index of the range of each sample, -1 for none, ``(n, T)``.
-        merge: whether neighbouring ranges may be merged.
-    """
-
-    name: str
-    unit: str
-    edges: Floats
-    bins: Ints
-    merge: bool = True
+    name: str  #: name of the quantity, such as ``time since inspiration``.
+    unit: str  #: unit of ``edges``.
+    edges: Floats  #: ends of the ranges, ``(k + 1,)``.
+    bins: Ints  #: index of the range of each sample, -1 for none, ``(n, T)``.
+    merge: bool = True  #: whether neighbouring ranges may be merged.
 
     def __len__(self) -> int:
         """Number of ranges k."""

@@ -40,21 +40,14 @@ _ROUNDS, _TOLERANCE, _STEPS = 4, 0.05, 15
 
 @dataclass(frozen=True, eq=False)
 class RigFit:
-    """Parameters of rigs.
+    """Parameters of rigs."""
 
-    Attributes:
-        fitted: the model of all rigs, with the same parameters.
-        evaluator: evaluator with which it was fitted.
-        rigs: the k rigs that were fitted.
-        values: physical values by path, one for each rig, ``(k,)``.
-        scatter: standard deviation between rigs, by path, of the logarithm of a parameter whose
-            scale is logarithmic.
-    """
-
-    fitted: FittedModel
-    evaluator: Evaluator
-    rigs: Ints
-    values: dict[str, Floats]
+    fitted: FittedModel  #: the model of all rigs, with the same parameters.
+    evaluator: Evaluator  #: evaluator with which it was fitted.
+    rigs: Ints  #: the k rigs that were fitted.
+    values: dict[str, Floats]  #: physical values by path, one for each rig, ``(k,)``.
+    #: standard deviation between rigs, by path, of the logarithm of a parameter whose scale is
+    #: logarithmic.
     scatter: dict[str, float]
 
     def pressures(self, data: Data, rigs: Ints, first: Floats) -> Floats:

@@ -167,54 +167,32 @@ _MOST_LEAK = 0.5
 
 @dataclass(frozen=True)
 class Term:
-    """An effect that a lung needs beyond R and C.
+    """An effect that a lung needs beyond R and C."""
 
-    Attributes:
-        name: name of the effect.
-        parameters: estimated parameters by short name.
-        nats: log-likelihood ratio on held-out breaths.
-        effect: root mean square of what the term alone explains, cmH2O.
-        alternatives: names of effects that would explain nearly as much.
-    """
-
-    name: str
-    parameters: dict[str, Estimate]
-    nats: float
-    effect: float
-    alternatives: tuple[str, ...]
+    name: str  #: name of the effect.
+    parameters: dict[str, Estimate]  #: estimated parameters by short name.
+    nats: float  #: log-likelihood ratio on held-out breaths.
+    effect: float  #: root mean square of what the term alone explains, cmH2O.
+    alternatives: tuple[str, ...]  #: names of effects that would explain nearly as much.
 
 
 @dataclass(frozen=True, eq=False)
 class Mechanics:
-    """Mechanics of a lung.
+    """Mechanics of a lung."""
 
-    Attributes:
-        label: label of the lung in the recording.
-        R: inspiratory resistance at small flow, cmH2O/(L/s).
-        C: compliance over the tidal volume, mL/cmH2O.
-        offset: pressure at the start of a breath without the effect of flow, cmH2O.
-        terms: effects beyond R and C, the most important first.
-        match: comparison with the label, with R at the flow for which the label holds.
-        settings: known settings that this lung may be: the label if it holds, then the nearest.
-        noise: standard deviation of the residual, cmH2O.
-        breaths: number of breaths that were used.
-        samples: number of smoothed samples.
-        notes: warnings to the reader.
-        faults: what may be wrong with the sensors, of :data:`FAULTS`.
-    """
-
-    label: str
-    R: Estimate
-    C: Estimate
-    offset: Estimate
-    terms: tuple[Term, ...]
-    match: LungMatch
+    label: str  #: label of the lung in the recording.
+    R: Estimate  #: inspiratory resistance at small flow, cmH2O/(L/s).
+    C: Estimate  #: compliance over the tidal volume, mL/cmH2O.
+    offset: Estimate  #: pressure at the start of a breath without the effect of flow, cmH2O.
+    terms: tuple[Term, ...]  #: effects beyond R and C, the most important first.
+    match: LungMatch  #: comparison with the label, with R at the flow for which the label holds.
+    #: known settings that this lung may be: the label if it holds, then the nearest.
     settings: tuple[Lung, ...]
-    noise: float
-    breaths: int
-    samples: int
-    notes: tuple[str, ...]
-    faults: tuple[str, ...] = ()
+    noise: float  #: standard deviation of the residual, cmH2O.
+    breaths: int  #: number of breaths that were used.
+    samples: int  #: number of smoothed samples.
+    notes: tuple[str, ...]  #: warnings to the reader.
+    faults: tuple[str, ...] = ()  #: what may be wrong with the sensors, of :data:`FAULTS`.
 
 
 #: Shares of the time that a lung takes, measured: smoothing, and what delays the pressure.
@@ -408,21 +386,13 @@ def _notes(
 
 @dataclass(frozen=True, eq=False)
 class LungFit:
-    """Coefficients of a regression, and the quantities of a lung that follow from them.
+    """Coefficients of a regression, and the quantities of a lung that follow from them."""
 
-    Attributes:
-        fitted: the regression.
-        covariance: covariance of its coefficients, ``(k, k)``.
-        table: cross products of its breaths.
-        segments: segments of the breaths.
-        blur: uncertainty of the time over which the flow is integrated, s.
-    """
-
-    fitted: RegressionFit
-    covariance: Floats
-    table: CrossProducts
-    segments: tuple[Segment, ...]
-    blur: float
+    fitted: RegressionFit  #: the regression.
+    covariance: Floats  #: covariance of its coefficients, ``(k, k)``.
+    table: CrossProducts  #: cross products of its breaths.
+    segments: tuple[Segment, ...]  #: segments of the breaths.
+    blur: float  #: uncertainty of the time over which the flow is integrated, s.
 
     def resistance(self, flow: float) -> Estimate:
         """Inspiratory resistance at a flow, L/s, and at half of the tidal volume, cmH2O/(L/s)."""

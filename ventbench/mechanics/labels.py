@@ -46,31 +46,22 @@ class Estimate:
 
 @dataclass(frozen=True)
 class LungMatch:
-    """The lung that was recorded, compared with its label; R in cmH2O/(L/s), C in mL/cmH2O.
+    """The lung that was recorded, compared with its label; R in cmH2O/(L/s), C in mL/cmH2O."""
 
-    Attributes:
-        label: id of the lung in the recording, such as ``R20C50``.
-        fitted_R: resistance.
-        fitted_C: compliance.
-        ci95_R: ends of the 95 % interval of R.
-        ci95_C: ends of the 95 % interval of C.
-        label_matches: whether R and C are within tolerance of the label, and known well enough to
-            be called a match.
-        source: ``pressure`` (given the valve's gain) or ``pressure and flow``.
-        settings: ids of known settings that the lung may be, the nearest first.
-        informative: False if the label is within tolerance only because the intervals are wide.
-        doubt: why the label cannot be judged although the intervals are narrow, as a sentence.
-    """
-
-    label: str
-    fitted_R: float
-    fitted_C: float
-    ci95_R: tuple[float, float]
-    ci95_C: tuple[float, float]
+    label: str  #: id of the lung in the recording, such as ``R20C50``.
+    fitted_R: float  #: resistance.
+    fitted_C: float  #: compliance.
+    ci95_R: tuple[float, float]  #: ends of the 95 % interval of R.
+    ci95_C: tuple[float, float]  #: ends of the 95 % interval of C.
+    #: whether R and C are within tolerance of the label, and known well enough to be called a
+    #: match.
     label_matches: bool
-    source: str
+    source: str  #: ``pressure`` (given the valve's gain) or ``pressure and flow``.
+    #: ids of known settings that the lung may be, the nearest first.
     settings: tuple[str, ...] = ()
+    #: False if the label is within tolerance only because the intervals are wide.
     informative: bool = True
+    #: why the label cannot be judged although the intervals are narrow, as a sentence.
     doubt: str = ""
 
 

@@ -50,19 +50,13 @@ TIMES = tuple(float(x) for x in np.geomspace(0.3, 3.0, 11))
 
 @dataclass(frozen=True)
 class RegressionColumn:
-    """A column of the regression; a term may have several columns to choose from.
+    """A column of the regression; a term may have several columns to choose from."""
 
-    Attributes:
-        term: name of the effect.
-        values: values of the column at the m samples of a segment, ``(m,)``.
-        time: relaxation time, s, or None.
-        of_pressure: whether the column is made of the measured pressure, which a lag has delayed
-            already.
-    """
-
-    term: str
+    term: str  #: name of the effect.
+    #: values of the column at the m samples of a segment, ``(m,)``.
     values: Callable[[Segment], Floats]
-    time: float | None = None
+    time: float | None = None  #: relaxation time, s, or None.
+    #: whether the column is made of the measured pressure, which a lag has delayed already.
     of_pressure: bool = False
 
 
@@ -150,20 +144,15 @@ def course(segment: Segment, columns: Sequence[RegressionColumn]) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class CrossProducts:
-    """Cross products of the columns and the pressure, of b breaths.
+    """Cross products of the columns and the pressure, of b breaths."""
 
-    Attributes:
-        products: ``(b, g, K + 1, K + 1)`` for the g models of noise of :data:`GRID` and K columns;
-            the last row and column belong to the pressure.
-        freedom: number of samples less offsets, ``(b,)``.
-        constant: part of the log-likelihood that depends on the model of noise alone, ``(b, g)``.
-        breaths: index of each breath in the recording, ``(b,)``.
-    """
-
+    #: ``(b, g, K + 1, K + 1)`` for the g models of noise of :data:`GRID` and K columns; the last
+    #: row and column belong to the pressure.
     products: Floats
-    freedom: Floats
+    freedom: Floats  #: number of samples less offsets, ``(b,)``.
+    #: part of the log-likelihood that depends on the model of noise alone, ``(b, g)``.
     constant: Floats
-    breaths: Ints
+    breaths: Ints  #: index of each breath in the recording, ``(b,)``.
 
     def __len__(self) -> int:
         """Number of breaths b."""
@@ -172,19 +161,12 @@ class CrossProducts:
 
 @dataclass(frozen=True, eq=False)
 class RegressionFit:
-    """A fit of k columns.
+    """A fit of k columns."""
 
-    Attributes:
-        columns: indices of the columns.
-        coefficients: ``(k,)``.
-        sigma: standard deviation of the innovations of the noise, cmH2O.
-        grid: index of the model of noise in :data:`GRID`.
-    """
-
-    columns: tuple[int, ...]
-    coefficients: Floats
-    sigma: float
-    grid: int
+    columns: tuple[int, ...]  #: indices of the columns.
+    coefficients: Floats  #: ``(k,)``.
+    sigma: float  #: standard deviation of the innovations of the noise, cmH2O.
+    grid: int  #: index of the model of noise in :data:`GRID`.
 
     @property
     def autocorrelation(self) -> float:

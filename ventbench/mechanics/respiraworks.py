@@ -22,15 +22,10 @@ _LEAD = 0.25
 
 @dataclass(frozen=True, eq=False)
 class SurveyedRun:
-    """A run and the mechanics of its lung.
+    """A run and the mechanics of its lung."""
 
-    Attributes:
-        run: the run as recorded.
-        mechanics: None if the run has neither flow nor volume.
-    """
-
-    run: RespiraWorksRun
-    mechanics: Mechanics | None
+    run: RespiraWorksRun  #: the run as recorded.
+    mechanics: Mechanics | None  #: None if the run has neither flow nor volume.
 
 
 def breaths_of(run: RespiraWorksRun) -> Breaths:

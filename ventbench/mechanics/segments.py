@@ -40,32 +40,19 @@ class Segment:
 
     What flows is known at m closely spaced samples, since a lag needs all of its course. The
     pressure is compared at n of them, half a window apart.
-
-    Attributes:
-        breath: index of the breath.
-        first: whether the segment begins where the breath does.
-        rows: which of the m samples are compared, ``(n,)``.
-        begins: True at the first compared sample after a gap, bool ``(n,)``.
-        pressure: at the compared samples, cmH2O, ``(n,)``.
-        time: time from the start of the breath, s, ``(m,)``.
-        volume: volume from the start of the segment, L, ``(m,)``.
-        flow: L/s, ``(m,)``.
-        slope: derivative of the flow, L/s2, ``(m,)``.
-        dose: integral of the pressure from the start of the segment, cmH2O s, ``(m,)``.
-        lag: time constant of the pressure sensor, s.
     """
 
-    breath: int
-    first: bool
-    rows: Ints
-    begins: Bools
-    pressure: Floats
-    time: Floats
-    volume: Floats
-    flow: Floats
-    slope: Floats
-    dose: Floats
-    lag: float = 0.0
+    breath: int  #: index of the breath.
+    first: bool  #: whether the segment begins where the breath does.
+    rows: Ints  #: which of the m samples are compared, ``(n,)``.
+    begins: Bools  #: True at the first compared sample after a gap, bool ``(n,)``.
+    pressure: Floats  #: at the compared samples, cmH2O, ``(n,)``.
+    time: Floats  #: time from the start of the breath, s, ``(m,)``.
+    volume: Floats  #: volume from the start of the segment, L, ``(m,)``.
+    flow: Floats  #: L/s, ``(m,)``.
+    slope: Floats  #: derivative of the flow, L/s2, ``(m,)``.
+    dose: Floats  #: integral of the pressure from the start of the segment, cmH2O s, ``(m,)``.
+    lag: float = 0.0  #: time constant of the pressure sensor, s.
 
     def __len__(self) -> int:
         """Number of compared samples n."""

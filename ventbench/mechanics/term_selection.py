@@ -59,19 +59,13 @@ FEWEST_BREATHS, MOST_TERMS = 4, 5
 
 @dataclass(frozen=True)
 class SelectedTerm:
-    """A term of the model.
+    """A term of the model."""
 
-    Attributes:
-        name: name of the effect.
-        column: index of its column.
-        nats: log-likelihood ratio on held-out breaths, or what they gain (see :data:`_BY_GAIN`).
-        alternatives: other terms that would have gained nearly as much.
-    """
-
-    name: str
-    column: int
+    name: str  #: name of the effect.
+    column: int  #: index of its column.
+    #: log-likelihood ratio on held-out breaths, or what they gain (see :data:`_BY_GAIN`).
     nats: float
-    alternatives: tuple[str, ...]
+    alternatives: tuple[str, ...]  #: other terms that would have gained nearly as much.
 
 
 @dataclass(frozen=True)
@@ -182,22 +176,15 @@ def splits(count: int) -> list[Bools]:
 
 @dataclass(frozen=True)
 class DelayEstimate:
-    """What delays the pressure behind a change of the flow: the circuit, or the pressure sensor.
+    """What delays the pressure behind a change of the flow: the circuit, or the pressure sensor."""
 
-    Attributes:
-        name: ``circuit_compliance`` or ``sensor_lag``.
-        value: compliance of the circuit between flow sensor and lung, mL/cmH2O, or time constant of
-            the pressure sensor, s.
-        nats: log-likelihood ratio on held-out breaths.
-        effect: root mean square of what it alone explains, cmH2O.
-        alternatives: the other name if it would explain nearly as much.
-    """
-
-    name: str
+    name: str  #: ``circuit_compliance`` or ``sensor_lag``.
+    #: compliance of the circuit between flow sensor and lung, mL/cmH2O, or time constant of the
+    #: pressure sensor, s.
     value: Estimate
-    nats: float
-    effect: float
-    alternatives: tuple[str, ...]
+    nats: float  #: log-likelihood ratio on held-out breaths.
+    effect: float  #: root mean square of what it alone explains, cmH2O.
+    alternatives: tuple[str, ...]  #: the other name if it would explain nearly as much.
 
 
 def delay(
@@ -329,21 +316,13 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class _DelayFamily:
-    """A cause of a delay, and the strengths to choose from.
+    """A cause of a delay, and the strengths to choose from."""
 
-    Attributes:
-        name: name of the effect.
-        unit: unit of its strength.
-        grid: strengths, equally spaced from zero on.
-        least: least strength that is reported.
-        deviation: least standard deviation of a strength.
-    """
-
-    name: str
-    unit: str
-    grid: tuple[float, ...]
-    least: float
-    deviation: float
+    name: str  #: name of the effect.
+    unit: str  #: unit of its strength.
+    grid: tuple[float, ...]  #: strengths, equally spaced from zero on.
+    least: float  #: least strength that is reported.
+    deviation: float  #: least standard deviation of a strength.
 
 
 #: Circuits from 0 to 4 mL/cmH2O, and sensors from 0 to 150 ms. A lag shorter than a sample at

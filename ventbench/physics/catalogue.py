@@ -19,16 +19,12 @@ from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """Mechanisms and basis terms that a model can be built of.
+    """Mechanisms and basis terms that a model can be built of."""
 
-    Attributes:
-        library: mechanisms by name, in alphabetical order.
-        basis_terms: basis terms of nonparametric components, by name, in alphabetical order.
-        events: what happens to a circuit in operation, by name, in alphabetical order.
-    """
-
-    library: dict[str, Mechanism]
+    library: dict[str, Mechanism]  #: mechanisms by name, in alphabetical order.
+    #: basis terms of nonparametric components, by name, in alphabetical order.
     basis_terms: dict[str, Mechanism]
+    #: what happens to a circuit in operation, by name, in alphabetical order.
     events: dict[str, Mechanism]
 
     @cached_property

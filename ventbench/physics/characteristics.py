@@ -41,21 +41,13 @@ _TINY = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Characteristic:
-    """A quantity of one part of the rig without and with a mechanism.
+    """A quantity of one part of the rig without and with a mechanism."""
 
-    Attributes:
-        x: what the quantity depends on, ``(k,)``.
-        without: the quantity without the mechanism, ``(k,)``.
-        acting: the quantity with the mechanism, ``(k,)``.
-        x_label: name and unit of ``x``.
-        y_label: name and unit of the quantity.
-    """
-
-    x: Floats
-    without: Floats
-    acting: Floats
-    x_label: str
-    y_label: str
+    x: Floats  #: what the quantity depends on, ``(k,)``.
+    without: Floats  #: the quantity without the mechanism, ``(k,)``.
+    acting: Floats  #: the quantity with the mechanism, ``(k,)``.
+    x_label: str  #: name and unit of ``x``.
+    y_label: str  #: name and unit of the quantity.
 
 
 def characteristic(

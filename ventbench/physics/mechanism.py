@@ -31,36 +31,23 @@ Site = Literal[
 
 @flax.struct.dataclass
 class View:
-    """Quantities that a mechanism may use while it changes the network; every array ``(...)``.
+    """Quantities that a mechanism may use while it changes the network; every array ``(...)``."""
 
-    Attributes:
-        time: time since the start of the breath, s.
-        volume: volume of the lung before the step, L; a linear lung has the recoil ``volume / C``.
-        pressure: last known pressure at the airway, cmH2O.
-        flow: last known flow into the lung, L/s.
-        state: own state of the mechanism before the step (0 if it has none), ``(K, ...)`` for one
-            with several states.
-        length: length of the implicit step, s.
-        elastance: elastance 1/C of the lung, cmH2O/L.
-        peep: pressure behind the expiratory valve, cmH2O.
-        position: position of the breath in the recording, 0..1.
-        resistance: resistance R of the airway, cmH2O/(L/s).
-        outlet: conductance of the open expiratory valve, 1 / R_ex, L/s per cmH2O.
-        opened: expiratory valve, 0 closed, 1 open.
-    """
-
-    time: Array
+    time: Array  #: time since the start of the breath, s.
+    #: volume of the lung before the step, L; a linear lung has the recoil ``volume / C``.
     volume: Array
-    pressure: Array
-    flow: Array
+    pressure: Array  #: last known pressure at the airway, cmH2O.
+    flow: Array  #: last known flow into the lung, L/s.
+    #: own state of the mechanism before the step (0 if it has none), ``(K, ...)`` for one with
+    #: several states.
     state: Array
-    length: Array
-    elastance: Array
-    peep: Array
-    position: Array
-    resistance: Array
-    outlet: Array
-    opened: Array
+    length: Array  #: length of the implicit step, s.
+    elastance: Array  #: elastance 1/C of the lung, cmH2O/L.
+    peep: Array  #: pressure behind the expiratory valve, cmH2O.
+    position: Array  #: position of the breath in the recording, 0..1.
+    resistance: Array  #: resistance R of the airway, cmH2O/(L/s).
+    outlet: Array  #: conductance of the open expiratory valve, 1 / R_ex, L/s per cmH2O.
+    opened: Array  #: expiratory valve, 0 closed, 1 open.
 
 
 @flax.struct.dataclass
@@ -76,32 +63,19 @@ class Network:
         p = recoil + elastance h Q + resistance Q + quadratic Q |Q| + inertance (Q - Q0) / h
 
     Any of ``circuit``, ``inertance``, ``quadratic``, ``leak`` and ``outlet`` may be zero.
-
-    Attributes:
-        inflow: flow out of the inspiratory valve, L/s.
-        circuit: compliance of tubing and connectors, L/cmH2O.
-        leak: slope of the leak, L/s per cmH2O.
-        leak_flow: leak at zero pressure on that slope, L/s.
-        outlet: conductance of the expiratory valve, L/s per cmH2O.
-        behind: pressure behind the expiratory valve, cmH2O.
-        resistance: resistance of the airway, cmH2O/(L/s).
-        quadratic: quadratic resistance of the airway, cmH2O s2/L2.
-        inertance: inertance of the gas, cmH2O s2/L.
-        recoil: recoil of the lung without flow, less the pressure of the muscles, cmH2O.
-        elastance: slope of the recoil, cmH2O/L.
     """
 
-    inflow: Array
-    circuit: Array
-    leak: Array
-    leak_flow: Array
-    outlet: Array
-    behind: Array
-    resistance: Array
-    quadratic: Array
-    inertance: Array
-    recoil: Array
-    elastance: Array
+    inflow: Array  #: flow out of the inspiratory valve, L/s.
+    circuit: Array  #: compliance of tubing and connectors, L/cmH2O.
+    leak: Array  #: slope of the leak, L/s per cmH2O.
+    leak_flow: Array  #: leak at zero pressure on that slope, L/s.
+    outlet: Array  #: conductance of the expiratory valve, L/s per cmH2O.
+    behind: Array  #: pressure behind the expiratory valve, cmH2O.
+    resistance: Array  #: resistance of the airway, cmH2O/(L/s).
+    quadratic: Array  #: quadratic resistance of the airway, cmH2O s2/L2.
+    inertance: Array  #: inertance of the gas, cmH2O s2/L.
+    recoil: Array  #: recoil of the lung without flow, less the pressure of the muscles, cmH2O.
+    elastance: Array  #: slope of the recoil, cmH2O/L.
 
     def plus(self, **terms: Array) -> Network:
         """Add to coefficients, so that the order of mechanisms does not matter."""
@@ -141,49 +115,39 @@ class Description:
 
     All that other packages need to know about a mechanism stands here, so that a new one is a
     single file.
-
-    Attributes:
-        name: public name.
-        title: the mechanism in a few words.
-        site: part of the physics in which the mechanism acts.
-        equation: equation of the mechanism in plain text.
-        parameters: parameters in the order of reports; the first one is the strength.
-        source: publications behind the equation and the ranges.
-        signature: what it changes in a recording.
-        confusable: names of mechanisms, or of other effects, with a similar signature.
-        detectable: smallest strength that about 20 breaths of one lung reveal, in the unit of the
-            strength; None if nobody has measured it.
-        least: smallest strength that a diagnosis names, in the unit of the strength. Even where
-            the data ask for less, such a strength is within the integrator, the clock, or the form
-            of another mechanism.
-        least_reason: why less is no statement about a rig, in words.
-        equivalents: names of other structures, in or outside the library, that have the same
-            impedance, so that pressure alone can never tell them from this mechanism.
-        interchangeable: pairs of parameters whose values can be exchanged without any effect, such
-            as the time constants of two lags in series. Reports give the larger value first.
-        beside_error: standard deviation, as a share of a parameter, of what the forms of other
-            mechanisms shift where it acts beside them.
-        ubiquitous: whether every rig has a little of it, which is no finding.
-        special_case_of: basis terms (of ``ventbench.physics.nonparametric``) that contain this
-            mechanism, exactly or nearly.
     """
 
-    name: str
-    title: str
-    site: Site
-    equation: str
+    name: str  #: public name.
+    title: str  #: the mechanism in a few words.
+    site: Site  #: part of the physics in which the mechanism acts.
+    equation: str  #: equation of the mechanism in plain text.
+    #: parameters in the order of reports; the first one is the strength.
     parameters: tuple[Parameter, ...]
-    source: str
-    signature: str
+    source: str  #: publications behind the equation and the ranges.
+    signature: str  #: what it changes in a recording.
+    #: names of mechanisms, or of other effects, with a similar signature.
     confusable: tuple[str, ...] = ()
+    #: smallest strength that about 20 breaths of one lung reveal, in the unit of the strength; None
+    #: if nobody has measured it.
     detectable: float | None = None
+    #: smallest strength that a diagnosis names, in the unit of the strength. Even where the data
+    #: ask for less, such a strength is within the integrator, the clock, or the form of another
+    #: mechanism.
     least: float = 0.0
-    least_reason: str = ""
+    least_reason: str = ""  #: why less is no statement about a rig, in words.
+    #: names of other structures, in or outside the library, that have the same impedance, so that
+    #: pressure alone can never tell them from this mechanism.
     equivalents: tuple[str, ...] = ()
+    #: pairs of parameters whose values can be exchanged without any effect, such as the time
+    #: constants of two lags in series. Reports give the larger value first.
     interchangeable: tuple[tuple[str, str], ...] = ()
+    #: basis terms (of ``ventbench.physics.nonparametric``) that contain this mechanism, exactly or
+    #: nearly.
     special_case_of: tuple[str, ...] = ()
+    #: standard deviation, as a share of a parameter, of what the forms of other mechanisms shift
+    #: where it acts beside them.
     beside_error: float = 0.0
-    ubiquitous: bool = False
+    ubiquitous: bool = False  #: whether every rig has a little of it, which is no finding.
 
     @property
     def strength(self) -> Parameter:
@@ -325,18 +289,12 @@ _NEUTRAL_BASE = {parameter.name: parameter.neutral for parameter in BASE_PARAMET
 
 @dataclass(frozen=True)
 class Assembly:
-    """The mechanisms of a model in order of rank, and all parameter values by owner.
+    """The mechanisms of a model in order of rank, and all parameter values by owner."""
 
-    Attributes:
-        base: values of the base model's parameters.
-        mechanisms: mechanisms that have a named parameter.
-        values: parameter values of each of them.
-        active: whether each of them is active; empty if inactive ones are computed as well.
-    """
-
-    base: Values
-    mechanisms: dict[str, Mechanism]
-    values: dict[str, Values]
+    base: Values  #: values of the base model's parameters.
+    mechanisms: dict[str, Mechanism]  #: mechanisms that have a named parameter.
+    values: dict[str, Values]  #: parameter values of each of them.
+    #: whether each of them is active; empty if inactive ones are computed as well.
     active: dict[str, Array]
 
     def change(self, name: str, hook: Callable[..., Before], before: Before, *seen: Any) -> Before:

@@ -29,49 +29,36 @@ from ventbench.task.lungs import Lung
 
 @flax.struct.dataclass
 class PhysicsState:
-    """State between two samples; every array has shape ``(...)``.
+    """State between two samples; every array has shape ``(...)``."""
 
-    Attributes:
-        continuous: see :class:`~ventbench.physics.solver.ContinuousState`.
-        memory: memories of mechanisms from sample to sample, by name.
-        commanded: flows that the last ``memory + 1`` commands ask for, the latest first, L/s.
-        opened: expiratory valve during the last ``memory + 1`` samples, the latest first, 0/1.
-        past: durations of the last ``memory`` samples, the latest first, s.
-        time: time since the start of the breath, s.
-        first: volume of the lung at the start of the breath, L.
-        peep: pressure behind the expiratory valve, cmH2O.
-    """
-
-    continuous: ContinuousState
-    memory: dict[str, Array]
+    continuous: ContinuousState  #: see :class:`~ventbench.physics.solver.ContinuousState`.
+    memory: dict[str, Array]  #: memories of mechanisms from sample to sample, by name.
+    #: flows that the last ``memory + 1`` commands ask for, the latest first, L/s.
     commanded: tuple[Array, ...]
+    #: expiratory valve during the last ``memory + 1`` samples, the latest first, 0/1.
     opened: tuple[Array, ...]
-    past: tuple[Array, ...]
-    time: Array
-    first: Array
-    peep: Array
+    past: tuple[Array, ...]  #: durations of the last ``memory`` samples, the latest first, s.
+    time: Array  #: time since the start of the breath, s.
+    first: Array  #: volume of the lung at the start of the breath, L.
+    peep: Array  #: pressure behind the expiratory valve, cmH2O.
 
 
 @flax.struct.dataclass
 class Physics:
-    """Base model and mechanisms; parameters that are not named stand at their neutral values.
+    """Base model and mechanisms; parameters that are not named stand at their neutral values."""
 
-    Attributes:
-        values: one array ``()`` or ``(...)`` for each name.
-        names: paths of parameters, such as ``R`` or ``valve_delay.delay``. A mechanism takes part
-            if any of its parameters is named; at its neutral strength it changes nothing.
-        substeps: number of substeps in a sample.
-        memory: number of past samples that a dead time can reach back over.
-        divisions: steps of the integrator in a substep.
-        skip_idle: skip mechanisms whose parameters are neutral in all elements. This is much faster
-            where few of many are active; derivatives by the parameters of the others are zero.
-    """
-
-    values: tuple[Array, ...]
+    values: tuple[Array, ...]  #: one array ``()`` or ``(...)`` for each name.
+    #: paths of parameters, such as ``R`` or ``valve_delay.delay``. A mechanism takes part if any of
+    #: its parameters is named; at its neutral strength it changes nothing.
     names: tuple[str, ...] = flax.struct.field(pytree_node=False)
+    #: number of substeps in a sample.
     substeps: int = flax.struct.field(pytree_node=False, default=dead_time.SUBSTEPS)
+    #: number of past samples that a dead time can reach back over.
     memory: int = flax.struct.field(pytree_node=False, default=dead_time.MEMORY)
+    #: skip mechanisms whose parameters are neutral in all elements. This is much faster where few
+    #: of many are active; derivatives by the parameters of the others are zero.
     skip_idle: bool = flax.struct.field(pytree_node=False, default=False)
+    #: steps of the integrator in a substep.
     divisions: int = flax.struct.field(pytree_node=False, default=1)
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[PhysicsState, Signals]:

@@ -17,57 +17,44 @@ EXPIRATORY_RESISTANCE = 5.0
 
 @dataclass(frozen=True)
 class Parameter:
-    """A scalar parameter, and how a fit is to treat it.
+    """A scalar parameter, and how a fit is to treat it."""
 
-    Attributes:
-        name: short, such as ``delay``.
-        unit: unit of its values, ``1`` if there is none.
-        meaning: what it is, in words.
-        low: lowest plausible and permitted value.
-        high: highest plausible and permitted value.
-        neutral: value at which its mechanism does nothing; of a shape parameter, the default.
-        mild: a small effect that occurs, and where a fit starts.
-        strong: a large effect that occurs.
-        scale: ``"log"`` for what is positive and known to a factor; else ``"linear"``.
-        scope: ``"shared"`` by all breaths, or one for each ``"breath"``.
-        shape: True for what only shapes the effect (an exponent, a recovery time): it stays at
-            ``neutral`` unless a fit is asked to free it.
-        follows: ``"R"`` or ``"C"`` if it scales with the lung's R or C.
-        scan: values that a search must also try, as it may end in the wrong minimum.
-        kinked: True for a dead time: the likelihood is flat between two samples and falls off
-            steeply where an edge passes one, so that its interval is a profile's.
-        spread: standard deviation before any data, in coordinates, around ``neutral``; given for
-            what must stay there where no data bear on it, be it a strength.
-        grid: values at which screening tries the mechanism, for a parameter other than the strength
-            that changes the shape of the effect much; only the neutral value if empty.
-        discrete: True if the response has no useful derivative with respect to it, such as a choice
-            between two rules. A fit holds it at the grid value that screening chose.
-        uncertain: True for a shape parameter whose default is a guess. Final estimates free it, so
-            that the interval of the strength allows for it.
-        share: True for a dimensionless share, which reports show in percent.
-        change_point: True for the position in the recording, 0..1, from which on a change has set
-            in. The likelihood is constant between two breaths: a fit tries all of them.
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    low: float
-    high: float
-    neutral: float
-    mild: float
-    strong: float
+    name: str  #: short, such as ``delay``.
+    unit: str  #: unit of its values, ``1`` if there is none.
+    meaning: str  #: what it is, in words.
+    low: float  #: lowest plausible and permitted value.
+    high: float  #: highest plausible and permitted value.
+    neutral: float  #: value at which its mechanism does nothing; of a shape parameter, the default.
+    mild: float  #: a small effect that occurs, and where a fit starts.
+    strong: float  #: a large effect that occurs.
+    #: ``"log"`` for what is positive and known to a factor; else ``"linear"``.
     scale: Literal["linear", "log"] = "linear"
+    #: ``"shared"`` by all breaths, or one for each ``"breath"``.
     scope: Literal["shared", "breath"] = "shared"
+    #: True for what only shapes the effect (an exponent, a recovery time): it stays at ``neutral``
+    #: unless a fit is asked to free it.
     shape: bool = False
-    follows: str | None = None
+    follows: str | None = None  #: ``"R"`` or ``"C"`` if it scales with the lung's R or C.
+    #: values that a search must also try, as it may end in the wrong minimum.
     scan: tuple[float, ...] = ()
+    #: True for a dead time: the likelihood is flat between two samples and falls off steeply where
+    #: an edge passes one, so that its interval is a profile's.
     kinked: bool = False
+    #: standard deviation before any data, in coordinates, around ``neutral``; given for what must
+    #: stay there where no data bear on it, be it a strength.
     spread: float | None = None
+    #: values at which screening tries the mechanism, for a parameter other than the strength that
+    #: changes the shape of the effect much; only the neutral value if empty.
     grid: tuple[float, ...] = ()
+    #: True if the response has no useful derivative with respect to it, such as a choice between
+    #: two rules. A fit holds it at the grid value that screening chose.
     discrete: bool = False
+    #: True for a shape parameter whose default is a guess. Final estimates free it, so that the
+    #: interval of the strength allows for it.
     uncertain: bool = False
-    share: bool = False
+    share: bool = False  #: True for a dimensionless share, which reports show in percent.
+    #: True for the position in the recording, 0..1, from which on a change has set in. The
+    #: likelihood is constant between two breaths: a fit tries all of them.
     change_point: bool = False
 
     def __post_init__(self) -> None:

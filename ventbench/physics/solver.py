@@ -22,20 +22,13 @@ _GAMMA = 1.0 - 0.5**0.5
 
 @flax.struct.dataclass
 class ContinuousState:
-    """Continuous states of a model; every array has shape ``(...)``.
+    """Continuous states of a model; every array has shape ``(...)``."""
 
-    Attributes:
-        volume: volume of the lung, L, zero where a linear lung has no recoil.
-        flow: into the lung, L/s.
-        pressure: pressure at the airway, cmH2O.
-        reading: pressure at the sensor's output, cmH2O.
-        internal: states of mechanisms by name; ``(K, ...)`` for one with several states.
-    """
-
-    volume: Array
-    flow: Array
-    pressure: Array
-    reading: Array
+    volume: Array  #: volume of the lung, L, zero where a linear lung has no recoil.
+    flow: Array  #: into the lung, L/s.
+    pressure: Array  #: pressure at the airway, cmH2O.
+    reading: Array  #: pressure at the sensor's output, cmH2O.
+    #: states of mechanisms by name; ``(K, ...)`` for one with several states.
     internal: dict[str, Array]
 
 

@@ -36,16 +36,11 @@ class Corrected:
     The pressure is ``simulator + with_mechanisms - without_mechanisms``. What the simulator knows
     beyond the physics stays; where both physics agree, the plant is the simulator. Plant files
     call the two physics ``wanted`` and ``had``.
-
-    Attributes:
-        simulator: the plant that is corrected.
-        with_mechanisms: physics of the recordings, with the missing mechanisms.
-        without_mechanisms: physics of the simulator itself.
     """
 
-    simulator: Any
-    with_mechanisms: Any
-    without_mechanisms: Any
+    simulator: Any  #: the plant that is corrected.
+    with_mechanisms: Any  #: physics of the recordings, with the missing mechanisms.
+    without_mechanisms: Any  #: physics of the simulator itself.
 
     def init(
         self, pressure: Array, peep: Array | None = None
@@ -97,14 +92,10 @@ class Stressed:
     """A plant under stress: :class:`~ventbench.plants.corrected.Corrected` that starts from truth.
 
     Both physics are one model with an axis of two in front, so that they are compiled once.
-
-    Attributes:
-        simulator: the scored plant.
-        physics: with the stressor, then without, leaves ``(2,)``.
     """
 
-    simulator: Any
-    physics: Physics
+    simulator: Any  #: the scored plant.
+    physics: Physics  #: with the stressor, then without, leaves ``(2,)``.
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[tuple[Any, Any], Signals]:
         """Lung at rest at a true pressure; see :class:`~ventbench.task.interfaces.Plant`."""

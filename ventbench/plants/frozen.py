@@ -56,15 +56,10 @@ BY_ALL, BY_NONE = -1, -2
 
 @dataclass(frozen=True)
 class Seen:
-    """The breaths of the training.
+    """The breaths of the training."""
 
-    Attributes:
-        prints: their fingerprints, of k breaths.
-        fold: member that has not seen the breath, or :data:`BY_ALL`, ``(k,)``.
-    """
-
-    prints: Fingerprints
-    fold: NDArray[np.int8]
+    prints: Fingerprints  #: their fingerprints, of k breaths.
+    fold: NDArray[np.int8]  #: member that has not seen the breath, or :data:`BY_ALL`, ``(k,)``.
 
     def folds(self, breaths: Breaths) -> Ints:
         """Look breaths up: a fold, :data:`BY_ALL` or :data:`BY_NONE`, shape ``(n,)``.
@@ -80,23 +75,15 @@ class Frozen:
     """Version and parameters of the official simulators.
 
     Plants that it gives have numpy leaves: they take the precision in force where they are used.
-
-    Attributes:
-        folder: folder that the files were read from.
-        manifest: content of the manifest: provenance, split, sessions, errors.
-        manifest_sha256: SHA-256 of the manifest.
-        sessions: what a breath's clock is compared with.
-        members: float64 leaves ``(members, sessions, ...)``.
-        seen: the breaths of the training.
-        population: that rigs of each lung are drawn from; None where none was fitted.
     """
 
-    folder: Path
-    manifest: dict[str, Any]
-    manifest_sha256: str
-    sessions: Sessions
-    members: Hybrid
-    seen: Seen
+    folder: Path  #: folder that the files were read from.
+    manifest: dict[str, Any]  #: content of the manifest: provenance, split, sessions, errors.
+    manifest_sha256: str  #: SHA-256 of the manifest.
+    sessions: Sessions  #: what a breath's clock is compared with.
+    members: Hybrid  #: float64 leaves ``(members, sessions, ...)``.
+    seen: Seen  #: the breaths of the training.
+    #: that rigs of each lung are drawn from; None where none was fitted.
     population: RigPopulation | None = None
 
     def __repr__(self) -> str:

@@ -54,80 +54,50 @@ SUBSTEPS = 4
 
 @flax.struct.dataclass
 class HybridState:
-    """State between two samples; every array has shape ``(...)`` unless it says otherwise.
+    """State between two samples; every array has shape ``(...)`` unless it says otherwise."""
 
-    Attributes:
-        elastic: lung volume over linear compliance, ``V / C``, cmH2O.
-        drop: airway pressure minus elastic recoil, cmH2O.
-        sensor: pressure that the sensor shows, cmH2O.
-        flow: flow out of the inspiratory valve, L/s.
-        commanded: flows that the last 7 commands ask for, the latest first, L/s, one array each.
-        opened: expiratory valve during the last 7 samples, the latest first, 0/1, one array each.
-        past: durations of the last 6 samples, the latest first, s, one array each.
-        plays: position of each play, %, one array a play.
-        u_in: last command, %.
-        peep: end-expiratory pressure, cmH2O.
-        outlet: opening of the expiratory valve, 0..1; None where it closes at once.
-    """
-
-    elastic: Array
-    drop: Array
-    sensor: Array
-    flow: Array
+    elastic: Array  #: lung volume over linear compliance, ``V / C``, cmH2O.
+    drop: Array  #: airway pressure minus elastic recoil, cmH2O.
+    sensor: Array  #: pressure that the sensor shows, cmH2O.
+    flow: Array  #: flow out of the inspiratory valve, L/s.
+    #: flows that the last 7 commands ask for, the latest first, L/s, one array each.
     commanded: tuple[Array, ...]
+    #: expiratory valve during the last 7 samples, the latest first, 0/1, one array each.
     opened: tuple[Array, ...]
+    #: durations of the last 6 samples, the latest first, s, one array each.
     past: tuple[Array, ...]
-    plays: tuple[Array, ...]
-    u_in: Array
-    peep: Array
+    plays: tuple[Array, ...]  #: position of each play, %, one array a play.
+    u_in: Array  #: last command, %.
+    peep: Array  #: end-expiratory pressure, cmH2O.
+    #: opening of the expiratory valve, 0..1; None where it closes at once.
     outlet: Array | None = None
 
 
 @flax.struct.dataclass
 class Hybrid:
-    """One lung on one rig; every array has shape ``()`` or ``(...)`` unless it says otherwise.
+    """One lung on one rig; every array has shape ``()`` or ``(...)`` unless it says otherwise."""
 
-    Attributes:
-        R: laminar part of the resistance, cmH2O/(L/s).
-        K2: quadratic part, cmH2O s2/L2: the drop over the airway is ``R Q + K2 Q |Q|``.
-        E: elastance at low volume, cmH2O/L.
-        stiffening: change of relative slope of the elastic curve at each knot, ``(..., 5)``.
-        offset: elastic recoil minus airway pressure at rest, cmH2O.
-        slopes: slopes of the valve's curve between knots, L/s per %, ``(..., 13)``.
-        direction: weight of each play in the effective command, ``(..., 3)``.
-        valve_delay: dead time of the inspiratory valve, s.
-        valve_lag: time constant of the inspiratory valve, s.
-        circuit_compliance: compliance of tubing and bellows' dead space, L/cmH2O.
-        sensor_lag: time constant of the sensor, s.
-        rising: shift that is added to the reading while the command rises, cmH2O.
-        falling: shift that is subtracted from the reading while the command falls, cmH2O.
-        conductance: conductance of the open expiratory valve, L/s per cmH2O.
-        closing_conductance: conductance of the expiratory valve while it closes, L/s per cmH2O.
-        opening_delay: delay of the expiratory valve when it opens, s.
-        closing_delay: delay of the expiratory valve when it closes, s.
-        rest: command that held the flow before the first sample, %.
-        closing_lag: time constant with which the expiratory valve closes after its delay, s; None
-            for a valve that closes at once.
-    """
-
-    R: Array
-    K2: Array
-    E: Array
-    stiffening: Array
-    offset: Array
-    slopes: Array
-    direction: Array
-    valve_delay: Array
-    valve_lag: Array
-    circuit_compliance: Array
-    sensor_lag: Array
-    rising: Array
-    falling: Array
-    conductance: Array
+    R: Array  #: laminar part of the resistance, cmH2O/(L/s).
+    K2: Array  #: quadratic part, cmH2O s2/L2: the drop over the airway is ``R Q + K2 Q |Q|``.
+    E: Array  #: elastance at low volume, cmH2O/L.
+    stiffening: Array  #: change of relative slope of the elastic curve at each knot, ``(..., 5)``.
+    offset: Array  #: elastic recoil minus airway pressure at rest, cmH2O.
+    slopes: Array  #: slopes of the valve's curve between knots, L/s per %, ``(..., 13)``.
+    direction: Array  #: weight of each play in the effective command, ``(..., 3)``.
+    valve_delay: Array  #: dead time of the inspiratory valve, s.
+    valve_lag: Array  #: time constant of the inspiratory valve, s.
+    circuit_compliance: Array  #: compliance of tubing and bellows' dead space, L/cmH2O.
+    sensor_lag: Array  #: time constant of the sensor, s.
+    rising: Array  #: shift that is added to the reading while the command rises, cmH2O.
+    falling: Array  #: shift that is subtracted from the reading while the command falls, cmH2O.
+    conductance: Array  #: conductance of the open expiratory valve, L/s per cmH2O.
+    #: conductance of the expiratory valve while it closes, L/s per cmH2O.
     closing_conductance: Array
-    opening_delay: Array
-    closing_delay: Array
-    rest: Array
+    opening_delay: Array  #: delay of the expiratory valve when it opens, s.
+    closing_delay: Array  #: delay of the expiratory valve when it closes, s.
+    rest: Array  #: command that held the flow before the first sample, %.
+    #: time constant with which the expiratory valve closes after its delay, s; None for a valve
+    #: that closes at once.
     closing_lag: Array | None = None
 
     def valve(self, u_in: Array) -> Array:

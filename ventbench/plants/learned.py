@@ -29,17 +29,12 @@ class MLP:
 
     The layers are unrolled, not scanned: each is one matrix product whose bias and activation
     XLA fuses into one pass.
-
-    Attributes:
-        weights: one matrix a layer, shapes ``(in, width)``, ``(width, width)``, ...,
-            ``(width, out)``.
-        biases: one vector a layer, shapes ``(width,)``, ..., ``(out,)``.
-        activation: a name in :data:`ACTIVATIONS`.
     """
 
+    #: one matrix a layer, shapes ``(in, width)``, ``(width, width)``, ..., ``(width, out)``.
     weights: tuple[Array, ...]
-    biases: tuple[Array, ...]
-    activation: str = flax.struct.field(pytree_node=False)
+    biases: tuple[Array, ...]  #: one vector a layer, shapes ``(width,)``, ..., ``(out,)``.
+    activation: str = flax.struct.field(pytree_node=False)  #: a name in :data:`ACTIVATIONS`.
 
     def __call__(self, x: Array) -> Array:
         """Evaluate at inputs of shape ``(..., in)``; returns shape ``(..., out)``."""
@@ -75,24 +70,15 @@ def mlp(key: Array, sizes: tuple[int, ...], activation: str, last_scale: float =
 
 @dataclass(frozen=True)
 class Architecture:
-    """Shape of a learned plant; the defaults are the paper's for R5C10.
+    """Shape of a learned plant; the defaults are the paper's for R5C10."""
 
-    Attributes:
-        pressures: length of the pressure window, H_p.
-        controls: length of the control window, H_c; the command now is its last entry.
-        width: number of units of each hidden layer.
-        depth: number of matrices, the output's included (the authors' count).
-        boundaries: N_B, one-hidden-layer networks for the first steps of an inspiration.
-        boundary_width: hidden width of the boundary networks (authors' code: 100).
-        activation: ``"tanh"`` or ``"selu"``, of the general network; boundary ones are tanh.
-    """
-
-    pressures: int = 5
-    controls: int = 10
-    width: int = 150
-    depth: int = 9
-    boundaries: int = 1
-    boundary_width: int = 100
+    pressures: int = 5  #: length of the pressure window, H_p.
+    controls: int = 10  #: length of the control window, H_c; the command now is its last entry.
+    width: int = 150  #: number of units of each hidden layer.
+    depth: int = 9  #: number of matrices, the output's included (the authors' count).
+    boundaries: int = 1  #: N_B, one-hidden-layer networks for the first steps of an inspiration.
+    boundary_width: int = 100  #: hidden width of the boundary networks (authors' code: 100).
+    #: ``"tanh"`` or ``"selu"``, of the general network; boundary ones are tanh.
     activation: str = "tanh"
 
     def __post_init__(self) -> None:
@@ -138,19 +124,12 @@ class Normalisation:
 
 @flax.struct.dataclass
 class Boundary:
-    """N_B networks of one hidden tanh layer, side by side in two matrices.
+    """N_B networks of one hidden tanh layer, side by side in two matrices."""
 
-    Attributes:
-        hidden: shape ``(in, N_B * width)``.
-        hidden_bias: shape ``(N_B * width,)``.
-        output: shape ``(N_B * width, 2)``.
-        output_bias: shape ``(N_B, 2)``.
-    """
-
-    hidden: Array
-    hidden_bias: Array
-    output: Array
-    output_bias: Array
+    hidden: Array  #: shape ``(in, N_B * width)``.
+    hidden_bias: Array  #: shape ``(N_B * width,)``.
+    output: Array  #: shape ``(N_B * width, 2)``.
+    output_bias: Array  #: shape ``(N_B, 2)``.
 
     def __call__(self, x: Array, index: Array) -> Array:
         """Evaluate network ``index`` (shape ``(...)``) at inputs of shape ``(..., in)``.
@@ -167,19 +146,12 @@ class Boundary:
 
 @flax.struct.dataclass
 class LearnedState:
-    """Windows of a learned plant.
+    """Windows of a learned plant."""
 
-    Attributes:
-        pressures: the last samples, the newest last, cmH2O, shape ``(..., H_p)``.
-        controls: the last commands, the newest last, %, shape ``(..., H_c)``.
-        count: steps since the inspiration began, shape ``(...)``.
-        peep: pressure behind the expiratory valve, cmH2O, shape ``(...)``.
-    """
-
-    pressures: Array
-    controls: Array
-    count: Array
-    peep: Array
+    pressures: Array  #: the last samples, the newest last, cmH2O, shape ``(..., H_p)``.
+    controls: Array  #: the last commands, the newest last, %, shape ``(..., H_c)``.
+    count: Array  #: steps since the inspiration began, shape ``(...)``.
+    peep: Array  #: pressure behind the expiratory valve, cmH2O, shape ``(...)``.
 
 
 @flax.struct.dataclass
@@ -209,34 +181,20 @@ class Learned:
     then better than its physics.
 
     Source: the paper, section 4.3 and appendix B; authors' code for the boundary networks.
-
-    Attributes:
-        general: network after the boundary steps.
-        boundary: networks of the first steps; None if there are none.
-        pressure_mean: mean by which pressures of the windows are normalised, cmH2O.
-        pressure_scale: scale by which pressures of the windows are normalised, cmH2O.
-        control_mean: mean by which commands of the windows are normalised, %.
-        control_scale: scale by which commands of the windows are normalised, %.
-        jump_scale: cmH2O for a unit jump output at a command step of ``control_scale``.
-        rate_scale: cmH2O in ``REFERENCE_DT`` for a unit rate output.
-        tau: time constant of expiration, s.
-        valve_scale: factor on commands, see :meth:`vary`, shape ``(...)`` or ``()``.
-        time_scale: factor on time constants, see :meth:`vary`, shape ``(...)`` or ``()``.
-        windows: ``(H_p, H_c)``.
     """
 
-    general: MLP
-    boundary: Boundary | None
-    pressure_mean: Array
-    pressure_scale: Array
-    control_mean: Array
-    control_scale: Array
-    jump_scale: Array
-    rate_scale: Array
-    tau: Array
-    valve_scale: Array
-    time_scale: Array
-    windows: tuple[int, int] = flax.struct.field(pytree_node=False)
+    general: MLP  #: network after the boundary steps.
+    boundary: Boundary | None  #: networks of the first steps; None if there are none.
+    pressure_mean: Array  #: mean by which pressures of the windows are normalised, cmH2O.
+    pressure_scale: Array  #: scale by which pressures of the windows are normalised, cmH2O.
+    control_mean: Array  #: mean by which commands of the windows are normalised, %.
+    control_scale: Array  #: scale by which commands of the windows are normalised, %.
+    jump_scale: Array  #: cmH2O for a unit jump output at a command step of ``control_scale``.
+    rate_scale: Array  #: cmH2O in ``REFERENCE_DT`` for a unit rate output.
+    tau: Array  #: time constant of expiration, s.
+    valve_scale: Array  #: factor on commands, see :meth:`vary`, shape ``(...)`` or ``()``.
+    time_scale: Array  #: factor on time constants, see :meth:`vary`, shape ``(...)`` or ``()``.
+    windows: tuple[int, int] = flax.struct.field(pytree_node=False)  #: ``(H_p, H_c)``.
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[LearnedState, Signals]:
         """Lung at rest; see :class:`~ventbench.task.interfaces.Plant`."""

@@ -32,19 +32,15 @@ from ventbench.task.lungs import Lung, lung
 
 @dataclass(frozen=True)
 class PlantFamily:
-    """One kind of plant.
+    """One kind of plant."""
 
-    Attributes:
-        plant: class of the plants; files name it by the class's name, so that a class that is
-            renamed needs a line in :data:`RENAMED`.
-        for_lung: makes the plant of a lung at its label, if labels are all it needs. The family
-            then has a name for ``--plant`` and goes through the contract tests of physics plants.
-        parts: further classes in its files.
-    """
-
+    #: class of the plants; files name it by the class's name, so that a class that is renamed needs
+    #: a line in :data:`RENAMED`.
     plant: type
+    #: makes the plant of a lung at its label, if labels are all it needs. The family then has a
+    #: name for ``--plant`` and goes through the contract tests of physics plants.
     for_lung: Callable[[Lung], Plant] | None = None
-    parts: tuple[type, ...] = ()
+    parts: tuple[type, ...] = ()  #: further classes in its files.
 
 
 #: By the name that ``--plant`` takes. ``physics`` and the learned ones are more than one line, see

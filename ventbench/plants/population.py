@@ -118,15 +118,10 @@ def from_vector(vector: Any, xp: Any = jnp) -> Hybrid:
 
 @dataclass(frozen=True, eq=False)
 class RigPopulation:
-    """Populations of the rigs of L lungs.
+    """Populations of the rigs of L lungs."""
 
-    Attributes:
-        mean: shape ``(L, p)``.
-        factor: lower triangular factor of the covariance of a new rig, shape ``(L, p, p)``.
-    """
-
-    mean: Floats
-    factor: Floats
+    mean: Floats  #: shape ``(L, p)``.
+    factor: Floats  #: lower triangular factor of the covariance of a new rig, shape ``(L, p, p)``.
 
     def rigs(self, seed: bytes, lung: int, count: int) -> Hybrid:
         """Draw rigs of a lung, by its index and a seed of 32 bytes; the same everywhere.

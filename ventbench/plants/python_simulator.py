@@ -48,14 +48,10 @@ def is_jax_plant(value: object) -> bool:
 
 @dataclass(frozen=True)
 class PythonSimulator:
-    """A simulator of one breath's commands, in the form that the resolver of simulators calls.
+    """A simulator of one breath's commands, in the form that the resolver of simulators calls."""
 
-    Attributes:
-        name: what messages call it.
-        run: takes the arguments of :data:`_ARGUMENTS` by name.
-    """
-
-    name: str
+    name: str  #: what messages call it.
+    #: takes the arguments of :data:`_ARGUMENTS` by name.
     run: Callable[[dict[str, Any]], ArrayLike]
 
     def __call__(

@@ -22,26 +22,19 @@ from ventbench.task.lungs import LUNGS, Lung
 
 @dataclass(frozen=True, eq=False)
 class Rigs:
-    """Plants of L lungs, each on one or several rigs; make one with a function of this module.
+    """Plants of L lungs, each on one or several rigs; make one with a function of this module."""
 
-    Attributes:
-        lungs: L of them.
-        plants: leaves ``(members, sessions, ...)`` where :attr:`sessions` says which are scored;
-            leaves ``(L, ...)`` where each lung has one rig only.
-        sessions: scored sessions of each lung, the reference rig first; None for one rig each.
-        about: version and hashes, for the result.
-        sha256: of the manifest of the frozen simulators; None for others.
-        held_out: for each lung the scored sessions that no entry may be trained on.
-        population: that further rigs are drawn from; None for none.
-    """
-
-    lungs: tuple[Lung, ...]
+    lungs: tuple[Lung, ...]  #: L of them.
+    #: leaves ``(members, sessions, ...)`` where :attr:`sessions` says which are scored; leaves
+    #: ``(L, ...)`` where each lung has one rig only.
     plants: Plant
+    #: scored sessions of each lung, the reference rig first; None for one rig each.
     sessions: tuple[tuple[int, ...], ...] | None = None
-    about: Mapping[str, Any] = field(default_factory=dict)
-    sha256: str | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)  #: version and hashes, for the result.
+    sha256: str | None = None  #: of the manifest of the frozen simulators; None for others.
+    #: for each lung the scored sessions that no entry may be trained on.
     held_out: tuple[tuple[int, ...], ...] = ()
-    population: RigPopulation | None = None
+    population: RigPopulation | None = None  #: that further rigs are drawn from; None for none.
 
     @property
     def members(self) -> int:

@@ -34,21 +34,13 @@ _UNIT_MS, _SPIKE_UNITS, _FAR_SAMPLES = 0.2, 1.5, 2.0
 
 @dataclass(frozen=True)
 class SampleTiming:
-    """Sampling of n breaths, read off their times; every array has shape ``(n,)``.
+    """Sampling of n breaths, read off their times; every array has shape ``(n,)``."""
 
-    Attributes:
-        interval_ms: median sampling interval, ms.
-        spiky: whether more than a few samples come late.
-        inspiratory: number of inspiratory samples.
-        known: False where times were blank, so that ``spiky`` says nothing.
-        regular: whether the interval is one at which the rigs run.
-    """
-
-    interval_ms: Floats
-    spiky: Bools
-    inspiratory: Ints
-    known: Bools
-    regular: Bools
+    interval_ms: Floats  #: median sampling interval, ms.
+    spiky: Bools  #: whether more than a few samples come late.
+    inspiratory: Ints  #: number of inspiratory samples.
+    known: Bools  #: False where times were blank, so that ``spiky`` says nothing.
+    regular: Bools  #: whether the interval is one at which the rigs run.
 
 
 def sample_timing(breaths: Breaths) -> SampleTiming:
@@ -63,21 +55,13 @@ def sample_timing(breaths: Breaths) -> SampleTiming:
 
 @dataclass(frozen=True)
 class Session:
-    """One session.
+    """One session."""
 
-    Attributes:
-        lung: id of the setting, such as ``R20C50``.
-        interval_ms: median sampling interval, ms.
-        spiky: whether the rig is a spiky one.
-        inspiratory: most frequent number of inspiratory samples.
-        breaths: number of breaths that defined it.
-    """
-
-    lung: str
-    interval_ms: float
-    spiky: bool
-    inspiratory: int
-    breaths: int
+    lung: str  #: id of the setting, such as ``R20C50``.
+    interval_ms: float  #: median sampling interval, ms.
+    spiky: bool  #: whether the rig is a spiky one.
+    inspiratory: int  #: most frequent number of inspiratory samples.
+    breaths: int  #: number of breaths that defined it.
 
     @property
     def rig(self) -> int:

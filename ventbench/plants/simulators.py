@@ -28,27 +28,19 @@ _SAME_COMMAND = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Simulators:
-    """Simulators of lungs, whatever they were given as.
+    """Simulators of lungs, whatever they were given as."""
 
-    Attributes:
-        kind: what they are. ``"function"`` answers to commands, ``"pressures"`` only to the
-            recorded commands of its own breaths; all others have plants: ``"plants"`` are those of
-            the caller or of a file, and else it is the name, such as ``"frozen"``.
-        name: what messages and reports call them.
-        about: JSON values that results keep of them: version, file, hashes.
-        lungs: lungs for which :attr:`stacked` has plants, in its order; empty where there is none.
-        sha256: SHA-256 of the file or manifest that they come from; None if there is none.
-        official: the official set if they are it, else None.
-        origin: JSON values that a file of plants says of its making, such as the recording that
-            they were fitted to and its breaths that no fit has seen.
-    """
-
+    #: what they are. ``"function"`` answers to commands, ``"pressures"`` only to the recorded
+    #: commands of its own breaths; all others have plants: ``"plants"`` are those of the caller or
+    #: of a file, and else it is the name, such as ``"frozen"``.
     kind: str
-    name: str
-    about: Mapping[str, Any]
+    name: str  #: what messages and reports call them.
+    about: Mapping[str, Any]  #: JSON values that results keep of them: version, file, hashes.
+    #: lungs for which :attr:`stacked` has plants, in its order; empty where there is none.
     lungs: tuple[Lung, ...] = ()
+    #: SHA-256 of the file or manifest that they come from; None if there is none.
     sha256: str | None = None
-    official: frozen.Frozen | None = None
+    official: frozen.Frozen | None = None  #: the official set if they are it, else None.
     _stack: Callable[[], Plant] | None = None
     _for_breaths: PlantsFor | None = None
     _cross_fitted: PlantsFor | None = None
@@ -56,6 +48,8 @@ class Simulators:
     _make: Callable[[Lung], Plant] | None = None
     _function: PythonSimulator | None = None
     _table: Mapping[int, tuple[Lung, Floats, Floats]] = field(default_factory=dict, repr=False)
+    #: JSON values that a file of plants says of its making, such as the recording that they were
+    #: fitted to and its breaths that no fit has seen.
     origin: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:

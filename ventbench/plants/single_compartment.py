@@ -28,18 +28,12 @@ class SingleCompartment:
     ``q = gain u_in``. Expiration (valve open): flow leaves through ``R_ex`` in series with ``R``
     towards PEEP, so that ``P_alv`` relaxes to ``peep + R_ex q_in`` with time constant
     ``(R + R_ex) C``. Everything with R in cmH2O/(L/s) and C in L/cmH2O inside.
-
-    Attributes:
-        R: airway resistance, cmH2O/(L/s), shape ``()`` or ``(...)``.
-        C: compliance, mL/cmH2O, shape ``()`` or ``(...)``.
-        gain: flow of the inspiratory valve, mL/s per %.
-        R_ex: resistance of the expiratory path, cmH2O/(L/s).
     """
 
-    R: Array
-    C: Array
-    gain: Array
-    R_ex: Array
+    R: Array  #: airway resistance, cmH2O/(L/s), shape ``()`` or ``(...)``.
+    C: Array  #: compliance, mL/cmH2O, shape ``()`` or ``(...)``.
+    gain: Array  #: flow of the inspiratory valve, mL/s per %.
+    R_ex: Array  #: resistance of the expiratory path, cmH2O/(L/s).
 
     def init(
         self, pressure: Array, peep: Array | None = None

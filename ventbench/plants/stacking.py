@@ -118,12 +118,9 @@ class VmappedPlant:
     """A stack of n plants as one plant, for kinds whose parameters cannot broadcast.
 
     Every argument has shape ``(n,)``.
-
-    Attributes:
-        plants: every leaf ``(n, ...)``.
     """
 
-    plants: Any
+    plants: Any  #: every leaf ``(n, ...)``.
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Signals]:
         """Lungs at rest; see :class:`~ventbench.task.interfaces.Plant`."""

@@ -49,22 +49,14 @@ class TwoBalloon:
     the balloon lies the label's R (R -> 0 is the paper's model); expired air leaves through
     ``R_ex`` towards PEEP (the authors' code leaks ``0.05 p`` instead). Integrated by the classical
     Runge-Kutta method, half-size steps agree to 1e-4 cmH2O.
-
-    Attributes:
-        R: airway resistance, cmH2O/(L/s), shape ``()`` or ``(...)``.
-        C: compliance at rest volume, mL/cmH2O, shape ``()`` or ``(...)``.
-        gain: flow of the inspiratory valve at zero pressure, mL/s per %.
-        R_ex: resistance of the expiratory path, cmH2O/(L/s).
-        K: pressure scale of the balloon, cmH2O.
-        supply: supply pressure, cmH2O.
     """
 
-    R: Array
-    C: Array
-    gain: Array
-    R_ex: Array
-    K: Array
-    supply: Array
+    R: Array  #: airway resistance, cmH2O/(L/s), shape ``()`` or ``(...)``.
+    C: Array  #: compliance at rest volume, mL/cmH2O, shape ``()`` or ``(...)``.
+    gain: Array  #: flow of the inspiratory valve at zero pressure, mL/s per %.
+    R_ex: Array  #: resistance of the expiratory path, cmH2O/(L/s).
+    K: Array  #: pressure scale of the balloon, cmH2O.
+    supply: Array  #: supply pressure, cmH2O.
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[TwoBalloonState, Signals]:
         """Lung at rest; see :class:`~ventbench.task.interfaces.Plant`.

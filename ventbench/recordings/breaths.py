@@ -26,40 +26,26 @@ class Breaths:
 
     Padding (`valid` False) follows a short breath: u_in is 0, u_out 1, pressure, flow and volume
     NaN, and time continues at the last interval.
-
-    Attributes:
-        breath_id: int64, (n,).
-        R: resistance, cmH2O/(L/s), float64, (n,).
-        C: compliance, mL/cmH2O, float64, (n,).
-        time: s from each breath's first sample, float64, (n, T).
-        dt: s, `dt[:, i] = time[:, i+1] - time[:, i]`, the last repeated, float64, (n, T).
-        u_in: opening of the inspiratory valve, %, float64, (n, T).
-        u_out: 1 while the expiratory valve is open, int8, (n, T).
-        pressure: cmH2O, NaN where blank, float64, (n, T).
-        valid: True for a sample, False for padding, bool, (n, T).
-        time_inferred: True if a breath's times were blank and are an estimate, bool, (n,).
-        flow: mL/s, NaN where blank, float64, (n, T), or None.
-        volume: mL, NaN where blank, float64, (n, T), or None.
-        source: path of the file, or None.
-        sha256: SHA-256 of the file, hex, or None if the breaths are not those of a whole file.
-        notes: what a reader of the file should know, a sentence each.
     """
 
-    breath_id: np.ndarray
-    R: np.ndarray
-    C: np.ndarray
-    time: np.ndarray
+    breath_id: np.ndarray  #: int64, (n,).
+    R: np.ndarray  #: resistance, cmH2O/(L/s), float64, (n,).
+    C: np.ndarray  #: compliance, mL/cmH2O, float64, (n,).
+    time: np.ndarray  #: s from each breath's first sample, float64, (n, T).
+    #: s, `dt[:, i] = time[:, i+1] - time[:, i]`, the last repeated, float64, (n, T).
     dt: np.ndarray
-    u_in: np.ndarray
-    u_out: np.ndarray
-    pressure: np.ndarray
-    valid: np.ndarray
+    u_in: np.ndarray  #: opening of the inspiratory valve, %, float64, (n, T).
+    u_out: np.ndarray  #: 1 while the expiratory valve is open, int8, (n, T).
+    pressure: np.ndarray  #: cmH2O, NaN where blank, float64, (n, T).
+    valid: np.ndarray  #: True for a sample, False for padding, bool, (n, T).
+    #: True if a breath's times were blank and are an estimate, bool, (n,).
     time_inferred: np.ndarray
-    flow: np.ndarray | None = None
-    volume: np.ndarray | None = None
-    source: str | None = None
+    flow: np.ndarray | None = None  #: mL/s, NaN where blank, float64, (n, T), or None.
+    volume: np.ndarray | None = None  #: mL, NaN where blank, float64, (n, T), or None.
+    source: str | None = None  #: path of the file, or None.
+    #: SHA-256 of the file, hex, or None if the breaths are not those of a whole file.
     sha256: str | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: what a reader of the file should know, a sentence each.
 
     def __post_init__(self) -> None:
         """Make the arrays read-only."""

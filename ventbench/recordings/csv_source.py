@@ -35,13 +35,9 @@ BLANKS = ["", "NaN", "nan", "NA", "N/A", "null"]
 
 @dataclass
 class CsvSource(Source):
-    """A CSV file, plain or gzipped.
+    """A CSV file, plain or gzipped."""
 
-    Attributes:
-        block: bytes of text that are read at a time.
-    """
-
-    block: int = BLOCK
+    block: int = BLOCK  #: bytes of text that are read at a time.
 
     def __post_init__(self) -> None:
         """Read and check the header.

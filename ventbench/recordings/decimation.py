@@ -49,15 +49,10 @@ _MULTIPLE = 20
 
 @dataclass(frozen=True, eq=False)
 class Decimation:
-    """Breaths on a coarser grid.
+    """Breaths on a coarser grid."""
 
-    Attributes:
-        breaths: n breaths; pressures at samples that are only kept for a command are blank.
-        index: sample of the full recording at each kept sample, ``(n, T)``; padding repeats the
-            last.
-    """
-
-    breaths: Breaths
+    breaths: Breaths  #: n breaths; pressures at samples that are only kept for a command are blank.
+    #: sample of the full recording at each kept sample, ``(n, T)``; padding repeats the last.
     index: Ints
 
     def of(self, values: Floats) -> Floats:

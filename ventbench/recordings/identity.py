@@ -41,17 +41,11 @@ _BLANK, _NONE = -(2**31), -(2**31) + 1
 
 @dataclass(frozen=True)
 class Fingerprints:
-    """Fingerprints of n breaths; one column a grid.
+    """Fingerprints of n breaths; one column a grid."""
 
-    Attributes:
-        commands: of lung and commands, ``(n, 3)``.
-        pressures: of the pressures, ``(n, 3)``.
-        measured: whether no pressure among them is blank, ``(n,)``.
-    """
-
-    commands: Keys
-    pressures: Keys
-    measured: Bools
+    commands: Keys  #: of lung and commands, ``(n, 3)``.
+    pressures: Keys  #: of the pressures, ``(n, 3)``.
+    measured: Bools  #: whether no pressure among them is blank, ``(n,)``.
 
     def select(self, which: Ints) -> Fingerprints:
         """Return those of some of the breaths."""
@@ -60,15 +54,11 @@ class Fingerprints:
 
 @dataclass(frozen=True)
 class Matches:
-    """Which known breath each of n breaths is.
+    """Which known breath each of n breaths is."""
 
-    Attributes:
-        known: index of the known breath, -1 if it is none, ``(n,)``.
-        certain: whether the pressures agree too; without, they are blank in one of the two, and the
-            breath is perhaps a copy, ``(n,)``.
-    """
-
-    known: Ints
+    known: Ints  #: index of the known breath, -1 if it is none, ``(n,)``.
+    #: whether the pressures agree too; without, they are blank in one of the two, and the breath is
+    #: perhaps a copy, ``(n,)``.
     certain: Bools
 
 

@@ -18,48 +18,31 @@ PAD_LIMIT = 10
 
 @dataclass(frozen=True)
 class RecordingReport:
-    """The result of `check`.
+    """The result of `check`."""
 
-    Attributes:
-        file: the path as the caller wrote it.
-        kind: `csv`, `csv.gz`, `parquet` or `xlsx`, or None if the file cannot be read.
-        sha256: SHA-256 of the file, hex, or None if it cannot be read to its end.
-        problems: the first problems, in file order.
-        problem_count: number of all problems.
-        warnings: the first warnings.
-        warning_count: number of all warnings.
-        suspicious: columns that are not what they are called, though `load` takes the file.
-        rows: data rows read.
-        breaths: breaths read.
-        lengths: smallest and largest number of samples in a breath.
-        lungs: breaths for each lung, by R then C.
-        interval: `min` and `max` between two samples and `p5`, `median`, `p95` of the breaths' mean
-            intervals, s; empty if no times are known.
-        time_inferred: interval, s, inferred for each breath without times, by breath_id.
-        time_interpolated: number of single blank times that are interpolated.
-        time_shifted: number of breaths that are shifted to start at time 0.
-        blank_pressures: number of samples without pressure.
-        optional: optional columns in the file.
-    """
-
-    file: str
+    file: str  #: the path as the caller wrote it.
+    #: `csv`, `csv.gz`, `parquet` or `xlsx`, or None if the file cannot be read.
     kind: str | None = None
-    sha256: str | None = None
-    problems: tuple[RecordingProblem, ...] = ()
-    problem_count: int = 0
-    warnings: tuple[RecordingProblem, ...] = ()
-    warning_count: int = 0
+    sha256: str | None = None  #: SHA-256 of the file, hex, or None if it cannot be read to its end.
+    problems: tuple[RecordingProblem, ...] = ()  #: the first problems, in file order.
+    problem_count: int = 0  #: number of all problems.
+    warnings: tuple[RecordingProblem, ...] = ()  #: the first warnings.
+    warning_count: int = 0  #: number of all warnings.
+    #: columns that are not what they are called, though `load` takes the file.
     suspicious: tuple[RecordingProblem, ...] = ()
-    rows: int = 0
-    breaths: int = 0
-    lengths: tuple[int, int] = (0, 0)
-    lungs: dict[str, int] = field(default_factory=dict)
+    rows: int = 0  #: data rows read.
+    breaths: int = 0  #: breaths read.
+    lengths: tuple[int, int] = (0, 0)  #: smallest and largest number of samples in a breath.
+    lungs: dict[str, int] = field(default_factory=dict)  #: breaths for each lung, by R then C.
+    #: `min` and `max` between two samples and `p5`, `median`, `p95` of the breaths' mean intervals,
+    #: s; empty if no times are known.
     interval: dict[str, float] = field(default_factory=dict)
+    #: interval, s, inferred for each breath without times, by breath_id.
     time_inferred: dict[int, float] = field(default_factory=dict)
-    time_interpolated: int = 0
-    time_shifted: int = 0
-    blank_pressures: int = 0
-    optional: tuple[str, ...] = ()
+    time_interpolated: int = 0  #: number of single blank times that are interpolated.
+    time_shifted: int = 0  #: number of breaths that are shifted to start at time 0.
+    blank_pressures: int = 0  #: number of samples without pressure.
+    optional: tuple[str, ...] = ()  #: optional columns in the file.
 
     @property
     def ok(self) -> bool:
@@ -170,19 +153,12 @@ def _intervals(tally: Tally) -> dict[str, float]:
 
 @dataclass
 class Tally:
-    """Counts over the blocks that were added; keeps a few numbers a breath and no samples.
+    """Counts over the blocks that were added; keeps a few numbers a breath and no samples."""
 
-    Attributes:
-        blank_pressures: samples without pressure.
-        dt_min: shortest known interval between two samples, s.
-        dt_max: longest known interval, s.
-        optional: optional columns in the file.
-    """
-
-    blank_pressures: int = 0
-    dt_min: float = float("inf")
-    dt_max: float = float("-inf")
-    optional: tuple[str, ...] = ()
+    blank_pressures: int = 0  #: samples without pressure.
+    dt_min: float = float("inf")  #: shortest known interval between two samples, s.
+    dt_max: float = float("-inf")  #: longest known interval, s.
+    optional: tuple[str, ...] = ()  #: optional columns in the file.
     _parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _figures: list[dict[str, np.ndarray]] = field(default_factory=list)
 

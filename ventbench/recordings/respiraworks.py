@@ -23,26 +23,16 @@ _LABELS = ("run", "test", "breath", "time_step", "R", "C", "drive")
 
 @dataclass(frozen=True, eq=False)
 class RespiraWorksRun:
-    """One test of one day: consecutive breaths on one lung.
+    """One test of one day: consecutive breaths on one lung."""
 
-    Attributes:
-        name: name of the test day or gas supply.
-        test: number of the ISO test condition.
-        drive: source of the gas, such as a blower.
-        R: resistance that the operators noted, cmH2O/(L/s).
-        C: compliance that the operators noted, mL/cmH2O.
-        breath: number of each sample's breath, int64, (T,).
-        time: s, float64, (T,).
-        signals: signals by the names of `SIGNALS`, float64, NaN where not logged, each (T,).
-    """
-
-    name: str
-    test: int
-    drive: str
-    R: float
-    C: float
-    breath: np.ndarray
-    time: np.ndarray
+    name: str  #: name of the test day or gas supply.
+    test: int  #: number of the ISO test condition.
+    drive: str  #: source of the gas, such as a blower.
+    R: float  #: resistance that the operators noted, cmH2O/(L/s).
+    C: float  #: compliance that the operators noted, mL/cmH2O.
+    breath: np.ndarray  #: number of each sample's breath, int64, (T,).
+    time: np.ndarray  #: s, float64, (T,).
+    #: signals by the names of `SIGNALS`, float64, NaN where not logged, each (T,).
     signals: dict[str, np.ndarray]
 
 

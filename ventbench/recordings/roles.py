@@ -47,21 +47,14 @@ _EXCHANGED, _HELD = 1.35, 1.6
 
 @dataclass(frozen=True)
 class Finding:
-    """Something about a column that no ventilator and no lung does.
+    """Something about a column that no ventilator and no lung does."""
 
-    Attributes:
-        column: name in the schema.
-        what: a phrase without a full stop.
-        advice: a sentence that names the option that mends it.
-        level: ``refused`` where nothing can be done with the recording, else ``suspicious``.
-        value: the figure that shows it.
-    """
-
-    column: str
-    what: str
-    advice: str
+    column: str  #: name in the schema.
+    what: str  #: a phrase without a full stop.
+    advice: str  #: a sentence that names the option that mends it.
+    #: ``refused`` where nothing can be done with the recording, else ``suspicious``.
     level: str = "suspicious"
-    value: float = float("nan")
+    value: float = float("nan")  #: the figure that shows it.
 
     def __str__(self) -> str:
         """The finding in one line."""
@@ -70,21 +63,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Saturation:
-    """A level at which the readings of a sensor end.
+    """A level at which the readings of a sensor end."""
 
-    Attributes:
-        column: ``pressure`` or ``flow``.
-        level: the level, in the unit of the schema.
-        upper: whether readings end above it, else below it.
-        count: readings at the level.
-        share: share of all readings of the column.
-    """
-
-    column: str
-    level: float
-    upper: bool
-    count: int
-    share: float
+    column: str  #: ``pressure`` or ``flow``.
+    level: float  #: the level, in the unit of the schema.
+    upper: bool  #: whether readings end above it, else below it.
+    count: int  #: readings at the level.
+    share: float  #: share of all readings of the column.
 
     def __str__(self) -> str:
         """The saturation as a phrase."""

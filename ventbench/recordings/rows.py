@@ -19,17 +19,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive rows of a file, as read.
+    """Consecutive rows of a file, as read."""
 
-    Attributes:
-        row0: the first row's number in the file, 0 for the first data row.
-        columns: arrays by column name, each (m,): int64 for id and breath_id, float64 with NaN for
-            blank otherwise, in the units of the schema.
-        blank_id: rows with a blank breath_id, (m,) bool; breath_id then repeats the one before.
-    """
-
-    row0: int
+    row0: int  #: the first row's number in the file, 0 for the first data row.
+    #: arrays by column name, each (m,): int64 for id and breath_id, float64 with NaN for blank
+    #: otherwise, in the units of the schema.
     columns: dict[str, np.ndarray]
+    #: rows with a blank breath_id, (m,) bool; breath_id then repeats the one before.
     blank_id: np.ndarray
 
     def __len__(self) -> int:
@@ -44,13 +40,9 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Rows(Chunk):
-    """Rows of whole breaths.
+    """Rows of whole breaths."""
 
-    Attributes:
-        starts: index of each breath's first row, (k,), k >= 1.
-    """
-
-    starts: np.ndarray
+    starts: np.ndarray  #: index of each breath's first row, (k,), k >= 1.
 
     @property
     def lengths(self) -> np.ndarray:
@@ -115,27 +107,18 @@ def _join(chunks: list[Chunk]) -> Chunk:
 
 @dataclass
 class Source:
-    """A file, or a table in memory, that is read once, in order.
+    """A file, or a table in memory, that is read once, in order."""
 
-    Attributes:
-        file: the path as the caller wrote it.
-        kind: format.
-        names: column names.
-        warnings: about columns that are ignored.
-        sha256: SHA-256 of the file on disk; None until all chunks are read.
-        place: what messages count in: ``line`` or ``row``.
-        size: bytes, or rows of Parquet.
-        done: how much of that has been read.
-    """
-
-    file: str
-    kind: Kind
-    names: tuple[str, ...] = field(default=(), init=False)
+    file: str  #: the path as the caller wrote it.
+    kind: Kind  #: format.
+    names: tuple[str, ...] = field(default=(), init=False)  #: column names.
+    #: about columns that are ignored.
     warnings: tuple[RecordingProblem, ...] = field(default=(), init=False)
+    #: SHA-256 of the file on disk; None until all chunks are read.
     sha256: str | None = field(default=None, init=False)
-    place: str = field(default="line", init=False)
-    size: int = field(default=0, init=False)
-    done: int = field(default=0, init=False)
+    place: str = field(default="line", init=False)  #: what messages count in: ``line`` or ``row``.
+    size: int = field(default=0, init=False)  #: bytes, or rows of Parquet.
+    done: int = field(default=0, init=False)  #: how much of that has been read.
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield the rows in order.

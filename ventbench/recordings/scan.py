@@ -62,16 +62,11 @@ BATCH = 1 << 17
 
 @dataclass
 class ParquetSource(Source):
-    """A Parquet file, a spreadsheet, or a table in memory.
-
-    Attributes:
-        table: the table in memory; None for Parquet.
-        batch: rows that are read at a time.
-    """
+    """A Parquet file, a spreadsheet, or a table in memory."""
 
     kind: Kind = "parquet"
-    table: pa.Table | None = None
-    batch: int = BATCH
+    table: pa.Table | None = None  #: the table in memory; None for Parquet.
+    batch: int = BATCH  #: rows that are read at a time.
 
     def __post_init__(self) -> None:
         """Read and check names and types.
@@ -242,15 +237,10 @@ INSPIRATION = 1.0
 
 @dataclass(frozen=True)
 class IntervalTable:
-    """Sampling intervals of a file's breaths with known times.
+    """Sampling intervals of a file's breaths with known times."""
 
-    Attributes:
-        by_count: median interval, s, by number of inspiratory samples.
-        overall: median interval of all breaths, s, or None if no breath has times.
-    """
-
-    by_count: dict[int, float]
-    overall: float | None
+    by_count: dict[int, float]  #: median interval, s, by number of inspiratory samples.
+    overall: float | None  #: median interval of all breaths, s, or None if no breath has times.
 
     def estimate(self, n_inspiratory: int, length: int) -> float | None:
         """Interval of a breath without times, s, of n inspiratory samples of so many in all.
@@ -291,19 +281,13 @@ def leading_zeros(u_out: np.ndarray, starts: np.ndarray, lengths: np.ndarray) ->
 
 @dataclass(frozen=True)
 class KnownTimes:
-    """Times of breaths, with what follows from each breath alone.
+    """Times of breaths, with what follows from each breath alone."""
 
-    Attributes:
-        time: s from the breath's first sample, NaN in all of a breath without times, (m,).
-        blank: breaths with fewer than two times, which have none then, (k,) bool.
-        interpolated: number of single times that are interpolated, (k,).
-        shifted: breaths that do not start at 0 in the file, (k,) bool.
-    """
-
+    #: s from the breath's first sample, NaN in all of a breath without times, (m,).
     time: np.ndarray
-    blank: np.ndarray
-    interpolated: np.ndarray
-    shifted: np.ndarray
+    blank: np.ndarray  #: breaths with fewer than two times, which have none then, (k,) bool.
+    interpolated: np.ndarray  #: number of single times that are interpolated, (k,).
+    shifted: np.ndarray  #: breaths that do not start at 0 in the file, (k,) bool.
 
 
 def known_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> KnownTimes:
@@ -340,29 +324,18 @@ def _interpolate(time: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Block:
-    """k whole breaths with m samples in all.
+    """k whole breaths with m samples in all."""
 
-    Attributes:
-        breath_id: (k,) int64.
-        R: cmH2O/(L/s), (k,).
-        C: mL/cmH2O, (k,).
-        first_row: each breath's first data row in the file, from 0, (k,).
-        lengths: samples, (k,).
-        n_inspiratory: leading samples with u_out = 0, (k,).
-        interval: mean sampling interval, s, NaN if times are blank, (k,).
-        times: times of the samples, and what was interpolated or shifted.
-        samples: u_in %, u_out 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file
-            has them, each (m,).
-    """
-
-    breath_id: np.ndarray
-    R: np.ndarray
-    C: np.ndarray
-    first_row: np.ndarray
-    lengths: np.ndarray
-    n_inspiratory: np.ndarray
-    interval: np.ndarray
-    times: KnownTimes
+    breath_id: np.ndarray  #: (k,) int64.
+    R: np.ndarray  #: cmH2O/(L/s), (k,).
+    C: np.ndarray  #: mL/cmH2O, (k,).
+    first_row: np.ndarray  #: each breath's first data row in the file, from 0, (k,).
+    lengths: np.ndarray  #: samples, (k,).
+    n_inspiratory: np.ndarray  #: leading samples with u_out = 0, (k,).
+    interval: np.ndarray  #: mean sampling interval, s, NaN if times are blank, (k,).
+    times: KnownTimes  #: times of the samples, and what was interpolated or shifted.
+    #: u_in %, u_out 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file has them,
+    #: each (m,).
     samples: dict[str, np.ndarray]
 
 

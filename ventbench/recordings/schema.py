@@ -25,26 +25,18 @@ SHOWN = 20
 
 @dataclass(frozen=True)
 class RecordingProblem:
-    """An error in a recording, or something that its user should know.
+    """An error in a recording, or something that its user should know."""
 
-    Attributes:
-        file: the path as the caller wrote it.
-        what: the problem, a phrase without a full stop.
-        advice: what to do about it, a sentence.
-        line: line of a CSV file, 1 for the header; in Parquet the row, 1 for the first. None for
-            the whole file.
-        column: name of the column, or None.
-        value: the cell as it is written in the file (CSV) or printed (Parquet), or None.
-        place: `line` or `row`, the unit of `line`.
-    """
-
-    file: str
-    what: str
-    advice: str
+    file: str  #: the path as the caller wrote it.
+    what: str  #: the problem, a phrase without a full stop.
+    advice: str  #: what to do about it, a sentence.
+    #: line of a CSV file, 1 for the header; in Parquet the row, 1 for the first. None for the whole
+    #: file.
     line: int | None = None
-    column: str | None = None
+    column: str | None = None  #: name of the column, or None.
+    #: the cell as it is written in the file (CSV) or printed (Parquet), or None.
     value: str | None = None
-    place: str = "line"
+    place: str = "line"  #: `line` or `row`, the unit of `line`.
 
     def __str__(self) -> str:
         """The problem in one line: where, what, advice."""
@@ -113,14 +105,10 @@ class _Entry:
 
 @dataclass
 class ProblemLog:
-    """Problems and warnings of one file by row; keeps the first `SHOWN` of each, and counts all.
+    """Problems and warnings of one file by row; keeps the first `SHOWN` of each, and counts all."""
 
-    Attributes:
-        file: the path as the caller wrote it.
-        counts: number of problems and of warnings.
-    """
-
-    file: str
+    file: str  #: the path as the caller wrote it.
+    #: number of problems and of warnings.
     counts: dict[Level, int] = field(default_factory=lambda: {"problem": 0, "warning": 0})
     _kept: dict[Level, list[_Entry]] = field(default_factory=lambda: {"problem": [], "warning": []})
 
@@ -193,27 +181,16 @@ Kind = Literal["csv", "csv.gz", "parquet", "xlsx", "table"]
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a recording.
+    """One column of a recording."""
 
-    Attributes:
-        name: name in the header.
-        unit: unit of every value, as it is printed.
-        low: smallest value that is accepted, in `unit`.
-        high: largest value that is accepted, in `unit`.
-        blank: whether a cell may be blank (read as NaN).
-        whole: whether the column holds integers of 64 bits.
-        positive: whether `low` itself is outside the range.
-        advice: what to do about a value outside the range.
-    """
-
-    name: str
-    unit: str
-    low: float = float("-inf")
-    high: float = float("inf")
-    blank: bool = False
-    whole: bool = False
-    positive: bool = False
-    advice: str = "Fix the row."
+    name: str  #: name in the header.
+    unit: str  #: unit of every value, as it is printed.
+    low: float = float("-inf")  #: smallest value that is accepted, in `unit`.
+    high: float = float("inf")  #: largest value that is accepted, in `unit`.
+    blank: bool = False  #: whether a cell may be blank (read as NaN).
+    whole: bool = False  #: whether the column holds integers of 64 bits.
+    positive: bool = False  #: whether `low` itself is outside the range.
+    advice: str = "Fix the row."  #: what to do about a value outside the range.
 
     @property
     def span(self) -> str:

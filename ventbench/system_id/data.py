@@ -14,27 +14,17 @@ from ventbench.recordings.breaths import Breaths
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """n breaths of T samples, c = 1 (pressure) or 2 (pressure and flow) channels.
+    """n breaths of T samples, c = 1 (pressure) or 2 (pressure and flow) channels."""
 
-    Attributes:
-        u_in: inspiratory valve, %, ``(n, T)``.
-        u_out: expiratory valve, 0/1, ``(n, T)``.
-        dt: time to the next sample, s, ``(n, T)``.
-        measured: pressure, cmH2O, and flow, mL/s; zero where nothing was measured, ``(n, c, T)``.
-        weight: 1 where measured, else 0, ``(n, c, T)``.
-        R: label of the lung's resistance, cmH2O/(L/s), ``(n,)``.
-        C: label of the lung's compliance, mL/cmH2O, ``(n,)``.
-        position: place of each breath in its recording, 0 first, 1 last, ``(n,)``.
-    """
-
-    u_in: Floats
-    u_out: Floats
-    dt: Floats
+    u_in: Floats  #: inspiratory valve, %, ``(n, T)``.
+    u_out: Floats  #: expiratory valve, 0/1, ``(n, T)``.
+    dt: Floats  #: time to the next sample, s, ``(n, T)``.
+    #: pressure, cmH2O, and flow, mL/s; zero where nothing was measured, ``(n, c, T)``.
     measured: Floats
-    weight: Floats
-    R: Floats
-    C: Floats
-    position: Floats
+    weight: Floats  #: 1 where measured, else 0, ``(n, c, T)``.
+    R: Floats  #: label of the lung's resistance, cmH2O/(L/s), ``(n,)``.
+    C: Floats  #: label of the lung's compliance, mL/cmH2O, ``(n,)``.
+    position: Floats  #: place of each breath in its recording, 0 first, 1 last, ``(n,)``.
 
     def __len__(self) -> int:
         """Number of breaths n."""

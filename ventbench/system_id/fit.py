@@ -44,25 +44,15 @@ _LEVERAGE = 0.98
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of a fit.
+    """Result of a fit."""
 
-    Attributes:
-        mechanisms: names of the hypothesis.
-        problem: the problem with the estimated or given noise.
-        minimum: minimum of its cost.
-        values: physical values of all columns of the predictor, ``(n, P + 1)``.
-        residual: predicted minus measured, ``(n, c, T)``.
-        log_likelihood: log-likelihood of each breath, ``(n,)``.
-        covariance: covariance of the unknowns in coordinates, ``(U, U)``.
-    """
-
-    mechanisms: tuple[str, ...]
-    problem: Problem
-    minimum: Minimum
-    values: Floats
-    residual: Floats
-    log_likelihood: Floats
-    covariance: Floats
+    mechanisms: tuple[str, ...]  #: names of the hypothesis.
+    problem: Problem  #: the problem with the estimated or given noise.
+    minimum: Minimum  #: minimum of its cost.
+    values: Floats  #: physical values of all columns of the predictor, ``(n, P + 1)``.
+    residual: Floats  #: predicted minus measured, ``(n, c, T)``.
+    log_likelihood: Floats  #: log-likelihood of each breath, ``(n,)``.
+    covariance: Floats  #: covariance of the unknowns in coordinates, ``(U, U)``.
 
     @property
     def bic(self) -> float:

@@ -22,23 +22,14 @@ _SLOW = 4
 
 @dataclass(frozen=True)
 class Minimum:
-    """Point at which a search ended.
+    """Point at which a search ended."""
 
-    Attributes:
-        x: the point, ``(U,)``.
-        cost: cost at the point.
-        gradient: gradient at the point, ``(U,)``.
-        hessian: Gauss-Newton Hessian at the point, ``(U, U)``.
-        iterations: number of evaluations of the normal equations.
-        converged: False if the search ran out of iterations.
-    """
-
-    x: Floats
-    cost: float
-    gradient: Floats
-    hessian: Floats
-    iterations: int
-    converged: bool
+    x: Floats  #: the point, ``(U,)``.
+    cost: float  #: cost at the point.
+    gradient: Floats  #: gradient at the point, ``(U,)``.
+    hessian: Floats  #: Gauss-Newton Hessian at the point, ``(U, U)``.
+    iterations: int  #: number of evaluations of the normal equations.
+    converged: bool  #: False if the search ran out of iterations.
 
 
 def minimise(

@@ -18,16 +18,13 @@ LEAST_SIGMA = 0.02
 
 @dataclass(frozen=True)
 class Noise:
-    """First-order autoregressive noise of each channel, Gaussian with exponential tails (Huber).
+    """First-order autoregressive noise of each channel, Gaussian with exponential tails (Huber)."""
 
-    Attributes:
-        sigma: standard deviations of pressure, cmH2O, and of flow, mL/s, one for each channel.
-        ar: correlations of neighbouring samples, one for each channel, within -1..1.
-        tail: whitened size from which the tails are exponential; ``inf`` for a Gaussian.
-    """
-
+    #: standard deviations of pressure, cmH2O, and of flow, mL/s, one for each channel.
     sigma: tuple[float, ...] = (0.25, 20.0)
+    #: correlations of neighbouring samples, one for each channel, within -1..1.
     ar: tuple[float, ...] = (0.0, 0.0)
+    #: whitened size from which the tails are exponential; ``inf`` for a Gaussian.
     tail: float = 3.0
 
     def whiten(self, residual: Floats, weight: Floats) -> Floats:

@@ -48,17 +48,11 @@ def free_paths(mechanisms: Iterable[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Layout of the vector of a fit: U numbers in the coordinates of their parameters.
+    """Layout of the vector of a fit: U numbers in the coordinates of their parameters."""
 
-    Attributes:
-        paths: paths of the k free parameters.
-        index: unknown that each breath uses for each free parameter, ``(n, k)``.
-        path_of: free parameter of each unknown, as an index into ``paths``, ``(U,)``.
-    """
-
-    paths: tuple[str, ...]
-    index: Ints
-    path_of: Ints
+    paths: tuple[str, ...]  #: paths of the k free parameters.
+    index: Ints  #: unknown that each breath uses for each free parameter, ``(n, k)``.
+    path_of: Ints  #: free parameter of each unknown, as an index into ``paths``, ``(U,)``.
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -151,26 +145,17 @@ def make_unknowns(
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The cost that a fit minimises. Methods take the unknowns ``x`` in coordinates, ``(U,)``.
+    """The cost that a fit minimises. Methods take the unknowns ``x`` in coordinates, ``(U,)``."""
 
-    Attributes:
-        data: measurements.
-        predictor: predicts the same breaths.
-        unknowns: layout of ``x``.
-        fixed: physical values of all columns of the predictor, ``(n, P + 1)``; the unknowns
-            replace those of free parameters.
-        noise: measurement noise.
-        mean: prior mean in coordinates, ``(U,)``.
-        precision: prior precision, 1 / variance, ``(U,)``.
-    """
-
-    data: Data
-    predictor: Predictor
-    unknowns: Unknowns
+    data: Data  #: measurements.
+    predictor: Predictor  #: predicts the same breaths.
+    unknowns: Unknowns  #: layout of ``x``.
+    #: physical values of all columns of the predictor, ``(n, P + 1)``; the unknowns replace those
+    #: of free parameters.
     fixed: Floats
-    noise: Noise
-    mean: Floats
-    precision: Floats
+    noise: Noise  #: measurement noise.
+    mean: Floats  #: prior mean in coordinates, ``(U,)``.
+    precision: Floats  #: prior precision, 1 / variance, ``(U,)``.
 
     @cached_property
     def columns(self) -> tuple[int, ...]:

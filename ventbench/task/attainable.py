@@ -70,21 +70,16 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Attainable:
-    """Bounds of n cells.
+    """Bounds of n cells."""
 
-    Attributes:
-        error: error that :attr:`commands` attain, cmH2O, shape ``(n,)``: an upper bound on the
-            least error.
-        lower: error of the rise with a fully open valve, cmH2O, shape ``(n,)``: a lower bound.
-        stationarity: by how much the error could fall at first order when every command moves by
-            at most :data:`CERTIFICATE_RADIUS`, cmH2O, shape ``(n,)``.
-        commands: %, shape ``(n, COMMANDS)``.
-    """
-
+    #: error that :attr:`commands` attain, cmH2O, shape ``(n,)``: an upper bound on the least error.
     error: Floats
+    #: error of the rise with a fully open valve, cmH2O, shape ``(n,)``: a lower bound.
     lower: Floats
+    #: by how much the error could fall at first order when every command moves by at most
+    #: :data:`CERTIFICATE_RADIUS`, cmH2O, shape ``(n,)``.
     stationarity: Floats
-    commands: Floats
+    commands: Floats  #: %, shape ``(n, COMMANDS)``.
 
 
 def _pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:

@@ -101,25 +101,17 @@ PlantT = TypeVar("PlantT")
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Cells of L lungs, n draws and P PIPs, and the plant of each.
+    """Cells of L lungs, n draws and P PIPs, and the plant of each."""
 
-    Attributes:
-        name: ``"development"`` for the published draws.
-        commitment: of the seed, 64 hexadecimal digits.
-        cells: batch shape ``(L, n, P)``, float64 numpy leaves.
-        rig: session of each lung in each draw, or :data:`FIRST_DRAWN` and more for a rig that is
-            drawn anew, shape ``(L, n)``.
-        member: member of the ensemble, 0 for a drawn rig, shape ``(L, n)``.
-        ranked: whether a draw is meant for rigs that nobody trained on, shape ``(n,)``.
-        drawn: rigs that are drawn anew, leaves ``(L, n, ...)``; None where there are none.
-    """
-
-    name: str
-    commitment: str
-    cells: Scenario
+    name: str  #: ``"development"`` for the published draws.
+    commitment: str  #: of the seed, 64 hexadecimal digits.
+    cells: Scenario  #: batch shape ``(L, n, P)``, float64 numpy leaves.
+    #: session of each lung in each draw, or :data:`FIRST_DRAWN` and more for a rig that is drawn
+    #: anew, shape ``(L, n)``.
     rig: Ints
-    member: Ints
-    ranked: Bools
+    member: Ints  #: member of the ensemble, 0 for a drawn rig, shape ``(L, n)``.
+    ranked: Bools  #: whether a draw is meant for rigs that nobody trained on, shape ``(n,)``.
+    #: rigs that are drawn anew, leaves ``(L, n, ...)``; None where there are none.
     drawn: Plant | None = None
 
     @property

@@ -26,31 +26,20 @@ _EXPIRATORY = waveform.expiratory_command(np.arange(protocol.BREATH_STEPS))
 
 @flax.struct.dataclass
 class Scenario:
-    """A batch of cells; every field has the batch shape ``(...)`` unless it says otherwise.
+    """A batch of cells; every field has the batch shape ``(...)`` unless it says otherwise."""
 
-    Attributes:
-        pip: peak inspiratory pressure, cmH2O.
-        peep: positive end-expiratory pressure, cmH2O.
-        start: pressure at which each inspiration starts, cmH2O.
-        dt: true control step, s.
-        r_scale: true over nominal resistance.
-        c_scale: true over nominal compliance.
-        delay: additional dead time of the command, as a share of one step, 0..1.
-        gain: flow of the inspiratory valve in each breath over that of its rig, ``(..., BREATHS)``.
-        quantum: step of the pressure sensor's converter, cmH2O; 0 for none.
-        noise: noise that is added to the measured pressure before the converter, cmH2O, shape
-            ``(..., BREATHS, INSPIRATION_STEPS)``.
-    """
-
-    pip: Array
-    peep: Array
-    start: Array
-    dt: Array
-    r_scale: Array
-    c_scale: Array
-    delay: Array
+    pip: Array  #: peak inspiratory pressure, cmH2O.
+    peep: Array  #: positive end-expiratory pressure, cmH2O.
+    start: Array  #: pressure at which each inspiration starts, cmH2O.
+    dt: Array  #: true control step, s.
+    r_scale: Array  #: true over nominal resistance.
+    c_scale: Array  #: true over nominal compliance.
+    delay: Array  #: additional dead time of the command, as a share of one step, 0..1.
+    #: flow of the inspiratory valve in each breath over that of its rig, ``(..., BREATHS)``.
     gain: Array
-    quantum: Array
+    quantum: Array  #: step of the pressure sensor's converter, cmH2O; 0 for none.
+    #: noise that is added to the measured pressure before the converter, cmH2O, shape ``(...,
+    #: BREATHS, INSPIRATION_STEPS)``.
     noise: Array
 
 
@@ -78,17 +67,11 @@ def _table(values: Floats, scenario: Scenario) -> Array:
 
 @flax.struct.dataclass
 class LoopState:
-    """State of the loop: a batch of plants in mid-breath.
+    """State of the loop: a batch of plants in mid-breath."""
 
-    Attributes:
-        plant: states of the plants.
-        signals: what the plants show; readings are without noise.
-        previous: command of the previous step as applied, %, shape ``(...)``.
-    """
-
-    plant: Any
-    signals: Signals
-    previous: Array
+    plant: Any  #: states of the plants.
+    signals: Signals  #: what the plants show; readings are without noise.
+    previous: Array  #: command of the previous step as applied, %, shape ``(...)``.
 
 
 def vary(plant: Plant, scenario: Scenario, breath: Array | int) -> Plant:

@@ -23,18 +23,13 @@ class Signals(NamedTuple):
     """What a plant shows at one instant; every array has shape ``(...)``.
 
     A signal that a kind of plant does not have is None, for all of its plants and at all times.
-
-    Attributes:
-        reading: airway pressure as the sensor shows it, cmH2O.
-        airway_pressure: true pressure at the airway, cmH2O; None if only readings were learned.
-        flow: flow into the lung, mL/s.
-        volume: gas in the lung above a level that stays the same within a breath, mL.
     """
 
-    reading: Any
+    reading: Any  #: airway pressure as the sensor shows it, cmH2O.
+    #: true pressure at the airway, cmH2O; None if only readings were learned.
     airway_pressure: Any = None
-    flow: Any = None
-    volume: Any = None
+    flow: Any = None  #: flow into the lung, mL/s.
+    volume: Any = None  #: gas in the lung above a level that stays the same within a breath, mL.
 
     @property
     def scored(self) -> Any:
@@ -95,19 +90,12 @@ class Plant(Protocol):
 
 
 class Task(NamedTuple):
-    """Information that a submission gets before a run.
+    """Information that a submission gets before a run."""
 
-    Attributes:
-        track: ``"performance"`` or ``"robustness"``.
-        lung: id of the lung in the performance track, None in the robustness track.
-        dt: nominal control step, s.
-        inspiration_steps: steps of one inspiration; ``act`` is called once for each.
-    """
-
-    track: str
-    lung: str | None
-    dt: float
-    inspiration_steps: int
+    track: str  #: ``"performance"`` or ``"robustness"``.
+    lung: str | None  #: id of the lung in the performance track, None in the robustness track.
+    dt: float  #: nominal control step, s.
+    inspiration_steps: int  #: steps of one inspiration; ``act`` is called once for each.
 
 
 class Observation(NamedTuple):
@@ -115,22 +103,15 @@ class Observation(NamedTuple):
 
     In a submission every field is a Python float (``targets_ahead`` a tuple of floats); in pure
     controllers every field is an array with the batch shape ``(...)``.
-
-    Attributes:
-        time: since the start of the breath, s.
-        dt: control step, s.
-        pressure: measured airway pressure, cmH2O.
-        target: target pressure now, cmH2O.
-        targets_ahead: the next 10 targets, cmH2O; shape ``(..., 10)``.
-        previous_u_in: command of the step before as applied, %; at the start of a breath the bias
-            flow of the expiration, 5 %.
     """
 
-    time: Any
-    dt: Any
-    pressure: Any
-    target: Any
-    targets_ahead: Any
+    time: Any  #: since the start of the breath, s.
+    dt: Any  #: control step, s.
+    pressure: Any  #: measured airway pressure, cmH2O.
+    target: Any  #: target pressure now, cmH2O.
+    targets_ahead: Any  #: the next 10 targets, cmH2O; shape ``(..., 10)``.
+    #: command of the step before as applied, %; at the start of a breath the bias flow of the
+    #: expiration, 5 %.
     previous_u_in: Any
 
 

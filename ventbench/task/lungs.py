@@ -12,15 +12,10 @@ _ID = re.compile(r"R(\d+(?:\.\d+)?)C(\d+(?:\.\d+)?)")
 
 @dataclass(frozen=True, order=True)
 class Lung:
-    """One setting of a test lung.
+    """One setting of a test lung."""
 
-    Attributes:
-        R: airway resistance, cmH2O/(L/s).
-        C: compliance, mL/cmH2O.
-    """
-
-    R: float
-    C: float
+    R: float  #: airway resistance, cmH2O/(L/s).
+    C: float  #: compliance, mL/cmH2O.
 
     @property
     def id(self) -> str:

@@ -19,13 +19,10 @@ from ventbench.task.interfaces import Controller, Observation, Plant
 
 @flax.struct.dataclass
 class Script:
-    """A controller that ignores what it observes.
+    """A controller that ignores what it observes."""
 
-    Attributes:
-        u_in: commands of a run in order, %, shape ``(BREATHS * INSPIRATION_STEPS,)`` or
-            ``(..., BREATHS * INSPIRATION_STEPS)`` for different ones in each cell of a batch.
-    """
-
+    #: commands of a run in order, %, shape ``(BREATHS * INSPIRATION_STEPS,)`` or ``(..., BREATHS *
+    #: INSPIRATION_STEPS)`` for different ones in each cell of a batch.
     u_in: Array
 
     def init(self, shape: tuple[int, ...]) -> Array:
@@ -73,19 +70,13 @@ def open_loop(plant: Plant, start: Array, u_in: Array, u_out: Array, dt: Array) 
 
 @flax.struct.dataclass
 class Inspirations:
-    """Inspirations of a closed-loop run; every array has shape ``(..., BREATHS, steps)``.
+    """Inspirations of a closed-loop run; every array has shape ``(..., BREATHS, steps)``."""
 
-    Attributes:
-        pressure: airway pressure at each step, which is scored, cmH2O.
-        requested: what the controller asked for, %.
-        u_in: what was applied, %.
-        volume: gas in the lung, mL, see :class:`~ventbench.task.interfaces.Signals`; None where the
-            plant has none.
-    """
-
-    pressure: Array
-    requested: Array
-    u_in: Array
+    pressure: Array  #: airway pressure at each step, which is scored, cmH2O.
+    requested: Array  #: what the controller asked for, %.
+    u_in: Array  #: what was applied, %.
+    #: gas in the lung, mL, see :class:`~ventbench.task.interfaces.Signals`; None where the plant
+    #: has none.
     volume: Array | None
 
 
@@ -94,14 +85,10 @@ class Expirations:
     """Expirations of a closed-loop run; every array has shape ``(..., BREATHS, steps)``.
 
     The expiratory valve is open throughout.
-
-    Attributes:
-        pressure: true airway pressure at each step, cmH2O.
-        u_in: inspiratory valve as applied, %.
     """
 
-    pressure: Array
-    u_in: Array
+    pressure: Array  #: true airway pressure at each step, cmH2O.
+    u_in: Array  #: inspiratory valve as applied, %.
 
 
 def scored_step(before: LoopState, after: LoopState, requested: Array, applied: Array) -> Any:

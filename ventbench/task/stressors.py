@@ -46,33 +46,23 @@ _ALWAYS = (1.0,) * protocol.BREATHS
 
 @dataclass(frozen=True)
 class Stressor:
-    """One stressor at two severities.
+    """One stressor at two severities."""
 
-    Attributes:
-        name: public name.
-        category: where it sits.
-        title: the stressor in a clinician's words.
-        strength: path of the parameter that it changes, ``mechanism.parameter`` or ``R``, ``C``.
-        mild: strength of the mild severity, in the parameter's unit; a factor for ``scale``, a
-            label for ``label``.
-        strong: strength of the strong severity.
-        reason: where the two strengths come from.
-        rule: how the strength acts.
-        breaths: share of the strength in each breath of a run.
-        fixed: further parameters, the same for both severities, by path.
-        by_severity: further parameters that differ, ``{path: (mild, strong)}``.
-    """
-
-    name: str
-    category: Category
-    title: str
+    name: str  #: public name.
+    category: Category  #: where it sits.
+    title: str  #: the stressor in a clinician's words.
+    #: path of the parameter that it changes, ``mechanism.parameter`` or ``R``, ``C``.
     strength: str
+    #: strength of the mild severity, in the parameter's unit; a factor for ``scale``, a label for
+    #: ``label``.
     mild: float
-    strong: float
-    reason: str
-    rule: Rule = "add"
-    breaths: tuple[float, ...] = _ALWAYS
+    strong: float  #: strength of the strong severity.
+    reason: str  #: where the two strengths come from.
+    rule: Rule = "add"  #: how the strength acts.
+    breaths: tuple[float, ...] = _ALWAYS  #: share of the strength in each breath of a run.
+    #: further parameters, the same for both severities, by path.
     fixed: Mapping[str, ByBreath] = field(default_factory=dict)
+    #: further parameters that differ, ``{path: (mild, strong)}``.
     by_severity: Mapping[str, tuple[ByBreath, ByBreath]] = field(default_factory=dict)
 
     def at(self, severity: Severity) -> float:
@@ -87,17 +77,12 @@ class Stressor:
 
 @dataclass(frozen=True)
 class Condition:
-    """What a run is stressed with: nothing, a stressor, or a pair.
+    """What a run is stressed with: nothing, a stressor, or a pair."""
 
-    Attributes:
-        stressors: none, one or two names; more where :attr:`shares` are given.
-        severity: of all of them; None without a stressor.
-        shares: share of the strength of each, 0..1, on a logarithmic scale where the strength is a
-            factor or a label; empty for all of it.
-    """
-
-    stressors: tuple[str, ...] = ()
-    severity: Severity | None = None
+    stressors: tuple[str, ...] = ()  #: none, one or two names; more where :attr:`shares` are given.
+    severity: Severity | None = None  #: of all of them; None without a stressor.
+    #: share of the strength of each, 0..1, on a logarithmic scale where the strength is a factor or
+    #: a label; empty for all of it.
     shares: tuple[float, ...] = ()
 
     @property

@@ -44,19 +44,13 @@ AGREEMENT = 0.02
 
 @dataclass(frozen=True, eq=False)
 class BestPIDs:
-    """Best PIDs of L lungs, and of all together as one more where that was asked for; S searches.
+    """Best PIDs of L lungs, and of all together as one more where that was asked; S searches."""
 
-    Attributes:
-        gains: P, I, D, %/cmH2O, shape ``(L, 3)``.
-        error: weighted mean over draws and PIPs without the first step, cmH2O, shape ``(L,)``.
-        search_gains: where each search ended, shape ``(L, S, 3)``.
-        search_errors: their errors, shape ``(L, S)``.
-    """
-
-    gains: Floats
+    gains: Floats  #: P, I, D, %/cmH2O, shape ``(L, 3)``.
+    #: weighted mean over draws and PIPs without the first step, cmH2O, shape ``(L,)``.
     error: Floats
-    search_gains: Floats
-    search_errors: Floats
+    search_gains: Floats  #: where each search ended, shape ``(L, S, 3)``.
+    search_errors: Floats  #: their errors, shape ``(L, S)``.
 
     @property
     def agree(self) -> Bools:

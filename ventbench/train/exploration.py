@@ -29,23 +29,14 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class ExplorationRanges:
-    """Exploration of one lung.
+    """Exploration of one lung."""
 
-    Attributes:
-        gains: P, I, D of the PID, %/cmH2O.
-        boundary_u: what is added at the start of a breath, %.
-        boundary_s: time in which the boundary disturbance falls to zero, s.
-        triangular_u: the largest of what is added, %.
-        triangular_s: start and end of the triangular disturbance, s.
-        boundary_share: share of breaths with the boundary disturbance.
-    """
-
-    gains: tuple[float, float, float]
-    boundary_u: Range
-    boundary_s: Range
-    triangular_u: Range
-    triangular_s: Range = (0.1, 0.5)
-    boundary_share: float = 0.25
+    gains: tuple[float, float, float]  #: P, I, D of the PID, %/cmH2O.
+    boundary_u: Range  #: what is added at the start of a breath, %.
+    boundary_s: Range  #: time in which the boundary disturbance falls to zero, s.
+    triangular_u: Range  #: the largest of what is added, %.
+    triangular_s: Range = (0.1, 0.5)  #: start and end of the triangular disturbance, s.
+    boundary_share: float = 0.25  #: share of breaths with the boundary disturbance.
 
 
 #: The paper's table, by lung id.
@@ -61,19 +52,12 @@ RANGES = {
 
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """Disturbances of n breaths; every array has shape ``(n,)``.
+    """Disturbances of n breaths; every array has shape ``(n,)``."""
 
-    Attributes:
-        boundary: whether it is a boundary disturbance; else a triangular one.
-        u: the largest of what is added, %.
-        begin: start of the disturbance, s; 0 for a boundary.
-        end: end of the disturbance, s.
-    """
-
-    boundary: Bools
-    u: Floats
-    begin: Floats
-    end: Floats
+    boundary: Bools  #: whether it is a boundary disturbance; else a triangular one.
+    u: Floats  #: the largest of what is added, %.
+    begin: Floats  #: start of the disturbance, s; 0 for a boundary.
+    end: Floats  #: end of the disturbance, s.
 
     def at(self, time: float) -> Floats:
         """Disturbance at a time of the breath, s, added to the PID's command, %, ``(n,)``."""
@@ -102,31 +86,22 @@ def draw_disturbances(
 
 @dataclass(frozen=True)
 class Limits:
-    """Pressures at which exploring is interrupted.
+    """Pressures at which exploring is interrupted."""
 
-    Attributes:
-        ease: the valve closes while the measured pressure is above ``min(60, PIP + 15)`` cmH2O or
-            this, cmH2O.
-        vent: pressure above which the expiratory valve opens for the rest of the inspiration, as it
-            does where a pressure is not a number, cmH2O.
-        vented: breaths that ended so, after which exploring stops.
-    """
-
+    #: the valve closes while the measured pressure is above ``min(60, PIP + 15)`` cmH2O or this,
+    #: cmH2O.
     ease: float = protocol.SAFETY_PRESSURE
+    #: pressure above which the expiratory valve opens for the rest of the inspiration, as it does
+    #: where a pressure is not a number, cmH2O.
     vent: float = protocol.SAFETY_PRESSURE
-    vented: int = 3
+    vented: int = 3  #: breaths that ended so, after which exploring stops.
 
 
 class VentilatorInterface(Protocol):
-    """A ventilator, real or simulated, or several side by side.
+    """A ventilator, real or simulated, or several side by side."""
 
-    Attributes:
-        width: number of lungs side by side; 1 for a real ventilator.
-        dt: control step, s.
-    """
-
-    width: int
-    dt: float
+    width: int  #: number of lungs side by side; 1 for a real ventilator.
+    dt: float  #: control step, s.
 
     def start(self, peep: float) -> Floats:
         """Bring the lungs to rest at PEEP, cmH2O; returns measured pressures, ``(width,)``."""

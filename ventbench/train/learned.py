@@ -34,27 +34,16 @@ _PAD_BREATHS, _PAD_STEPS = 128, 32
 
 @flax.struct.dataclass
 class WindowedInspirations:
-    """Training data: inspirations, step by step, padded; every array float32.
+    """Training data: inspirations, step by step, padded; every array float32."""
 
-    Attributes:
-        start: first pressure, cmH2O, shape ``(n,)``.
-        u_in: command of each step, %, shape ``(n, T)``.
-        dt: time for which it was held, s, shape ``(n, T)``.
-        after: pressure at its end, cmH2O, 0 where unknown, shape ``(n, T)``.
-        weight: weight of the pressure in the loss, 0 where unknown, shape ``(n, T)``.
-        window: measured pressures up to each step, the newest last, cmH2O, ``(n, T, H_p)``.
-        known: whether each pressure of the window was measured, shape ``(n, T, H_p)``.
-        count: breaths before the padding, shape ``()``.
-    """
-
-    start: Array
-    u_in: Array
-    dt: Array
-    after: Array
-    weight: Array
-    window: Array
-    known: Array
-    count: Array
+    start: Array  #: first pressure, cmH2O, shape ``(n,)``.
+    u_in: Array  #: command of each step, %, shape ``(n, T)``.
+    dt: Array  #: time for which it was held, s, shape ``(n, T)``.
+    after: Array  #: pressure at its end, cmH2O, 0 where unknown, shape ``(n, T)``.
+    weight: Array  #: weight of the pressure in the loss, 0 where unknown, shape ``(n, T)``.
+    window: Array  #: measured pressures up to each step, the newest last, cmH2O, ``(n, T, H_p)``.
+    known: Array  #: whether each pressure of the window was measured, shape ``(n, T, H_p)``.
+    count: Array  #: breaths before the padding, shape ``()``.
 
 
 def inspirations(
@@ -190,26 +179,17 @@ def expiratory_time_constant(u_out: Floats, dt: Floats, pressure: Floats) -> flo
 
 @dataclasses.dataclass(frozen=True)
 class LearnedConfig:
-    """Settings of the training of a learned plant.
+    """Settings of the training of a learned plant."""
 
-    Attributes:
-        steps: updates; the schedules stretch over them.
-        batch: breaths an update, drawn with replacement.
-        learning_rate: peak of the cosine schedule.
-        weight_decay: weight decay of AdamW.
-        one_step: share of the updates with one-step loss.
-        whole: share of the updates, at the end, with open-loop runs over the whole inspiration;
-            between the two the horizon grows geometrically.
-        softness: error below which the loss turns from absolute to square, cmH2O.
-    """
-
-    steps: int = 1500
-    batch: int = 32
-    learning_rate: float = 3e-3
-    weight_decay: float = 1e-3
-    one_step: float = 0.2
+    steps: int = 1500  #: updates; the schedules stretch over them.
+    batch: int = 32  #: breaths an update, drawn with replacement.
+    learning_rate: float = 3e-3  #: peak of the cosine schedule.
+    weight_decay: float = 1e-3  #: weight decay of AdamW.
+    one_step: float = 0.2  #: share of the updates with one-step loss.
+    #: share of the updates, at the end, with open-loop runs over the whole inspiration; between the
+    #: two the horizon grows geometrically.
     whole: float = 0.4
-    softness: float = 0.2
+    softness: float = 0.2  #: error below which the loss turns from absolute to square, cmH2O.
 
     def __post_init__(self) -> None:
         """Refuse numbers that cannot work.

@@ -123,18 +123,12 @@ def errors(
 
 @dataclass(frozen=True, eq=False)
 class PIDGrid:
-    """Errors of every PID.
+    """Errors of every PID."""
 
-    Attributes:
-        lungs: ids, L of them.
-        pips: cmH2O, N of them.
-        gains: P, I and D, %/cmH2O, shape ``(G, 3)``.
-        error: mean ``|pressure - PIP|`` of an inspiration, cmH2O, float32, shape ``(L, G, N)``.
-    """
-
-    lungs: tuple[str, ...]
-    pips: tuple[float, ...]
-    gains: Floats
+    lungs: tuple[str, ...]  #: ids, L of them.
+    pips: tuple[float, ...]  #: cmH2O, N of them.
+    gains: Floats  #: P, I and D, %/cmH2O, shape ``(G, 3)``.
+    #: mean ``|pressure - PIP|`` of an inspiration, cmH2O, float32, shape ``(L, G, N)``.
     error: NDArray[np.float32]
 
     def __repr__(self) -> str:

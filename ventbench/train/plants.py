@@ -30,22 +30,16 @@ from ventbench.task.metrics.score import LEAST_HEADROOM
 
 @dataclass(frozen=True, eq=False)
 class TrainingPlants:
-    """Plants of L lungs to train a controller on.
+    """Plants of L lungs to train a controller on."""
 
-    Attributes:
-        lungs: L of them.
-        plants: leaves ``(K, L, ...)``, numpy: K plants of each lung, the nominal one first. Of the
-            frozen simulators they are all members of all training rigs, in turn where a lung has
-            fewer than K; of others the members of the ensemble.
-        about: version and hashes of the simulators, for the report.
-        weights: of the error of each lung at each PIP, mean 1, shape ``(L, P)``: the inverse of
-            what the normalised score divides by, without deviations; 1 for simulators without
-            published bounds.
-    """
-
-    lungs: tuple[Lung, ...]
+    lungs: tuple[Lung, ...]  #: L of them.
+    #: leaves ``(K, L, ...)``, numpy: K plants of each lung, the nominal one first. Of the frozen
+    #: simulators they are all members of all training rigs, in turn where a lung has fewer than K;
+    #: of others the members of the ensemble.
     plants: Plant
-    about: Mapping[str, Any]
+    about: Mapping[str, Any]  #: version and hashes of the simulators, for the report.
+    #: of the error of each lung at each PIP, mean 1, shape ``(L, P)``: the inverse of what the
+    #: normalised score divides by, without deviations; 1 for simulators without published bounds.
     weights: Floats
 
     @property
@@ -112,17 +106,12 @@ NETWORKS = (*LUNG_IDS, ALL)
 
 @dataclass(frozen=True)
 class TrainedControllers:
-    """Controllers by the lung that they were trained for.
+    """Controllers by the lung that they were trained for."""
 
-    Attributes:
-        controllers: pure controllers by lung id, or :data:`ALL`.
-        report: content of ``training.json``: settings, errors, provenance of the simulators.
-        folder: folder in which ``weights.npz`` and ``training.json`` were written.
-    """
-
-    controllers: dict[str, Controller]
+    controllers: dict[str, Controller]  #: pure controllers by lung id, or :data:`ALL`.
+    #: content of ``training.json``: settings, errors, provenance of the simulators.
     report: dict[str, Any]
-    folder: Path
+    folder: Path  #: folder in which ``weights.npz`` and ``training.json`` were written.
 
     def to_frame(self) -> pd.DataFrame:
         """One row a network: the columns that the report has for every network."""

@@ -43,39 +43,25 @@ from ventbench.train.plants import ALL, TrainedControllers, check_names, plants_
 
 @dataclass(frozen=True)
 class ResidualConfig:
-    """Settings of the training of residual controllers; hashable, since they are static in ``jit``.
+    """Settings of the training of residual controllers; hashable, for they are static in ``jit``."""
 
-    Attributes:
-        updates: number of updates of the network; the schedule stretches over them.
-        copies: runs of each lung at each PIP in an update.
-        learning_rate: peak of the cosine schedule of Adam.
-        weight_decay: decay of the network's weights.
-        lam: weight of the mean absolute correction, cmH2O for each %; the paper's lambda.
-        first_breath: weight of the breath that is not scored; each scored breath has 1.
-        widths: units of the network's hidden layers.
-        pressures: number of earlier errors that it sees.
-        commands: number of earlier commands that it sees.
-        ahead: number of steps of the previous breath that it sees; 0 for none.
-        limit: largest correction, %.
-        members: plants of each lung that are trained on, the nominal one first; all if None.
-        spread: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
-        round_robin: whether each update takes one lung at one PIP, in turn, as in the paper,
-            instead of all of them.
-    """
-
-    updates: int = 3000
-    copies: int = 6
-    learning_rate: float = 4e-3
-    weight_decay: float = 1e-5
+    updates: int = 3000  #: number of updates of the network; the schedule stretches over them.
+    copies: int = 6  #: runs of each lung at each PIP in an update.
+    learning_rate: float = 4e-3  #: peak of the cosine schedule of Adam.
+    weight_decay: float = 1e-5  #: decay of the network's weights.
+    #: weight of the mean absolute correction, cmH2O for each %; the paper's lambda.
     lam: float = 0.0
-    first_breath: float = 0.1
-    widths: tuple[int, ...] = (64, 64)
-    pressures: int = 5
-    commands: int = 6
-    ahead: int = 6
-    limit: float = 100.0
+    first_breath: float = 0.1  #: weight of the breath that is not scored; each scored breath has 1.
+    widths: tuple[int, ...] = (64, 64)  #: units of the network's hidden layers.
+    pressures: int = 5  #: number of earlier errors that it sees.
+    commands: int = 6  #: number of earlier commands that it sees.
+    ahead: int = 6  #: number of steps of the previous breath that it sees; 0 for none.
+    limit: float = 100.0  #: largest correction, %.
+    #: plants of each lung that are trained on, the nominal one first; all if None.
     members: int | None = None
-    spread: float = 1.0
+    spread: float = 1.0  #: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
+    #: whether each update takes one lung at one PIP, in turn, as in the paper, instead of all of
+    #: them.
     round_robin: bool = False
 
     def __post_init__(self) -> None:
@@ -115,17 +101,11 @@ valve.defvjp(_valve_forward, _valve_backward)
 
 @flax.struct.dataclass
 class DifferentiableRun:
-    """One run of three inspirations; every array ``(..., BREATHS, INSPIRATION_STEPS)``.
+    """One run of three inspirations; every array ``(..., BREATHS, INSPIRATION_STEPS)``."""
 
-    Attributes:
-        pressure: airway pressure, cmH2O.
-        correction: correction of the PID's command, %.
-        u_in: command as applied, %.
-    """
-
-    pressure: Array
-    correction: Array
-    u_in: Array
+    pressure: Array  #: airway pressure, cmH2O.
+    correction: Array  #: correction of the PID's command, %.
+    u_in: Array  #: command as applied, %.
 
 
 def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun:

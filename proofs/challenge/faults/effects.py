@@ -27,32 +27,22 @@ from ventbench.task.lungs import Lung
 
 @dataclass(frozen=True)
 class FaultsCase(Case):
-    """A recording of the third generator.
+    """A recording of the third generator."""
 
-    Attributes:
-        generator: always ``"faults"``; the sealed answers tell the generators apart by it.
-        interval: sampling interval, s.
-        inspiration: duration of inspiration, s.
-        tubing: compliance of the circuit that every rig has, mL/cmH2O.
-        choice: seed of which breaths and commands are affected.
-    """
-
+    #: always ``"faults"``; the sealed answers tell the generators apart by it.
     generator: str = "faults"
-    interval: float = 0.03
-    inspiration: float = 1.0
-    tubing: float = 0.05
-    choice: int = 0
+    interval: float = 0.03  #: sampling interval, s.
+    inspiration: float = 1.0  #: duration of inspiration, s.
+    tubing: float = 0.05  #: compliance of the circuit that every rig has, mL/cmH2O.
+    choice: int = 0  #: seed of which breaths and commands are affected.
 
 
 @dataclass(frozen=True)
 class Family(EffectFamily):
-    """A fault.
-
-    Attributes:
-        share: ends of the share of the breaths that it affects; None for all.
-    """
+    """A fault."""
 
     forms: tuple[str, ...] = ("plain",)
+    #: ends of the share of the breaths that it affects; None for all.
     share: tuple[float, float] | None = None
 
 

@@ -36,18 +36,12 @@ _PERIOD = 3.0
 
 @dataclass(frozen=True)
 class StepGrid:
-    """Integration steps of n breaths.
+    """Integration steps of n breaths."""
 
-    Attributes:
-        nodes: ends of the steps, s, ``(n, steps + 1)``.
-        command: index of the command that the valve follows in a step, -1 before the first,
-            ``(n, steps)``.
-        opened: 1 in the steps with an open expiratory valve, ``(n, steps)``.
-    """
-
-    nodes: Floats
+    nodes: Floats  #: ends of the steps, s, ``(n, steps + 1)``.
+    #: index of the command that the valve follows in a step, -1 before the first, ``(n, steps)``.
     command: NDArray[np.int64]
-    opened: Floats
+    opened: Floats  #: 1 in the steps with an open expiratory valve, ``(n, steps)``.
 
 
 def sampling_times(n: int, samples: int, jitter: float, rng: np.random.Generator) -> Floats:

@@ -31,44 +31,29 @@ SAME = "library"
 
 @dataclass(frozen=True)
 class StrangerCase(Case):
-    """A recording of the second generator, with the nuisances of its laboratory.
+    """A recording of the second generator, with the nuisances of its laboratory."""
 
-    Attributes:
-        generator: always ``"stranger"``; the sealed answers tell the two generators apart by it.
-        interval: mean sampling interval, s.
-        inspiration: duration of inspiration, s.
-        clock_step: resolution of the logged times, s; 0 for none.
-        gain_scatter: relative standard deviation of the valve's gain from breath to breath.
-        outliers: share of readings that are far off.
-        missing: share of readings that are blank.
-        proportional: largest proportional gain of the controller, % per cmH2O.
-        explored: share of breaths that explore instead of following a target.
-        dead_space: compliance of the circuit that every rig has, mL/cmH2O.
-    """
-
+    #: always ``"stranger"``; the sealed answers tell the two generators apart by it.
     generator: str = "stranger"
-    interval: float = 0.032
-    inspiration: float = 1.0
-    clock_step: float = 0.0
+    interval: float = 0.032  #: mean sampling interval, s.
+    inspiration: float = 1.0  #: duration of inspiration, s.
+    clock_step: float = 0.0  #: resolution of the logged times, s; 0 for none.
+    #: relative standard deviation of the valve's gain from breath to breath.
     gain_scatter: float = 0.0
-    outliers: float = 0.0
-    missing: float = 0.0
-    proportional: float = 2.0
-    explored: float = 0.5
-    dead_space: float = 0.03
+    outliers: float = 0.0  #: share of readings that are far off.
+    missing: float = 0.0  #: share of readings that are blank.
+    proportional: float = 2.0  #: largest proportional gain of the controller, % per cmH2O.
+    explored: float = 0.5  #: share of breaths that explore instead of following a target.
+    dead_space: float = 0.03  #: compliance of the circuit that every rig has, mL/cmH2O.
 
 
 @dataclass(frozen=True)
 class Family(EffectFamily):
-    """An effect of the second generator.
+    """An effect of the second generator."""
 
-    Attributes:
-        names: names of the vocabulary that are right for it, though it is outside the library.
-        places: places of the vocabulary that are right for it without a name.
-    """
-
+    #: names of the vocabulary that are right for it, though it is outside the library.
     names: tuple[str, ...] = ()
-    places: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()  #: places of the vocabulary that are right for it without a name.
 
 
 EFFECTS: dict[str, Family] = {

@@ -25,17 +25,11 @@ from ventbench.system_id.data import Floats
 
 @dataclass(frozen=True, eq=False)
 class Alternatives:
-    """Alternative explanations of the effect of a selected mechanism.
+    """Alternative explanations of the effect of a selected mechanism."""
 
-    Attributes:
-        names: other mechanisms, the likeliest first.
-        confidence: posterior probability of the selected mechanism, with equal priors.
-        models: the fitted alternatives among the library's mechanisms.
-    """
-
-    names: tuple[str, ...]
-    confidence: float
-    models: tuple[RankedModel, ...]
+    names: tuple[str, ...]  #: other mechanisms, the likeliest first.
+    confidence: float  #: posterior probability of the selected mechanism, with equal priors.
+    models: tuple[RankedModel, ...]  #: the fitted alternatives among the library's mechanisms.
 
 
 #: Alternatives that have been fitted, the best first, by the rest of a hypothesis and the name that

@@ -33,32 +33,20 @@ Start = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class RankedModel:
-    """A hypothesis in a comparison, by its last term.
+    """A hypothesis in a comparison, by its last term."""
 
-    Attributes:
-        name: name of the term.
-        fitted: the hypothesis with the term.
-        criterion: BIC at the comparison's noise.
-    """
-
-    name: str
-    fitted: FittedModel
-    criterion: float
+    name: str  #: name of the term.
+    fitted: FittedModel  #: the hypothesis with the term.
+    criterion: float  #: BIC at the comparison's noise.
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Terms that could be added to a hypothesis, compared at one noise.
+    """Terms that could be added to a hypothesis, compared at one noise."""
 
-    Attributes:
-        base: the hypothesis without any candidate.
-        ranked: the candidates, the best first.
-        held_out_gain: held-out log-likelihood that the best gains, nats, ``(n,)``.
-    """
-
-    base: FittedModel
-    ranked: tuple[RankedModel, ...]
-    held_out_gain: Floats
+    base: FittedModel  #: the hypothesis without any candidate.
+    ranked: tuple[RankedModel, ...]  #: the candidates, the best first.
+    held_out_gain: Floats  #: held-out log-likelihood that the best gains, nats, ``(n,)``.
 
 
 def compare_candidates(

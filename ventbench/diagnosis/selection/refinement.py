@@ -51,19 +51,12 @@ from ventbench.physics.catalogue import special_cases
 
 @dataclass(frozen=True, eq=False)
 class NonparametricFit:
-    """A nonparametric basis term beside mechanisms.
+    """A nonparametric basis term beside mechanisms."""
 
-    Attributes:
-        term: name of the basis term.
-        full: the model with the term and the mechanisms.
-        nats: held-out log-likelihood that the term gains.
-        places: components whose best term BIC cannot tell from it, and their weights, the largest
-            first.
-    """
-
-    term: str
-    full: FittedModel
-    nats: float
+    term: str  #: name of the basis term.
+    full: FittedModel  #: the model with the term and the mechanisms.
+    nats: float  #: held-out log-likelihood that the term gains.
+    #: components whose best term BIC cannot tell from it, and their weights, the largest first.
     places: tuple[tuple[str, float], ...] = ()
 
 

@@ -49,23 +49,15 @@ _AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Candidate:
-    """A term that may be missing.
+    """A term that may be missing."""
 
-    Attributes:
-        name: name of the term.
-        hypothesis: what it adds.
-        start: values to start a fit from, by path.
-        nats: log-likelihood that it is expected to gain.
-        white_nats: log-likelihood that it would gain if the noise were white.
-        other_starts: values at the other settings of its grid that promise something, by path: a
-            gas that rings has a local minimum for each number of periods between two samples.
-    """
-
-    name: str
-    hypothesis: Hypothesis
-    start: dict[str, float]
-    nats: float
-    white_nats: float
+    name: str  #: name of the term.
+    hypothesis: Hypothesis  #: what it adds.
+    start: dict[str, float]  #: values to start a fit from, by path.
+    nats: float  #: log-likelihood that it is expected to gain.
+    white_nats: float  #: log-likelihood that it would gain if the noise were white.
+    #: values at the other settings of its grid that promise something, by path: a gas that rings
+    #: has a local minimum for each number of periods between two samples.
     other_starts: tuple[dict[str, float], ...] = ()
 
     @property

@@ -10,19 +10,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class NonparametricComponent:
-    """A place in the physics, and the basis terms of any effect there.
+    """A place in the physics, and the basis terms of any effect there."""
 
-    Attributes:
-        name: public name, such as ``f(V)``.
-        terms: names of its basis terms, which are fitted together.
-        meaning: the component in words.
-        axis: variable that its curve depends on, with the unit.
-    """
-
-    name: str
-    terms: tuple[str, ...]
-    meaning: str
-    axis: str
+    name: str  #: public name, such as ``f(V)``.
+    terms: tuple[str, ...]  #: names of its basis terms, which are fitted together.
+    meaning: str  #: the component in words.
+    axis: str  #: variable that its curve depends on, with the unit.
 
 
 #: All nonparametric components, by public name.

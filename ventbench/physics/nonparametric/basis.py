@@ -19,13 +19,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PiecewiseLinear:
-    """Straight lines from knot to knot, and constant beyond the first and the last.
+    """Straight lines from knot to knot, and constant beyond the first and the last."""
 
-    Attributes:
-        knots: rising.
-    """
-
-    knots: tuple[float, ...]
+    knots: tuple[float, ...]  #: rising.
 
     def __call__(self, x: Array, at: Sequence[Number]) -> Array:
         """Value at ``x``, given the values at the knots."""
@@ -47,12 +43,9 @@ class PiecewiseQuadratic:
     """A smooth curve through zero whose slope is a straight line from knot to knot.
 
     Beyond the last knot it goes on straight, and so it does below the first, which is zero.
-
-    Attributes:
-        knots: rising, from 0.
     """
 
-    knots: tuple[float, ...]
+    knots: tuple[float, ...]  #: rising, from 0.
 
     def __call__(self, x: Array, slopes: Sequence[Number]) -> tuple[Array, Array]:
         """Value and slope at ``x``, given the slopes at the knots."""
@@ -81,20 +74,13 @@ def per_state(constants: tuple[float, ...], state: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A curve for a plot.
+    """A curve for a plot."""
 
-    Attributes:
-        x: argument, ``(k,)``.
-        y: values, ``(k,)``.
-        x_unit: name and unit of the argument, such as ``volume, mL``.
-        y_unit: name and unit of the values.
-        absorbed: powers of ``x`` that a change of base parameters could produce as well.
-    """
-
-    x: Floats
-    y: Floats
-    x_unit: str
-    y_unit: str
+    x: Floats  #: argument, ``(k,)``.
+    y: Floats  #: values, ``(k,)``.
+    x_unit: str  #: name and unit of the argument, such as ``volume, mL``.
+    y_unit: str  #: name and unit of the values.
+    #: powers of ``x`` that a change of base parameters could produce as well.
     absorbed: tuple[int, ...] = ()
 
 

@@ -20,23 +20,15 @@ ROLES = (
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of a known kind of file.
+    """Columns of a known kind of file."""
 
-    Attributes:
-        name: name on the command line.
-        about: what writes such files.
-        columns: role of each column.
-        units: units by role, where they are not those of the schema.
-        required: columns by which a file is recognised.
-        lead: time before the number of a breath changes at which its samples begin, s.
-    """
-
-    name: str
-    about: str
-    columns: dict[str, str]
+    name: str  #: name on the command line.
+    about: str  #: what writes such files.
+    columns: dict[str, str]  #: role of each column.
+    #: units by role, where they are not those of the schema.
     units: dict[str, str] = field(default_factory=dict)
-    required: tuple[str, ...] = ()
-    lead: float = 0.0
+    required: tuple[str, ...] = ()  #: columns by which a file is recognised.
+    lead: float = 0.0  #: time before the number of a breath changes at which its samples begin, s.
 
 
 LAYOUTS: dict[str, Layout] = {

@@ -51,23 +51,14 @@ _STANDS_STILL = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Imported:
-    """An imported recording.
+    """An imported recording."""
 
-    Attributes:
-        breaths: the breaths, in the units of the schema.
-        conversions: change of units by role.
-        columns: role of each column of the file that is used.
-        understood: what was understood, a sentence each.
-        warnings: what may be wrong, a sentence each.
-        preview: the first rows as they are written.
-    """
-
-    breaths: Breaths
-    conversions: Mapping[str, Conversion]
-    columns: Mapping[str, str]
-    understood: tuple[str, ...]
-    warnings: tuple[str, ...]
-    preview: str
+    breaths: Breaths  #: the breaths, in the units of the schema.
+    conversions: Mapping[str, Conversion]  #: change of units by role.
+    columns: Mapping[str, str]  #: role of each column of the file that is used.
+    understood: tuple[str, ...]  #: what was understood, a sentence each.
+    warnings: tuple[str, ...]  #: what may be wrong, a sentence each.
+    preview: str  #: the first rows as they are written.
 
     def __repr__(self) -> str:
         """Breaths and columns."""

@@ -60,24 +60,16 @@ _Row: TypeAlias = tuple[int, list[str]]
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns of equal length.
+    """Columns of equal length."""
 
-    Attributes:
-        file: path as the caller wrote it.
-        columns: values by name, float64 with NaN for blank, ``(m,)``; text only where no cell is a
-            number. Times of day are seconds.
-        units: units that headers state, by name.
-        lines: line of each row in a text file, ``(m,)``, else None.
-        rate: sampling rate that stands beside the columns, Hz, or None.
-        notes: what was understood, a sentence each.
-    """
-
-    file: str
+    file: str  #: path as the caller wrote it.
+    #: values by name, float64 with NaN for blank, ``(m,)``; text only where no cell is a number.
+    #: Times of day are seconds.
     columns: dict[str, NDArray[Any]]
-    units: dict[str, str] = field(default_factory=dict)
-    lines: Ints | None = None
-    rate: float | None = None
-    notes: tuple[str, ...] = ()
+    units: dict[str, str] = field(default_factory=dict)  #: units that headers state, by name.
+    lines: Ints | None = None  #: line of each row in a text file, ``(m,)``, else None.
+    rate: float | None = None  #: sampling rate that stands beside the columns, Hz, or None.
+    notes: tuple[str, ...] = ()  #: what was understood, a sentence each.
 
     def __len__(self) -> int:
         """Number of rows."""

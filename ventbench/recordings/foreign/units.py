@@ -55,17 +55,11 @@ _SPELLINGS = {
 
 @dataclass(frozen=True)
 class Conversion:
-    """An exact change of units.
+    """An exact change of units."""
 
-    Attributes:
-        unit: unit in the file.
-        to: unit of the schema.
-        factor: one ``unit`` in ``to``; its reciprocal is the exact way back.
-    """
-
-    unit: str
-    to: str
-    factor: Fraction
+    unit: str  #: unit in the file.
+    to: str  #: unit of the schema.
+    factor: Fraction  #: one ``unit`` in ``to``; its reciprocal is the exact way back.
 
     def apply(self, values: Floats) -> Floats:
         """Convert; one rounding to the nearest number at most for each of two integers."""

@@ -36,19 +36,12 @@ _CHUNK = 4_000_000
 
 @dataclass(frozen=True)
 class Summary:
-    """A sample in four numbers; NaN where they do not exist.
+    """A sample in four numbers; NaN where they do not exist."""
 
-    Attributes:
-        mean: mean of the values; NaN if there are none.
-        median: median of the values; NaN if there are none.
-        ci95: 95 % interval of the mean; ``(NaN, NaN)`` below two values.
-        count: number of values; missing ones (NaN) are not counted.
-    """
-
-    mean: float
-    median: float
-    ci95: tuple[float, float]
-    count: int
+    mean: float  #: mean of the values; NaN if there are none.
+    median: float  #: median of the values; NaN if there are none.
+    ci95: tuple[float, float]  #: 95 % interval of the mean; ``(NaN, NaN)`` below two values.
+    count: int  #: number of values; missing ones (NaN) are not counted.
 
 
 def resampled_means(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int = SEED) -> Floats:

@@ -151,23 +151,14 @@ def time_above_alarm(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> Floa
 
 
 class InspirationSignals(NamedTuple):
-    """Inspirations of T steps, and what was asked of them; shapes as of the module.
+    """Inspirations of T steps, and what was asked of them; shapes as of the module."""
 
-    Attributes:
-        pressure: true airway pressure at each step, cmH2O.
-        u_in: inspiratory valve as applied, %.
-        requested: what the controller asked for, %.
-        peep: cmH2O.
-        pip: cmH2O.
-        dt: control step, s.
-    """
-
-    pressure: Floats
-    u_in: Floats
-    requested: Floats
-    peep: Floats
-    pip: Floats
-    dt: Floats
+    pressure: Floats  #: true airway pressure at each step, cmH2O.
+    u_in: Floats  #: inspiratory valve as applied, %.
+    requested: Floats  #: what the controller asked for, %.
+    peep: Floats  #: cmH2O.
+    pip: Floats  #: cmH2O.
+    dt: Floats  #: control step, s.
 
 
 #: Takes inspirations and returns a figure of each, shape ``(...)``; NaN where it does not exist.

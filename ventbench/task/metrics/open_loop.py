@@ -87,19 +87,13 @@ WIDE_OPEN = 70.0
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """Commands of an entry on one lung, and the recordings of it.
+    """Commands of an entry on one lung, and the recordings of it."""
 
-    Attributes:
-        wide_open: share of commands at or above :data:`WIDE_OPEN`, 0..1.
-        sparse: share of commands in ranges with fewer than :data:`SPARSE_BELOW` recorded samples.
-        recorded_wide_open: recorded samples of the lung at or above :data:`WIDE_OPEN`.
-        recorded: all its recorded samples.
-    """
-
-    wide_open: float
+    wide_open: float  #: share of commands at or above :data:`WIDE_OPEN`, 0..1.
+    #: share of commands in ranges with fewer than :data:`SPARSE_BELOW` recorded samples.
     sparse: float
-    recorded_wide_open: int
-    recorded: int
+    recorded_wide_open: int  #: recorded samples of the lung at or above :data:`WIDE_OPEN`.
+    recorded: int  #: all its recorded samples.
 
 
 def command_counts(u_in: ArrayLike) -> Ints:

@@ -27,24 +27,16 @@ _SUFFIXES = (".csv", ".csv.gz", ".parquet")
 
 @dataclass(frozen=True)
 class RigRecordings:
-    """Recordings of a training.
+    """Recordings of a training."""
 
-    Attributes:
-        breaths: n breaths, the measured ones first.
-        measured: number of breaths without a blank pressure, m. Reconstructed breaths have blanks,
-            if only in their expiration.
-        fold: fold of each measured breath, ``(m,)``.
-        labels: the settings that occur, by R and C.
-        sources: SHA-256 and number of breaths of each file, by name.
-        skipped: files that are not in the public schema.
-    """
-
-    breaths: Breaths
+    breaths: Breaths  #: n breaths, the measured ones first.
+    #: number of breaths without a blank pressure, m. Reconstructed breaths have blanks, if only in
+    #: their expiration.
     measured: int
-    fold: Ints
-    labels: tuple[Lung, ...]
-    sources: dict[str, dict[str, Any]]
-    skipped: tuple[str, ...]
+    fold: Ints  #: fold of each measured breath, ``(m,)``.
+    labels: tuple[Lung, ...]  #: the settings that occur, by R and C.
+    sources: dict[str, dict[str, Any]]  #: SHA-256 and number of breaths of each file, by name.
+    skipped: tuple[str, ...]  #: files that are not in the public schema.
 
     @property
     def measured_breaths(self) -> Breaths:
@@ -149,26 +141,17 @@ SAMPLES = 33
 
 @flax.struct.dataclass
 class InspirationData:
-    """n inspirations of S samples, float64; samples after the inspiration do not count.
+    """n inspirations of S samples, float64; samples after the inspiration do not count."""
 
-    Attributes:
-        groups: setting, kind of rig and session.
-        start: first pressure, cmH2O, ``(n,)``; 0 where unknown.
-        start_known: whether it was measured, ``(n,)``.
-        u_in: commands, %, ``(n, S - 1)``.
-        dt: time for which each command is held, s, ``(n, S - 1)``.
-        pressure: pressure at the end of each command, cmH2O, ``(n, S - 1)``; 0 where it has
-            no weight.
-        share: weight of each pressure in the mean of its breath, ``(n, S - 1)``; the weights
-            of a breath add up to one.
-    """
-
-    groups: Groups
-    start: Array
-    start_known: Array
-    u_in: Array
-    dt: Array
+    groups: Groups  #: setting, kind of rig and session.
+    start: Array  #: first pressure, cmH2O, ``(n,)``; 0 where unknown.
+    start_known: Array  #: whether it was measured, ``(n,)``.
+    u_in: Array  #: commands, %, ``(n, S - 1)``.
+    dt: Array  #: time for which each command is held, s, ``(n, S - 1)``.
+    #: pressure at the end of each command, cmH2O, ``(n, S - 1)``; 0 where it has no weight.
     pressure: Array
+    #: weight of each pressure in the mean of its breath, ``(n, S - 1)``; the weights of a breath
+    #: add up to one.
     share: Array
 
 
@@ -234,23 +217,15 @@ def inspirations(
 
 @flax.struct.dataclass
 class WholeBreaths:
-    """n measured breaths of T samples, float64; pressure 0 where none is known.
+    """n measured breaths of T samples, float64; pressure 0 where none is known."""
 
-    Attributes:
-        groups: setting, kind of rig and session.
-        pressure: cmH2O, shape ``(n, T)``.
-        u_in: inspiratory valve, %, shape ``(n, T)``.
-        u_out: expiratory valve, 0/1, shape ``(n, T)``.
-        dt: time for which each command is held, s, shape ``(n, T)``.
-        share: weight of each sample in the error of its breath, shape ``(n, T)``: the inspiration
-            adds up to one, and so does the expiration; all 0 for a breath that cannot be used.
-    """
-
-    groups: Groups
-    pressure: Array
-    u_in: Array
-    u_out: Array
-    dt: Array
+    groups: Groups  #: setting, kind of rig and session.
+    pressure: Array  #: cmH2O, shape ``(n, T)``.
+    u_in: Array  #: inspiratory valve, %, shape ``(n, T)``.
+    u_out: Array  #: expiratory valve, 0/1, shape ``(n, T)``.
+    dt: Array  #: time for which each command is held, s, shape ``(n, T)``.
+    #: weight of each sample in the error of its breath, shape ``(n, T)``: the inspiration adds up
+    #: to one, and so does the expiration; all 0 for a breath that cannot be used.
     share: Array
 
 

@@ -30,59 +30,36 @@ CHUNK = 20
 
 @flax.struct.dataclass
 class Noise:
-    """What differs from breath to breath.
+    """What differs from breath to breath."""
 
-    Attributes:
-        pressure: scale of the error of a sample, cmH2O.
-        independent: samples of a breath that count as independent; errors of neighbours are alike.
-        saturation: breaths whose mean error is larger count less and less, cmH2O.
-        gain: scale of the logarithm of a breath's gain.
-        start: scale of the start of a breath around its recorded first pressure, cmH2O.
-        unknown_start: mean of first pressures that were not recorded, cmH2O.
-        unknown_start_scale: scale of one of those around the mean of its rig, cmH2O.
-        rig_start: standard deviation of a rig's mean first pressure around that, cmH2O.
-    """
-
-    pressure: float = 0.25
+    pressure: float = 0.25  #: scale of the error of a sample, cmH2O.
+    #: samples of a breath that count as independent; errors of neighbours are alike.
     independent: float = 10.0
-    saturation: float = 1.5
-    gain: float = 0.02
-    start: float = 0.2
-    unknown_start: float = 6.0
-    unknown_start_scale: float = 0.5
-    rig_start: float = 0.6
+    saturation: float = 1.5  #: breaths whose mean error is larger count less and less, cmH2O.
+    gain: float = 0.02  #: scale of the logarithm of a breath's gain.
+    start: float = 0.2  #: scale of the start of a breath around its recorded first pressure, cmH2O.
+    unknown_start: float = 6.0  #: mean of first pressures that were not recorded, cmH2O.
+    unknown_start_scale: float = 0.5  #: scale of one of those around the mean of its rig, cmH2O.
+    rig_start: float = 0.6  #: standard deviation of a rig's mean first pressure around that, cmH2O.
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Settings of the optimisation; hashable, since they are static in compiled functions.
+    """Settings of the optimisation; hashable, since they are static in compiled functions."""
 
-    Attributes:
-        iterations: iterations of Adam, a multiple of ``CHUNK``.
-        learning_rate: peak of the cosine schedule.
-        softness: error below which the loss turns from absolute to square, cmH2O.
-    """
-
-    iterations: int = 160
-    learning_rate: float = 0.05
-    softness: float = 0.1
+    iterations: int = 160  #: iterations of Adam, a multiple of ``CHUNK``.
+    learning_rate: float = 0.05  #: peak of the cosine schedule.
+    softness: float = 0.1  #: error below which the loss turns from absolute to square, cmH2O.
 
 
 @flax.struct.dataclass
 class Fitted:
-    """The fitted quantities.
+    """The fitted quantities."""
 
-    Attributes:
-        pooled: parameters of valves, lungs and rigs.
-        gain: logarithm of each breath's gain, ``(n,)``.
-        start: deviation of each breath's start, cmH2O, ``(n,)``.
-        rig_start: mean first pressure of each rig where it was not recorded, cmH2O, ``(J,)``.
-    """
-
-    pooled: Pooled
-    gain: Array
-    start: Array
-    rig_start: Array
+    pooled: Pooled  #: parameters of valves, lungs and rigs.
+    gain: Array  #: logarithm of each breath's gain, ``(n,)``.
+    start: Array  #: deviation of each breath's start, cmH2O, ``(n,)``.
+    rig_start: Array  #: mean first pressure of each rig where it was not recorded, cmH2O, ``(J,)``.
 
 
 def simulate(plant: Hybrid, start: Array, data: InspirationData) -> Array:

@@ -75,36 +75,23 @@ def label_gain(R: float, label: float, laminar_share: float) -> float:
 
 @dataclass(frozen=True)
 class LabelTest:
-    """What the test of one session found.
+    """What the test of one session found."""
 
-    Attributes:
-        session: index of the session.
-        lung: its label.
-        measured: breaths whose pressure was measured.
-        breaths: all its breaths.
-        R: resistance at :data:`REFERENCE_FLOW` with the fitted gain, cmH2O/(L/s).
-        R_interval: 95 % interval of it.
-        C: chord compliance over :data:`CHORD` with the fitted gain, mL/cmH2O.
-        C_interval: 95 % interval of it.
-        laminar_share: largest part of the labelled resistance that does not depend on the flow; an
-            orifice has none, and a linear resistor has 1.
-        error_own_label: median error of its breaths by its own label, cmH2O.
-        best_other_label: the label that explains them best among the others; None if there is none.
-        error_best_other_label: median error by that one, cmH2O.
-    """
-
-    session: int
-    lung: Lung
-    measured: int
-    breaths: int
-    R: float
-    R_interval: tuple[float, float]
-    C: float
-    C_interval: tuple[float, float]
+    session: int  #: index of the session.
+    lung: Lung  #: its label.
+    measured: int  #: breaths whose pressure was measured.
+    breaths: int  #: all its breaths.
+    R: float  #: resistance at :data:`REFERENCE_FLOW` with the fitted gain, cmH2O/(L/s).
+    R_interval: tuple[float, float]  #: 95 % interval of it.
+    C: float  #: chord compliance over :data:`CHORD` with the fitted gain, mL/cmH2O.
+    C_interval: tuple[float, float]  #: 95 % interval of it.
+    #: largest part of the labelled resistance that does not depend on the flow; an orifice has
+    #: none, and a linear resistor has 1.
     laminar_share: float
-    error_own_label: float
+    error_own_label: float  #: median error of its breaths by its own label, cmH2O.
+    #: the label that explains them best among the others; None if there is none.
     best_other_label: str | None
-    error_best_other_label: float | None
+    error_best_other_label: float | None  #: median error by that one, cmH2O.
 
     @property
     def _shares(self) -> tuple[float, ...]:

@@ -45,66 +45,37 @@ class Groups:
 
 @flax.struct.dataclass
 class Pooled:
-    """Unconstrained parameters; L settings, G kinds of rig, J sessions. Logarithms unless said.
+    """Unconstrained parameters; L settings, G kinds of rig, J sessions. Logarithms unless said."""
 
-    Attributes:
-        slopes: slopes of the valve's curve, L/s per %, shape ``(13,)``.
-        slopes_rig: deviation that is added to the slopes for a kind of rig, ``(G, 13)``.
-        R: laminar resistance, cmH2O/(L/s), ``(L,)``.
-        K2: quadratic resistance, cmH2O s2/L2, ``(L,)``.
-        E: elastance, cmH2O/L, ``(L,)``.
-        stiffening: ratio of the elastic curve's slope to that below each knot, ``(L, 5)``.
-        offset: elastic recoil minus pressure at rest, cmH2O, no logarithm, ``(L,)``.
-        direction: odds of the plays' weights, ``(G, 3)``.
-        rising: shift of the reading while the command rises, cmH2O, ``(G,)``.
-        falling: shift of the reading while the command falls, cmH2O, ``(G,)``.
-        valve_delay: dead time of the inspiratory valve, s, ``(G,)``.
-        valve_lag: time constant of the inspiratory valve, s, ``(G,)``.
-        sensor_lag: time constant of the sensor, s, ``(G,)``.
-        closing_delay: delay of the expiratory valve when it closes, s, ``(G,)``.
-        opening_delay: delay of the expiratory valve when it opens, s, ``(G,)``.
-        circuit_compliance: compliance of tubing and dead space, L/cmH2O, ``(G,)``.
-        conductance: conductance of the open expiratory valve, L/s per cmH2O, ``(G,)``.
-        closing_conductance: conductance of the expiratory valve while it closes, L/s per cmH2O,
-            ``(G,)``.
-        rest: command that held the flow before the first sample, %, ``()``.
-        session_gain: deviation that is added to all slopes, ``(J,)``.
-        session_R: deviation that is added to both resistances, ``(J,)``.
-        session_K2: deviation that is added to the quadratic resistance, ``(J,)``.
-        session_E: deviation that is added to the elastance, ``(J,)``.
-        session_offset: deviation that is added to the offset, cmH2O, no logarithm, ``(J,)``.
-        session_conductance: deviation that is added to the conductance, ``(J,)``.
-        session_closing_conductance: deviation that is added to the closing conductance, ``(J,)``.
-        closing_lag: time constant with which the expiratory valve closes, s, ``(G,)``.
-    """
-
-    slopes: Array
-    slopes_rig: Array
-    R: Array
-    K2: Array
-    E: Array
-    stiffening: Array
-    offset: Array
-    direction: Array
-    rising: Array
-    falling: Array
-    valve_delay: Array
-    valve_lag: Array
-    sensor_lag: Array
-    closing_delay: Array
-    opening_delay: Array
-    circuit_compliance: Array
-    conductance: Array
+    slopes: Array  #: slopes of the valve's curve, L/s per %, shape ``(13,)``.
+    slopes_rig: Array  #: deviation that is added to the slopes for a kind of rig, ``(G, 13)``.
+    R: Array  #: laminar resistance, cmH2O/(L/s), ``(L,)``.
+    K2: Array  #: quadratic resistance, cmH2O s2/L2, ``(L,)``.
+    E: Array  #: elastance, cmH2O/L, ``(L,)``.
+    stiffening: Array  #: ratio of the elastic curve's slope to that below each knot, ``(L, 5)``.
+    offset: Array  #: elastic recoil minus pressure at rest, cmH2O, no logarithm, ``(L,)``.
+    direction: Array  #: odds of the plays' weights, ``(G, 3)``.
+    rising: Array  #: shift of the reading while the command rises, cmH2O, ``(G,)``.
+    falling: Array  #: shift of the reading while the command falls, cmH2O, ``(G,)``.
+    valve_delay: Array  #: dead time of the inspiratory valve, s, ``(G,)``.
+    valve_lag: Array  #: time constant of the inspiratory valve, s, ``(G,)``.
+    sensor_lag: Array  #: time constant of the sensor, s, ``(G,)``.
+    closing_delay: Array  #: delay of the expiratory valve when it closes, s, ``(G,)``.
+    opening_delay: Array  #: delay of the expiratory valve when it opens, s, ``(G,)``.
+    circuit_compliance: Array  #: compliance of tubing and dead space, L/cmH2O, ``(G,)``.
+    conductance: Array  #: conductance of the open expiratory valve, L/s per cmH2O, ``(G,)``.
+    #: conductance of the expiratory valve while it closes, L/s per cmH2O, ``(G,)``.
     closing_conductance: Array
-    rest: Array
-    session_gain: Array
-    session_R: Array
-    session_K2: Array
-    session_E: Array
-    session_offset: Array
-    session_conductance: Array
+    rest: Array  #: command that held the flow before the first sample, %, ``()``.
+    session_gain: Array  #: deviation that is added to all slopes, ``(J,)``.
+    session_R: Array  #: deviation that is added to both resistances, ``(J,)``.
+    session_K2: Array  #: deviation that is added to the quadratic resistance, ``(J,)``.
+    session_E: Array  #: deviation that is added to the elastance, ``(J,)``.
+    session_offset: Array  #: deviation that is added to the offset, cmH2O, no logarithm, ``(J,)``.
+    session_conductance: Array  #: deviation that is added to the conductance, ``(J,)``.
+    #: deviation that is added to the closing conductance, ``(J,)``.
     session_closing_conductance: Array
-    closing_lag: Array
+    closing_lag: Array  #: time constant with which the expiratory valve closes, s, ``(G,)``.
 
 
 def direction(pooled: Pooled) -> Array:
@@ -180,48 +151,28 @@ class Scales:
     """Standard deviations of the prior; of logarithms unless a unit is named.
 
     Those of rigs are the spread of the public recordings' rigs that are what their label says.
-
-    Attributes:
-        sheet: flow at 100 % around the data sheet.
-        smoothness: difference between neighbouring slopes of the valve's curve.
-        valve_rig: what a kind of valve adds to the slopes.
-        smoothness_rig: difference between neighbouring additions of a kind of valve.
-        compliance: compliance of a lung around its label.
-        resistance: both resistances of a lung around their label.
-        spring: elastances of lungs of one labelled compliance around their mean, relative to label.
-        resistor: resistances of lungs of one labelled resistance around their mean.
-        stiffening: change of the elastic curve's slope at a knot.
-        offset: elastic recoil minus pressure at rest, of a lung, cmH2O.
-        kind: delays, lags, circuit and expiratory valve of a kind of rig.
-        direction: weights of the plays, no logarithm.
-        reading: shift of the reading by the direction of the command, cmH2O.
-        rig_gain: gain of the valve of a rig.
-        rig_resistance: both resistances of a rig.
-        rig_quadratic: further deviation of a rig's quadratic resistance.
-        rig_elastance: elastance of a rig.
-        rig_offset: offset of a rig, cmH2O.
-        rig_expiration: conductances of a rig's expiratory valve.
     """
 
-    sheet: float = 0.25
-    smoothness: float = 0.5
-    valve_rig: float = 0.2
-    smoothness_rig: float = 0.15
-    compliance: float = 0.1
-    resistance: float = 0.5
+    sheet: float = 0.25  #: flow at 100 % around the data sheet.
+    smoothness: float = 0.5  #: difference between neighbouring slopes of the valve's curve.
+    valve_rig: float = 0.2  #: what a kind of valve adds to the slopes.
+    smoothness_rig: float = 0.15  #: difference between neighbouring additions of a kind of valve.
+    compliance: float = 0.1  #: compliance of a lung around its label.
+    resistance: float = 0.5  #: both resistances of a lung around their label.
+    #: elastances of lungs of one labelled compliance around their mean, relative to label.
     spring: float = 0.1
-    resistor: float = 0.2
-    stiffening: float = 0.3
-    offset: float = 1.0
-    kind: float = 1.0
-    direction: float = 0.2
-    reading: float = 0.5
-    rig_gain: float = 0.05
-    rig_resistance: float = 0.1
-    rig_quadratic: float = 0.15
-    rig_elastance: float = 0.06
-    rig_offset: float = 0.3
-    rig_expiration: float = 0.3
+    resistor: float = 0.2  #: resistances of lungs of one labelled resistance around their mean.
+    stiffening: float = 0.3  #: change of the elastic curve's slope at a knot.
+    offset: float = 1.0  #: elastic recoil minus pressure at rest, of a lung, cmH2O.
+    kind: float = 1.0  #: delays, lags, circuit and expiratory valve of a kind of rig.
+    direction: float = 0.2  #: weights of the plays, no logarithm.
+    reading: float = 0.5  #: shift of the reading by the direction of the command, cmH2O.
+    rig_gain: float = 0.05  #: gain of the valve of a rig.
+    rig_resistance: float = 0.1  #: both resistances of a rig.
+    rig_quadratic: float = 0.15  #: further deviation of a rig's quadratic resistance.
+    rig_elastance: float = 0.06  #: elastance of a rig.
+    rig_offset: float = 0.3  #: offset of a rig, cmH2O.
+    rig_expiration: float = 0.3  #: conductances of a rig's expiratory valve.
 
 
 #: Scale of each field that has one of its own around its centre. ``None`` marks heavy tails.
@@ -247,20 +198,13 @@ _HEAVY_TAILED = {
 
 @flax.struct.dataclass
 class Centre:
-    """Centre of the prior, at which a fit starts.
+    """Centre of the prior, at which a fit starts."""
 
-    Attributes:
-        pooled: the parameters.
-        sheet_flow: logarithm of the flow at 100 %, L/s, ``()``.
-        same_resistor: share of each lung in the mean of those with its labelled resistance,
-            ``(L, L)``.
-        same_spring: the same for labelled compliances, ``(L, L)``.
-    """
-
-    pooled: Pooled
-    sheet_flow: Array
+    pooled: Pooled  #: the parameters.
+    sheet_flow: Array  #: logarithm of the flow at 100 %, L/s, ``()``.
+    #: share of each lung in the mean of those with its labelled resistance, ``(L, L)``.
     same_resistor: Array
-    same_spring: Array
+    same_spring: Array  #: the same for labelled compliances, ``(L, L)``.
 
 
 def centre(labels: Sequence[Lung], sessions: int, laminar_share: float = LAMINAR_SHARE) -> Centre:

@@ -201,27 +201,16 @@ def scales() -> Floats:
 
 @dataclass(frozen=True)
 class FittedPopulation:
-    """A fitted population and what it was fitted to.
+    """A fitted population and what it was fitted to."""
 
-    Attributes:
-        sessions: indices of the J sessions.
-        lungs: id of the lung of each.
-        units: what each session says of its rig.
-        prior: of the fit.
-        population: the fit.
-        gain: logarithm of each measured breath's gain around its session's median, ``(m,)``.
-        gain_sd: standard deviation of it within sessions.
-        gain_lag: correlation of it between neighbours in the files' order.
-    """
-
-    sessions: tuple[int, ...]
-    lungs: tuple[str, ...]
-    units: Units
-    prior: Prior
-    population: Population
-    gain: Floats
-    gain_sd: float
-    gain_lag: float
+    sessions: tuple[int, ...]  #: indices of the J sessions.
+    lungs: tuple[str, ...]  #: id of the lung of each.
+    units: Units  #: what each session says of its rig.
+    prior: Prior  #: of the fit.
+    population: Population  #: the fit.
+    gain: Floats  #: logarithm of each measured breath's gain around its session's median, ``(m,)``.
+    gain_sd: float  #: standard deviation of it within sessions.
+    gain_lag: float  #: correlation of it between neighbours in the files' order.
 
     def left_out(self) -> list[float]:
         """:func:`~ventbench.train.rigs.random_effects.surprise` of each session by the others."""

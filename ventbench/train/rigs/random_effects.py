@@ -23,17 +23,11 @@ from ventbench.base.arrays import Floats
 
 @dataclass(frozen=True)
 class Units:
-    """What the data of J units say of p parameters.
+    """What the data of J units say of p parameters."""
 
-    Attributes:
-        information: ``A_j``, shape ``(J, p, p)``.
-        weighted: ``b_j``, shape ``(J, p)``.
-        design: ``X_j``, shape ``(J, p, q)``.
-    """
-
-    information: Floats
-    weighted: Floats
-    design: Floats
+    information: Floats  #: ``A_j``, shape ``(J, p, p)``.
+    weighted: Floats  #: ``b_j``, shape ``(J, p)``.
+    design: Floats  #: ``X_j``, shape ``(J, p, q)``.
 
     def without(self, j: int) -> Units:
         """All units but one."""
@@ -42,38 +36,24 @@ class Units:
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of :func:`fit`.
+    """Prior of :func:`fit`."""
 
-    Attributes:
-        scale: standard deviations of the parameters between units, shape ``(p,)``.
-        units: how many units each scale counts for, shape ``(p,)``; infinity for one that is given.
-        uncorrelated: how many units count for no correlation between parameters.
-        centre: of ``beta``, shape ``(q,)``.
-        centre_scale: standard deviations of ``beta`` around it, shape ``(q,)``.
-    """
-
-    scale: Floats
+    scale: Floats  #: standard deviations of the parameters between units, shape ``(p,)``.
+    #: how many units each scale counts for, shape ``(p,)``; infinity for one that is given.
     units: Floats
-    uncorrelated: float
-    centre: Floats
-    centre_scale: Floats
+    uncorrelated: float  #: how many units count for no correlation between parameters.
+    centre: Floats  #: of ``beta``, shape ``(q,)``.
+    centre_scale: Floats  #: standard deviations of ``beta`` around it, shape ``(q,)``.
 
 
 @dataclass(frozen=True)
 class Population:
-    """Result of a fit.
+    """Result of a fit."""
 
-    Attributes:
-        beta: shape ``(q,)``.
-        beta_covariance: shape ``(q, q)``.
-        covariance: ``Sigma``, shape ``(p, p)``.
-        units: posterior means of ``theta_j``, shape ``(J, p)``.
-    """
-
-    beta: Floats
-    beta_covariance: Floats
-    covariance: Floats
-    units: Floats
+    beta: Floats  #: shape ``(q,)``.
+    beta_covariance: Floats  #: shape ``(q, q)``.
+    covariance: Floats  #: ``Sigma``, shape ``(p, p)``.
+    units: Floats  #: posterior means of ``theta_j``, shape ``(J, p)``.
 
     def predictive(self, design: Floats) -> tuple[Floats, Floats]:
         """Mean and covariance of a new unit with a design ``(..., p, q)``."""

@@ -83,26 +83,19 @@ _RESAMPLED_ITERATIONS = 100
 
 @dataclass(frozen=True)
 class RigConfig:
-    """Settings of the training.
+    """Settings of the training."""
 
-    Attributes:
-        folds: folds of the cross-validation, and members of the ensemble beside the scored one.
-        resamples: fits to resampled breaths, for intervals.
-        reconstructed: weight of a breath whose pressure is partly blank; a measured one has 1.
-        unlisted: weight of a breath of a lung that is not listed.
-        seed: seed of folds, drawn priors and resampling.
-        laminar_share: part of the labelled resistance that does not depend on the flow, around
-            which the prior of the resistances lies: 0.4 as in a QuickLung, 1 for a linear resistor.
-        fit: settings of the optimisation.
-    """
-
+    #: folds of the cross-validation, and members of the ensemble beside the scored one.
     folds: int = 5
-    resamples: int = 3
+    resamples: int = 3  #: fits to resampled breaths, for intervals.
+    #: weight of a breath whose pressure is partly blank; a measured one has 1.
     reconstructed: float = 0.4
-    unlisted: float = 0.2
-    seed: int = 0
+    unlisted: float = 0.2  #: weight of a breath of a lung that is not listed.
+    seed: int = 0  #: seed of folds, drawn priors and resampling.
+    #: part of the labelled resistance that does not depend on the flow, around which the prior of
+    #: the resistances lies: 0.4 as in a QuickLung, 1 for a linear resistor.
     laminar_share: float = LAMINAR_SHARE
-    fit: FitConfig = field(default_factory=FitConfig)
+    fit: FitConfig = field(default_factory=FitConfig)  #: settings of the optimisation.
 
     def __post_init__(self) -> None:
         """Refuse a share that is none.
@@ -241,21 +234,13 @@ def _arrange(
 
 @dataclass(frozen=True)
 class _Fits:
-    """All fits of a training.
+    """All fits of a training."""
 
-    Attributes:
-        scored: fit to all breaths.
-        members: fits without each fold.
-        resampled: fits to resampled breaths.
-        without_rigs: fits without the sessions of each round.
-        tests: tests of the labels of all sessions.
-    """
-
-    scored: Fitted
-    members: list[Fitted]
-    resampled: list[Fitted]
-    without_rigs: list[Fitted]
-    tests: list[LabelTest]
+    scored: Fitted  #: fit to all breaths.
+    members: list[Fitted]  #: fits without each fold.
+    resampled: list[Fitted]  #: fits to resampled breaths.
+    without_rigs: list[Fitted]  #: fits without the sessions of each round.
+    tests: list[LabelTest]  #: tests of the labels of all sessions.
 
 
 def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progress) -> _Fits:

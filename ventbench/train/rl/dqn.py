@@ -19,21 +19,13 @@ from ventbench.train.rl import episodes
 
 @flax.struct.dataclass
 class Replay:
-    """Steps to learn from, the oldest overwritten first; N of them.
+    """Steps to learn from, the oldest overwritten first; N of them."""
 
-    Attributes:
-        features: features before the choice, ``(N, features)``.
-        choice: index into the corrections, ``(N,)``.
-        reward: discounted sum of the next rewards, ``(N,)``.
-        discount: discount of what follows them; 0 where the breath ends, ``(N,)``.
-        following: features then, ``(N, features)``.
-    """
-
-    features: Array
-    choice: Array
-    reward: Array
-    discount: Array
-    following: Array
+    features: Array  #: features before the choice, ``(N, features)``.
+    choice: Array  #: index into the corrections, ``(N,)``.
+    reward: Array  #: discounted sum of the next rewards, ``(N,)``.
+    discount: Array  #: discount of what follows them; 0 where the breath ends, ``(N,)``.
+    following: Array  #: features then, ``(N, features)``.
 
 
 @flax.struct.dataclass
@@ -50,37 +42,23 @@ class DQNState:
 
 @dataclass(frozen=True)
 class DQN:
-    """Settings; one iteration is some breaths into the replay, then some updates.
+    """Settings; one iteration is some breaths into the replay, then some updates."""
 
-    Attributes:
-        breaths: breaths of an iteration, three an episode.
-        iterations: iterations of a training, over which the learning rate falls to zero.
-        learning_rate: initial learning rate of Adam.
-        vary: draw cells with noise and deviations; false for nominal ones.
-        widths: hidden layers of the network.
-        updates: updates of an iteration.
-        batch: steps of an update.
-        memory: breaths that the replay holds.
-        discount: factor of a reward one step later.
-        steps: rewards that are summed before the value of the next state is added.
-        follow: share by which the target network moves to the online network at each update.
-        explore: share of random choices, at the start and at the end.
-        explored: share of the training after which exploration has reached its end.
-    """
-
-    breaths: int = 24
-    iterations: int = 2400
-    learning_rate: float = 3e-3
-    vary: bool = True
-    widths: tuple[int, ...] = (64, 64)
-    updates: int = 8
-    batch: int = 256
-    memory: int = 2400
-    discount: float = 0.95
-    steps: int = 1
+    breaths: int = 24  #: breaths of an iteration, three an episode.
+    iterations: int = 2400  #: iterations of a training, over which the learning rate falls to zero.
+    learning_rate: float = 3e-3  #: initial learning rate of Adam.
+    vary: bool = True  #: draw cells with noise and deviations; false for nominal ones.
+    widths: tuple[int, ...] = (64, 64)  #: hidden layers of the network.
+    updates: int = 8  #: updates of an iteration.
+    batch: int = 256  #: steps of an update.
+    memory: int = 2400  #: breaths that the replay holds.
+    discount: float = 0.95  #: factor of a reward one step later.
+    steps: int = 1  #: rewards that are summed before the value of the next state is added.
+    #: share by which the target network moves to the online network at each update.
     follow: float = 0.01
+    #: share of random choices, at the start and at the end.
     explore: tuple[float, float] = (1.0, 0.05)
-    explored: float = 0.4
+    explored: float = 0.4  #: share of the training after which exploration has reached its end.
 
     @property
     def network(self) -> TanhNetwork:

@@ -40,45 +40,28 @@ OBSERVATION = 5 + protocol.TARGETS_AHEAD
 
 @flax.struct.dataclass
 class Episode:
-    """What stays the same in an episode.
+    """What stays the same in an episode."""
 
-    Attributes:
-        plant: of the rig, without the deviations of the cell.
-        cell: PIP, deviations and noise, hidden from the controller.
-        weight: of errors, see :class:`ventbench.train.plants.TrainingPlants`.
-    """
-
-    plant: Any
-    cell: Scenario
-    weight: Array
+    plant: Any  #: of the rig, without the deviations of the cell.
+    cell: Scenario  #: PIP, deviations and noise, hidden from the controller.
+    weight: Array  #: of errors, see :class:`ventbench.train.plants.TrainingPlants`.
 
 
 @flax.struct.dataclass
 class Progress:
-    """What a command changes.
+    """What a command changes."""
 
-    Attributes:
-        loop: state of the breath.
-        error: sum of ``|pressure - PIP|`` over the scored steps so far, cmH2O.
-    """
-
-    loop: env.LoopState
-    error: Array
+    loop: env.LoopState  #: state of the breath.
+    error: Array  #: sum of ``|pressure - PIP|`` over the scored steps so far, cmH2O.
 
 
 @flax.struct.dataclass
 class State:
-    """One environment in mid-episode.
+    """One environment in mid-episode."""
 
-    Attributes:
-        episode: what stays the same.
-        progress: what changes.
-        count: commands so far.
-    """
-
-    episode: Episode
-    progress: Progress
-    count: Array
+    episode: Episode  #: what stays the same.
+    progress: Progress  #: what changes.
+    count: Array  #: commands so far.
 
 
 def load_lungs(simulator: Given = "frozen", *, rigs: Literal["training", "reference"]) -> Lungs:

@@ -35,15 +35,10 @@ Act = Callable[[Array, Array, Array], tuple[Array, Any]]
 
 @flax.struct.dataclass
 class Lungs:
-    """Lungs to learn on; see :class:`ventbench.train.plants.TrainingPlants`.
+    """Lungs to learn on; see :class:`ventbench.train.plants.TrainingPlants`."""
 
-    Attributes:
-        plants: K plants of each of L lungs, the nominal one first, leaves ``(K, L, ...)``.
-        weights: of the error of each lung at each PIP, ``(L, P)``.
-    """
-
-    plants: Any
-    weights: Array
+    plants: Any  #: K plants of each of L lungs, the nominal one first, leaves ``(K, L, ...)``.
+    weights: Array  #: of the error of each lung at each PIP, ``(L, P)``.
 
     @property
     def nominal(self) -> Any:
@@ -58,17 +53,11 @@ class Lungs:
 
 @flax.struct.dataclass
 class Episodes:
-    """Cells to run, E of them, each with its plant.
+    """Cells to run, E of them, each with its plant."""
 
-    Attributes:
-        plants: leaves ``(E, ...)``.
-        cells: E cells.
-        weight: of the errors in each, ``(E,)``.
-    """
-
-    plants: Any
-    cells: Scenario
-    weight: Array
+    plants: Any  #: leaves ``(E, ...)``.
+    cells: Scenario  #: E cells.
+    weight: Array  #: of the errors in each, ``(E,)``.
 
 
 def draw(

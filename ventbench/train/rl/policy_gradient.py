@@ -29,21 +29,13 @@ class PolicyGradientState:
 
 @dataclass(frozen=True)
 class PolicyGradient:
-    """Settings; one iteration is one update.
+    """Settings; one iteration is one update."""
 
-    Attributes:
-        breaths: breaths of an update, three an episode, PIPs in turn.
-        iterations: iterations of a training, over which the learning rate falls to zero.
-        learning_rate: initial learning rate of Adam.
-        vary: draw cells with noise and deviations; false for nominal ones.
-        widths: hidden layers of the network.
-    """
-
-    breaths: int = 6
-    iterations: int = 1600
-    learning_rate: float = 3e-3
-    vary: bool = True
-    widths: tuple[int, ...] = (32, 32)
+    breaths: int = 6  #: breaths of an update, three an episode, PIPs in turn.
+    iterations: int = 1600  #: iterations of a training, over which the learning rate falls to zero.
+    learning_rate: float = 3e-3  #: initial learning rate of Adam.
+    vary: bool = True  #: draw cells with noise and deviations; false for nominal ones.
+    widths: tuple[int, ...] = (32, 32)  #: hidden layers of the network.
 
     @property
     def network(self) -> TanhNetwork:

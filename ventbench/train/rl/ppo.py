@@ -51,35 +51,20 @@ def clipped_loss(ratio: Array, advantage: Array, clip: float) -> Array:
 
 @dataclass(frozen=True)
 class PPO:
-    """Settings; one iteration is one batch of breaths, used ``epochs`` times.
+    """Settings; one iteration is one batch of breaths, used ``epochs`` times."""
 
-    Attributes:
-        breaths: breaths of an iteration, three an episode.
-        iterations: iterations of a training, over which the learning rate falls to zero.
-        learning_rate: initial learning rate of Adam.
-        vary: draw cells with noise and deviations; false for nominal ones.
-        widths: hidden layers of both networks.
-        epochs: passes over a batch.
-        minibatches: minibatches of a pass.
-        discount: factor of a reward one step later.
-        trace: lambda of the generalised advantage estimates.
-        clip: limit of the change of the ratio of probabilities.
-        spread: initial standard deviation of the policy, in units of ``SCALE``.
-        entropy: weight of the entropy in the loss.
-    """
-
-    breaths: int = 96
-    iterations: int = 600
-    learning_rate: float = 1e-3
-    vary: bool = True
-    widths: tuple[int, ...] = (32, 32)
-    epochs: int = 6
-    minibatches: int = 4
-    discount: float = 0.95
-    trace: float = 0.9
-    clip: float = 0.2
-    spread: float = 0.3
-    entropy: float = 0.0
+    breaths: int = 96  #: breaths of an iteration, three an episode.
+    iterations: int = 600  #: iterations of a training, over which the learning rate falls to zero.
+    learning_rate: float = 1e-3  #: initial learning rate of Adam.
+    vary: bool = True  #: draw cells with noise and deviations; false for nominal ones.
+    widths: tuple[int, ...] = (32, 32)  #: hidden layers of both networks.
+    epochs: int = 6  #: passes over a batch.
+    minibatches: int = 4  #: minibatches of a pass.
+    discount: float = 0.95  #: factor of a reward one step later.
+    trace: float = 0.9  #: lambda of the generalised advantage estimates.
+    clip: float = 0.2  #: limit of the change of the ratio of probabilities.
+    spread: float = 0.3  #: initial standard deviation of the policy, in units of ``SCALE``.
+    entropy: float = 0.0  #: weight of the entropy in the loss.
 
     @property
     def network(self) -> TanhNetwork:

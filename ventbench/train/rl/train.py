@@ -88,25 +88,18 @@ class _Run:
 
 @dataclass(frozen=True)
 class TrainedPolicies:
-    """R finished trainings.
+    """R finished trainings."""
 
-    Attributes:
-        policies: the best of each, leaves ``(R, ...)``.
-        validation: errors of the policies on fresh cells with noise, cmH2O, ``(R,)``.
-        episodes: breaths that a run had seen at each point of its curve, ``(points,)``.
-        curves: nominal error of the policy then, cmH2O, ``(R, points)``.
-        validation_curves: error of the policy on the fresh cells, cmH2O, ``(R, points)``.
-        seconds: computing time of all runs together until each point, without compiling,
-            ``(points,)``.
-        compile_seconds: time of compiling, which comes first, with the chunk that is run for it, s.
-    """
-
-    policies: Any
+    policies: Any  #: the best of each, leaves ``(R, ...)``.
+    #: errors of the policies on fresh cells with noise, cmH2O, ``(R,)``.
     validation: NDArray[np.float32]
-    episodes: Ints
-    curves: NDArray[np.float32]
+    episodes: Ints  #: breaths that a run had seen at each point of its curve, ``(points,)``.
+    curves: NDArray[np.float32]  #: nominal error of the policy then, cmH2O, ``(R, points)``.
+    #: error of the policy on the fresh cells, cmH2O, ``(R, points)``.
     validation_curves: NDArray[np.float32]
+    #: computing time of all runs together until each point, without compiling, ``(points,)``.
     seconds: Floats
+    #: time of compiling, which comes first, with the chunk that is run for it, s.
     compile_seconds: float
 
 

@@ -43,7 +43,7 @@ from ventbench.train.plants import ALL, TrainedControllers, check_names, plants_
 
 @dataclass(frozen=True)
 class ResidualConfig:
-    """Settings of the training of residual controllers; hashable, for they are static in ``jit``."""
+    """Settings of the training of residual controllers; hashable, as they are static in ``jit``."""
 
     updates: int = 3000  #: number of updates of the network; the schedule stretches over them.
     copies: int = 6  #: runs of each lung at each PIP in an update.

@@ -121,7 +121,7 @@ def main() -> None:
         "log loss of terms left out, nats": [round(each["loss"], 3) for each in found],
         "by frequencies alone": round(float(alone), 3),
     }  # fmt: skip
-    plain = {
+    plain: dict[str, Any] = {
         name: np.stack([np.asarray(each[name], np.float32) for each in found])
         for name in ("w1", "b1", "w2", "b2")
     }
@@ -131,7 +131,7 @@ def main() -> None:
         mean=mean,
         sd=sd,
         terms=TERM,
-        about=json.dumps(about),  # type: ignore[arg-type]
+        about=json.dumps(about),
     )
     print(f"{WEIGHTS}: {hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()} {about}")
 

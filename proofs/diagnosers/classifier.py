@@ -113,7 +113,7 @@ def summaries(breaths: Breaths) -> Floats:
     n = np.broadcast_to(np.linspace(-1.0, 1.0, len(u))[:, None], u.shape)
     time = np.cumsum(_late(np.where(breaths.valid, breaths.dt, 0.0), 1), axis=1)
     frame, upper = np.linalg.qr(base[inside])
-    line = np.linalg.solve(upper + 1e-9 * np.eye(3), frame.T @ p[inside])
+    line = np.asarray(np.linalg.solve(upper + 1e-9 * np.eye(3), frame.T @ p[inside]), float)
     r = np.where(inside, p - base @ line, 0.0)
     above, change = p - line[0], np.diff(u, axis=1, prepend=0.0)
     high, rough = np.quantile(p[inside], 0.9), np.diff(r, 2, axis=1)
@@ -184,7 +184,7 @@ def _correlations(x: Floats, y: Floats) -> list[float]:
 def _breath(base: Floats, r: Floats, inside: NDArray[np.bool_], line: Floats) -> Floats:
     """Offset, relative resistance and elastance of a breath beside those of all, ridged."""
     x = base[inside] * np.array([1.0, max(line[1], 1.0), max(line[2], 1.0)])
-    return np.linalg.solve(x.T @ x + 0.3 * np.eye(3), x.T @ r[inside])
+    return np.asarray(np.linalg.solve(x.T @ x + 0.3 * np.eye(3), x.T @ r[inside]), float)
 
 
 def _course(series: Floats) -> list[float]:

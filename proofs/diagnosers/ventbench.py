@@ -167,9 +167,7 @@ def _session(found: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(names | ({"saturation"} if found["saturated"] is not None else set()))
 
 
-def _names(
-    found: Mapping[str, Any], known: Mapping[str, Any]
-) -> list[tuple[frozenset[str], float]]:
+def _names(found: Mapping[str, Any], known: Any) -> list[tuple[frozenset[str], float]]:
     """Sets of names, the stated ones first: each is replaced by each known alternative."""
     choices = []
     for missing in found["mechanisms"]:

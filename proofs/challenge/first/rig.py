@@ -118,9 +118,8 @@ def record(
     """
     base = case.base or draw_base(case.lung_R, case.lung_C, rng)
     time = sampling_times(case.breaths, case.samples, case.jitter, rng)
-    controller = RecordingController(case, time, rng, share)
-    number = np.arange(len(time))
-    return _run(case, base, time, expiratory(time), controller.command, number, rng, steps)
+    command = RecordingController(case, time, rng, share).command
+    return _run(case, base, time, expiratory(time), command, np.arange(len(time)), rng, steps)
 
 
 def record_commands(

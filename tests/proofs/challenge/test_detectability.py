@@ -45,7 +45,8 @@ def test_rigs_side_by_side_are_those_alone(world):
     (question,) = at.draw("null", 1, rng)
     effort = Effect("patient_effort", "strong", "half sine", {"amplitude": 5.0, "duration": 0.8})
     effects = () if world == "faults" else (effort,)
-    one = replace(question.case, effects=effects, base=Base(20.0, 30.0))
+    base = Base(20.0, 30.0)
+    one = replace(question.case, effects=effects, base=base)
     other = replace(one, base=Base(24.0, 27.0, 6.0, 5.5))
     time = np.tile(np.arange(12) * 0.03, (2, 1))
     columns = np.full((2, 12), 25.0), (time > 0.2).astype(np.int8), time
@@ -57,7 +58,7 @@ def test_rigs_side_by_side_are_those_alone(world):
     many = breaths.select([0, 1, 0, 1])
     start = np.array([5.0, 5.5])
     found = at.replay(
-        replace(one, base=replace(one.base, **both)), many, np.concatenate([start, start]), 3
+        replace(one, base=replace(base, **both)), many, np.concatenate([start, start]), 3
     )
     alone = [at.replay(case, breaths, start, 3) for case in (one, other)]
     np.testing.assert_allclose(found, np.concatenate(alone), atol=1e-9)

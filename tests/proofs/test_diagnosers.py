@@ -98,7 +98,8 @@ def test_evidence_of_coefficients_is_that_of_the_marginal_density() -> None:
     rng = np.random.default_rng(3)
     X, y, sd = rng.standard_normal((20, 3)), rng.standard_normal(20), np.array([0.5, 1.0, 2.0])
     value, mean, sds = evidence.gaussian(X.T @ X, X.T @ y, sd)
-    marginal = stats.multivariate_normal(np.zeros(20), np.eye(20) + X * sd**2 @ X.T).logpdf(y)
+    spread = np.eye(20) + X * sd**2 @ X.T
+    marginal = stats.multivariate_normal.logpdf(y, np.zeros(20), spread)
     assert value == pytest.approx(marginal - stats.norm.logpdf(y).sum())
     precision = X.T @ X + np.diag(sd**-2)
     np.testing.assert_allclose(mean, np.linalg.solve(precision, X.T @ y))

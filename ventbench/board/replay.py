@@ -271,8 +271,10 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("headroom.error", record.headroom.error, replayed.controllable),
     ):
         if np.all(_off(recorded, given) <= TOLERANCE):
-            means = (x.mean(axis=(-2, -1)) for x in (recorded, given))  # NaN where a cell failed
-            text = _difference(f"{key}, mean over cells", *means, MEAN_TOLERANCE)
+            of_draws, now = (
+                x.mean(axis=(-2, -1)) for x in (recorded, given)
+            )  # NaN if a cell failed
+            text = _difference(f"{key}, mean over cells", of_draws, now, MEAN_TOLERANCE)
             texts += [] if text is None else [text]
     return texts + lung_leaks(record, replayed)
 

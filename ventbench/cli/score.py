@@ -385,8 +385,8 @@ def transfer(
         chosen = track or entry.manifest.tracks[0]
         with bars() as shown:
             runner = runner_of(entry, sandbox=not in_process)
-            told = counted(shown, f"running {entry.label}")
-            runs = transfers.transfer(entry, rigs, track=chosen, runner=runner, progress=told)
+            running = counted(shown, f"running {entry.label}")
+            runs = transfers.transfer(entry, rigs, track=chosen, runner=runner, progress=running)
         groups = transfers.by_group(runs, rigs)
         results.append({"name": entry.manifest.name, "track": chosen, "groups": groups})
     plants = results[0]["groups"]

@@ -269,10 +269,10 @@ class Problem:
         both[:, :, self.predictor.names.index(path)] = np.array([[2.0], [-1.0]])
         seen = self.predictor.predict_all(both)
         white = np.stack([self._white(self._residual(each)) for each in seen])
-        before, after = np.sum(self.noise.loss(white), axis=(2, 3))
+        earlier, later = np.sum(self.noise.loss(white), axis=(2, 3))
         order = np.argsort(self.data.position)
         places, first = np.unique(self.data.position[order], return_index=True)
-        costs = np.cumsum(before[order]) + after.sum() - np.cumsum(after[order])
+        costs = np.cumsum(earlier[order]) + later.sum() - np.cumsum(later[order])
         costs = costs[first[1:] - 1]
         between = places[:-1] + BETWEEN * np.diff(places)
         inner = slice(1, -1) if len(between) > 2 else slice(None)

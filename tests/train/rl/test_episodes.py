@@ -27,8 +27,13 @@ def lungs():
 
 
 @pytest.fixture(scope="module")
-def cells():
-    return episodes.sample(jax.random.key(3), 1200, lungs=6)
+def all_lungs(lungs):
+    return episodes.Lungs(jax.tree.map(lambda x: x[None], lungs), jnp.ones((6, 6)))
+
+
+@pytest.fixture(scope="module")
+def cells(all_lungs):
+    return episodes.draw(jax.random.key(3), all_lungs, 1200).cells
 
 
 def test_deviations_have_the_distributions_of_the_draws(cells):
@@ -53,8 +58,9 @@ def test_deviations_have_the_distributions_of_the_draws(cells):
     assert np.all(np.asarray(cells.quantum, float) == np.float32(draws.QUANTUM))
 
 
-def test_nominal_cells_are_the_protocols():
-    found = episodes.sample(jax.random.key(0), 6, vary=False)
+def test_nominal_cells_are_the_protocols(lungs):
+    lung = episodes.Lungs(jax.tree.map(lambda x: x[None, :1], lungs), jnp.ones((1, 6)))
+    found = episodes.draw(jax.random.key(0), lung, 6, vary=False).cells
     wanted = environment.nominal_scenario(protocol.PIPS)
     for name in ("pip", "peep", "start", "dt", "r_scale", "c_scale", "delay", "quantum"):
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-6)

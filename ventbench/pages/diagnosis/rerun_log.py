@@ -83,7 +83,7 @@ def log_lung(
     traces = diagnosis.traces
     breaths = traces.breaths.select(index)
     start = np.arange(len(index))[:, None] * span(diagnosis)
-    time = (start + breaths.time).ravel()
+    time = (start + breaths.time).ravel().astype(np.float64)
     order = breaths.valid.ravel()
 
     def line(part: str, values: Floats, name: str, color: str, width: float) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
+import re
 
 import pytest
 
@@ -24,6 +26,7 @@ def test_every_setting_is_described_in_its_group():
         group = getattr(DEFAULT, field.name)
         if not dataclasses.is_dataclass(group):
             continue
-        described = type(group).__doc__ or ""
+        source = inspect.getsource(type(group))
         for setting in dataclasses.fields(group):
-            assert f"    {setting.name}: " in described, f"{field.name}.{setting.name}"
+            lines = rf"(#: [^\n]+\n    {setting.name}: |\n    {setting.name}: [^\n]+  #: \w)"
+            assert re.search(lines, source), f"{field.name}.{setting.name}"

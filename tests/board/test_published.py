@@ -88,13 +88,15 @@ def test_only_unseen_draws_of_a_round_count() -> None:
     tracks = [track for track in board if track.round is not None and track.ranked]
     assert len(tracks) >= 2
     for track in tracks:
-        rigs = track.ranked[0].record.headroom
+        rigs, names = track.ranked[0].record.headroom, [row.record.name for row in track.ranked]
         seen = np.flatnonzero(~rigs.ranked)
         assert 0 < len(seen) < rigs.ranked.size
         again = comparison.ranks(
             np.stack([np.delete(r.record.headroom.normalised[1:], seen, 0).mean(axis=2).T
                       for r in track.ranked]),
-            np.delete(rigs.session, seen, 1), matters=comparison.POINTS,
+            np.delete(rigs.session, seen, 1),
+            [names.index(r.entry.source) if r.entry.source else None for r in track.ranked],
+            matters=comparison.POINTS,
         )  # fmt: skip
         assert again.rank.tolist() == [row.rank for row in track.ranked]
         for row in track.ranked:

@@ -60,7 +60,8 @@ def test_train(method, steps, tmp_path):
         result = run("train", method, *arguments)
         assert result.exit_code == 0, result.output
         about = json.loads((folder / "training.json").read_text())
-        assert about["networks"]["R20C50"]["error_pid"] == pytest.approx(2.552, abs=2e-3)
+        # As `ventbench.score` has it of this PID on the reference rig.
+        assert about["networks"]["R20C50"]["error_pid"] == pytest.approx(3.443, abs=2e-3)
         assert sorted(path.name for path in folder.iterdir()) == ["training.json", "weights.npz"]
         written.append((folder / "weights.npz").read_bytes())
         with np.load(folder / "weights.npz") as arrays:

@@ -20,7 +20,7 @@ LINES = {"ventbench + hardware_eval": 66_560, "proofs": 10_490}
 MODULES = 303
 
 #: Most lines of one module, and most modules that lie loose in ``ventbench/``.
-LONGEST, LOOSE = 580, 8
+LONGEST, LOOSE = 550, 8
 
 #: Most words of Markdown (as ``wc -w`` counts), and the folders that hold it beside the root.
 WORDS = 29_300

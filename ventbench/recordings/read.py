@@ -211,6 +211,9 @@ def session_files(path: FilePath) -> tuple[Path, ...]:
 
     Args:
         path: a file, or a folder of recordings; that of a session on a bench has one.
+
+    Raises:
+        InputError: if a folder has none.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -218,7 +221,9 @@ def session_files(path: FilePath) -> tuple[Path, ...]:
     if (folder / SESSION).is_file():
         return (folder / SESSION,)
     files = (file for file in folder.iterdir() if file.name.endswith(_SUFFIXES))
-    return tuple(sorted(files)) or (folder,)
+    if not (found := tuple(sorted(files))):
+        raise InputError(f"{folder} has no recording; name a file, or a folder with some")
+    return found
 
 
 def _joined(files: tuple[Path, ...], *, clip: bool, progress: Progress | None) -> Breaths:

@@ -7,6 +7,7 @@ import pickle
 
 import pytest
 
+from ventbench.base.errors import InputError
 from ventbench.recordings import RecordingError, check, load
 from ventbench.recordings.csv_source import BLOCK
 
@@ -268,7 +269,8 @@ def test_files_that_are_no_text(rows, write_csv, tmp_path):
 
 def test_files_that_are_not_there(tmp_path, monkeypatch):
     has(refused(tmp_path / "no.csv"), None, None, None, "there is no such file", "Check the path")
-    has(refused(tmp_path), None, None, None, "this is a folder", "Name one file")
+    with pytest.raises(InputError, match="has no recording; name a file"):
+        load(tmp_path)
 
     def denied(*_args, **_options):
         raise PermissionError(13, "Permission denied")

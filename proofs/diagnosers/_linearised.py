@@ -164,6 +164,8 @@ def simulate(data: Data, predictor: Predictor, around: Fit) -> Simulated:
     found = [(name, point, move(point)) for name in names for point in points(name)]
     acting = {name: [move(point) for point in courses(name)] for name in (*CONSTANT, OPEN)}
     seen = predictor.predict_all(np.stack(moved))[:, :, 0]
+    # a point that the model cannot simulate changes nothing, so no evidence chooses it
+    seen = np.where(np.isfinite(seen).all(axis=(1, 2), keepdims=True), seen, seen[0])
     columns = [(each - seen[0]) / scale.get(k, 1.0) for k, each in enumerate(seen[1:])]
     events = {name: np.stack([columns[k] for k in own]) for name, own in acting.items()}
     made = Simulated(data, values, columns, basis, of_basis, {}, (), events)

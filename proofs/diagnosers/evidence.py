@@ -162,10 +162,10 @@ def in_time(known: Known, predictor: Predictor, around: Fit) -> list[Term]:
         kept, sent = float(way.kept.sum()), float(way.sent.sum())
         if not kept:
             break
-        share = kept / sent
+        share = min(kept / sent, 0.5)  # a valve that waits counts at every sample
         reached = Predictor(replace(data, u_in=way.u_in), predictor.names, sizes=(_BREATHS,))
         column = reached.predict(values)[:, 0] - predictor.predict(values)[:, 0]
-        odds = kept * np.log(share) + (sent - kept) * np.log1p(-share)
+        odds = kept * np.log(share) + max(sent - kept, 0.0) * np.log1p(-share)
         odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2 + np.log(len(lags))
         terms.append(Term(name, [1.0], odds=float(odds), latent=[column], told={"share": share}))
     return terms

@@ -1,14 +1,11 @@
 """ventbench's own diagnosis as a diagnoser, by its public interface.
 
-A verdict becomes probabilities: names by how far each is preferred over its alternatives, places by
-their weights, and what the diagnosis cannot know by shares that were fitted on opened cases.
+Its posterior is passed on, beside what held-out breaths accept of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +13,7 @@ import numpy as np
 
 import ventbench
 from proofs.diagnosers.common import see
-from ventbench.physics.catalogue import library
+from ventbench.physics.catalogue import basis_terms, mechanism
 
 #: Public places of the diagnosis's places.
 _PLACES = {
@@ -24,36 +21,24 @@ _PLACES = {
     "f(Q)": "airway", "R(V)": "airway", "R(direction)": "airway", "f(V)": "lung",
     "memory of p": "lung", "exhalation path": "expiratory_valve",
     "measurement": "pressure_sensor", "f(t) at the alveolus": "muscles",
-    "f(t) at the supply": "supply",
+    "f(t) at the supply": "supply", "f(t) in the circuit": "circuit",
 }  # fmt: skip
 
 #: Names of what changes in the session: a step, and a drift.
 _CHANGES = {"gain": ("gain_step", "gain_drift"), "zero": ("zero_step", "sensor_drift")}
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Shares that the verdicts deserve, 0..1."""
+#: Public places of the sites of basis terms, where they differ.
+_SITES = {
+    "inspiratory valve": "inspiratory_valve", "alveolus": "lung", "sensor": "pressure_sensor",
+    "command": "inspiratory_valve", "expiratory valve": "expiratory_valve",
+}  # fmt: skip
 
-    nothing: float  #: of the verdict *nothing missing*; else an effect was overlooked.
-    named: float  #: of the stated names being all there is.
-    placed: float  #: of a place without a name being the place.
-    alone: float  #: of what is left where a verdict fails, that there is nothing beside the names.
-    #: of an effect without a name, that it is one of those names of the vocabulary for which the
-    #: diagnosis has no hypothesis, all alike; else it is at any place.
-    foreign: float
-    #: power of the unexplained error, in multiples of the noise from 1 on, by which the odds of a
-    #: verdict fall that leaves nothing open.
-    doubt: float
+#: Share that held-out breaths have beside the posterior of the search, and share of all places.
+_ACCEPTED, _UNSURE = 0.5, 0.05
 
-
-#: Fitted on opened cases by ``benchmarks/adapter_calibration.py``.
-CALIBRATION = Calibration(
-    nothing=0.87, named=0.87, placed=0.21, alone=0.24, foreign=0.95, doubt=3.6
-)
-
-#: Most hypotheses of alternatives and of all, and least probability of one.
-_MOST, _ALL, _LEAST = 60, 400, 1e-4
+#: Most hypotheses.
+_MOST = 100
 
 
 def diagnose(folder: Path) -> dict[str, Any]:
@@ -92,66 +77,43 @@ def _predictions(found: Any, seen: Any, observed: Any) -> Any:
     )
 
 
-def hypotheses(
-    found: Mapping[str, Any], vocabulary: Mapping[str, Any], shares: Calibration = CALIBRATION
-) -> list[dict[str, Any]]:
-    """Probabilities of a verdict.
-
-    What the verdict says has the share that such verdicts deserve. The rest goes to what it may
-    have missed: nothing beside the stated names, one effect more, or another in their place.
+def hypotheses(found: Mapping[str, Any], vocabulary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Probabilities of a diagnosis: the posterior of its search, and what held-out breaths accept.
 
     Args:
         found: a diagnosis as JSON values.
         vocabulary: that of the case.
-        shares: see :class:`Calibration`.
     """
-    names, places = vocabulary["names"], vocabulary["places"]
-    foreign = sorted(names.keys() - {*library(), "saturation"})
-    session = _session(found)
-    stated = [(terms | session, p) for terms, p in _names(found, names)]
-    main, slot = stated[0][0], found["slot"]
-    weights: dict[frozenset[str], float] = {}
+    always, places = _session(found), vocabulary["places"]
+    odds: dict[frozenset[str], float] = {}
 
     def add(terms: frozenset[str], probability: float) -> None:
-        weights[terms] = weights.get(terms, 0.0) + probability
+        odds[terms | always] = odds.get(terms | always, 0.0) + probability
 
-    def unnamed(base: frozenset[str], probability: float, named: list[str], at: list[str]) -> None:
-        share = shares.foreign if named else 0.0
-        for name in named:
-            add(base | {name}, probability * share / len(named))
-        for place in at:
-            add(base | {f"unknown:{place}"}, probability * (1.0 - share) / len(at))
-
-    if slot is not None:
-        told = shares.placed
-        for place, weight in _by_place(slot).items():
-            at = [name for name in foreign if names[name]["place"] == place]
-            for terms, probability in stated:
-                unnamed(terms, told * weight * probability, at, [place])
-    elif main or found["verdict"] == "nothing_missing":
-        told = _doubted(shares.named if main else shares.nothing, found["open_loop"], shares.doubt)
-        told *= min((missing.get("explains", 1.0) for missing in found["mechanisms"]), default=1.0)
-        for terms, probability in stated:
-            add(terms, told * probability)
-    else:
-        told = 0.0
-    # Where nothing more is the verdict itself, it cannot be what the verdict missed.
-    alone = shares.alone if slot is not None or not told else 0.0
-    add(main, (1.0 - told) * alone)
-    bases = {main, frozenset()}
-    for base in bases:
-        unnamed(base, (1.0 - told) * (1.0 - alone) / len(bases), foreign, places)
-    likely = sorted(weights, key=weights.__getitem__, reverse=True)[:_ALL]
-    kept = {terms: weights[terms] for terms in likely if weights[terms] > _LEAST}
-    total = sum(kept.values())
-    return [{"terms": sorted(terms), "probability": p / total} for terms, p in kept.items()]
+    for place in places:
+        add(frozenset({f"unknown:{place}"}), _UNSURE / len(places))
+    whole = sum(each["probability"] for each in found["posterior"])
+    for each in found["posterior"]:
+        terms = frozenset(_public(name) for name in each["terms"])
+        add(terms, (1.0 - _UNSURE) * (1.0 - _ACCEPTED) * each["probability"] / whole)
+    named = frozenset(missing["name"] for missing in found["mechanisms"])
+    unknown = {} if found["slot"] is None else _by_place(found["slot"])
+    if not named and not unknown and found["verdict"] == "unnamed":
+        unknown = dict.fromkeys(places, 1.0 / len(places))
+    for place, weight in (unknown or {"": 1.0}).items():
+        terms = named | {f"unknown:{place}"} if place else named
+        add(terms, (1.0 - _UNSURE) * _ACCEPTED * weight)
+    kept = sorted(odds.items(), key=lambda pair: -pair[1])[:_MOST]
+    total = sum(probability for _, probability in kept)
+    return [{"terms": sorted(terms), "probability": p / total} for terms, p in kept]
 
 
-def _doubted(share: float, errors: Mapping[str, Any], doubt: float) -> float:
-    """A share after a look at what stays unexplained."""
-    beyond = (errors["unexplained"] or 0.0) / (errors["noise_floor"] or np.inf)
-    odds = share / (1.0 - share) * max(beyond, 1.0) ** -doubt
-    return odds / (1.0 + odds)
+def _public(name: str) -> str:
+    """A term in the words of the vocabulary."""
+    if name not in basis_terms():
+        return name
+    site = mechanism(name).description.site
+    return f"unknown:{_SITES.get(site, site)}"
 
 
 def _session(found: Mapping[str, Any]) -> frozenset[str]:
@@ -159,21 +121,6 @@ def _session(found: Mapping[str, Any]) -> frozenset[str]:
     changes = found["changes"]
     names = {_CHANGES[c["of"]][int(c["drifts"])] for c in changes if c["of"] in _CHANGES}
     return frozenset(names | ({"saturation"} if found["saturated"] is not None else set()))
-
-
-def _names(found: Mapping[str, Any], known: Any) -> list[tuple[frozenset[str], float]]:
-    """Sets of names, the stated ones first: each is replaced by each known alternative."""
-    choices = []
-    for missing in found["mechanisms"]:
-        others = [name for name in missing["alternatives"] if name in known][:4]
-        sure = float(np.clip(missing["confidence"], 0.05, 0.99)) if others else 1.0
-        rest = [(name, (1.0 - sure) / len(others)) for name in others]
-        choices.append([(missing["name"], sure), *rest])
-    every = (
-        (frozenset(name for name, _ in chosen), float(np.prod([p for _, p in chosen])))
-        for chosen in product(*choices)
-    )
-    return list(islice(every, _MOST))
 
 
 def _by_place(slot: Mapping[str, Any]) -> dict[str, float]:

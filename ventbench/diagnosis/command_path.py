@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ventbench.diagnosis.hypothesis import Partition
-from ventbench.diagnosis.latent_inputs import SUPPLY, input_responses
+from ventbench.diagnosis.input_response import SUPPLY, input_responses
 from ventbench.system_id.data import Floats
 from ventbench.system_id.problem import Problem
 

@@ -1,60 +1,79 @@
 """The model that a recording needs: mechanisms, an unnamed effect beside them, or neither.
 
-:func:`conclude` selects mechanisms (:mod:`ventbench.diagnosis.selection.forward`), explains what
-they leave (:mod:`ventbench.diagnosis.remaining_error`), drops the mechanisms that this makes idle
-(:mod:`ventbench.diagnosis.selection.refinement`), and compares the remaining ones with alternatives
-(:mod:`ventbench.diagnosis.selection.alternatives`). If the valve's gain scatters between breaths,
-all is repeated with a gain of each breath's own, from the mechanisms that were selected with one
-gain and, if these are few, from the base model.
+:func:`conclude` searches by evidence (:mod:`ventbench.diagnosis.evidence`). The likeliest set
+is fitted to the training breaths, and held-out breaths accept each of its terms: what they do not
+ask for is dropped, the least needed first. Alternatives are the other sets of the posterior.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
+from typing import TypeAlias
 
 import numpy as np
 
-from ventbench.base.executor import parallel_map
-from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
-from ventbench.diagnosis.remaining_error import (
-    UnnamedEffect,
-    best_term,
-    explain_remaining_error,
-    gain_scatter,
+from ventbench.base.arrays import Floats
+from ventbench.diagnosis import evidence
+from ventbench.diagnosis.evaluator import (
+    Evaluator,
+    cross_validated_gain,
+    fit_with_noise,
 )
+from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
+from ventbench.diagnosis.in_time import SWINGS, swing_columns
+from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
 from ventbench.diagnosis.selection.acceptance import (
     is_consistent,
+    is_needed,
     is_negligible,
     passes_heldout_test,
 )
-from ventbench.diagnosis.selection.alternatives import (
-    Alternatives,
-    Replacements,
-    exchange,
-    find_alternatives,
-)
-from ventbench.diagnosis.selection.candidate_comparison import Comparison, fit_with_noise
-from ventbench.diagnosis.selection.forward import (
-    Progress,
-    drop_redundant_terms,
-    forward_selection,
-    is_far_from_label,
-    selection_at_label,
-)
-from ventbench.diagnosis.selection.refinement import (
-    SingleTermAlternative,
-    backward_elimination,
-    drop_compensating_terms,
-    eliminate_beside_input,
-    special_case_of,
-)
-from ventbench.diagnosis.selection.screening import component_of
-from ventbench.diagnosis.selection.shape_parameters import free_shape_parameters
-from ventbench.system_id.data import Floats
-from ventbench.system_id.noise import Noise
+from ventbench.physics.catalogue import basis_terms, library, mechanism
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
+from ventbench.system_id.noise import Noise, robust_noise
+
+#: Receives the current step, in words.
+Progress: TypeAlias = Callable[[str], None]
+
+#: Least posterior odds of a name that is listed as an alternative, and most that are.
+_NEAR, _LISTED = 0.05, 2
+
+#: Least posterior probability of an effect of some breaths that is looked for.
+_LOOKED_FOR = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Alternatives:
+    """Alternative explanations of the effect of a selected mechanism."""
+
+    names: tuple[str, ...]  #: other mechanisms, the likeliest first.
+    confidence: float  #: posterior probability of the selected mechanism among these.
+    models: tuple[FittedModel, ...]  #: models with an alternative in its place.
+
+
+@dataclass(frozen=True, eq=False)
+class Swing:
+    """A periodic input with a size and phase of its own in each breath."""
+
+    frequency: float  #: Hz.
+    frequency_sd: float  #: standard deviation, Hz.
+    course: Floats  #: expected course in each training breath, cmH2O or a share, ``(n, T)``.
+    noise: Noise  #: noise beside it.
+    held_out_log_likelihood: Floats  #: of each held-out breath with it, nats, ``(h,)``.
+
+
+@dataclass(frozen=True, eq=False)
+class UnnamedEffect:
+    """An effect for which the library has no mechanism."""
+
+    name: str  #: public name of the nonparametric component, or of the input's place.
+    term: str | None  #: the component's basis term, or None for a periodic input.
+    swing: Swing | None  #: the input, or None for a basis term.
+    nats: float  #: held-out log-likelihood that it gains.
+    #: posterior weight of each place, the largest first.
+    places: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,209 +93,283 @@ class Conclusion:
     gain_sd: float = 0.0
     #: whether much is missing, and neither mechanism nor unnamed effect is accepted.
     unresolved: bool = False
-    #: what is left as slow noise of the sensor, with the weight of each place where a course in
-    #: time may act; None if nothing slow is left, or an unnamed effect is it.
-    slow_noise: UnnamedEffect | None = None
     #: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without each
     #: mechanism, by name.
     worths: dict[str, float] = field(default_factory=dict)
+    #: posterior probability of each set of terms, by their names.
+    posterior: Mapping[frozenset[str], float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The selected mechanisms."""
         return self.named.names
 
+    @property
+    def likely_events(self) -> tuple[str, ...]:
+        """Effects of some breaths that may act."""
+
+        def share(name: str) -> float:
+            return sum(p for names, p in self.posterior.items() if name in names)
+
+        return tuple(name for name in (*EVENTS, *COMMANDS) if share(name) > _LOOKED_FOR)
+
+
+def component_of(term: str) -> str:
+    """Public name of the nonparametric component that a basis term belongs to."""
+    components = NONPARAMETRIC_COMPONENTS.values()
+    return next(component.name for component in components if term in component.terms)
+
 
 def conclude(
-    evaluator: Evaluator,
-    wider: Callable[[], Evaluator],
-    tell: Progress,
-    earlier: FittedModel | None = None,
-    *,
-    at_label: bool = True,
+    evaluator: Evaluator, every: Partition, tell: Progress, earlier: FittedModel | None = None
 ) -> Conclusion:
     """Find what a recording needs beyond the base model.
 
     Args:
-        evaluator: evaluator with the library's parameters.
-        wider: makes the evaluator with the parameters of the nonparametric terms as well.
+        evaluator: evaluator with the parameters of all candidates.
+        every: its training and held-out breaths together, which are searched.
         tell: called with a description of each step before it runs.
-        earlier: mechanisms that were selected otherwise, to start from too: with the same gain in
-            all breaths, or from what a simulator of these breaths answers.
-        at_label: whether to search at the labelled lung too, where R or C is far from it.
+        earlier: a model whose mechanisms are tried in any case.
     """
+    tell("searching")
+    found = evidence.search(
+        replace(evaluator, training=every), () if earlier is None else earlier.names
+    )
+    best = found.best
+    tell("comparing with held-out breaths")
     base = fit_with_noise(evaluator, Hypothesis())
-    wider = cache(wider)
-    single, scatter = SingleTermAlternative(evaluator, wider, base), _GainScatter(evaluator)
-    if earlier is None or len(earlier.names) < evaluator.settings.forward.kept_terms:
-        selected, comparisons = forward_selection(evaluator, base, tell, single, scatter)
-    else:
-        selected, comparisons = base, []
-    if scatter.sd:
-        # Exchanges are many fits, and would be repeated with the gains.
-        return _with_gains(evaluator, wider, scatter.sd, tell, selected)
-    if earlier is not None and not set(earlier.names) <= set(selected.names):
-        # Gains of the breaths' own can stand for a bent valve in the first rounds of a selection.
-        start = fit_with_noise(evaluator, earlier.hypothesis, earlier)
-        start = drop_redundant_terms(evaluator, start, start.names)
-        other = forward_selection(evaluator, start, tell, single)
-        selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
-    if at_label and is_far_from_label(evaluator, selected):
-        other = selection_at_label(evaluator, selected, tell, single)
-        if other is not None:
-            selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
-    known: Replacements = {}
-    for _ in range(evaluator.settings.refinement.exchanges):
-        if len(selected.names) < 2:  # nothing came after the first
-            break
-        tell("exchanging mechanisms")
-        other = exchange(evaluator, selected, comparisons, known)
-        if other is None:
-            break
-        selected, comparisons = forward_selection(evaluator, other, tell, single)
-    tell("looking for effects that no mechanism explains")
-    wide = wider()
-    reduced = drop_compensating_terms(evaluator, wide, selected, tell)
-    remaining = explain_remaining_error(evaluator, wide, reduced)
-    if reduced is not selected and not remaining.prefers_term:
-        # The term that explains the dropped mechanisms away must be there in their place.
-        remaining = explain_remaining_error(evaluator, wide, selected)
-    else:
-        selected = reduced
-    if not evaluator.gain_sd and remaining.gain_sd:
-        # Gains of the breaths' own move no lung: what was found at the label is selected already.
-        return _with_gains(evaluator, wider, remaining.gain_sd, tell, selected, at_label=False)
-    unnamed, full = None, selected
-    if remaining.latent is not None and not remaining.prefers_term:
-        unnamed = remaining.latent
-        assert unnamed.latent_input is not None
-        selected = eliminate_beside_input(evaluator, selected, unnamed.latent_input, unnamed.nats)
-        full = selected
-    elif remaining.term is not None:
-        selected, fit = backward_elimination(evaluator, wide, selected, remaining.term)
-        named = special_case_of(evaluator, selected, fit)
-        beside = fit if named is None else None
-        if named is not None:
-            selected = free_shape_parameters(evaluator, named)
-            full, beside = selected, best_term(wide, selected)
-        if beside is not None:
-            place = component_of(beside.term)
-            unnamed = UnnamedEffect(place, beside.term, None, beside.nats, beside.places)
-            full = beside.full
-    elif remaining.slow_noise is not None and not selected.hypothesis.breath_terms:
-        # Efforts have been compared with slow noise when they were selected.
-        slow = remaining.slow_noise
-        assert slow.latent_input is not None
-        selected = eliminate_beside_input(evaluator, selected, slow.latent_input, slow.nats)
-        full = selected
-    tell("comparing alternatives")
-    selected, alternatives = find_alternatives(
-        evaluator, selected, comparisons, known=known,
-        swap=unnamed is None and remaining.slow_noise is None,
-    )  # fmt: skip
-    has_term = unnamed is not None and unnamed.term is not None
-    selected, gains, worths = _supported(evaluator, selected, (wide, full) if has_term else None)
-    if unnamed is None or unnamed.term is None:
-        full = selected
-    else:
-        dropped = [name for name in full.names if name not in (*selected.names, unnamed.term)]
-        if dropped:
-            full = fit_with_noise(wide, full.hypothesis.without(*dropped), full)
-    latent = None if unnamed is None else unnamed.latent_input
+    full = _fitted(evaluator, found)
+    gain_sd = _gain_sd(evaluator, full, found.scatter)
+    if gain_sd:
+        evaluator = replace(evaluator, gain_sd=gain_sd)
+        full = fit_with_noise(evaluator, full.hypothesis, full)
+    whole = full
+    full, gains, worths = _supported(evaluator, full)
+    unknown = [name for name in full.names if name in basis_terms()]
+    if len(unknown) > 1:  # one of them is told
+        unknown.sort(key=gains.__getitem__)
+        full = fit_with_noise(evaluator, full.hypothesis.without(*unknown[:-1]), full)
+    named, unnamed = full, None
+    if unknown:
+        term = unknown[-1]
+        named = fit_with_noise(evaluator, full.hypothesis.without(term), full)
+        unnamed = UnnamedEffect(
+            component_of(term), term, None, gains[term], _places(found, component_of(term), term)
+        )
+    noise = full.noise
+    for term in best.terms:
+        if unnamed is None and term.name in SWINGS:
+            swing, gained = _swing(evaluator, full, term)
+            if passes_heldout_test(
+                gained, evaluator.settings.held_out_test, evaluator.settings.search.swing_nats
+            ):
+                place = SWINGS[term.name][0]
+                unnamed = UnnamedEffect(
+                    place, None, swing, float(gained.sum()), _places(found, place, term.name)
+                )
+                noise = swing.noise
     return Conclusion(
         base,
-        selected,
+        named,
         full,
         unnamed,
-        full.noise if latent is None else latent.noise,
-        gains,
-        {name: alternatives[name] for name in selected.names if name in alternatives},
-        evaluator.gain_sd,
-        unnamed is None and not selected.names and is_unresolved(evaluator, comparisons),
-        remaining.slow_noise if unnamed is None else None,
-        worths,
+        noise,
+        {name: gains[name] for name in named.names},
+        {name: _alternatives(evaluator, found, named, name) for name in named.names},
+        gain_sd,
+        unnamed is None and not named.names and _is_unresolved(evaluator, whole),
+        {name: worths[name] for name in named.names},
+        found.weights,
     )
 
 
-class _GainScatter:
-    """Asks whether gains scatter between breaths, and keeps the answer."""
+def _fitted(evaluator: Evaluator, found: Posterior) -> FittedModel:
+    """The likeliest set fitted to all training breaths, with their noise."""
+    best = found.best
+    hypothesis = best.fitted.hypothesis
+    if EFFORT in names_of(best.terms):
+        hypothesis = hypothesis.plus(Hypothesis((EFFORT,)))
+    values = evaluator.transferred_values(best.fitted, evaluator.training)
+    names = evaluator.training.predictor.names
+    start = {
+        path: values[:, k]
+        for k, path in enumerate(names)
+        if path != "position" and path.rpartition(".")[0] != EFFORT
+    }
+    first = evaluator.fit(hypothesis, best.noise, None, start)
+    return fit_with_noise(evaluator, hypothesis, first)
 
-    def __init__(self, evaluator: Evaluator) -> None:
-        self._evaluator = evaluator
-        self.sd = 0.0  # standard deviation of the logarithm of the gains
 
-    def __call__(self, selected: FittedModel) -> bool:
-        """Whether the gains scatter, if all breaths have had the same one so far."""
-        evaluator = self._evaluator
-        if not evaluator.gain_sd:
-            sd = gain_scatter(evaluator, selected)
-            self.sd = sd if sd <= evaluator.settings.latent_inputs.early_scatter else 0.0
-        return bool(self.sd)
+def _supported(
+    evaluator: Evaluator, model: FittedModel
+) -> tuple[FittedModel, dict[str, float], dict[str, float]]:
+    """Drop terms that training and held-out breaths do not both ask for, the least needed first.
+
+    Of a recording with few breaths, each is held out once (cross-validation).
+
+    Returns:
+        The rest, and what each of its terms gains on held-out breaths: log-likelihood, nats, and
+        root-mean-square error, cmH2O.
+    """
+    settings = evaluator.settings
+
+    def square(model: FittedModel) -> float:
+        data = evaluator.held_out.data
+        left = evaluator.predict(model, evaluator.held_out) - data.measured
+        return float(np.mean(np.square(left[data.weight > 0.0])))
+
+    def compared(name: str) -> tuple[Floats, float, bool]:
+        left = evaluator.fit(model.hypothesis.without(name), model.noise, model)
+        held_out = evaluator.held_out_log_likelihood(model)
+        gains = held_out - evaluator.held_out_log_likelihood(left)
+        before, after = square(left), square(model)
+        worth = float(np.sqrt(before) - np.sqrt(after))
+        if not is_needed(evaluator, model, left):
+            return gains, worth, False
+        if name in basis_terms():
+            least = max(settings.search.least_change, 0.5 * model.noise.sigma[0])
+            return gains, worth, before - after > least**2 or len(model.names) == 1
+        if is_negligible(evaluator, model, left, name):
+            return gains, worth, False
+        if not is_consistent(gains, settings.plausibility):
+            gains = cross_validated_gain(evaluator, model, left)
+            return gains, worth, is_consistent(gains, settings.plausibility)
+        return gains, worth, True
+
+    while True:
+        results = {name: compared(name) for name in model.names}
+        weak = [name for name, (_, _, supported) in results.items() if not supported]
+        if not weak:
+            nats = {name: float(gains.sum()) for name, (gains, _, _) in results.items()}
+            return model, nats, {name: worth for name, (_, worth, _) in results.items()}
+        least = min(weak, key=lambda name: float(results[name][0].sum()))
+        model = fit_with_noise(evaluator, model.hypothesis.without(least), model)
 
 
-def _with_gains(
-    evaluator: Evaluator,
-    wider: Callable[[], Evaluator],
-    sd: float,
-    tell: Progress,
-    selected: FittedModel,
-    *,
-    at_label: bool = True,
-) -> Conclusion:
-    """The conclusion with a gain of each breath's own, from mechanisms selected without.
+def _marginal_gains(
+    evaluator: Evaluator, fitted: FittedModel, partition: Partition, columns: Floats, sd: float
+) -> tuple[Floats, Floats]:
+    """What changes of each breath's own gain there, integrated out, and their sizes.
 
     Args:
-        evaluator: see :func:`conclude`.
-        wider: see :func:`conclude`.
-        sd: standard deviation of the logarithm of the gains.
-        tell: see :func:`conclude`.
-        selected: the mechanisms.
-        at_label: see :func:`conclude`.
+        evaluator: evaluator of the recording.
+        fitted: a model.
+        partition: n breaths.
+        columns: changes of the pressure by the coefficients, ``(n, k, T)``.
+        sd: their prior standard deviation.
+
+    Returns:
+        Log-likelihood of each breath, nats, ``(n,)``, and expected coefficients, ``(n, k)``.
     """
-    scattered = replace(evaluator, gain_sd=sd)
-    return conclude(
-        scattered, lambda: replace(wider(), gain_sd=sd), tell, selected, at_label=at_label
-    )
+    linear = linearise(*evaluator.refit_breath_parameters(fitted, partition), clip=6.0)
+    white = linear.without_own(linear.whiten(columns[:, :, None]))
+    nats, means = [], []
+    for X, left in zip(white, linear.residual, strict=True):
+        value, mean, _ = gaussian(X @ X.T, -X @ left, np.full(len(X), sd))
+        nats.append(value)
+        means.append(mean)
+    return np.array(nats), np.array(means)
 
 
-def _better_selection(
-    evaluator: Evaluator,
-    usual: tuple[FittedModel, list[Comparison]],
-    other: tuple[FittedModel, list[Comparison]],
-) -> tuple[FittedModel, list[Comparison]]:
-    """The other selection if BIC, at the noise that it leaves, and held-out breaths prefer it."""
-    model, noise = other[0], other[0].noise
-    against = evaluator.fit(usual[0].hypothesis, noise, usual[0])
-    gains = evaluator.held_out_log_likelihood(model) - evaluator.held_out_log_likelihood(against)
-    better = evaluator.criterion(model) < evaluator.criterion(against)
-    return (
-        other if better and passes_heldout_test(gains, evaluator.settings.held_out_test) else usual
-    )
+def _gain_sd(evaluator: Evaluator, fitted: FittedModel, sd: float) -> float:
+    """Standard deviation of the logarithm of the breaths' gains if held-out breaths ask for it."""
+    partition = evaluator.held_out
+    values = evaluator.transferred_values(fitted, partition)
+    gain = partition.predictor.names.index("gain")
+    slopes = partition.predictor.derivatives(values, (gain,))[1][:, :, 0]
+    slopes = slopes * values[:, gain, None, None]
+    gains = _marginal_gains(evaluator, fitted, partition, slopes, sd)[0]
+    return sd if passes_heldout_test(gains, evaluator.settings.held_out_test) else 0.0
 
 
-def without_name(
-    conclusion: Conclusion, name: str, evaluator: Evaluator, wide: Evaluator
-) -> Conclusion:
+def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing, Floats]:
+    """A periodic input fitted beside a model, and what it gains in each held-out breath, nats."""
+    frequency, spread = term.told["frequency"], term.told["spread"]
+
+    def at(frequency: float, partition: Partition) -> tuple[Floats, Floats, Floats]:
+        values = evaluator.transferred_values(fitted, partition)
+        columns, courses = swing_columns(term.name, partition, values, frequency)
+        nats, sizes = _marginal_gains(evaluator, fitted, partition, columns, spread)
+        return (
+            nats,
+            np.einsum("nk,nkt->nt", sizes, columns),
+            np.einsum("nk,nkt->nt", sizes, courses),
+        )
+
+    step = 0.02 * frequency
+    near = frequency + step * np.arange(-4, 5)
+    each = np.array([float(at(f, evaluator.training)[0].sum()) for f in near])
+    best = int(np.clip(np.argmax(each), 1, len(near) - 2))
+    frequency = float(near[best])
+    curvature = (2.0 * each[best] - each[best - 1] - each[best + 1]) / step**2
+    _, change, course = at(frequency, evaluator.training)
+    gained = at(frequency, evaluator.held_out)[0]
+    left = fitted.residual + change[:, None]
+    noise = robust_noise(left, fitted.problem.data.weight)
+    nats = evaluator.held_out_log_likelihood(fitted) + gained
+    return Swing(frequency, float(max(curvature, 1e-9) ** -0.5), course, noise, nats), gained
+
+
+def _places(found: Posterior, place: str, term: str) -> tuple[tuple[str, float], ...]:
+    """Posterior weights of the places of an unnamed effect, the largest first."""
+    odds = {place: 1.0}
+    for name, each in found.swaps(names_of(found.best.terms), term).items():
+        where = SWINGS[name][0] if name in SWINGS else None
+        where = component_of(name) if name in basis_terms() else where
+        if where is not None and each > _NEAR:
+            odds[where] = odds.get(where, 0.0) + each
+    total = sum(odds.values())
+    return tuple(sorted(((n, p / total) for n, p in odds.items()), key=lambda pair: -pair[1]))
+
+
+def _alternatives(
+    evaluator: Evaluator, found: Posterior, named: FittedModel, name: str
+) -> Alternatives:
+    """Other names of the posterior in the place of one."""
+    names = names_of(found.best.terms)
+    odds = {
+        other: each
+        for other, each in found.swaps(names, name).items()
+        if other in library() and each > _NEAR
+    }
+    others = (*odds, *(n for n in mechanism(name).description.equivalents if n not in odds))
+    models = []
+    for other in list(odds)[:_LISTED]:
+        if other != EFFORT and EFFORT not in named.names:
+            hypothesis = named.hypothesis.without(name).plus(Hypothesis((other,)))
+            models.append(evaluator.fit(hypothesis, named.noise, named))
+    return Alternatives(others[:_LISTED], 1.0 / (1.0 + sum(odds.values())), tuple(models))
+
+
+def _is_unresolved(evaluator: Evaluator, whole: FittedModel) -> bool:
+    """Whether a set explains much of training and held-out breaths though no term is accepted."""
+    if not whole.names or EFFORT in whole.names:
+        return False
+    base = evaluator.fit(Hypothesis(), whole.noise, whole)
+    much = evaluator.criterion(base) - evaluator.criterion(whole) > evaluator.settings.search.much
+    gains = evaluator.held_out_log_likelihood(whole) - evaluator.held_out_log_likelihood(base)
+    return much and float(gains.sum()) > evaluator.settings.held_out_test.threshold
+
+
+def without_name(conclusion: Conclusion, name: str, evaluator: Evaluator) -> Conclusion:
     """The conclusion without a mechanism whose strength may as well be none.
 
     Args:
         conclusion: the conclusion.
         name: name of the mechanism.
-        evaluator: evaluator with the library's parameters.
-        wide: evaluator of ``conclusion.full``.
+        evaluator: evaluator of the conclusion.
     """
     named = conclusion.named
-    evaluator, wide = (replace(each, gain_sd=conclusion.gain_sd) for each in (evaluator, wide))
     left = fit_with_noise(evaluator, named.hypothesis.without(name), named)
     full = left
     if conclusion.unnamed is not None and conclusion.unnamed.term is not None:
-        full = fit_with_noise(wide, conclusion.full.hypothesis.without(name), conclusion.full)
-    latent = None if conclusion.unnamed is None else conclusion.unnamed.latent_input
+        full = fit_with_noise(evaluator, conclusion.full.hypothesis.without(name), conclusion.full)
+    swing = None if conclusion.unnamed is None else conclusion.unnamed.swing
     return replace(
         conclusion,
         named=left,
         full=full,
-        noise=full.noise if latent is None else latent.noise,
+        noise=full.noise if swing is None else swing.noise,
         held_out_gains={k: v for k, v in conclusion.held_out_gains.items() if k != name},
         alternatives={k: v for k, v in conclusion.alternatives.items() if k != name},
     )
@@ -286,84 +379,3 @@ def without_term(conclusion: Conclusion) -> Conclusion:
     """The conclusion with its mechanisms alone, without a nonparametric term beside them."""
     named = conclusion.named
     return replace(conclusion, full=named, unnamed=None, noise=named.noise)
-
-
-def is_unresolved(evaluator: Evaluator, comparisons: Sequence[Comparison]) -> bool:
-    """Whether a candidate explains much of the training breaths but was not accepted.
-
-    Effects that hide each other do so: each alone helps some breaths and harms others. The
-    candidate must also gain a little on held-out breaths. Patient effort does not count, since it
-    explains coloured noise as well.
-
-    Args:
-        evaluator: evaluator of the recording.
-        comparisons: comparisons of the forward selection; the last one counts.
-    """
-    if not comparisons:
-        return False
-    last = comparisons[-1]
-    least = evaluator.criterion(last.base) - evaluator.settings.forward.large_gain
-    threshold = evaluator.settings.held_out_test.threshold
-
-    def gain(fitted: FittedModel) -> float:
-        before = evaluator.held_out_log_likelihood(last.base)
-        return float((evaluator.held_out_log_likelihood(fitted) - before).sum())
-
-    return any(
-        model.criterion < least and gain(model.fitted) > threshold
-        for model in last.ranked
-        if not varies_by_breath(model.name)
-    )
-
-
-def _supported(
-    evaluator: Evaluator, selected: FittedModel, beside: tuple[Evaluator, FittedModel] | None
-) -> tuple[FittedModel, dict[str, float], dict[str, float]]:
-    """Drop mechanisms that held-out breaths do not agree on; and what the others gain.
-
-    That is log-likelihood, nats, and root-mean-square error, cmH2O, of the held-out breaths.
-
-    Of a recording with few breaths, each is held out once (cross-validation).
-
-    Args:
-        evaluator: evaluator with the library's parameters.
-        selected: the mechanisms.
-        beside: the same with a nonparametric term, and its evaluator, if there is one. A mechanism
-            may help only beside the term.
-    """
-    settings = evaluator.settings.plausibility
-
-    def error(evaluator: Evaluator, model: FittedModel) -> float:
-        data = evaluator.held_out.data
-        left = evaluator.predict(model, evaluator.held_out) - data.measured
-        return float(np.sqrt(np.mean(np.square(left[data.weight > 0.0]))))
-
-    def gains_in(evaluator: Evaluator, model: FittedModel, name: str) -> tuple[Floats, FittedModel]:
-        left = evaluator.fit(model.hypothesis.without(name), model.noise, model)
-        held_out = evaluator.held_out_log_likelihood(model)
-        return held_out - evaluator.held_out_log_likelihood(left), left
-
-    def compared(name: str) -> tuple[Floats, float, bool]:
-        gains, left = gains_in(evaluator, selected, name)
-        worth = error(evaluator, left) - error(evaluator, selected)
-        if is_negligible(evaluator, selected, left, name):
-            return gains, worth, False
-        if is_consistent(gains, settings):
-            return gains, worth, True
-        if beside is not None and name in beside[1].names:
-            other, left = gains_in(*beside, name)
-            if is_consistent(other, settings):
-                return other, error(beside[0], left) - error(*beside), True
-        if gains.sum() <= 0.0:
-            return gains, worth, False
-        validated = cross_validated_gain(evaluator, selected, left)
-        return gains, worth, is_consistent(validated, settings)
-
-    while True:
-        results = dict(zip(selected.names, parallel_map(compared, selected.names), strict=True))
-        weak = [name for name, (_, _, supported) in results.items() if not supported]
-        if not weak:
-            nats = {name: float(gains.sum()) for name, (gains, _, _) in results.items()}
-            return selected, nats, {name: worth for name, (_, worth, _) in results.items()}
-        least = min(weak, key=lambda name: float(results[name][0].sum()))
-        selected = fit_with_noise(evaluator, selected.hypothesis.without(least), selected)

@@ -14,8 +14,9 @@ from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.adequacy import check_residuals, detection_limits
-from ventbench.diagnosis.conclusion import Conclusion
+from ventbench.diagnosis.conclusion import Alternatives, Conclusion
 from ventbench.diagnosis.corrected import Correction, correct
+from ventbench.diagnosis.evidence import IN_TIME, told_posterior
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import (
     BreathRequest,
@@ -46,7 +47,6 @@ from ventbench.diagnosis.residual_analysis import (
 )
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.selection.acceptance import explained_share
-from ventbench.diagnosis.selection.alternatives import Alternatives
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
     describe_otherwise,
@@ -156,6 +156,7 @@ def diagnose(
         breaths = _of_lung(breaths, parse_lung(lung).id)
     by_flow = drive == "flow" or (drive == "auto" and flow_drive.lacks_commands(breaths))
     told: list[MissingMechanism] = []
+    posterior = None  # that of all breaths has all effects
     while True:
         found = _diagnose(
             breaths, simulators, patient, by_flow, rigs, progress or (lambda what, share: None),
@@ -164,10 +165,12 @@ def diagnose(
         if isinstance(found, Diagnosis):
             break
         told.append(found.missing)
+        posterior = posterior or found.posterior
         breaths = found.rest_of(breaths)
     return replace(
         found,
         verdict="named" if told else found.verdict,
+        posterior=posterior or found.posterior,
         mechanisms=(*told, *found.mechanisms),
         simulator=_name(simulator, simulators),
         seconds=time.perf_counter() - began,
@@ -206,7 +209,7 @@ def _diagnose(
         data = make_data(driven)
         u_out = np.take_along_axis(recorded.u_out, index, axis=1)
         breaths = replace(driven, u_out=u_out)  # phases of the report are those of the recording
-        excluded += flow_drive.VENTILATOR_SIDE
+        excluded += (*flow_drive.VENTILATOR_SIDE, *IN_TIME)
         settings = flow_drive.without_ventilator(settings)
         notes += [*notes_on_flow, _NOTE_ON_FLOW]
     else:
@@ -297,7 +300,7 @@ def _diagnose(
     )  # fmt: skip
     if adequacy.changes:  # breaths that err more because of a change are no outliers
         open_loop = replace(open_loop, usual=open_loop.after.rmse)
-    is_input = conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None
+    is_input = conclusion.unnamed is not None and conclusion.unnamed.swing is not None
     rejected = (bool(missing) or term is not None) and not _helps(
         correction, recording_model, open_loop, data.select(uses.judging), by_breath=is_input
     )
@@ -341,13 +344,13 @@ def _diagnose(
         changes=adequacy.changes,
         saturated=saturated,
         gain_scatter=conclusion.gain_sd,
+        posterior=told_posterior(conclusion.posterior),
         detection_limits=limits,
         plants=correction.plants,
         simulator=simulators.name,
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
         notes=(
             *notes, *notes_on_simulator, *correction.notes, *notes_on_lungs,
-            *_note_on_slow_noise(conclusion, settings),
         ),
         settings=settings,
         seconds=0.0,
@@ -389,22 +392,6 @@ def steps_between(tell: Progress, low: float, high: float) -> Callable[[str], No
     return step
 
 
-def _note_on_slow_noise(conclusion: Conclusion, settings: SelectionConfig) -> list[str]:
-    """Note on slow errors that are left, if they are more than a sensor's usual wandering."""
-    slow = conclusion.slow_noise
-    if slow is None or slow.latent_input is None:
-        return []
-    size = slow.latent_input.size
-    if size < settings.latent_inputs.sensor_amplitude:
-        return []
-    weights = ", ".join(f"{place} {100.0 * weight:.1f} %" for place, weight in slow.places)
-    return [
-        f"Slow errors of {size:.1f} cmH2O are left that differ from breath to breath. Held-out "
-        "breaths take them for noise of the sensor rather than for a source in the physics "
-        f"(weights: {weights})."
-    ]
-
-
 def _note_on_rate(rate: float, breaths: Breaths) -> str:
     """Note on what was kept of a fast recording."""
     kept = breaths.valid.sum(axis=1)
@@ -426,7 +413,7 @@ def _helps(
     """Whether breaths that no fit and no test has seen speak for the correction.
 
     Its error need not be lower in a recording where a mild effect drowns in slow noise, but then
-    the likelihood of those breaths must rise. A latent input, which differs from breath to breath
+    the likelihood of those breaths must rise. A periodic input, which differs from breath to breath
     (``by_breath``), corrects nothing and is not judged here.
     """
     if correction.unchanged:
@@ -537,6 +524,6 @@ def _missing_mechanism(
 
 
 def _request(conclusion: Conclusion) -> BreathRequest | None:
-    rivals = [rival.fitted for other in conclusion.alternatives.values() for rival in other.models]
+    rivals = [rival for other in conclusion.alternatives.values() for rival in other.models]
     noise = Noise((conclusion.noise.sigma[0],), (0.0,))
     return request_breaths(conclusion.named, rivals, noise=noise)

@@ -12,19 +12,11 @@ import numpy as np
 from ventbench import mechanics
 from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
-from ventbench.diagnosis.conclusion import Conclusion
+from ventbench.diagnosis.conclusion import Conclusion, Swing, UnnamedEffect, component_of
 from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
-from ventbench.diagnosis.latent_inputs import (
-    ALVEOLUS,
-    CIRCUIT,
-    MEASUREMENT,
-    SUPPLY,
-    LatentInput,
-)
-from ventbench.diagnosis.remaining_error import UnnamedEffect
-from ventbench.diagnosis.selection.screening import component_of
+from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics.catalogue import (
     basis_terms,
@@ -110,15 +102,14 @@ def without_absorbed(curve: Curve) -> Curve:
 #: steps of time, jitter of the clock, forms of what acts beside them.
 FORM_ERROR = 0.015
 
-#: Mechanisms that a periodic latent input is, by its place, and least weight of one that counts.
+#: Mechanisms that a periodic input is, by its place, and least weight of one that counts.
 _OSCILLATIONS = {SUPPLY: "supply_ripple", CIRCUIT: "circuit_water"}
 _LEAST_WEIGHT = 0.05
 
-#: What a latent input is, by the place where it enters.
-_LATENT_INPUTS = {
+#: What an input is, by the place where it enters.
+_INPUTS = {
     ALVEOLUS: "a pressure at the alveolus that varies in time and that no command explains",
     SUPPLY: "a flow of the supply that varies in time and that no command explains",
-    MEASUREMENT: "a pressure at the sensor that varies in time and that is not in the airway",
     CIRCUIT: "a pressure in the circuit that swings while gas flows",
 }
 
@@ -337,8 +328,8 @@ def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
     if place is None:
         return None
     explains = _share(conclusion)
-    if place.latent_input is not None:
-        return _latent_input(place, place.latent_input, explains)
+    if place.swing is not None:
+        return _input(place, place.swing, explains)
     assert place.term is not None
     x, y, x_unit, y_unit = _curve(conclusion.full, place.term)
     meaning = NONPARAMETRIC_COMPONENTS[place.name].meaning
@@ -348,10 +339,10 @@ def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
 
 
 def oscillation(conclusion: Conclusion) -> MissingMechanism | None:
-    """The mechanism that a periodic latent input is; None if there is none, or no name for it."""
+    """The mechanism that a periodic input is; None if there is none, or no name for it."""
     effect = conclusion.unnamed
-    source = None if effect is None else effect.latent_input
-    if effect is None or source is None or not source.periodic:
+    source = None if effect is None else effect.swing
+    if effect is None or source is None:
         return None
     names = [_OSCILLATIONS.get(place) for place, weight in effect.places if weight >= _LEAST_WEIGHT]
     if _OSCILLATIONS.get(effect.name) is None or None in names:
@@ -359,7 +350,7 @@ def oscillation(conclusion: Conclusion) -> MissingMechanism | None:
     name, others = _OSCILLATIONS[effect.name], [each for each in names if each is not None]
     each = np.sqrt(2.0 * np.mean(source.course**2, axis=1))  # amplitude of each breath
     amplitude, wide = float(each.mean()), 1.96 * float(each.std()) / len(each) ** 0.5
-    frequency, sd = source.scale, 1.96 * source.scale_sd
+    frequency, sd = source.frequency, 1.96 * source.frequency_sd
     unit = mechanism(name).description.strength.unit
     return MissingMechanism(
         name,
@@ -403,20 +394,18 @@ def _share(conclusion: Conclusion) -> float:
     weight = named.problem.data.weight
     before = float(np.sum(named.residual**2) / weight.sum())
     floor = float(conclusion.noise.sigma[0] ** 2)
-    if conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None:
+    if conclusion.unnamed is not None and conclusion.unnamed.swing is not None:
         after = floor
     else:
         after = float(np.sum(conclusion.full.residual**2) / weight.sum())
     return float(np.clip((before - after) / max(before - min(floor, after), 1e-9), 0.0, 1.0))
 
 
-def _latent_input(place: UnnamedEffect, source: LatentInput, explains: float) -> NonparametricTerm:
+def _input(place: UnnamedEffect, source: Swing, explains: float) -> NonparametricTerm:
     size = np.sqrt(np.mean(source.course**2, axis=1))
     course = source.course[int(np.argmax(size))]
     unit = "share of the flow, 1" if place.name == SUPPLY else "pressure, cmH2O"
-    meaning = _LATENT_INPUTS[place.name]
-    if source.periodic:
-        meaning += f", {source.scale:.1f} times a second"
+    meaning = f"{_INPUTS[place.name]}, {source.frequency:.1f} times a second"
     x = np.arange(len(course), dtype=float)
     return NonparametricTerm(
         place.name, meaning, explains, place.nats, x, "sample of the breath where it is largest",

@@ -32,7 +32,7 @@ from ventbench.physics.catalogue import library
 from ventbench.system_id import problem as problems
 from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
-from ventbench.system_id.noise import Noise
+from ventbench.system_id.noise import Noise, robust_noise
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import Problem, make_unknowns, parameter_of
 
@@ -505,3 +505,34 @@ def cross_validated_gain(
     first = evaluator.held_out_log_likelihood(with_term)
     first = first - evaluator.held_out_log_likelihood(without_term)
     return np.concatenate([first, *(with_it - without for with_it, without in pairs)])
+
+
+def fit_with_noise(
+    evaluator: Evaluator, hypothesis: Hypothesis, warm_start: FittedModel | None = None
+) -> FittedModel:
+    """Fit a hypothesis to the training breaths, and its noise, in turn."""
+    settings = evaluator.settings.fit
+    noise = warm_start.problem.noise if warm_start else Noise()
+    fitted = evaluator.fit(hypothesis, noise, warm_start)
+    for _ in range(settings.noise_rounds):
+        noise = estimate_noise(fitted)
+        again = evaluator.fit(hypothesis, noise, fitted, restart=True)
+        gained = again.log_likelihood - fitted.log_likelihood_at(noise)
+        fitted = again if gained > 0 else evaluator.fit(hypothesis, noise, fitted)
+        if gained < settings.noise_gain:
+            break
+    return fitted
+
+
+def fit_with_white_noise(evaluator: Evaluator, current: FittedModel) -> FittedModel:
+    """Refit a model at white noise.
+
+    Coloured noise excuses slow errors, so that R, C and PEEP may drift anywhere to reduce it.
+    """
+    white = replace(current.noise, ar=(0.0, 0.0))
+    return evaluator.fit(current.hypothesis, white, current if current.names else None)
+
+
+def estimate_noise(fitted: FittedModel) -> Noise:
+    """Noise that a model leaves in the breaths that it was fitted to."""
+    return robust_noise(fitted.residual, fitted.problem.data.weight)

@@ -242,3 +242,6 @@ class Findings:
     #: reading at which the pressure sensor saturates, cmH2O, and share of the readings that do,
     #: which are left out; None if it does not.
     saturated: tuple[float, float] | None = None
+    #: the likeliest sets of terms by the search alone, with their probabilities: mechanisms, basis
+    #: terms (something unknown at their place) and effects in time. Held-out breaths have no say.
+    posterior: tuple[tuple[tuple[str, ...], float], ...] = ()

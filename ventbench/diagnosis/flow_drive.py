@@ -164,9 +164,9 @@ def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: 
 
 def without_ventilator(settings: SelectionConfig) -> SelectionConfig:
     """Settings whose nonparametric terms are those of the lung's side."""
-    chosen = settings.screening.nonparametric_terms
+    chosen = settings.search.nonparametric_terms
     terms = tuple(t for t in (chosen or basis_terms()) if t not in _VENTILATOR_TERMS)
-    return replace(settings, screening=replace(settings.screening, nonparametric_terms=terms))
+    return replace(settings, search=replace(settings.search, nonparametric_terms=terms))
 
 
 def _volume_at(nodes: Floats, time: Floats, flow: Floats, volume: Floats) -> Floats:

@@ -9,13 +9,21 @@ change gains after a refit, without doing one.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
-from ventbench.physics.catalogue import mechanism, strength_path
+from ventbench.physics.catalogue import (
+    basis_terms,
+    intermittent,
+    library,
+    mechanism,
+    paths,
+    strength_path,
+)
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.levenberg_marquardt import Minimum
 from ventbench.system_id.noise import Noise
@@ -172,6 +180,19 @@ class Hypothesis:
 def varies_by_breath(name: str) -> bool:
     """Whether a term has parameters that differ from breath to breath."""
     return any(parameter.scope == "breath" for parameter in mechanism(name).description.parameters)
+
+
+def all_parameter_paths(
+    settings: SelectionConfig, excluded: Collection[str] = ()
+) -> tuple[str, ...]:
+    """Paths of the parameters of all candidates: library, basis terms and events.
+
+    Mechanisms that cannot act are left out; those that differ from breath to breath stay in any
+    case, so that test lungs and patients share compiled functions.
+    """
+    kept = [name for name in library() if name not in excluded or varies_by_breath(name)]
+    chosen = settings.search.nonparametric_terms
+    return paths((*kept, *intermittent(), *(basis_terms() if chosen is None else chosen)))
 
 
 @dataclass(frozen=True, eq=False)

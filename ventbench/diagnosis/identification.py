@@ -20,11 +20,11 @@ from ventbench.diagnosis.evaluator import Evaluator, make_evaluator, make_proble
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
     Partition,
+    all_parameter_paths,
     make_partition,
     varies_by_breath,
 )
 from ventbench.diagnosis.selection.acceptance import excludes_neutral, is_weak
-from ventbench.diagnosis.selection.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.plants.simulators import Simulators
@@ -232,21 +232,14 @@ def identify(
         fitted: which breaths the final fit may use, ``(n,)``; all but the testing ones if None.
         earlier: mechanisms to start from too, fitted to the same lungs.
     """
-    names = library_paths(excluded)
-    narrow = make_evaluator(data, held, names, excluded, settings)
-    wide: list[Evaluator] = []
-
-    def widened() -> Evaluator:
-        every = all_parameter_paths(settings, excluded)
-        wide.append(make_evaluator(data, held, every, excluded, settings))
-        return wide[0]
-
-    conclusion = conclude(narrow, widened, tell, earlier)
+    names = all_parameter_paths(settings, excluded)
+    evaluator = make_evaluator(data, held, names, excluded, settings)
+    conclusion = conclude(evaluator, make_partition(data, names, settings), tell, earlier)
     # Gains that differ between breaths are parameters of each breath, unknown of held-out ones.
-    gain_sd, chosen = conclusion.gain_sd, ~held if fitted is None else fitted
+    evaluator = replace(evaluator, gain_sd=conclusion.gain_sd)
+    chosen = ~held if fitted is None else fitted
     while True:
         has_term = conclusion.unnamed is not None and conclusion.unnamed.term is not None
-        evaluator = replace(wide[0] if has_term else narrow, gain_sd=gain_sd)
         # A nonparametric term is fitted to the training breaths alone, to save time.
         final = evaluator.training
         if not has_term:
@@ -264,7 +257,7 @@ def identify(
         if _is_idle_form(conclusion, name, settings):
             conclusion = without_term(conclusion)
         else:
-            conclusion = without_name(conclusion, name, narrow, evaluator)
+            conclusion = without_name(conclusion, name, evaluator)
 
 
 def _with_changes_of(conclusion: Conclusion, fit: Fit) -> Conclusion:

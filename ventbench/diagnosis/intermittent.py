@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis.adequacy import order_p_value
 from ventbench.diagnosis.command_path import Paths, follow
-from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, fit_with_white_noise
+from ventbench.diagnosis.evidence import COMMANDS, told_posterior
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
@@ -40,22 +41,14 @@ from ventbench.diagnosis.hypothesis import (
     make_partition,
 )
 from ventbench.diagnosis.identification import IdentifiedModel, held_out
-from ventbench.diagnosis.patient_effort import EFFORT
-from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.mechanics.labels import Estimate
-from ventbench.physics.catalogue import intermittent, mechanism
+from ventbench.physics.catalogue import mechanism
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Data
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import Problem
-
-#: Effects on the commands, which have no parameters of a breath.
-COMMANDS = ("lost_commands", "late_commands")
-
-#: Effects of the muscles, which a test lung has not.
-_MUSCLES = ("cough",)
 
 #: Shares of the breaths that are tried; more than half of the breaths is not "some".
 _SHARES = np.array([0.03, 0.08, 0.15, 0.25, 0.4, 0.6])
@@ -75,6 +68,9 @@ _ORDERED = 0.002
 #: Samples by which commands may be late, least share of them that are lost or late, and nats by
 #: which two delays are alike.
 _LAGS, _RARE, _ALIKE = (2, 3, 4, 5), 0.003, 2.0
+
+#: Nats within which another effect is an alternative; a posterior probability of 1 : 150.
+_CLOSE = 5.0
 
 #: Steps between the points of a grid, as shares of its own, by which a breath's course is refined.
 _FINER = (0.5, 0.25)
@@ -97,6 +93,8 @@ class Intermittent:
     #: commands that reached the valve, %, ``(n, T)``; None if the affected breaths are to be set
     #: aside.
     u_in: Floats | None
+    #: posterior of the search that found it; see :class:`~ventbench.diagnosis.findings.Findings`.
+    posterior: tuple[tuple[tuple[str, ...], float], ...] = ()
 
     def leaves_enough(
         self, breaths: Breaths, simulators: Simulators, settings: SelectionConfig
@@ -143,14 +141,17 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         ids: their ids, ``(n,)``.
     """
     evaluator, conclusion = model.evaluator, model.conclusion
-    known = conclusion.named.hypothesis
+    known, likely = conclusion.named.hypothesis, conclusion.likely_events
+    if not likely:
+        return None
     found: list[_Found] = []
     for hypothesis in dict.fromkeys((known.without(*known.breath_terms), Hypothesis())):
         own = evaluator if hypothesis.names else replace(evaluator, gain_sd=0.0)
         alone = fit_with_noise(own, hypothesis)
-        names = [n for n in intermittent() if n not in _MUSCLES or EFFORT not in own.excluded]
+        names = [name for name in likely if name not in COMMANDS]
         found += [each for name in names if (each := _fit(own, alone, name)) is not None]
-        found += _fit_commands(own, alone)
+        if len(names) < len(likely):
+            found += _fit_commands(own, alone)
     found.sort(key=lambda each: -each.total)
     gained = found[0].held_out - _log_likelihood(model) if found else np.zeros(1)
     if float(gained.sum()) <= _least(evaluator):
@@ -162,13 +163,13 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     affected, u_in, estimates = _everywhere(best, data)
     if affected.sum() < _FEWEST or (u_in is None and _is_change(affected, evaluator, data)):
         return None
-    near = np.exp(-0.5 * evaluator.settings.refinement.close_criterion)
+    near = np.exp(-_CLOSE)
     missing = MissingMechanism(
         best.name, estimates, odds[best.name] / sum(odds.values()),
         tuple(name for name, value in odds.items() if value > near and name != best.name),
         float(gained.sum()), affected=tuple(int(i) for i in ids[affected]),
     )  # fmt: skip
-    return Intermittent(missing, ids, affected, u_in)
+    return Intermittent(missing, ids, affected, u_in, told_posterior(conclusion.posterior))
 
 
 def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:
@@ -182,9 +183,8 @@ def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:
 def _log_likelihood(model: IdentifiedModel) -> Floats:
     """Log-likelihood of the held-out breaths by all that was identified, nats, ``(h,)``."""
     conclusion = model.conclusion
-    for effect in (conclusion.unnamed, conclusion.slow_noise):
-        if effect is not None and effect.latent_input is not None:
-            return effect.latent_input.held_out_log_likelihood
+    if conclusion.unnamed is not None and conclusion.unnamed.swing is not None:
+        return conclusion.unnamed.swing.held_out_log_likelihood
     return model.evaluator.held_out_log_likelihood(conclusion.full)
 
 
@@ -231,7 +231,7 @@ def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _Found | None:
 
 def _least(evaluator: Evaluator) -> float:
     """Log-likelihood that an effect must gain, nats: as much as any course in time."""
-    return evaluator.settings.latent_inputs.threshold
+    return evaluator.settings.search.swing_nats
 
 
 def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_Found]:

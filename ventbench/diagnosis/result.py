@@ -200,6 +200,7 @@ class Diagnosis(Findings):
             if self.saturated is None
             else {"reading": self.saturated[0], "share": self.saturated[1]},
             "gain_scatter": self.gain_scatter,
+            "posterior": [{"terms": list(t), "probability": p} for t, p in self.posterior],
             "detection_limits": {
                 name: {"strength": limit, "unit": mechanism(name).description.strength.unit}
                 for name, limit in self.detection_limits.items()

@@ -71,6 +71,24 @@ class ScreeningSettings:
 
 
 @dataclass(frozen=True)
+class SearchSettings:
+    """The search by evidence."""
+
+    #: basis terms that are candidates; None for all that are registered.
+    nonparametric_terms: tuple[str, ...] | None = None
+    beam: int = 24  #: sets of each size that are extended by another term.
+    fits: int = 4  #: sets of the linear problem that are fitted.
+    most_terms: int = 5  #: most terms of a set.
+    #: held-out log-likelihood, nats, from which a periodic input is accepted: more than for a term,
+    #: since places and frequencies are searched.
+    swing_nats: float = 8.0
+    #: root mean square, cmH2O, of the error that a nonparametric term beside mechanisms explains,
+    #: to be kept: less may be their form, or what every rig has.
+    least_change: float = 0.1
+    much: float = 100.0  #: criterion from which a set that is not accepted leaves much missing.
+
+
+@dataclass(frozen=True)
 class HeldOutTestSettings:
     """Test whether held-out breaths ask for a term."""
 
@@ -289,6 +307,7 @@ class SelectionConfig:
     data: DataSettings = field(default_factory=DataSettings)
     fit: FitSettings = field(default_factory=FitSettings)
     screening: ScreeningSettings = field(default_factory=ScreeningSettings)
+    search: SearchSettings = field(default_factory=SearchSettings)
     held_out_test: HeldOutTestSettings = field(default_factory=HeldOutTestSettings)
     forward: ForwardSelectionSettings = field(default_factory=ForwardSelectionSettings)
     refinement: RefinementSettings = field(default_factory=RefinementSettings)

@@ -8,6 +8,8 @@ out impossible values; what remains is ruled out here, by figures that each mech
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
@@ -180,3 +182,21 @@ def is_negligible(
     return evaluator.criterion(without_term) - criterion < settings.negligible_share * (
         base - criterion
     )
+
+
+def drop_redundant_terms(
+    evaluator: Evaluator, current: FittedModel, names: Sequence[str]
+) -> FittedModel:
+    """Drop terms that are not needed, or negligible.
+
+    Args:
+        evaluator: evaluator of the recording.
+        current: the model.
+        names: the terms to judge.
+    """
+    for name in names:
+        without = evaluator.fit(current.hypothesis.without(name), current.noise, current)
+        needed = is_needed(evaluator, current, without)
+        if not needed or is_negligible(evaluator, current, without, name):
+            current = without
+    return current

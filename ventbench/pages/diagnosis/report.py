@@ -22,7 +22,7 @@ from ventbench.diagnosis.findings import (
     NonparametricTerm,
     OpenLoopError,
 )
-from ventbench.diagnosis.latent_inputs import ALVEOLUS, CIRCUIT, MEASUREMENT, SUPPLY
+from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
 from ventbench.pages.diagnosis import charts
 from ventbench.physics import mechanism
@@ -263,8 +263,8 @@ PARTS = {
     "alveolus": "lung",
 }
 
-#: Places of latent inputs.
-_LATENT = {ALVEOLUS: "alveolus", SUPPLY: "supply", MEASUREMENT: "sensor", CIRCUIT: "circuit"}
+#: Places of inputs that vary in time.
+_LATENT = {ALVEOLUS: "alveolus", SUPPLY: "supply", CIRCUIT: "circuit"}
 
 
 @dataclass(frozen=True)

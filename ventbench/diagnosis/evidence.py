@@ -1,0 +1,330 @@
+"""One search by evidence for what a recording needs beyond the base model.
+
+A rig is the base model with a set of terms: mechanisms of the library, basis terms (something
+unknown at their place), and what acts in time (:mod:`.in_time`). Around a fit, pressures are linear
+in all of them at once (:mod:`.linearised`). What is linear is integrated out, sets of terms are
+enumerated by their evidence, the best are fitted and scored again, and around the best fit all
+candidates are linearised anew, as long as one more of them is likelier. The answer is the posterior
+over all sets that were scored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ventbench.base.arrays import Floats
+from ventbench.diagnosis.evaluator import Evaluator, estimate_noise
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
+from ventbench.diagnosis.in_time import SWINGS, in_time
+from ventbench.diagnosis.linearised import (
+    CONSTANT,
+    EFFORT,
+    OPEN,
+    SCATTER,
+    Known,
+    Set,
+    Simulated,
+    Term,
+    gaussian,
+    latent_of,
+    names_of,
+    simulate,
+    within,
+)  # fmt: skip
+from ventbench.physics.catalogue import basis_terms, library
+from ventbench.system_id.data import Data
+from ventbench.system_id.noise import Noise
+from ventbench.system_id.problem import parameter_of
+
+#: Effects of some breaths, and what acts in time of which there is no parameter.
+EVENTS = ("cough", *CONSTANT, OPEN)
+COMMANDS = ("lost_commands", "late_commands")
+IN_TIME = frozenset({*EVENTS, *COMMANDS, *SWINGS})
+
+#: Effects of the muscles, which a test lung has not.
+MUSCLES = ("cough", "unknown:muscles")
+
+#: Prior odds of a term, of an unknown at a place beside those of a name, and the power of the
+#: likelihood: no model has what neighbouring samples share.
+_ODDS, _PLACE, _WARMTH = 0.7, 0.3, 0.2
+
+#: Standard deviations of the logarithm of the breaths' gains that are compared.
+_SCATTERS = (0.003, SCATTER, 0.03, 0.1)
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What the search has found."""
+
+    fitted: tuple[Known, ...]  #: sets that were fitted, likeliest first.
+    weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
+    base: FittedModel  #: the base model.
+    scatter: float  #: standard deviation of the logarithm of the breaths' gains.
+
+    def swaps(self, names: frozenset[str], name: str) -> dict[str, float]:
+        """Posterior odds of other names in the place of one of a set, the likeliest first."""
+        rest, own = names - {name}, self.weights[names]
+        odds = {
+            next(iter(other - rest)): weight / own
+            for other, weight in self.weights.items()
+            if len(other) == len(names) and rest < other and other != names
+        }
+        return dict(sorted(odds.items(), key=lambda pair: -pair[1]))
+
+    @cached_property
+    def best(self) -> Known:
+        """The likeliest set that was fitted."""
+        return max(self.fitted, key=lambda known: self.weights[names_of(known.terms)])
+
+
+def search(wide: Evaluator, also: Sequence[str] = ()) -> Posterior:
+    """Find the terms that breaths need.
+
+    Args:
+        wide: evaluator with the parameters of all candidates; its training breaths are searched.
+        also: names of a set that is fitted in any case.
+    """
+    return _Search(replace(wide.for_ranking, gain_sd=0.0)).run(also)
+
+
+def hypothesis_of(terms: Iterable[Term]) -> tuple[Hypothesis, dict[str, float]]:
+    """What of a set is a parameter of the model, and values to start its fit from."""
+    free, fixed, start, names = [], [], {}, []
+    for term in terms:
+        if len(term.latent):
+            continue
+        names.append(term.name)
+        for path, value in term.values.items():
+            about = parameter_of(path)
+            if about.shape and about.grid and about.discrete:
+                fixed.append((path, float(value)))
+                continue
+            start[path] = float(np.clip(value, about.low, about.high))
+            if about.shape and not (about.grid and about.discrete):
+                free.append(path)
+    return Hypothesis(tuple(names), tuple(free), tuple(fixed)), start
+
+
+def prior(names: Iterable[str]) -> float:
+    """Log prior of a set of names."""
+    one, unknown = np.log(_ODDS / len(library())), np.log(_PLACE)
+    return float(sum(one + unknown * (n in basis_terms() or ":" in n) for n in names))
+
+
+def evidence(G: Floats, b: Floats, terms: Set) -> float:
+    """Log evidence of a set of terms over none, with deviations of their forms."""
+    value, means = 0.0, [0.0] * len(terms)
+    for _ in range(2 if any(term.forms for term in terms) else 1):
+        index: list[int] = []
+        spread: list[float] = []
+        own = []
+        for term, mean in zip(terms, means, strict=True):
+            own.append(len(index))
+            index += [*term.main, *(term.forms if mean else ())]
+            spread += [*term.spread, *(abs(mean) * c for c in term.forms.values() if mean)]
+        value, found, sds = gaussian(G[np.ix_(index, index)], b[index], np.array(spread))
+        means = [float(found[k]) for k in own]
+    for k, term in zip(own, terms, strict=True):
+        value += term.odds
+        if np.isfinite(term.limits[0]):
+            value += within(term.limits, float(found[k]), float(sds[k]), 0.0, term.spread[0])
+    return value
+
+
+def enumerate_sets(
+    known: Known, latent: Sequence[Term], most: int, beam: int
+) -> list[tuple[float, Set]]:
+    """Sets of terms by log posterior over the empty one, likeliest first, one of each names.
+
+    Args:
+        known: the linearised experiment.
+        latent: terms that act in time.
+        most: most terms of a set.
+        beam: sets of each size that are extended.
+    """
+    columns, numbered = [*known.around.columns], []
+    for term in latent:
+        own = tuple(range(len(columns), len(columns) + len(term.latent)))
+        numbered.append(replace(term, main=own))
+        columns += term.latent
+    weight = known.around.data.weight
+    G, b = known.products(known.rows(np.stack(columns, axis=1) * weight))
+    best: dict[frozenset[str], tuple[float, Set]] = {frozenset(): (0.0, ())}
+
+    def score(terms: Set) -> float:
+        key, value = names_of(terms), evidence(G, b, terms)
+        total = value + prior(key)
+        if len(key) == len(terms) and (key not in best or total > best[key][0]):
+            best[key] = (total, terms)
+        return value
+
+    ranked: dict[str, list[tuple[float, Term]]] = {}
+    for term in (*known.around.terms, *numbered):
+        ranked.setdefault(term.name, []).append((score((term,)), term))
+    for each in ranked.values():
+        each.sort(key=lambda pair: -pair[0])
+    kept = {name: [term for _, term in each[:2]] for name, each in ranked.items()}
+
+    def top(size: int, count: int) -> list[Set]:
+        alike = [pair for key, pair in best.items() if len(key) == size]
+        return [terms for _, terms in sorted(alike, key=lambda pair: -pair[0])[:count]]
+
+    for size in range(2, most + 1):
+        sets = [(t,) for each in kept.values() for t in each] if size == 2 else top(size - 1, beam)
+        for terms in sets:
+            for name in kept.keys() - names_of(terms):
+                for term in kept[name] if size > 2 or name > terms[0].name else ():
+                    score((*terms, term))
+        for terms in top(size, beam // 3):
+            for k, term in enumerate(terms):
+                for _, other in ranked[term.name]:
+                    score((*terms[:k], other, *terms[k + 1 :]))
+    return sorted(best.values(), key=lambda pair: -pair[0])
+
+
+class _Search:
+    """The steps of a search."""
+
+    def __init__(self, evaluator: Evaluator) -> None:
+        self.evaluator, self.settings = evaluator, evaluator.settings.search
+        self.predictor = evaluator.training.predictor
+        excluded = set(evaluator.excluded)
+        if EFFORT in excluded:
+            excluded |= {*MUSCLES}
+        self.excluded = excluded
+        self.names = [n for n in library() if n not in excluded and n != EFFORT]
+        self.unnamed = self.settings.nonparametric_terms
+        if self.unnamed is None:
+            self.unnamed = tuple(basis_terms())
+        self.fits: dict[frozenset[str], FittedModel] = {}
+
+    def run(self, also: Sequence[str]) -> Posterior:
+        """Search."""
+        data, first = self.evaluator.training.data, self.fit(())
+        data = without_spikes(first, data)
+        noise = estimate_noise(self.fit((), data))
+        self.data, self.base = data, self.fit((), data, noise)
+        base = self.base
+        around = self.around(base)
+        self.scatter = self.likeliest_scatter(around, base, noise)
+        for _ in range(2):
+            noise = self.known(around, base, noise, loose=True).left
+        known = self.known(around, base, noise)
+        latent = in_time(
+            known, Partition(data, self.predictor), base, self.excluded, self.evaluator.settings
+        )
+        ranked = enumerate_sets(known, latent, 3, self.settings.beam)
+        self.tried = {frozenset[str](): known}
+        for _, terms in ranked[: self.settings.fits]:
+            self.attempt(around, noise, terms)
+        if also:
+            points = [t for n in also for t in around.terms if t.name == n]
+            self.attempt(around, noise, tuple({t.name: t for t in reversed(points)}.values()))
+        while True:
+            best = self.ordered()[0]
+            if not best.terms or len(best.terms) >= self.settings.most_terms:
+                break
+            around, own = self.around(best.fitted), names_of(best.terms)
+            self.scatter = self.likeliest_scatter(around, best.fitted, noise, best.terms)
+            noise = self.known(around, best.fitted, noise, best.terms, loose=True).left
+            one = self.known(around, best.fitted, noise, best.terms)
+            more = enumerate_sets(one, (), 1, self.settings.beam)
+            for terms in [t for _, t in more if t and not names_of(t) & own][:3]:
+                self.attempt(around, noise, (*best.terms, *terms))
+            for term in best.terms:
+                self.attempt(around, noise, tuple(t for t in best.terms if t is not term))
+            for key, s in self.tried.items():
+                self.tried[key] = self.known(around, s.fitted, noise, s.terms)
+            if names_of(self.ordered()[0].terms) <= own:
+                break
+        return Posterior(
+            tuple(self.ordered()), weigh(self.ordered(), ranked), self.base, self.scatter
+        )
+
+    def around(self, fitted: FittedModel) -> Simulated:
+        """All candidates, simulated around a fit."""
+        events = [name for name in EVENTS if name not in self.excluded]
+        return simulate(self.data, self.predictor, fitted, self.names, self.unnamed or (), events)
+
+    def known(
+        self, around: Simulated, fitted: FittedModel, noise: Noise, terms: Set = (),
+        *, loose: bool = False,
+    ) -> Known:  # fmt: skip
+        """A linearised fit."""
+        return Known(around, fitted, self.base, noise, terms, scatter=self.scatter, loose=loose)
+
+    def likeliest_scatter(
+        self, around: Simulated, fitted: FittedModel, noise: Noise, terms: Set = ()
+    ) -> float:
+        """Scatter of the gains beside a fit."""
+
+        def nats(scatter: float) -> float:
+            known = Known(around, fitted, self.base, noise, terms, scatter=scatter, loose=True)
+            return known.evidence
+
+        return max(_SCATTERS, key=nats)
+
+    def fit(
+        self, terms: Set, data: Data | None = None, noise: Noise | None = None,
+        warm_start: FittedModel | None = None,
+    ) -> FittedModel:  # fmt: skip
+        """Fit what of a set is a parameter of the model, from where the linear problem has it."""
+        partition = self.evaluator.training
+        if data is not None:
+            partition = Partition(data, self.predictor)
+        hypothesis, start = hypothesis_of(terms)
+        return self.evaluator.fit(
+            hypothesis, noise or Noise(), warm_start, start or None, partition=partition
+        )
+
+    def attempt(self, around: Simulated, noise: Noise, terms: Set) -> None:
+        """Fit a set; what acts in time is taken from the readings before a second fit."""
+        if names_of(terms) in self.tried:
+            return
+        fitted, told, latent = self.base, self.data, latent_of(terms)
+        for k in range(2 if latent else 1):
+            if k or len(terms) > len(latent):
+                fitted = self.fit(terms, told, noise, fitted)
+            made = self.tried[names_of(terms)] = self.known(around, fitted, noise, terms)
+            told = replace(self.data, measured=self.data.measured - made.in_time[:, None])
+
+    def ordered(self) -> list[Known]:
+        """Sets that were fitted, likeliest first."""
+        return sorted(self.tried.values(), key=lambda s: -s.evidence - prior(names_of(s.terms)))
+
+
+def told_posterior(
+    weights: Mapping[frozenset[str], float], count: int = 60
+) -> tuple[tuple[tuple[str, ...], float], ...]:
+    """The likeliest sets of terms with their probabilities, the likeliest first."""
+    most = sorted(weights.items(), key=lambda pair: -pair[1])[:count]
+    return tuple((tuple(sorted(names)), weight) for names, weight in most)
+
+
+def without_spikes(fitted: FittedModel, data: Data) -> Data:
+    """Take the weight off single readings that are far off, away from edges of the valves."""
+    r = fitted.residual[:, 0] * data.weight[:, 0]
+    away = np.abs(r - np.median([np.roll(r, k, axis=1) for k in (-2, -1, 0, 1, 2)], axis=0))
+    size = 1.4826 * float(np.median(away[data.weight[:, 0] > 0])) + 0.05
+    edge = np.abs(np.diff(data.u_out, axis=1, prepend=data.u_out[:, :1])) > 0
+    far = (away > 8.0 * size) & ~np.any([np.roll(edge, k, axis=1) for k in range(-2, 4)], axis=0)
+    far[:, :4] = far[:, -2:] = False
+    return replace(data, weight=data.weight * ~far[:, None])
+
+
+def weigh(
+    scored: Sequence[Known], linear: Sequence[tuple[float, Set]]
+) -> dict[frozenset[str], float]:
+    """Posterior of each set of names; those that were not fitted are a nat less likely."""
+    logs = {names_of(s.terms): _WARMTH * s.evidence for s in scored}
+    at = {names_of(terms): _WARMTH * (value - prior(names_of(terms))) for value, terms in linear}
+    logs = {names: value + prior(names) for names, value in logs.items()}
+    offset = max(logs.values()) - 1.0 - max(at[k] + prior(k) for k in logs if k in at)
+    for names, value in at.items():
+        logs.setdefault(names, value + prior(names) + offset)
+    odds = np.exp(np.array(list(logs.values())) - max(logs.values()))
+    return dict(zip(logs, (odds / odds.sum()).tolist(), strict=True))

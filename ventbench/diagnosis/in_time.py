@@ -1,0 +1,196 @@
+"""What acts in time as terms of a linearised experiment: in some breaths, or as a swing.
+
+A breath is affected or not, and the share of affected breaths is uniform: the likeliest set of
+breaths is found by flips. A swing has one frequency and in each breath a size and phase of its own.
+Commands that were lost or late are followed from sample to sample (:mod:`.command_path`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from ventbench.base.arrays import Floats
+from ventbench.diagnosis.command_path import follow
+from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition
+from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY, input_responses
+from ventbench.diagnosis.linearised import CONSTANT, EFFORT, OPEN, Known, Term, gaussian
+from ventbench.diagnosis.settings import SelectionConfig
+
+#: Pushes of the muscles: sign, size, cmH2O, durations and onsets, s; and shares of the size that
+#: harmonics have, as forms are unsure.
+_PUSHES = {
+    "cough": (1.0, 8.0, (0.15, 0.22, 0.3), np.arange(0.1, 1.9, 0.1)),
+    EFFORT: (-1.0, 3.0, (0.5, 0.8, 1.1), np.arange(0.0, 1.0, 0.1)),
+}
+_HARMONICS = (1.0, 0.5, 0.25)
+
+#: Oscillations: place, frequencies, Hz, harmonics, and standard deviations of coefficients.
+SWINGS = {
+    "supply_ripple": (SUPPLY, np.arange(1.5, 9.1, 0.25), 1, (0.06, 0.15)),
+    "circuit_water": (CIRCUIT, np.arange(1.5, 9.1, 0.25), 1, (0.5, 1.2)),
+    "unknown:muscles": (ALVEOLUS, np.arange(0.7, 2.6, 0.1), 2, (0.4, 1.0)),
+}
+
+#: Shares of the commands that are expected to be lost, or late; samples by which they are late.
+_COMMANDS = {"lost_commands": (0.08, (None,)), "late_commands": (0.18, (2, 3, 4))}
+
+
+def _share(n: int, k: int) -> float:
+    """Log prior of k affected breaths of n, whose share is uniform."""
+    return float(special.betaln(k + 1, n - k + 1))
+
+
+def _affected(G: Floats, b: Floats, sd: float, cost: float) -> tuple[Any, Floats]:
+    """Breaths in which an effect acts, by flips that gain, and its sizes there.
+
+    Args:
+        G: products of a column of each breath, ``(n, n)``.
+        b: their products with the residual, ``(n,)``.
+        sd: standard deviation of a size, which is positive.
+        cost: of each affected breath, nats.
+    """
+    n = len(b)
+
+    def value(acts: Any) -> tuple[float, Floats]:
+        at = np.flatnonzero(acts)
+        if not len(at):
+            return _share(n, 0), np.zeros(0)
+        gained, mean, _ = gaussian(G[np.ix_(at, at)], b[at], np.full(len(at), sd))
+        return gained + _share(n, len(at)) - cost * len(at) - 1e3 * float(np.sum(mean < 0.0)), mean
+
+    best: tuple[float, Any] = (-np.inf, None)
+    mean = gaussian(G, b, np.full(n, sd))[1]
+    for acts in (np.zeros(n, bool), mean > 0.3 * max(float(mean.max()), 0.0)):
+        reached, moves = value(acts)[0], True
+        while moves:
+            flips = [value(acts ^ (np.arange(n) == i))[0] for i in range(n)]
+            moves = max(flips) > reached
+            if moves:
+                acts, reached = acts ^ (np.arange(n) == int(np.argmax(flips))), max(flips)
+        if reached > best[0]:
+            best = reached, acts
+    return np.flatnonzero(best[1]), value(best[1])[1]
+
+
+def in_time(
+    known: Known, partition: Partition, around: FittedModel, excluded: Collection[str],
+    settings: SelectionConfig,
+) -> list[Term]:  # fmt: skip
+    """Terms that act in time.
+
+    Args:
+        known: the breaths, linearised around the base model.
+        partition: the same breaths.
+        around: the base model.
+        excluded: effects that cannot act.
+        settings: every threshold.
+    """
+    terms = _of_some_breaths(known, partition, excluded)
+    values = known.around.values
+    for name, (place, frequencies, harmonics, spreads) in SWINGS.items():
+        if name not in excluded:
+            by_input = input_responses(partition, values, place)
+            ways = [
+                (np.matmul(_waves(partition, f, harmonics), by_input), float(f), spread)
+                for f, spread in product(frequencies, spreads)
+            ]
+            terms.append(_likeliest_swing(known, name, ways))
+    if "lost_commands" not in excluded:
+        terms += _commands(known, partition, around, settings)
+    return terms
+
+
+def _of_some_breaths(known: Known, partition: Partition, excluded: Collection[str]) -> list[Term]:
+    """Events, each with the likeliest course in each breath and the likeliest breaths."""
+    n, data, terms = known.n, partition.data, []
+    time = np.cumsum(data.dt, axis=1) - data.dt
+    sizes = {name: size for name, (_, size) in CONSTANT.items()} | {OPEN: 1.0}
+    every = {(name, sizes[name]): known.around.events[name][None] for name in known.around.events}
+    pushes = {name: about for name, about in _PUSHES.items() if name not in excluded}
+    push = input_responses(partition, known.around.values, ALVEOLUS) if pushes else None
+    for name, (sign, size, durations, onsets) in pushes.items():
+        x = np.clip([(time - a) / d for a, d in product(onsets, durations)], 0.0, 1.0)
+        shape = [sign * np.sin(np.pi * h * x) for h in range(1, len(_HARMONICS) + 1)]
+        every[name, size] = np.matmul(np.stack(shape)[:, :, :, None], push)[:, :, :, 0]
+    for (name, size), each in every.items():  # the first, and deviations of its form
+        gains = []
+        for course in each[0]:
+            power, b = known.of_each_breath(course)
+            curvature = power + size**-2.0
+            gains.append(0.5 * np.maximum(b, 0.0) ** 2 / curvature - 0.5 * np.log(curvature))
+        chosen = each[:, np.argmax(gains, axis=0), np.arange(n)]
+        cost = float(np.log(each.shape[1]))
+        at = _affected(*known.of_breaths(chosen[0, :, None]), size, cost)[0]
+        if len(at):
+            which = (at[:, None] == np.arange(n))[:, :, None]
+            columns = [one for form in chosen for one in np.where(which, form, 0.0)]
+            spread = [size * h for h in _HARMONICS[: len(chosen)] for _ in at]
+            odds = _share(n, len(at)) - cost * len(at)
+            terms.append(Term(name, spread, odds=odds, latent=columns))
+    return terms
+
+
+def swing_columns(
+    name: str, partition: Partition, values: Floats, frequency: float
+) -> tuple[Floats, Floats]:
+    """Sines and cosines of a swing, as pressures and as they act, ``(n, 2 harmonics, T)`` each.
+
+    Args:
+        name: the swing, of :data:`SWINGS`.
+        partition: n breaths.
+        values: physical values of their parameters, ``(n, P + 1)``.
+        frequency: Hz.
+    """
+    place, _, harmonics, _ = SWINGS[name]
+    courses = _waves(partition, frequency, harmonics)
+    return np.matmul(courses, input_responses(partition, values, place)), courses
+
+
+def _waves(partition: Partition, frequency: float, harmonics: int) -> Floats:
+    time = np.cumsum(partition.data.dt, axis=1) - partition.data.dt
+    angle = 2.0 * np.pi * frequency * np.arange(1, harmonics + 1)[:, None] * time[:, None]
+    return np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
+
+
+def _likeliest_swing(known: Known, name: str, ways: list[tuple[Floats, float, float]]) -> Term:
+    """The frequency and size of the largest evidence."""
+    best, at = -np.inf, ways[0]
+    for way in ways:
+        G, b = known.of_breaths(way[0])
+        value = gaussian(G, b, np.full(len(b), way[2]))[0]
+        if value > best:
+            best, at = value, way
+    swings, frequency, spread = at
+    which = np.eye(known.n, dtype=bool)[:, :, None]
+    columns = [one for m in range(swings.shape[1]) for one in np.where(which, swings[:, m], 0.0)]
+    told = {"frequency": frequency, "spread": spread}
+    odds = -float(np.log(len(ways)))
+    return Term(name, [spread] * len(columns), odds=odds, latent=columns, told=told)
+
+
+def _commands(
+    known: Known, partition: Partition, around: FittedModel, settings: SelectionConfig
+) -> list[Term]:
+    """Lost and late commands."""
+    data, values, terms = partition.data, known.around.values, []
+    problem, x, share = replace(around.problem, noise=known.noise), around.minimum.x, 0.1
+    for name, (expected, lags) in _COMMANDS.items():
+        ways = [follow(problem, x, partition, share, lag) for lag in lags]
+        way = max(ways, key=lambda each: float(each.nats.sum()))
+        kept, sent = float(way.kept.sum()), float(way.sent.sum())
+        if not kept:
+            break
+        share = min(kept / sent, 0.5)  # a valve that waits counts at every sample
+        names = partition.predictor.names
+        reached = make_partition(replace(data, u_in=way.u_in), names, settings).predictor
+        column = reached.predict(values)[:, 0] - partition.predictor.predict(values)[:, 0]
+        odds = kept * np.log(share) + max(sent - kept, 0.0) * np.log1p(-share)
+        odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2 + np.log(len(lags))
+        terms.append(Term(name, [1.0], odds=float(odds), latent=[column]))
+    return terms

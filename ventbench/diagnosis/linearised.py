@@ -1,0 +1,364 @@
+"""A rig to first order around a fit: what candidates change, and what is integrated out beside."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy import linalg, special
+
+from ventbench.base.arrays import Floats
+from ventbench.diagnosis.hypothesis import FittedModel
+from ventbench.physics.catalogue import library, mechanism, strength_path
+from ventbench.physics.parameters import Parameter
+from ventbench.system_id.data import Data
+from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.problem import parameter_of
+
+#: Standard deviations: of a characteristic and of what every rig has of a basis term, as shares of
+#: their spread; of a mechanism, as a share of the least strength that is named.
+_FORM, _REST, _LEAST = 0.15, 0.02, 0.5
+
+#: Standard deviation of the logarithm of the valve's gain from breath to breath.
+SCATTER = 0.01
+
+#: Standard deviations of base parameters in coordinates, around those of the base fit.
+_BASE = {"R": 0.5, "C": 0.5, "R_ex": 0.5, "PEEP": 2.0, START: 1.0}
+
+#: Effects of some breaths: size that is simulated, and standard deviation of its multiple; one that
+#: has a course as well; and one that is no parameter of a fit.
+CONSTANT = {"intermittent_leak": (8.0, 1.5), "secretions": (0.5, 1.5)}
+OPEN, EFFORT = "disconnection", "patient_effort"
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """A candidate at one point of its shape."""
+
+    name: str  #: of the mechanism, basis term or event.
+    spread: Sequence[float]  #: prior standard deviations of the coefficients of its columns.
+    main: tuple[int, ...] = ()  #: these columns in the linearised experiment.
+    #: values by path, the strength first; its column is the effect of these.
+    values: Mapping[str, float] = field(default_factory=dict)
+    limits: tuple[float, float] = (-np.inf, np.inf)  #: least and largest coefficient of a strength.
+    odds: float = 0.0  #: logarithm of the prior of this point.
+    #: spreads of its characteristic by column of the basis terms.
+    forms: Mapping[int, float] = field(default_factory=dict)
+    #: changes of pressure ``(n, T)`` by what acts in time, which no fit knows.
+    latent: Sequence[Floats] = ()
+    told: Mapping[str, float] = field(default_factory=dict)  #: what is told of a swing.
+
+
+Set = tuple[Term, ...]
+
+
+def names_of(terms: Iterable[Term]) -> frozenset[str]:
+    """Names of a set."""
+    return frozenset(term.name for term in terms)
+
+
+def latent_of(terms: Iterable[Term]) -> Set:
+    """Those that act in time."""
+    return tuple(term for term in terms if len(term.latent))
+
+
+def gaussian(G: Floats, b: Floats, sd: Floats) -> tuple[float, Floats, Floats]:
+    """Log evidence of coefficients over none, their means and standard deviations.
+
+    Args:
+        G: ``X' K^-1 X``, ``(k, k)``.
+        b: ``X' K^-1 y``, ``(k,)``.
+        sd: prior standard deviations, ``(k,)``.
+    """
+    L = np.linalg.cholesky(np.eye(len(sd)) + sd[:, None] * G * sd)
+    root = linalg.solve_triangular(L, np.diag(sd), lower=True, check_finite=False)
+    q = root @ b
+    mean, sds = root.T @ q, np.sqrt(np.sum(root**2, axis=0))
+    return 0.5 * float(q @ q) - float(np.log(np.diag(L)).sum()), mean, sds
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """What candidates change, simulated around a fit."""
+
+    data: Data  #: n breaths of T samples.
+    values: Floats  #: physical values of the fit, ``(n, P + 1)``.
+    #: changes of pressure, ``(n, T)`` each, of which the first is that of the gain.
+    columns: Sequence[Floats]
+    #: paths and spreads of the coefficients of basis terms, by column.
+    basis: Mapping[int, tuple[str, float]]
+    of_basis: Mapping[str, list[int]]  #: columns of each basis term.
+    #: standard deviations of mechanisms that every rig has a little of, by column.
+    least: dict[int, float]
+    terms: Set  #: candidates.
+    #: changes of pressure by events of each course, ``(g, n, T)``, by name.
+    events: Mapping[str, Floats]
+
+    def forms(self, effect: Floats, name: str) -> dict[int, float]:
+        """Deviations of an effect's characteristic in the basis terms that contain it."""
+        found: dict[int, float] = {}
+        for basis in mechanism(name).description.special_case_of:
+            if own := self.of_basis.get(basis):
+                width = np.array([self.basis[j][1] for j in own])
+                A = np.stack([self.columns[j].reshape(-1) for j in own], axis=1) * width
+                ridge = 1e-3 * np.trace(A.T @ A) / len(own) * np.eye(len(own))
+                c = width * np.linalg.solve(A.T @ A + ridge, A.T @ effect.reshape(-1))
+                found |= dict(zip(own, (_FORM * np.abs(c) + 1e-12).tolist(), strict=True))
+        return found
+
+
+def points(name: str) -> list[dict[str, float]]:
+    """Values, by path, at which the effect of a mechanism is computed."""
+    strength, *others = mechanism(name).description.parameters
+    sizes: tuple[float, ...] = (strength.mild, strength.strong)
+    if any(p.change_point for p in others):
+        sizes = (strength.mild,)
+    elif strength.kinked:
+        sizes = tuple(strength.strong * x for x in (0.15, 0.35, 0.6, 1.0))
+    elif strength.low <= -strength.mild:
+        sizes += (-strength.mild,)
+
+    def grid(p: Parameter) -> tuple[float, ...]:
+        if p.change_point:  # before the first breath
+            return (-1.0,)
+        return p.grid or ((0.4, 1.0, 2.5) if p.uncertain else (p.neutral,))
+
+    paths = [f"{name}.{p.name}" for p in (strength, *others)]
+    every = product(sizes, *(grid(p) for p in others))
+    return [dict(zip(paths, point, strict=True)) for point in every]
+
+
+def courses(name: str) -> list[dict[str, float]]:
+    """Values of an event of some breaths, by path, for each of its courses."""
+    if name in CONSTANT:
+        return [{strength_path(name): CONSTANT[name][0]}]
+    _, onset, duration = mechanism(name).description.parameters
+    every = product((300.0,), onset.grid[::2], duration.grid[1:5])
+    paths = [f"{name}.{p}" for p in ("conductance", "onset", "duration")]
+    return [dict(zip(paths, point, strict=True)) for point in every]
+
+
+def simulate(
+    data: Data,
+    predictor: Predictor,
+    around: FittedModel,
+    names: Sequence[str],
+    unnamed: Sequence[str],
+    events: Collection[str],
+) -> Simulated:
+    """Simulate all candidates around a fit; what it has is no candidate.
+
+    Args:
+        data: n breaths.
+        predictor: predictor of these, with the parameters of all candidates.
+        around: the fit.
+        names: mechanisms that all breaths share.
+        unnamed: basis terms.
+        events: effects of some breaths.
+    """
+    values, order = around.values, (*predictor.names, START)
+    moved, scale = [values], {0: 0.01}
+
+    def move(changes: Mapping[str, Any]) -> int:
+        point = values.copy()
+        for path, value in changes.items():
+            point[:, order.index(path)] = value
+        moved.append(point)
+        return len(moved) - 2
+
+    move({"gain": 1.01 * values[:, order.index("gain")]})
+    basis: dict[int, tuple[str, float]] = {}
+    of_basis: dict[str, list[int]] = {}
+    for name in (n for n in unnamed if n not in around.names):
+        for p in mechanism(name).description.parameters:
+            path, spread = f"{name}.{p.name}", p.spread or 1.0
+            k = move({path: values[:, order.index(path)] + 0.1 * spread})
+            scale[k], basis[k] = 0.1 * spread, (path, spread)
+            of_basis.setdefault(name, []).append(k)
+    others = [n for n in names if n not in around.names]
+    found = [(name, point, move(point)) for name in others for point in points(name)]
+    acting = {n: [move(point) for point in courses(n)] for n in (*CONSTANT, OPEN) if n in events}
+    seen = predictor.predict_all(np.stack(moved))[:, :, 0]
+    # a point that the model cannot simulate changes nothing, so no evidence chooses it
+    seen = np.where(np.isfinite(seen).all(axis=(1, 2), keepdims=True), seen, seen[0])
+    columns = [(each - seen[0]) / scale.get(k, 1.0) for k, each in enumerate(seen[1:])]
+    courses_of = {name: np.stack([columns[k] for k in own]) for name, own in acting.items()}
+    made = Simulated(data, values, columns, basis, of_basis, {}, (), courses_of)
+    terms, least = [], {}
+    places = np.unique(data.position)
+    between = (0.5 * (places[1:] + places[:-1])[1:-1]).tolist()
+    for name, point, k in found:
+        about, size = mechanism(name).description, point[strength_path(name)]
+        at = [f"{name}.{p.name}" for p in about.parameters if p.change_point]
+        alike = sum(other == name for other, _, _ in found) * (len(between) if at else 1)
+        low, high = sorted((about.strength.low / size, about.strength.high / size))
+        term = Term(
+            name, (abs(about.strength.strong / size),), (k,), point, (low, high),
+            -float(np.log(max(alike, 1))),
+        )  # fmt: skip
+        for x in between if at else ():
+            columns.append(np.where(data.position[:, None] > x, columns[k], 0.0))
+            terms.append(replace(term, main=(len(columns) - 1,), values=point | {at[0]: x}))
+        if not at:
+            terms.append(replace(term, forms=made.forms(columns[k], name)))
+            if about.least and not any(t.name == name for t in terms[:-1]):
+                least[k] = _LEAST * about.least / abs(size)
+    terms += [Term(name, [basis[j][1] for j in own], tuple(own)) for name, own in of_basis.items()]
+    return replace(made, least=least, terms=tuple(terms))
+
+
+class Known:
+    """An experiment, linearised around a fit whose parameters return to their prior means.
+
+    All nuisance is integrated out: the parameters of the fit, what every rig has, deviations of
+    forms, and what acts in time beside the fit.
+    """
+
+    def __init__(
+        self, around: Simulated, fitted: FittedModel, base: FittedModel, noise: Noise,
+        terms: Set = (), *, scatter: float = SCATTER, loose: bool = False,
+    ) -> None:  # fmt: skip
+        """Linearise.
+
+        Args:
+            around: what candidates change.
+            fitted: fit of what of the terms is a parameter of the model.
+            base: fit of the base model, whose parameters are prior means.
+            noise: measurement noise.
+            terms: the terms of the rig.
+            scatter: standard deviation of the logarithm of the gain from breath to breath.
+            loose: whether basis terms have their whole spread.
+        """
+        self.fitted, self.terms, latent = fitted, terms, latent_of(terms)
+        self.around, self.noise, self.n = around, noise, len(around.data)
+        self.scatter = scatter
+        measured, weight = around.data.measured[:, 0], around.data.weight[:, 0]
+        residual, slopes = fitted.problem.jacobian(fitted.minimum.x)
+        left = weight * (measured - residual[:, 0] - fitted.problem.data.measured[:, 0])
+        free = {k: s for k, (p, s) in around.basis.items() if owner_of(p) not in fitted.names}
+        form = {k: (1.0 if loose else _REST) * s for k, s in free.items()}
+        own, each = [], [scatter * around.columns[0]]
+        self.paths: list[tuple[str, float, float]] = []
+        layout = fitted.problem.unknowns
+        for j, path in enumerate(layout.paths):
+            about, here = parameter_of(path), fitted.minimum.x[layout.index[:, j]]
+            if about.change_point:
+                continue
+            mean: Any = about.coordinate(base.column(path)) if "." not in path else about.prior()[0]
+            sd = _BASE[path] if "." not in path else about.prior()[1]
+            if "." in path and path == strength_path(owner_of(path)):
+                mean = float(about.coordinate(about.neutral))
+                sd = about.spread or abs(about.strong - about.neutral)
+                forms = around.forms(slopes[:, j, 0] * (here - mean)[:, None], owner_of(path))
+                form |= {k: float(np.hypot(form[k], s)) for k, s in forms.items() if k in form}
+            mean = np.broadcast_to(mean, here.shape)
+            left = left - slopes[:, j, 0] * (mean - here)[:, None]
+            if path == START:
+                each.append(sd * slopes[:, j, 0])
+                continue
+            for unknown in np.unique(layout.index[:, j]):  # one of each lung that has its own
+                which = layout.index[:, j] == unknown
+                own.append(sd * slopes[:, j, 0] * which[:, None])
+                self.paths.append((path, float(np.mean(mean[which])), sd))
+        own += [s * around.columns[k] for k, s in (form | around.least).items()]
+        own += [s * one for t in latent for one, s in zip(t.latent, t.spread, strict=True)]
+        self.latent = sum(len(t.latent) for t in latent)
+        shared = np.stack(own, axis=1) * weight[:, None]  # (n, z, T)
+        self.residual, self.of_each = left * weight, np.stack(each, axis=1) * weight[:, None]
+        self.shared = shared
+        self.y = self.rows(self.residual[:, None])[:, 0]
+        white = np.moveaxis(self.rows(self.of_each).reshape(self.n, -1, 2), 2, 0)
+        blocks = [np.asarray(linalg.block_diag(*x[:, :, None])) for x in white]
+        self.Z = np.concatenate([self.rows(shared), *blocks], axis=1)
+        self.factor = linalg.cho_factor(np.eye(self.Z.shape[1]) + self.Z.T @ self.Z, lower=True)
+        self.mean = linalg.cho_solve(self.factor, self.Z.T @ self.y)
+
+    def rows(self, columns: Floats) -> Floats:
+        """Whitened ``(n, m, T)`` as ``(n T, m)``."""
+        white = self.noise.whiten(columns[:, :, None], self.around.data.weight)[:, :, 0]
+        return np.moveaxis(white, 1, 2).reshape(-1, white.shape[1])
+
+    def products(self, X: Floats) -> tuple[Floats, Floats]:
+        """``X' K^-1 X`` and ``X' K^-1 y``, ``K = 1 + Z Z'``."""
+        ZX = self.Z.T @ X
+        return X.T @ X - ZX.T @ linalg.cho_solve(self.factor, ZX), X.T @ self.y - ZX.T @ self.mean
+
+    def of_breaths(self, columns: Floats) -> tuple[Floats, Floats]:
+        """The same of columns ``(n, m, T)`` with coefficients of each breath, ``(n m, n m)``."""
+        P = self.noise.whiten(columns[:, :, None], self.around.data.weight)[:, :, 0]
+        ZP = np.matmul(P, self.Z.reshape(self.n, P.shape[2], -1)).reshape(-1, self.Z.shape[1])
+        b = np.einsum("nmt,nt->nm", P, self.y.reshape(self.n, -1)).reshape(-1) - ZP @ self.mean
+        G = linalg.block_diag(*np.matmul(P, P.swapaxes(1, 2)))
+        return G - ZP @ linalg.cho_solve(self.factor, ZP.T), b
+
+    def of_each_breath(self, course: Floats) -> tuple[Floats, Floats]:
+        """Diagonal of the same, and products with the residual, of a course ``(n, T)``."""
+        P = self.noise.whiten(course[:, None, None], self.around.data.weight)[:, 0, 0]
+        ZP = np.einsum("nt,ntz->nz", P, self.Z.reshape(self.n, P.shape[1], -1))
+        b = np.einsum("nt,nt->n", P, self.y.reshape(self.n, -1)) - ZP @ self.mean
+        return np.sum(P**2, axis=1) - np.sum(ZP * linalg.cho_solve(self.factor, ZP.T).T, axis=1), b
+
+    @cached_property
+    def evidence(self) -> float:
+        """Log evidence of the terms."""
+        power = self.y @ self.y - (self.Z.T @ self.y) @ self.mean
+        value = -0.5 * float(power) - float(np.log(np.diag(self.factor[0])).sum())
+        value += sum(term.odds for term in self.terms)
+        for (path, mean, sd), found in zip(self.paths, self._parameters, strict=True):
+            if owner_of(path) in library() and path == strength_path(owner_of(path)):
+                about = parameter_of(path)
+                ends = (float(about.coordinate(about.low)), float(about.coordinate(about.high)))
+                value += within(ends, *found, mean, sd)
+        return value
+
+    @cached_property
+    def _parameters(self) -> list[tuple[float, float]]:
+        """Posterior mean and standard deviation of each path, in coordinates."""
+        sds = np.sqrt(np.diag(linalg.cho_solve(self.factor, np.eye(len(self.mean)))))
+        return [
+            (mean + sd * float(self.mean[k]), sd * float(sds[k]))
+            for k, (_, mean, sd) in enumerate(self.paths)
+        ]
+
+    @cached_property
+    def in_time(self) -> Floats:
+        """Expected change of pressure by what acts in time, cmH2O, ``(n, T)``."""
+        which = slice(self.shared.shape[1] - self.latent, self.shared.shape[1])
+        return np.einsum("nkt,k->nt", self.shared[:, which], self.mean[which])
+
+    @cached_property
+    def gains(self) -> Floats:
+        """Posterior mean of the logarithm of each breath's gain beside what all share, ``(n,)``."""
+        count = self.shared.shape[1]
+        return self.scatter * self.mean[count : count + self.n]
+
+    @property
+    def left(self) -> Noise:
+        """Noise beside all that is known here."""
+        count = self.shared.shape[1]
+        told = np.einsum("nkt,k->nt", self.shared, self.mean[:count])
+        told += np.einsum("nkt,kn->nt", self.of_each, self.mean[count:].reshape(2, self.n))
+        weight = self.around.data.weight
+        return robust_noise((self.residual - told)[:, None] * weight, weight)
+
+
+def owner_of(path: str) -> str:
+    """Mechanism of a parameter; none if it is of the base model."""
+    return path.rpartition(".")[0]
+
+
+def within(
+    limits: tuple[float, float], mean: float, sd: float, before: float, sd_before: float
+) -> float:
+    """Log of the share of a Gaussian that lies within limits, over that of its prior."""
+
+    def share(centre: float, width: float) -> float:
+        a, b = ((end - centre) / width for end in limits)
+        return max(float(special.ndtr(b) - special.ndtr(a)) if a < 5 else 0.0, 1e-12)
+
+    return float(np.log(share(mean, sd)) - np.log(share(before, sd_before)))

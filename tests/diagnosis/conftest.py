@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import pytest
 
-from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 
 from . import small
 

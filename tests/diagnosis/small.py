@@ -14,11 +14,12 @@ from hardware_eval.emulation.cases import Base, Case, Effect
 from proofs.challenge.first.rig import record
 from proofs.challenge.stranger import laboratory
 from proofs.challenge.stranger.effects import StrangerCase
+from ventbench.diagnosis.conclusion import Conclusion, conclude
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
-from ventbench.diagnosis.selection.screening import all_parameter_paths
+from ventbench.diagnosis.hypothesis import all_parameter_paths, make_partition
 from ventbench.diagnosis.settings import (
     DataSettings,
-    ScreeningSettings,
+    SearchSettings,
     SelectionConfig,
     SimulatorSettings,
 )
@@ -39,13 +40,13 @@ FEW = ("flow_shape", "leak_shape", "volume_resistance")
 #: One compilation for all of these breaths, and a few terms to choose from.
 SETTINGS = SelectionConfig(
     data=DataSettings(batch_size=BREATHS),
-    screening=ScreeningSettings(nonparametric_terms=FEW),
+    search=SearchSettings(nonparametric_terms=FEW),
     # With the noise of the usual seed, a strength comes out three intervals too high.
     simulator=SimulatorSettings(noise_seed=1),
 )
 
 #: All nonparametric terms to choose from, which take minutes to compile.
-ALL_TERMS = dataclasses.replace(SETTINGS, screening=ScreeningSettings())
+ALL_TERMS = dataclasses.replace(SETTINGS, search=SearchSettings())
 
 
 def effect(name: str, form: str = "library", /, **parameters: float) -> Effect:
@@ -76,6 +77,21 @@ def split_wide(breaths: Breaths, settings: SelectionConfig = SETTINGS) -> Evalua
     """Training and held-out breaths, with the parameters of the nonparametric terms as well."""
     names = all_parameter_paths(settings)
     return make_evaluator(make_data(breaths), HELD[: len(breaths)], names, settings=settings)
+
+
+def concluded(breaths: Breaths, settings: SelectionConfig = SETTINGS) -> Conclusion:
+    """What a recording needs."""
+    return concluded_of(split_wide(breaths, settings), breaths)
+
+
+def concluded_of(evaluator: Evaluator, breaths: Breaths) -> Conclusion:
+    """What a recording needs that is split already."""
+    names = evaluator.training.predictor.names
+    told: list[str] = []
+    every = make_partition(make_data(breaths), names, evaluator.settings)
+    found = conclude(evaluator, every, told.append)
+    assert told
+    return found
 
 
 def numbered(breaths: Breaths, first: int) -> Breaths:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from ventbench.diagnosis import latent_inputs
-from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.latent_inputs import MEASUREMENT, exceeds_sensor_noise
 from ventbench.diagnosis.patient_effort import (
     AMPLITUDE,
     DURATION,
@@ -20,7 +17,6 @@ from ventbench.diagnosis.patient_effort import (
     PatientEffortTerm,
     breath_term,
 )
-from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.system_id import Noise
 
 from . import small
@@ -104,21 +100,6 @@ def test_training_and_held_out_breaths_are_integrated_alike(active, fitted):
     held_out = training.held_out_log_likelihood(fitted)
     marginal = TERM.marginal_log_likelihood(fitted, fitted.noise)
     assert marginal == pytest.approx(held_out, abs=4.0)
-
-
-def test_effort_is_told_from_slow_sensor_noise(active, fitted):
-    assert exceeds_sensor_noise(active, fitted)
-    wandering = small.split(small.made(noise=0.3, coloured=0.9, correlation=0.9, seed=4))
-    assert not exceeds_sensor_noise(wandering, fit_with_noise(wandering, EFFORT))
-
-
-@pytest.mark.parametrize(("size", "told"), [(0.9, False), (2.0, True)])
-def test_effort_need_not_outdo_noise_that_no_sensor_has(size, told, active, fitted, monkeypatch):
-    """Beside other strong effects, an input explains all that is missing, and effort a part."""
-    better = np.full(len(active.held_out.data), 1e6)
-    noise = SimpleNamespace(size=size, held_out_log_likelihood=better)
-    monkeypatch.setattr(latent_inputs, "fit_latent_inputs", lambda *_: {MEASUREMENT: noise})
-    assert exceeds_sensor_noise(active, fitted) is told
 
 
 def test_the_prediction_is_the_mean_over_efforts(active, fitted):

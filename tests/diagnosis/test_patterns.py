@@ -18,9 +18,7 @@ import pytest
 from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.stranger.effects import StrangerCase
 from proofs.challenge.stranger.laboratory import record
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
-from ventbench.diagnosis.selection.forward import forward_selection
+from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.task.lungs import lung
 
 from . import small
@@ -101,9 +99,7 @@ def selected(
         breaths=small.BREATHS, samples=small.SAMPLES, inspiration=0.8,
         explored=0.0 if closed_loop else 0.5, proportional=4.0,
     )  # fmt: skip
-    evaluator = small.split(record(case, np.random.default_rng(seed)))
-    base = fit_with_noise(evaluator, Hypothesis())
-    return forward_selection(evaluator, base, lambda _: None)[0]
+    return small.concluded(record(case, np.random.default_rng(seed))).named
 
 
 def effect(name: str, form: str, /, **parameters: float) -> Effect:

@@ -12,9 +12,9 @@ import pytest
 from ventbench.base import precision
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion
+from ventbench.diagnosis.evaluator import fit_with_noise
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.identification import IdentifiedModel, held_out, identify
-from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.diagnosis.simulator_comparison import (
     describe_otherwise,

@@ -13,7 +13,7 @@ import pytest
 from tests.diagnosis import made
 from ventbench.diagnosis import number_text
 from ventbench.diagnosis.findings import MissingMechanism
-from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY
+from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.diagnosis.residual_analysis import profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
@@ -122,7 +122,7 @@ def test_the_guilty_part_of_the_rig_is_lit(found: Diagnosis, tmp_path: Path) -> 
     assert (parts["airway"].look, parts["airway"].badge) == ("suspect", "3")
 
 
-@pytest.mark.parametrize("place", [*NONPARAMETRIC_COMPONENTS, ALVEOLUS, SUPPLY, MEASUREMENT])
+@pytest.mark.parametrize("place", [*NONPARAMETRIC_COMPONENTS, ALVEOLUS, SUPPLY, CIRCUIT])
 def test_every_place_is_in_the_picture(place: str) -> None:
     term = made.unnamed(12).nonparametric
     assert term is not None

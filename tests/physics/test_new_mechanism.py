@@ -9,9 +9,9 @@ import pytest
 from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
 from ventbench.diagnosis.evaluator import make_evaluator
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise, fit_with_white_noise
-from ventbench.diagnosis.selection.screening import screen_mechanisms
+from ventbench.diagnosis.evidence import search
+from ventbench.diagnosis.hypothesis import all_parameter_paths
+from ventbench.diagnosis.settings import SearchSettings, SelectionConfig
 from ventbench.physics import Description, Mechanism, Parameter, library, paths, physics
 from ventbench.physics.catalogue import extended
 from ventbench.system_id import Predictor, fit, interval, make_data
@@ -94,10 +94,11 @@ def test_a_fit_estimates_its_strength(relieved):
     assert conductance.value == pytest.approx(20.0, rel=0.1)
 
 
-def test_screening_puts_it_first(relieved):
+def test_the_search_names_it(relieved):
     with extended(POP_OFF_VALVE):
-        evaluator = make_evaluator(relieved[1], np.arange(12) % 2 == 1, paths(NAMES))
-        null = fit_with_noise(evaluator, Hypothesis())
-        candidates = screen_mechanisms(null, fit_with_white_noise(evaluator, null), NAMES)
-    assert candidates[0].name == "pop_off_valve"
-    assert candidates[0].nats > 50.0
+        settings = SelectionConfig(search=SearchSettings(nonparametric_terms=()))
+        names = all_parameter_paths(settings)
+        evaluator = make_evaluator(relieved[1], np.arange(12) % 2 == 1, names, settings=settings)
+        found = search(evaluator)
+    assert found.best.terms[0].name == "pop_off_valve"
+    assert found.weights[frozenset({"pop_off_valve"})] > 0.5

@@ -278,14 +278,6 @@ class Evaluator:
             delay_rounds=delay_rounds, settings=self.settings,
         )  # fmt: skip
 
-    @property
-    def at_label(self) -> Hypothesis | None:
-        """The base model with R and C held at the label; None if there are several labels."""
-        data = self.training.data
-        if len(np.unique(data.R)) > 1 or len(np.unique(data.C)) > 1:
-            return None
-        return Hypothesis(fixed=(("R", float(data.R[0])), ("C", float(data.C[0]))))
-
     @cached_property
     def for_ranking(self) -> Evaluator:
         """Evaluator with as many training breaths as rank candidates: one batch of simulations.
@@ -298,20 +290,6 @@ class Evaluator:
         names = self.training.predictor.names
         partition = make_partition(self.training.data.select(index), names, self.settings)
         return replace(self, training=partition)
-
-    def restricted(self, fitted: FittedModel) -> FittedModel:
-        """A model of the training breaths as one of the breaths of :attr:`for_ranking`."""
-        partition = self.for_ranking.training
-        if partition is self.training:
-            return fitted
-        paths, fixed = fitted.problem.unknowns.paths, dict(fitted.hypothesis.fixed)
-        problem = make_problem(partition, paths, fitted.noise, fixed, self.gain_sd)
-        index = self._ranking_breaths
-        x = problem.unknowns.pack({path: fitted.column(path)[index] for path in paths})
-        size = len(x)
-        minimum = Minimum(x, problem.cost(x), np.zeros(size), np.eye(size), 0, False)
-        likelihood = float(problem.log_likelihood(x).sum())
-        return FittedModel(fitted.hypothesis, problem, minimum, likelihood)
 
     @cached_property
     def _ranking_breaths(self) -> NDArray[np.intp]:

@@ -160,10 +160,6 @@ class Hypothesis:
             tuple((path, value) for path, value in self.fixed if kept(path)),
         )
 
-    def with_default(self, path: str) -> Hypothesis:
-        """The hypothesis with a shape parameter at its default."""
-        return Hypothesis(self.names, tuple(p for p in self.free if p != path), self.fixed)
-
     @property
     def breath_terms(self) -> tuple[str, ...]:
         """Terms with parameters that differ from breath to breath."""

@@ -113,7 +113,7 @@ def _of_some_breaths(known: Known, partition: Partition, excluded: Collection[st
     sizes = {name: size for name, (_, size) in CONSTANT.items()} | {OPEN: 1.0}
     every = {(name, sizes[name]): known.around.events[name][None] for name in known.around.events}
     pushes = {name: about for name, about in _PUSHES.items() if name not in excluded}
-    push = input_responses(partition, known.around.values, ALVEOLUS) if pushes else None
+    push = input_responses(partition, known.around.values, ALVEOLUS)
     for name, (sign, size, durations, onsets) in pushes.items():
         x = np.clip([(time - a) / d for a, d in product(onsets, durations)], 0.0, 1.0)
         shape = [sign * np.sin(np.pi * h * x) for h in range(1, len(_HARMONICS) + 1)]

@@ -20,7 +20,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ventbench.diagnosis.gaussian_process import LinearBreaths
 from ventbench.diagnosis.hypothesis import FittedModel, Linearisation, linearise
 from ventbench.system_id.data import Floats
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
@@ -48,19 +47,8 @@ _TEMPLATE = 1.0
 _RESTART_GAIN, _TOLERANCE, _STEPS = 1.0, 0.2, 7
 
 
-class ScreenedTerm(NamedTuple):
-    """Expected gain of a term that differs from breath to breath."""
-
-    nats: tuple[float, ...]  #: log-likelihood that it is expected to gain, for each linearisation.
-    start: dict[str, float]  #: values to start a fit from, by path.
-
-
 class BreathTerm(Protocol):
     """The part of a hypothesis that differs from breath to breath."""
-
-    def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm | None:
-        """Expected gain by integration over each breath; None if nothing is integrated out."""
-        ...
 
     def start(
         self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
@@ -102,10 +90,6 @@ def breath_term(names: Iterable[str]) -> BreathTerm:
 class NoBreathTerm:
     """Stands for a hypothesis whose parameters are equal in all breaths."""
 
-    def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm | None:
-        """Return None: nothing is integrated out."""
-        return None
-
     def start(
         self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
     ) -> Floats:
@@ -137,12 +121,6 @@ class Evidence(NamedTuple):
 @dataclass(frozen=True)
 class PatientEffortTerm:
     """Efforts of a patient, integrated out in each breath."""
-
-    def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm:
-        """Expected gain: sums over the grid of onsets, at the best duration of a grid."""
-        evidence = [self.evidence([linearisation])[0] for linearisation in linearisations]
-        nats = [max(float(terms.nats.sum()), 0.0) for terms in evidence]
-        return ScreenedTerm(tuple(nats), {DURATION: evidence[int(np.argmax(nats))].duration})
 
     def start(
         self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
@@ -177,8 +155,7 @@ class PatientEffortTerm:
     def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
         """Integrate efforts out of breaths without any, at the fitted duration, ``(n,)``."""
         duration = float(fitted.column(DURATION)[0])
-        linear = linearise(problem, x, clip=np.inf)
-        start = self.evidence([linear], duration)[0]
+        start = self.evidence([linearise(problem, x)], duration)[0]
         breathwise, minimum = self._fit_each_breath(problem, x, start)
         curvature = minimum.hessian[
             breathwise.unknowns.index[:, :, None], breathwise.unknowns.index[:, None, :]
@@ -188,18 +165,7 @@ class PatientEffortTerm:
         gained = with_effort - problem.log_likelihood(x)
         laplace = np.logaddexp(np.log(1.0 - PROBABILITY), np.log(PROBABILITY) + gained)
         # A weak effort's onset is free, as on the grid; for a strong one that is too coarse.
-        return np.maximum(self._faint_gain(problem, x, self._effects(linear, duration)), laplace)
-
-    def _faint_gain(self, problem: Problem, x: Floats, effects: list[Floats]) -> Floats:
-        """Log-likelihood that faint efforts gain, as a sum over the grid of onsets, ``(n,)``."""
-        breaths, noise = LinearBreaths.of(problem, x), problem.noise
-        size = AMPLITUDE_SD / _TEMPLATE
-        active = [
-            breaths.whitened(noise, effect[:, None]).marginal(size).nats for effect in effects
-        ]
-        mixed = np.logaddexp.reduce(active, axis=0) - np.log(len(effects))
-        gained = mixed - breaths.whitened(noise).marginal(size).nats
-        return np.logaddexp(np.log(1.0 - PROBABILITY), np.log(PROBABILITY) + gained)
+        return np.maximum(start.nats, laplace)
 
     def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
         """Integrate efforts out around the efforts that the fit found, ``(n,)``."""

@@ -28,7 +28,7 @@ from ventbench.diagnosis.hypothesis import (
 )
 from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
-from ventbench.physics.catalogue import library
+from ventbench.physics.catalogue import library, mechanism
 from ventbench.system_id import problem as problems
 from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
@@ -82,6 +82,11 @@ def fit(
         known = set(warm_start.problem.unknowns.paths)
         first |= {p: warm_start.column(p) for p in layout.paths if p in known}
     first |= {p: value for p, value in (start or {}).items() if p in layout.paths}
+    for name in hypothesis.names:
+        for pair in mechanism(name).description.interchangeable:
+            one, other = (f"{name}.{short}" for short in pair)
+            if {one, other} <= set(first) and np.all(np.less(first[one], first[other])):
+                first[one], first[other] = first[other], first[one]
     low, high = layout.bounds()
     x = layout.pack(first)
     if restart:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,8 +78,8 @@ class Posterior:
 
     @cached_property
     def best(self) -> Known:
-        """The likeliest set that was fitted."""
-        return max(self.fitted, key=lambda known: self.weights[names_of(known.terms)])
+        """The set of the largest evidence: held-out breaths have their say."""
+        return self.fitted[0]
 
 
 def search(wide: Evaluator, also: Sequence[str] = ()) -> Posterior:
@@ -186,6 +187,16 @@ def enumerate_sets(
     return sorted(best.values(), key=lambda pair: -pair[0])
 
 
+class _View(NamedTuple):
+    """A linearisation, and its sets of terms."""
+
+    base: FittedModel
+    around: Simulated
+    noise: Noise
+    scatter: float
+    ranked: list[tuple[float, Set]]
+
+
 class _Search:
     """The steps of a search."""
 
@@ -200,7 +211,7 @@ class _Search:
         self.unnamed = self.settings.nonparametric_terms
         if self.unnamed is None:
             self.unnamed = tuple(basis_terms())
-        self.fits: dict[frozenset[str], FittedModel] = {}
+        self.tried: dict[frozenset[str], Known] = {}
 
     def run(self, also: Sequence[str]) -> Posterior:
         """Search."""
@@ -208,23 +219,24 @@ class _Search:
         data = without_spikes(first, data)
         noise = estimate_noise(self.fit((), data))
         self.data, self.base = data, self.fit((), data, noise)
-        base = self.base
-        around = self.around(base)
-        self.scatter = self.likeliest_scatter(around, base, noise)
-        for _ in range(2):
-            noise = self.known(around, base, noise, loose=True).left
-        known = self.known(around, base, noise)
-        latent = in_time(
-            known, Partition(data, self.predictor), base, self.excluded, self.evaluator.settings
+        views = [self.view(self.base, noise)]
+        if self.is_far_from_label(self.base):
+            views.append(self.view(self.at_label(noise), noise))
+        for view in views:
+            for _, terms in view.ranked[: self.settings.fits]:
+                self.attempt(view.around, view.noise, terms, view.base)
+        main = min(
+            views, key=lambda view: view.noise.sigma[0] * (1.0 - view.noise.ar[0] ** 2) ** 0.5
         )
-        ranked = enumerate_sets(known, latent, 3, self.settings.beam)
-        self.tried = {frozenset[str](): known}
-        for _, terms in ranked[: self.settings.fits]:
-            self.attempt(around, noise, terms)
+        around, noise, ranked = main.around, main.noise, main.ranked
+        self.scatter = main.scatter
+        self.tried[frozenset()] = self.known(around, self.base, noise)
+        self.rescore(around, noise)
         if also:
             points = [t for n in also for t in around.terms if t.name == n]
-            self.attempt(around, noise, tuple({t.name: t for t in reversed(points)}.values()))
-        while True:
+            terms = tuple({t.name: t for t in reversed(points)}.values())
+            self.attempt(around, noise, terms, self.base)
+        for _ in range(2 * self.settings.most_terms):
             best = self.ordered()[0]
             if not best.terms or len(best.terms) >= self.settings.most_terms:
                 break
@@ -234,12 +246,12 @@ class _Search:
             one = self.known(around, best.fitted, noise, best.terms)
             more = enumerate_sets(one, (), 1, self.settings.beam)
             for terms in [t for _, t in more if t and not names_of(t) & own][:3]:
-                self.attempt(around, noise, (*best.terms, *terms))
+                self.attempt(around, noise, (*best.terms, *terms), best.fitted)
             for term in best.terms:
-                self.attempt(around, noise, tuple(t for t in best.terms if t is not term))
-            for key, s in self.tried.items():
-                self.tried[key] = self.known(around, s.fitted, noise, s.terms)
-            if names_of(self.ordered()[0].terms) <= own:
+                rest = tuple(t for t in best.terms if t is not term)
+                self.attempt(around, noise, rest, best.fitted)
+            self.rescore(around, noise)
+            if names_of(self.ordered()[0].terms) == own:
                 break
         return Posterior(
             tuple(self.ordered()), weigh(self.ordered(), ranked), self.base, self.scatter
@@ -281,16 +293,55 @@ class _Search:
             hypothesis, noise or Noise(), warm_start, start or None, partition=partition
         )
 
-    def attempt(self, around: Simulated, noise: Noise, terms: Set) -> None:
+    def view(self, base: FittedModel, noise: Noise) -> _View:
+        """Sets of terms by a linearisation around a base model."""
+        around = self.around(base)
+        self.scatter = self.likeliest_scatter(around, base, noise)
+        for _ in range(2):
+            noise = self.known(around, base, noise, loose=True).left
+        known = self.known(around, base, noise)
+        latent = in_time(
+            known, Partition(self.data, self.predictor), base, self.excluded,
+            self.evaluator.settings,
+        )  # fmt: skip
+        ranked = enumerate_sets(known, latent, 3, self.settings.beam)
+        return _View(base, around, noise, self.scatter, ranked)
+
+    def is_far_from_label(self, base: FittedModel) -> bool:
+        """Whether the base model makes up for much by R or C."""
+        ratios = [base.column(path) / getattr(self.data, path) for path in ("R", "C")]
+        return bool(np.max(np.abs(np.log(ratios))) > np.log(self.settings.label_factor))
+
+    def at_label(self, noise: Noise) -> FittedModel:
+        """The base model with the labels' R and C: lags of 0.1 s take R to nothing."""
+        return self.evaluator.fit(
+            Hypothesis(), noise, None, {"R": self.data.R, "C": self.data.C},
+            partition=Partition(self.data, self.predictor), iterations=0, delay_rounds=0,
+        )  # fmt: skip
+
+    def attempt(self, around: Simulated, noise: Noise, terms: Set, start: FittedModel) -> None:
         """Fit a set; what acts in time is taken from the readings before a second fit."""
-        if names_of(terms) in self.tried:
+        if not terms:
             return
-        fitted, told, latent = self.base, self.data, latent_of(terms)
+        fitted, told, latent = start, self.data, latent_of(terms)
         for k in range(2 if latent else 1):
             if k or len(terms) > len(latent):
                 fitted = self.fit(terms, told, noise, fitted)
-            made = self.tried[names_of(terms)] = self.known(around, fitted, noise, terms)
+            elif start is not self.base:
+                fitted = self.base
+            made = self.known(around, fitted, noise, terms)
             told = replace(self.data, measured=self.data.measured - made.in_time[:, None])
+        before = self.tried.get(names_of(terms))
+        if (
+            before is None
+            or self.known(around, before.fitted, noise, terms).evidence < made.evidence
+        ):
+            self.tried[names_of(terms)] = made
+
+    def rescore(self, around: Simulated, noise: Noise) -> None:
+        """Score all sets alike."""
+        for key, s in self.tried.items():
+            self.tried[key] = self.known(around, s.fitted, noise, s.terms)
 
     def ordered(self) -> list[Known]:
         """Sets that were fitted, likeliest first."""
@@ -319,11 +370,11 @@ def without_spikes(fitted: FittedModel, data: Data) -> Data:
 def weigh(
     scored: Sequence[Known], linear: Sequence[tuple[float, Set]]
 ) -> dict[frozenset[str], float]:
-    """Posterior of each set of names; those that were not fitted are a nat less likely."""
+    """Posterior of each set of names; the likeliest that was not fitted is a nat behind."""
     logs = {names_of(s.terms): _WARMTH * s.evidence for s in scored}
     at = {names_of(terms): _WARMTH * (value - prior(names_of(terms))) for value, terms in linear}
     logs = {names: value + prior(names) for names, value in logs.items()}
-    offset = max(logs.values()) - 1.0 - max(at[k] + prior(k) for k in logs if k in at)
+    offset = max(logs.values()) - 1.0 - max(value + prior(k) for k, value in at.items())
     for names, value in at.items():
         logs.setdefault(names, value + prior(names) + offset)
     odds = np.exp(np.array(list(logs.values())) - max(logs.values()))

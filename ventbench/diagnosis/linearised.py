@@ -215,6 +215,8 @@ def simulate(
 class Known:
     """An experiment, linearised around a fit whose parameters return to their prior means.
 
+    These are the labels of R and C, and the base fit's R_ex, PEEP and starts.
+
     All nuisance is integrated out: the parameters of the fit, what every rig has, deviations of
     forms, and what acts in time beside the fit.
     """
@@ -249,7 +251,9 @@ class Known:
             about, here = parameter_of(path), fitted.minimum.x[layout.index[:, j]]
             if about.change_point:
                 continue
-            mean: Any = about.coordinate(base.column(path)) if "." not in path else about.prior()[0]
+            mean: Any = about.prior()[0] if "." in path else about.coordinate(base.column(path))
+            if path in ("R", "C"):
+                mean = about.coordinate(getattr(around.data, path))
             sd = _BASE[path] if "." not in path else about.prior()[1]
             if "." in path and path == strength_path(owner_of(path)):
                 mean = float(about.coordinate(about.neutral))

@@ -65,6 +65,9 @@ class SearchSettings:
     beam: int = 24  #: sets of each size that are extended by another term.
     fits: int = 4  #: sets of the linear problem that are fitted.
     most_terms: int = 5  #: most terms of a set.
+    #: factor between a refitted R or C and its label beyond which sets are also enumerated around
+    #: the label: strong lags let a refit take R to nothing.
+    label_factor: float = 1.3
     #: held-out log-likelihood, nats, from which a periodic input is accepted: more than for a term,
     #: since places and frequencies are searched.
     swing_nats: float = 8.0

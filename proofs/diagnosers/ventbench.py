@@ -85,10 +85,12 @@ def hypotheses(found: Mapping[str, Any], vocabulary: Mapping[str, Any]) -> list[
         vocabulary: that of the case.
     """
     always, places = _session(found), vocabulary["places"]
+    known = vocabulary["names"].keys() | {f"unknown:{place}" for place in places}
     odds: dict[frozenset[str], float] = {}
 
     def add(terms: frozenset[str], probability: float) -> None:
-        odds[terms | always] = odds.get(terms | always, 0.0) + probability
+        terms = (terms | always) & known
+        odds[terms] = odds.get(terms, 0.0) + probability
 
     for place in places:
         add(frozenset({f"unknown:{place}"}), _UNSURE / len(places))

@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.answer import answer
@@ -19,17 +18,16 @@ from proofs.challenge.make import make
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Limits, built_in, find
 from proofs.challenge.vocabulary import PUBLISHED, TERMS, VOCABULARY
-from proofs.diagnosers import classifier, evidence, lisdd
+from proofs.diagnosers import classifier, lisdd
 from proofs.diagnosers.common import Templates
 from proofs.diagnosers.gaussian_process import _Process
 from proofs.diagnosers.sindy import thresholded_least_squares
-from proofs.diagnosers.ventbench import Calibration, hypotheses
+from proofs.diagnosers.ventbench import hypotheses
 
 
 def test_the_project_enters_itself_and_its_rivals() -> None:
     assert built_in() == (
-        "classifier", "evidence", "forward_search", "gaussian_process", "lisdd", "refit", "sindy",
-        "ventbench",
+        "classifier", "forward_search", "gaussian_process", "lisdd", "refit", "sindy", "ventbench",
     )  # fmt: skip
 
 
@@ -94,101 +92,46 @@ def test_the_classifier_has_its_weights_and_sees_what_drifts() -> None:
         assert chances[k, at] > 10.0 * chances[0, at]
 
 
-def test_evidence_of_coefficients_is_that_of_the_marginal_density() -> None:
-    rng = np.random.default_rng(3)
-    X, y, sd = rng.standard_normal((20, 3)), rng.standard_normal(20), np.array([0.5, 1.0, 2.0])
-    value, mean, sds = evidence.gaussian(X.T @ X, X.T @ y, sd)
-    spread = np.eye(20) + X * sd**2 @ X.T
-    _, log_volume = np.linalg.slogdet(2.0 * np.pi * spread)
-    marginal = -0.5 * (y @ np.linalg.solve(spread, y) + log_volume)
-    assert value == pytest.approx(marginal - stats.norm.logpdf(y).sum())
-    precision = X.T @ X + np.diag(sd**-2)
-    np.testing.assert_allclose(mean, np.linalg.solve(precision, X.T @ y))
-    np.testing.assert_allclose(sds, np.sqrt(np.diag(np.linalg.inv(precision))))
-
-
-def test_an_event_is_found_in_the_breaths_that_it_affects() -> None:
-    rng = np.random.default_rng(4)
-    for acts in ([2, 5, 6], [0, 1, 2, 3, 4, 6, 7, 8, 9, 11]):
-        size = np.isin(np.arange(12), acts) * rng.uniform(0.7, 1.3, 12)
-        G = 40.0 * (np.eye(12) - 0.8 / 12)  # their mean is hardly known
-        b = G @ size + rng.standard_normal(12)
-        at, sizes = evidence.affected(G, b, 1.0, 1.0)
-        assert at.tolist() == acts
-        assert np.all(sizes > 0.2)
-    at, _ = evidence.affected(G, rng.standard_normal(12), 1.0, 1.0)
-    assert not len(at)
-
-
-SHARES = Calibration(nothing=0.9, named=0.8, placed=0.7, alone=0.25, foreign=0.6, doubt=2.0)
-
-
-def shares_of(verdict: str, *mechanisms: dict, **found) -> dict[frozenset[str], float]:
-    given = {"verdict": verdict, "mechanisms": mechanisms, "slot": None, "changes": [],
-             "saturated": None, "open_loop": {"unexplained": 0.1, "noise_floor": 0.2},
-             } | found  # fmt: skip
-    told = hypotheses(given, PUBLISHED, SHARES)
-    assert sum(each["probability"] for each in told) == pytest.approx(1.0)
-    assert all(TERMS.issuperset(each["terms"]) for each in told)
-    return {frozenset(each["terms"]): each["probability"] for each in told}
-
-
-def named(name: str, confidence: float = 1.0, *alternatives: str) -> dict:
-    return {"name": name, "confidence": confidence, "alternatives": list(alternatives)}
+def told(verdict: str, *mechanisms: str, **found) -> dict[frozenset[str], float]:
+    given = {"verdict": verdict, "mechanisms": [{"name": name} for name in mechanisms],
+             "slot": None, "changes": [], "saturated": None,
+             "posterior": [{"terms": list(mechanisms), "probability": 1.0}]} | found  # fmt: skip
+    answer = hypotheses(given, PUBLISHED)
+    assert sum(each["probability"] for each in answer) == pytest.approx(1.0)
+    assert all(TERMS.issuperset(each["terms"]) for each in answer)
+    return {frozenset(each["terms"]): each["probability"] for each in answer}
 
 
 def terms(*names: str) -> frozenset[str]:
     return frozenset(names)
 
 
-def test_a_verdict_has_its_share_and_what_it_may_have_missed_the_rest() -> None:
-    silent = shares_of("nothing_missing")
-    assert silent[terms()] == pytest.approx(0.9)
-    assert silent[terms("cough")] == silent[terms("lost_commands")] == pytest.approx(0.06 / 8)
-    assert silent[terms("unknown:lung")] == pytest.approx(0.04 / 9)
-    told = shares_of("named", named("leak", 0.75, "valve_dead_band"))
-    assert told[terms("leak")] == pytest.approx(0.8 * 0.75)
-    assert told[terms("valve_dead_band")] == pytest.approx(0.8 * 0.25)
-    assert told[terms("leak", "cough")] == told[terms("cough")] == pytest.approx(0.1 * 0.6 / 8)
-    assert terms() not in told
-    alike = shares_of("named", named("viscoelasticity", 0.6, "second_compartment"))
-    assert alike[terms("viscoelasticity")] == pytest.approx(0.8), "the other has no name here"
-    changed = shares_of("named", changes=[{"of": "gain", "drifts": False}], saturated={})
-    assert changed[terms("gain_step", "saturation")] == pytest.approx(0.8)
+def test_the_posterior_is_passed_on_beside_what_held_out_breaths_accept() -> None:
+    silent = told("nothing_missing")
+    assert silent[terms()] == pytest.approx(0.95)
+    assert silent[terms("unknown:lung")] == pytest.approx(0.05 / 9)
+    two = [{"terms": ["leak", "recoil_shape"], "probability": 0.2},
+           {"terms": ["valve_dead_band"], "probability": 0.6}]  # fmt: skip
+    both = told("named", "leak", posterior=two)
+    assert both[terms("leak")] > both[terms("valve_dead_band")] > 0.25
+    ratio = both[terms("valve_dead_band")] / both[terms("leak", "unknown:lung")]
+    assert ratio == pytest.approx(3.0)
+    changed = told("named", changes=[{"of": "gain", "drifts": False}], saturated={})
+    assert changed[terms("gain_step", "saturation")] == pytest.approx(0.95)
 
 
-def test_what_stays_unexplained_speaks_against_a_verdict_that_leaves_nothing_open() -> None:
-    for verdict, names, share in (("named", [named("leak")], 0.8), ("nothing_missing", [], 0.9)):
-        large = {"open_loop": {"unexplained": 0.6, "noise_floor": 0.2}}
-        told = shares_of(verdict, *names, **large)[terms(*(each["name"] for each in names))]
-        assert told / (1.0 - told) == pytest.approx(share / (1.0 - share) / 9.0)
-
-
-def test_a_place_without_a_name_may_be_a_name_without_a_hypothesis() -> None:
+def test_an_effect_without_a_name_is_at_its_places() -> None:
     slot = {"name": "f(t) at the supply", "places": {"f(t) at the supply": 3.0, "f(Q)": 1.0}}
-    told = shares_of("unnamed", slot=slot)
-    rest = 0.3 * 0.75  # and a quarter of it: nothing is missing
-    assert told[terms()] == pytest.approx(0.3 * 0.25)
-    assert told[terms("supply_ripple")] == pytest.approx(0.7 * 0.75 * 0.6 + rest * 0.6 / 8)
-    assert told[terms("unknown:supply")] == pytest.approx(0.7 * 0.75 * 0.4 + rest * 0.4 / 9)
-    assert told[terms("secretions")] == pytest.approx(0.7 * 0.25 * 0.6 + rest * 0.6 / 8)
-    assert told[terms("cough")] == pytest.approx(rest * 0.6 / 8)
-    beside = shares_of("named", named("leak"), slot={"name": "nowhere", "places": {}})
-    assert beside[terms("leak")] == pytest.approx(0.3 * 0.25)
-    assert beside[terms("leak", "unknown:airway")] > beside[terms("unknown:airway")]
+    where = told("unnamed", slot=slot, posterior=[{"terms": ["supply_memory"], "probability": 1}])
+    assert where[terms("unknown:supply")] > 3.0 * where[terms("unknown:airway")]
+    nowhere = told("unnamed")
+    assert nowhere[terms("unknown:lung")] == nowhere[terms("unknown:supply")]
 
 
 def test_an_answer_is_not_longer_than_may_be() -> None:
     names = sorted(VOCABULARY)
-    many = [named(names[k], 0.3, *names[k + 1 : k + 4]) for k in (0, 4, 8)]
-    every = ("f(p)", "f(Q)", "f(V)", "measurement", "f(t) at the supply", "exhalation path")
-    assert 100 < len(shares_of("named", *many, slot={"places": dict.fromkeys(every, 1.0)})) <= 500
-
-
-def test_an_effect_without_name_and_place_is_a_set() -> None:
-    told = shares_of("unnamed")
-    assert told[terms()] == pytest.approx(0.25)
-    assert told[terms("cough")] == told[terms("circuit_water")] == pytest.approx(0.75 * 0.6 / 8)
+    many = [{"terms": [one, other], "probability": 1.0} for one in names for other in names[:9]]
+    assert len(told("nothing_missing", posterior=many)) == 100
 
 
 @pytest.mark.slow

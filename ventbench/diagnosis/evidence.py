@@ -193,8 +193,8 @@ class _View(NamedTuple):
     base: FittedModel
     around: Simulated
     noise: Noise
-    scatter: float
-    ranked: list[tuple[float, Set]]
+    scatters: tuple[float, ...]  #: of the gains, that are compared.
+    ways: tuple[list[tuple[float, Set]], ...]  #: ranked sets at each scatter.
 
 
 class _Search:
@@ -223,13 +223,13 @@ class _Search:
         if self.is_far_from_label(self.base):
             views.append(self.view(self.at_label(noise), noise))
         for view in views:
-            for _, terms in view.ranked[: self.settings.fits]:
+            self.scatters = view.scatters
+            for terms in (terms for way in view.ways for _, terms in way[: self.settings.fits]):
                 self.attempt(view.around, view.noise, terms, view.base)
         main = min(
             views, key=lambda view: view.noise.sigma[0] * (1.0 - view.noise.ar[0] ** 2) ** 0.5
         )
-        around, noise, ranked = main.around, main.noise, main.ranked
-        self.scatter = main.scatter
+        around, noise, self.scatters = main.around, main.noise, main.scatters
         self.tried[frozenset()] = self.known(around, self.base, noise)
         self.rescore(around, noise)
         if also:
@@ -241,7 +241,6 @@ class _Search:
             if not best.terms or len(best.terms) >= self.settings.most_terms:
                 break
             around, own = self.around(best.fitted), names_of(best.terms)
-            self.scatter = self.likeliest_scatter(around, best.fitted, noise, best.terms)
             noise = self.known(around, best.fitted, noise, best.terms, loose=True).left
             one = self.known(around, best.fitted, noise, best.terms)
             more = enumerate_sets(one, (), 1, self.settings.beam)
@@ -253,9 +252,9 @@ class _Search:
             self.rescore(around, noise)
             if names_of(self.ordered()[0].terms) == own:
                 break
-        return Posterior(
-            tuple(self.ordered()), weigh(self.ordered(), ranked), self.base, self.scatter
-        )
+        ordered = self.ordered()
+        ranked = main.ways[main.scatters.index(ordered[0].scatter)]
+        return Posterior(tuple(ordered), weigh(ordered, ranked), self.base, ordered[0].scatter)
 
     def around(self, fitted: FittedModel) -> Simulated:
         """All candidates, simulated around a fit."""
@@ -266,8 +265,15 @@ class _Search:
         self, around: Simulated, fitted: FittedModel, noise: Noise, terms: Set = (),
         *, loose: bool = False,
     ) -> Known:  # fmt: skip
-        """A linearised fit."""
-        return Known(around, fitted, self.base, noise, terms, scatter=self.scatter, loose=loose)
+        """A linearised fit at the scatter of the gains that is likelier beside it.
+
+        A drift of the gain is scatter, too, until it is among the terms.
+        """
+        ways = (
+            Known(around, fitted, self.base, noise, terms, scatter=scatter, loose=loose)
+            for scatter in self.scatters
+        )
+        return max(ways, key=lambda known: known.evidence)
 
     def likeliest_scatter(
         self, around: Simulated, fitted: FittedModel, noise: Noise, terms: Set = ()
@@ -296,7 +302,8 @@ class _Search:
     def view(self, base: FittedModel, noise: Noise) -> _View:
         """Sets of terms by a linearisation around a base model."""
         around = self.around(base)
-        self.scatter = self.likeliest_scatter(around, base, noise)
+        likeliest = self.likeliest_scatter(around, base, noise)
+        self.scatters = tuple(sorted({min(SCATTER, likeliest), likeliest}))
         for _ in range(2):
             noise = self.known(around, base, noise, loose=True).left
         known = self.known(around, base, noise)
@@ -304,8 +311,14 @@ class _Search:
             known, Partition(self.data, self.predictor), base, self.excluded,
             self.evaluator.settings,
         )  # fmt: skip
-        ranked = enumerate_sets(known, latent, 3, self.settings.beam)
-        return _View(base, around, noise, self.scatter, ranked)
+        ways = [
+            enumerate_sets(
+                Known(around, base, self.base, noise, scatter=scatter), latent, 3,
+                self.settings.beam,
+            )
+            for scatter in self.scatters
+        ]  # fmt: skip
+        return _View(base, around, noise, self.scatters, tuple(ways))
 
     def is_far_from_label(self, base: FittedModel) -> bool:
         """Whether the base model makes up for much by R or C."""

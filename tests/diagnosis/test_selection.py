@@ -109,7 +109,8 @@ def test_the_noise_is_that_of_the_shape_that_is_freed():
     """What a drift of another form leaves is no noise, and no other effect either."""
     drift = small.effect("sensor_drift", "warming", drift=4.0)
     named = small.concluded(small.made(drift, noise=0.05, seed=4)).named
-    assert named.hypothesis == Hypothesis(("sensor_drift",), ("sensor_drift.warming",))
+    assert named.names == ("sensor_drift",)
+    assert "sensor_drift.warming" in named.hypothesis.free
     assert named.noise.sigma[0] == pytest.approx(0.05, rel=0.2)
     assert named.noise.sigma[0] == pytest.approx(estimate_noise(named).sigma[0], rel=0.05)
 

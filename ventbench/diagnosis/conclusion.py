@@ -22,7 +22,7 @@ from ventbench.diagnosis.evaluator import (
 )
 from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
-from ventbench.diagnosis.in_time import SWINGS, swing_columns
+from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
 from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
 from ventbench.diagnosis.selection.acceptance import (
     is_consistent,
@@ -247,7 +247,7 @@ def _supported(
 
 
 def _marginal_gains(
-    evaluator: Evaluator, fitted: FittedModel, partition: Partition, columns: Floats, sd: float
+    evaluator: Evaluator, fitted: FittedModel, partition: Partition, columns: Floats, sd: Floats
 ) -> tuple[Floats, Floats]:
     """What changes of each breath's own gain there, integrated out, and their sizes.
 
@@ -256,7 +256,7 @@ def _marginal_gains(
         fitted: a model.
         partition: n breaths.
         columns: changes of the pressure by the coefficients, ``(n, k, T)``.
-        sd: their prior standard deviation.
+        sd: their prior standard deviations, ``(k,)``.
 
     Returns:
         Log-likelihood of each breath, nats, ``(n,)``, and expected coefficients, ``(n, k)``.
@@ -265,7 +265,7 @@ def _marginal_gains(
     white = linear.without_own(linear.whiten(columns[:, :, None]))
     nats, means = [], []
     for X, left in zip(white, linear.residual, strict=True):
-        value, mean, _ = gaussian(X @ X.T, -X @ left, np.full(len(X), sd))
+        value, mean, _ = gaussian(X @ X.T, -X @ left, sd)
         nats.append(value)
         means.append(mean)
     return np.array(nats), np.array(means)
@@ -278,7 +278,7 @@ def _gain_sd(evaluator: Evaluator, fitted: FittedModel, sd: float) -> float:
     gain = partition.predictor.names.index("gain")
     slopes = partition.predictor.derivatives(values, (gain,))[1][:, :, 0]
     slopes = slopes * values[:, gain, None, None]
-    gains = _marginal_gains(evaluator, fitted, partition, slopes, sd)[0]
+    gains = _marginal_gains(evaluator, fitted, partition, slopes, np.array([sd]))[0]
     return sd if passes_heldout_test(gains, evaluator.settings.held_out_test) else 0.0
 
 
@@ -289,7 +289,8 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
     def at(frequency: float, partition: Partition) -> tuple[Floats, Floats, Floats]:
         values = evaluator.transferred_values(fitted, partition)
         columns, courses = swing_columns(term.name, partition, values, frequency)
-        nats, sizes = _marginal_gains(evaluator, fitted, partition, columns, spread)
+        sds = swing_spreads(columns.shape[1], spread)
+        nats, sizes = _marginal_gains(evaluator, fitted, partition, columns, sds)
         return (
             nats,
             np.einsum("nk,nkt->nt", sizes, columns),

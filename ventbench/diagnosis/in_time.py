@@ -152,6 +152,15 @@ def swing_columns(
     return np.matmul(courses, input_responses(partition, values, place)), courses
 
 
+def swing_spreads(count: int, spread: float) -> Floats:
+    """Standard deviations of the coefficients of a swing: a second harmonic is half the first.
+
+    Else half of a frequency explains as much as the frequency.
+    """
+    each = spread / np.arange(1, count // 2 + 1)
+    return np.concatenate([each, each])
+
+
 def _waves(partition: Partition, frequency: float, harmonics: int) -> Floats:
     time = np.cumsum(partition.data.dt, axis=1) - partition.data.dt
     angle = 2.0 * np.pi * frequency * np.arange(1, harmonics + 1)[:, None] * time[:, None]
@@ -163,7 +172,8 @@ def _likeliest_swing(known: Known, name: str, ways: list[tuple[Floats, float, fl
     best, at = -np.inf, ways[0]
     for way in ways:
         G, b = known.of_breaths(way[0])
-        value = gaussian(G, b, np.full(len(b), way[2]))[0]
+        spreads = np.tile(swing_spreads(way[0].shape[1], way[2]), known.n)
+        value = gaussian(G, b, spreads)[0]
         if value > best:
             best, at = value, way
     swings, frequency, spread = at
@@ -171,7 +181,8 @@ def _likeliest_swing(known: Known, name: str, ways: list[tuple[Floats, float, fl
     columns = [one for m in range(swings.shape[1]) for one in np.where(which, swings[:, m], 0.0)]
     told = {"frequency": frequency, "spread": spread}
     odds = -float(np.log(len(ways)))
-    return Term(name, [spread] * len(columns), odds=odds, latent=columns, told=told)
+    spreads = np.repeat(swing_spreads(swings.shape[1], spread), known.n).tolist()
+    return Term(name, spreads, odds=odds, latent=columns, told=told)
 
 
 def _commands(

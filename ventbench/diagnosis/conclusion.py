@@ -283,32 +283,41 @@ def _gain_sd(evaluator: Evaluator, fitted: FittedModel, sd: float) -> float:
 
 
 def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing, Floats]:
-    """A periodic input fitted beside a model, and what it gains in each held-out breath, nats."""
-    frequency, spread = term.told["frequency"], term.told["spread"]
+    """A periodic input fitted beside a model, and what it gains in each held-out breath, nats.
 
-    def at(frequency: float, partition: Partition) -> tuple[Floats, Floats, Floats]:
-        values = evaluator.transferred_values(fitted, partition)
+    The noise beside it is estimated in turn with its course.
+    """
+    frequency, spread = term.told["frequency"], term.told["spread"]
+    training, held_out, weight = evaluator.training, evaluator.held_out, fitted.problem.data.weight
+
+    def at(
+        frequency: float, model: FittedModel, partition: Partition
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Log-likelihood, sizes, change of the pressure, and course."""
+        values = evaluator.transferred_values(model, partition)
         columns, courses = swing_columns(term.name, partition, values, frequency)
         sds = swing_spreads(columns.shape[1], spread)
-        nats, sizes = _marginal_gains(evaluator, fitted, partition, columns, sds)
-        return (
-            nats,
-            np.einsum("nk,nkt->nt", sizes, columns),
-            np.einsum("nk,nkt->nt", sizes, courses),
-        )
+        nats, sizes = _marginal_gains(evaluator, model, partition, columns, sds)
+        change, course = (np.einsum("nk,nkt->nt", sizes, each) for each in (columns, courses))
+        return nats, sizes, change, course
 
+    beside = fitted
+    for _ in range(3):
+        left = fitted.residual + at(frequency, beside, training)[2][:, None]
+        beside = replace(fitted, problem=replace(fitted.problem, noise=robust_noise(left, weight)))
     step = 0.02 * frequency
     near = frequency + step * np.arange(-4, 5)
-    each = np.array([float(at(f, evaluator.training)[0].sum()) for f in near])
+    each = np.array([float(at(f, beside, training)[0].sum()) for f in near])
     best = int(np.clip(np.argmax(each), 1, len(near) - 2))
     frequency = float(near[best])
     curvature = (2.0 * each[best] - each[best - 1] - each[best + 1]) / step**2
-    _, change, course = at(frequency, evaluator.training)
-    gained = at(frequency, evaluator.held_out)[0]
-    left = fitted.residual + change[:, None]
-    noise = robust_noise(left, fitted.problem.data.weight)
-    nats = evaluator.held_out_log_likelihood(fitted) + gained
-    return Swing(frequency, float(max(curvature, 1e-9) ** -0.5), course, noise, nats), gained
+    _, sizes, _, course = at(frequency, beside, training)
+    power = np.mean(sizes**2, axis=0).reshape(2, -1).sum(axis=0)  # of each harmonic
+    told = frequency * (1 + int(np.argmax(power)))
+    sd = told / frequency * float(max(curvature, 1e-9) ** -0.5)
+    nats = evaluator.held_out_log_likelihood(beside) + at(frequency, beside, held_out)[0]
+    gained = nats - evaluator.held_out_log_likelihood(fitted)
+    return Swing(told, sd, course, beside.noise, nats), gained
 
 
 def _places(found: Posterior, place: str, term: str) -> tuple[tuple[str, float], ...]:

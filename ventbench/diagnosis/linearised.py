@@ -22,7 +22,7 @@ from ventbench.system_id.problem import parameter_of
 
 #: Standard deviations: of a characteristic and of what every rig has of a basis term, as shares of
 #: their spread; of a mechanism, as a share of the least strength that is named.
-_FORM, _REST, _LEAST = 0.15, 0.02, 0.5
+_FORM, _REST, _LEAST = 0.15, 0.01, 0.2
 
 #: Standard deviation of the logarithm of the valve's gain from breath to breath.
 SCATTER = 0.01

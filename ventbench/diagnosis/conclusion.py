@@ -127,7 +127,8 @@ def conclude(
 
     Args:
         evaluator: evaluator with the parameters of all candidates.
-        every: its training and held-out breaths together, which are searched.
+        every: the breaths that are searched: its training breaths, and perhaps others that judge no
+            corrected simulator.
         tell: called with a description of each step before it runs.
         earlier: a model whose mechanisms are tried in any case.
     """

@@ -234,10 +234,12 @@ def identify(
     """
     names = all_parameter_paths(settings, excluded)
     evaluator = make_evaluator(data, held, names, excluded, settings)
-    conclusion = conclude(evaluator, make_partition(data, names, settings), tell, earlier)
+    # Breaths that judge are in no search, though they test: few breaths have both uses.
+    chosen = ~held if fitted is None else fitted
+    searched = make_partition(data.select(chosen), names, settings)
+    conclusion = conclude(evaluator, searched, tell, earlier)
     # Gains that differ between breaths are parameters of each breath, unknown of held-out ones.
     evaluator = replace(evaluator, gain_sd=conclusion.gain_sd)
-    chosen = ~held if fitted is None else fitted
     while True:
         has_term = conclusion.unnamed is not None and conclusion.unnamed.term is not None
         # A nonparametric term is fitted to the training breaths alone, to save time.

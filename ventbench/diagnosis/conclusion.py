@@ -286,10 +286,10 @@ def _gain_sd(evaluator: Evaluator, fitted: FittedModel, sd: float) -> float:
 def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing, Floats]:
     """A periodic input fitted beside a model, and what it gains in each held-out breath, nats.
 
-    The noise beside it is estimated in turn with its course.
+    Parameters and noise beside it are estimated in turn with its course.
     """
     frequency, spread = term.told["frequency"], term.told["spread"]
-    training, held_out, weight = evaluator.training, evaluator.held_out, fitted.problem.data.weight
+    training, held_out = evaluator.training, evaluator.held_out
 
     def at(
         frequency: float, model: FittedModel, partition: Partition
@@ -302,10 +302,13 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
         change, course = (np.einsum("nk,nkt->nt", sizes, each) for each in (columns, courses))
         return nats, sizes, change, course
 
-    beside = fitted
+    beside, data = fitted, training.data
     for _ in range(3):
-        left = fitted.residual + at(frequency, beside, training)[2][:, None]
-        beside = replace(fitted, problem=replace(fitted.problem, noise=robust_noise(left, weight)))
+        change = at(frequency, beside, training)[2][:, None]
+        told = Partition(replace(data, measured=data.measured - change), training.predictor)
+        refit = evaluator.fit(fitted.hypothesis, beside.noise, beside, partition=told)
+        noise = robust_noise(refit.residual, data.weight)
+        beside = replace(refit, problem=replace(refit.problem, data=data, noise=noise))
     step = 0.02 * frequency
     near = frequency + step * np.arange(-4, 5)
     each = np.array([float(at(f, beside, training)[0].sum()) for f in near])

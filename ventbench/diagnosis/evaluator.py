@@ -186,6 +186,8 @@ def _known_minimum(problem: Problem, x: Floats, earlier: FittedModel | None) -> 
     known, layout = earlier.problem, problem.unknowns
     if known.predictor is not problem.predictor or known.noise != problem.noise:
         return None
+    if known.data is not problem.data:  # the same breaths, less what acts in time
+        return None
     if known.unknowns.paths != layout.paths or len(earlier.minimum.x) != len(x):
         return None
     pairs = (

@@ -342,6 +342,8 @@ class _Search:
                 fitted = self.fit(terms, told, noise, fitted)
             elif start is not self.base:
                 fitted = self.base
+            if not all(np.isfinite(each).all() for each in fitted.jacobian):
+                return  # the model cannot simulate it
             made = self.known(around, fitted, noise, terms)
             told = replace(self.data, measured=self.data.measured - made.in_time[:, None])
         before = self.tried.get(names_of(terms))

@@ -240,7 +240,7 @@ class Known:
         self.around, self.noise, self.n = around, noise, len(around.data)
         self.scatter = scatter
         measured, weight = around.data.measured[:, 0], around.data.weight[:, 0]
-        residual, slopes = fitted.problem.jacobian(fitted.minimum.x)
+        residual, slopes = fitted.jacobian
         left = weight * (measured - residual[:, 0] - fitted.problem.data.measured[:, 0])
         free = {k: s for k, (p, s) in around.basis.items() if owner_of(p) not in fitted.names}
         form = {k: (1.0 if loose else _REST) * s for k, s in free.items()}

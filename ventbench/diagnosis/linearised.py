@@ -21,8 +21,9 @@ from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import parameter_of
 
 #: Standard deviations: of a characteristic and of what every rig has of a basis term, as shares of
-#: their spread; of a mechanism, as a share of the least strength that is named.
-_FORM, _REST, _LEAST = 0.15, 0.01, 0.2
+#: their spread; of a mechanism, as a share of the least strength that is named, and of one
+#: that every rig has.
+_FORM, _REST, _LEAST, _UBIQUITOUS = 0.15, 0.01, 0.2, 0.5
 
 #: Standard deviation of the logarithm of the valve's gain from breath to breath.
 SCATTER = 0.01
@@ -207,7 +208,8 @@ def simulate(
         if not at:
             terms.append(replace(term, forms=made.forms(columns[k], name)))
             if about.least and not any(t.name == name for t in terms[:-1]):
-                least[k] = _LEAST * about.least / abs(size)
+                share = _UBIQUITOUS if about.ubiquitous else _LEAST
+                least[k] = share * about.least / abs(size)
     terms += [Term(name, [basis[j][1] for j in own], tuple(own)) for name, own in of_basis.items()]
     return replace(made, least=least, terms=tuple(terms))
 

@@ -24,7 +24,7 @@ from ventbench.task.lungs import LUNG_IDS, Lung
 from ventbench.task.metrics import bootstrap
 from ventbench.train import pid_grid
 from ventbench.train.rl import episodes
-from ventbench.train.rl.policy_gradient import PolicyGradient
+from ventbench.train.rl.ppo import PolicyGradient
 from ventbench.train.rl.train import METHODS, Method, TrainedPolicies, method_for, train
 
 Floats = NDArray[np.float64]

@@ -90,12 +90,8 @@ def run(
     ],
     port: Port,
     lung: Lungs,
-    pip: Annotated[
-        list[float] | None,
-        typer.Option("--pip", metavar="CMH2O", help="PIP; repeatable. Default: all six."),
-    ] = None,
     pips: Annotated[
-        str | None, typer.Option(metavar="LIST", help="PIPs separated by commas, such as 10,20,35.")
+        str | None, typer.Option(metavar="LIST", help="PIPs, such as 10,20,35. Default: all six.")
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, max=100, help="Runs of each lung and PIP.")] = 10,
     track: Annotated[
@@ -162,7 +158,7 @@ def run(
     from ventbench.base import files
     from ventbench.task import protocol
 
-    chosen = [*(pip or ()), *numbers("--pips", pips)] or list(protocol.PIPS)
+    chosen = numbers("--pips", pips) or list(protocol.PIPS)
     entries, track = ev.open_entries(submissions, track)
     if seed is None:
         begun = ev.begun_plan(out)
@@ -376,7 +372,7 @@ def collect(
     """
     from hardware_eval.bench import collect as collection
     from hardware_eval.results import evaluate as ev
-    from ventbench.cli.options import bars
+    from ventbench.cli.options import bar
     from ventbench.task import protocol
     from ventbench.task.lungs import scored_lung
     from ventbench.train.exploration import Limits
@@ -390,12 +386,11 @@ def collect(
     with bench_on(port, yes=yes) as (line, bench, person):
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
-        with bars() as shown:
-            bar = shown.add_task("exploring", total=breaths)
+        with bar("exploring") as exploring:
             done = collection.collect(
                 bench, label, breaths, out, seed=seed, limits=Limits(ease=ease),
                 about={"device": ev.device_about(line)},
-                progress=lambda number: shown.update(bar, completed=number),
+                progress=lambda number: exploring(number, breaths),
             )  # fmt: skip
     count = len(done.breaths)
     emit({"breaths": count, "recording": str(done.recording), "stopped": done.stopped}, json)

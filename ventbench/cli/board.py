@@ -11,8 +11,8 @@ from ventbench.cli.options import (
     JsonFile,
     Scheduler,
     Sources,
-    bars,
-    counted,
+    bar,
+    console_of,
     emit,
     known_lungs,
     notes,
@@ -95,8 +95,7 @@ def add(
         supersedes = store.find_record(store.load(folder), supersedes).sha256
     done = []
     try:
-        with bars() as shown:
-            replaying = counted(shown, "replaying records")
+        with bar("replaying records") as replaying:
             for path in paths:
                 new = create.amend(path, supersedes=supersedes, reason=reason, source=about)
                 done.append(store.add(folder, new, frozen.load()))
@@ -221,16 +220,15 @@ def verify(
 
     if records and not rerun:
         raise InputError("records are chosen for --rerun; without it all are verified")
-    with bars() as shown:
-        progress = counted(shown, "replaying records")
-        report = verifier.verify(folder, frozen.load, progress=progress)
+    with bar("replaying records") as replaying:
+        report = verifier.verify(folder, frozen.load, progress=replaying)
     if rerun and not report.problems:  # else the records are not what they were
         _rerun(report, folder, records or [], source or [], jobs, scheduler)
     console = told(dataclasses.asdict(report), json)
     for note in report.notes:
-        console.print(f"note: {plain(note)}", markup=False, highlight=False)
+        console.print(f"note: {plain(note)}")
     for problem in report.problems:
-        console.print(plain(problem), style="red", markup=False, highlight=False, soft_wrap=True)
+        console.print(plain(problem), style="red", soft_wrap=True)
     _summary(console, report)
     if report.problems:
         raise typer.Exit(1)
@@ -266,8 +264,6 @@ def _summary(console: Console, report: Report) -> None:
     console.print(
         f"{state}: {report.records} records, {report.replayed} replayed "
         f"(largest difference {report.deviation:.1e} cmH2O){reproduced}",
-        markup=False,
-        highlight=False,
         soft_wrap=True,
     )
 
@@ -311,13 +307,11 @@ def show(
 
 def tables_of(folder: Path, name: str, *, err: bool = False) -> None:
     """Print the tables of a round."""
-    from rich.console import Console
-
     from ventbench.board import frames
 
     for track in frames.load_tracks(folder):
         if track.draws == name:
-            _print_track(Console(stderr=err), track)
+            _print_track(console_of(err), track)
 
 
 def _print_track(console: Console, track: Track) -> None:
@@ -332,7 +326,7 @@ def _print_track(console: Console, track: Track) -> None:
             reasons = row.entry.reasons
             said = any(reason.startswith(status) for reason in reasons)
             why = plain("; ".join(reasons if said else (status, *reasons))[:300])
-            console.print(f"{row.record.name}: {why}", markup=False, highlight=False)
+            console.print(f"{row.record.name}: {why}")
     if track.stress:
         console.print(_stress_table(track))
 

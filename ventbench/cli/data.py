@@ -12,8 +12,7 @@ from ventbench.cli.options import (
     JsonFile,
     Pad,
     PlantName,
-    bars,
-    counted,
+    bar,
     emit,
     known_lungs,
     waiting,
@@ -45,8 +44,7 @@ def check(
     """
     from ventbench import recordings
 
-    with bars() as shown:
-        reading = counted(shown, f"reading {file}")
+    with bar(f"reading {file}") as reading:
         report = recordings.check(file, clip=clip, pad=pad, progress=reading)
     emit(report.to_dict(), json)
     for line in report.lines():
@@ -215,8 +213,7 @@ def explore(
     ventilator = exploration.SimulatedVentilator(
         chosen, min(breaths, _TOGETHER), noise=noise, seed=seed
     )
-    with bars() as shown:
-        exploring = counted(shown, f"exploring {lung}")
+    with bar(f"exploring {lung}") as exploring:
         made = exploration.explore(ventilator, lung, breaths, seed=seed, progress=exploring)
     recordings.write(made, out)
     for note in made.notes:

@@ -36,16 +36,15 @@ def doctor(json: JsonFile = None) -> None:
 
     Example: `ventbench doctor`
     """
-    from rich.markup import escape
     from rich.table import Table
 
     report = examine()
     console, table = told(report, json), Table(show_header=False)
     for name, value in report["facts"].items():
-        table.add_row(escape(name), escape(value))
+        table.add_row(name, value)
     console.print(table)
     for problem in report["problems"]:
-        console.print(f"- {problem}", markup=False, highlight=False)
+        console.print(f"- {problem}")
     if report["problems"]:
         raise typer.Exit(1)
     console.print("Nothing needs attention.")

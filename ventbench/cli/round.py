@@ -163,14 +163,7 @@ def score(
             err=str(json) == "-",
         )
         return
-    tasks = {}
-    with bars() as shown, executor(workers, scheduler) as pool:
-
-        def tell(what: str, done: int, count: int) -> None:
-            if what not in tasks:
-                tasks[what] = shown.add_task(what, total=count)
-            shown.update(tasks[what], completed=done, total=count)
-
+    with bars() as tell, executor(workers, scheduler) as pool:
         made = official_runs.score(
             folder, name, pool, out / name, places=[folder.parent / "submissions", *(source or [])],
             secret=os.environ.get(attestation.SECRET) or None, progress=tell,

@@ -16,10 +16,9 @@ from ventbench.cli.options import (
     Pad,
     PlantName,
     TrustFmu,
-    bars,
-    counted,
+    bar,
     known_lungs,
-    notes,
+    read_recording,
     simulator_of,
     table_of,
     told,
@@ -64,7 +63,7 @@ def lungs(json: JsonFile = None) -> None:
         label = official.sessions.table[session].lung
         if label in known:
             text = f"not scored: session {session} of {label}: {reason}"
-            console.print(text, markup=False, highlight=False, soft_wrap=True)
+            console.print(text, soft_wrap=True)
 
 
 def coverage(
@@ -181,28 +180,21 @@ def open_loop(
     import numpy as np
 
     from ventbench import open_loop_report
-    from ventbench import recordings as files
     from ventbench.base.errors import InputError
 
-    said = notes()
-    with bars() as shown:
-        reading = counted(shown, f"reading {recordings}")
-        breaths = files.load(recordings, clip=clip, pad=pad, progress=reading)
-    for note in breaths.notes:
-        said.print(f"note: {note}", markup=False, highlight=False)
+    breaths = read_recording(recordings, clip=clip, pad=pad)
     if not np.isfinite(breaths.pressure).any():
         raise InputError(
             f"{recordings}: all pressures are blank; fill them in: there is nothing to compare a "
             "simulator with"
         )
-    with bars() as shown:
-        simulating = counted(shown, f"simulating {len(breaths)} breaths")
+    with bar(f"simulating {len(breaths)} breaths") as simulating:
         chosen = simulator_of(plant, in_process)
         result = open_loop_report.open_loop(breaths, chosen, progress=simulating)
     console = told(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
     for line in result.misfit_lines():
-        console.print(line, markup=False, highlight=False)
+        console.print(line)
 
 
 def _open_loop_table(result: dict[str, Any]) -> Any:

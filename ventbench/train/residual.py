@@ -60,9 +60,6 @@ class ResidualConfig:
     #: plants of each lung that are trained on, the nominal one first; all if None.
     members: int | None = None
     spread: float = 1.0  #: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
-    #: whether each update takes one lung at one PIP, in turn, as in the paper, instead of all of
-    #: them.
-    round_robin: bool = False
 
     def __post_init__(self) -> None:
         """Refuse numbers that cannot work.
@@ -232,15 +229,6 @@ def run_chunks(
     return carry
 
 
-def _cells(number: Array, lungs: int, pips: int, config: ResidualConfig) -> tuple[Array, Array]:
-    """Lung and PIP of each run of an update."""
-    if config.round_robin:
-        cell = jnp.full(config.copies, number % (lungs * pips))
-    else:
-        cell = jnp.repeat(jnp.arange(lungs * pips), config.copies)
-    return cell // pips, cell % pips
-
-
 @partial(jax.jit, static_argnames="config")
 def _advance(
     carry: tuple[Any, Any],
@@ -259,7 +247,9 @@ def _advance(
     def update(carry: tuple[Any, Any], number: Array) -> tuple[tuple[Any, Any], Array]:
         layers, state = carry
         member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
-        lung, pip = _cells(number, lungs, len(protocol.PIPS), config)
+        # Lung and PIP of each run.
+        cell = jnp.repeat(jnp.arange(lungs * len(pips)), config.copies)
+        lung, pip = cell // len(pips), cell % len(pips)
         member = jax.random.randint(member_key, lung.shape, 0, members)
         cells = draws.random_scenarios(scenario_key, pips[pip], spread=config.spread, smooth=True)
         those = jax.tree.map(lambda leaf: leaf[member, lung], plants)

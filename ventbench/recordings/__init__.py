@@ -4,7 +4,6 @@ from ventbench.recordings.breaths import Breaths as Breaths
 from ventbench.recordings.breaths import join as join
 from ventbench.recordings.breaths import make_breaths as make_breaths
 from ventbench.recordings.read import check as check
-from ventbench.recordings.read import iter_breaths as iter_breaths
 from ventbench.recordings.read import load as load
 from ventbench.recordings.read import recordings_dir as recordings_dir
 from ventbench.recordings.report import RecordingReport as RecordingReport

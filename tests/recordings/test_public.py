@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ventbench.recordings import check, load, load_respiraworks
+from ventbench.mechanics import load_respiraworks
+from ventbench.recordings import check, load
 from ventbench.recordings.scan import interval_table
 
 

@@ -7,8 +7,6 @@ from ventbench.recordings.read import check as check
 from ventbench.recordings.read import load as load
 from ventbench.recordings.read import recordings_dir as recordings_dir
 from ventbench.recordings.report import RecordingReport as RecordingReport
-from ventbench.recordings.respiraworks import RespiraWorksRun as RespiraWorksRun
-from ventbench.recordings.respiraworks import load_respiraworks as load_respiraworks
 from ventbench.recordings.roles import Finding as Finding
 from ventbench.recordings.roles import Saturation as Saturation
 from ventbench.recordings.roles import check_roles as check_roles

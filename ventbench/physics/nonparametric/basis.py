@@ -8,13 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.physics.mechanism import Mechanism, Values
 from ventbench.physics.parameters import Parameter
 
 Number = Array | float
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from hardware_eval.commands import (
     told,
 )
 from ventbench import __version__
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.cli import options
@@ -155,7 +156,6 @@ def run(
     from hardware_eval.bench.selftest import Sheet, chosen_parts
     from hardware_eval.bench.selftest import selftest as run_selftest
     from hardware_eval.results import evaluate as ev
-    from ventbench.base import files
     from ventbench.task import protocol
 
     chosen = numbers("--pips", pips) or list(protocol.PIPS)

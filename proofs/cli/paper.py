@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ventbench.base import files
 from ventbench.cli.options import JsonFile, RecordingsDir, Scheduler, Workers, bar, told
 
 
@@ -53,7 +54,6 @@ def paper(
     from rich.table import Table
 
     from proofs.paper.paper import reproduce_paper
-    from ventbench.base import files
 
     with bar("paper") as progress:
         result, stored = reproduce_paper(

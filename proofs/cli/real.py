@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from proofs.cli import ResultsPage
+from ventbench.base import files
+from ventbench.base.errors import require
 from ventbench.cli.options import (
     JsonFile,
     RecordingsDir,
@@ -65,9 +67,9 @@ def rig(
     """
     from proofs.real.rig import prove
     from proofs.results_page import proof_section, write_section
-    from ventbench.base import compilation, errors
+    from ventbench.base import compilation
 
-    errors.require("jinja2", "rerun")
+    require("jinja2", "rerun")
     folder = recordings_folder(recordings)
     compilation.keep()
     with bars() as tell:
@@ -137,7 +139,7 @@ def pairs(
     """
     from proofs.real import comparisons as work
     from proofs.results_page import pairs_section, write_section
-    from ventbench.base import compilation, files
+    from ventbench.base import compilation
 
     folder = recordings_folder(recordings)
     compilation.keep()

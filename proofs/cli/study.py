@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from ventbench.base import files
+from ventbench.base.errors import InputError, require
 from ventbench.base.files import json_values
 from ventbench.cli.options import (
     JsonFile,
@@ -55,10 +57,9 @@ def samples(
     Example: `python -m proofs study samples --lung R20C50 --seeds 5`
     """
     from proofs.studies import samples as work
-    from ventbench.base import errors, files
     from ventbench.task.lungs import scored_lung
 
-    errors.require("matplotlib")
+    require("matplotlib")
     with bars() as tell:
         result = work.sample_efficiency(
             scored_lung(lung), range(seeds), out, share=share,
@@ -185,8 +186,6 @@ def networks(
 
 
 def _check(only: list[str] | None, known: dict[str, Any]) -> None:
-    from ventbench.base.errors import InputError
-
     for name in only or ():
         if name not in known:
             raise InputError(

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ventbench.base.errors import InputError
+from ventbench.base.text import plain
 from ventbench.cli.options import (
     JsonFile,
     Scheduler,
@@ -81,7 +83,6 @@ def add(
 
     Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
     """
-    from ventbench.base.errors import InputError
     from ventbench.board import create, store
     from ventbench.plants import frozen
 
@@ -136,7 +137,6 @@ def sign(
     """
     import os
 
-    from ventbench.base.errors import InputError
     from ventbench.board import attestation, store
 
     secret = os.environ.get(attestation.SECRET, "")
@@ -213,8 +213,6 @@ def verify(
     """
     import dataclasses
 
-    from ventbench.base.errors import InputError
-    from ventbench.base.text import plain
     from ventbench.board import verify as verifier
     from ventbench.plants import frozen
 
@@ -316,8 +314,6 @@ def tables_of(folder: Path, name: str, *, err: bool = False) -> None:
 
 def _print_track(console: Console, track: Track) -> None:
     """Print the ranking of a track, why others are not ranked, and the ranking under stress."""
-    from ventbench.base.text import plain
-
     if not track.rows:
         return
     console.print(_table(track))
@@ -337,7 +333,6 @@ def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
 
     Example: `ventbench board records`
     """
-    from ventbench.base.text import plain
     from ventbench.board import frames
 
     folder = at_hand(folder)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     Clip,
     JsonFile,
@@ -161,8 +162,6 @@ def import_(
 
 def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
     """Split ``NAME=VALUE``."""
-    from ventbench.base.errors import InputError
-
     pairs = {}
     for text in given or ():
         name, equals, value = text.rpartition("=")
@@ -174,8 +173,6 @@ def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
 
 def _offsets(given: list[str] | None) -> dict[str, float]:
     """Numbers of ``ROLE=VALUE``."""
-    from ventbench.base.errors import InputError
-
     pairs = _pairs(given, "--offset")
     try:
         return {role: float(value) for role, value in pairs.items()}

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ventbench.base import files
+from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     Clip,
     JsonFile,
@@ -79,7 +81,6 @@ def _is_respiraworks(path: Path) -> bool:
 
 
 def _survey(path: Path, progress: Callable[[int, int], None]) -> tuple[SurveyedRun, ...]:
-    from ventbench.base.errors import InputError
     from ventbench.mechanics import survey
 
     runs = survey(path, progress)
@@ -93,17 +94,16 @@ def _of_session(path: Path, *, clip: bool, pad: bool) -> dict[str, Mechanics]:
     from ventbench.mechanics import share_faults
     from ventbench.recordings.read import session_files
 
-    files = session_files(path)
+    paths = session_files(path)
     found = {
-        f"{file.stem}: {lung.label}" if len(files) > 1 else lung.label: lung
-        for file in files
+        f"{file.stem}: {lung.label}" if len(paths) > 1 else lung.label: lung
+        for file in paths
         for lung in _identify(file, clip=clip, pad=pad)
     }
     return dict(zip(found, share_faults(list(found.values())), strict=True))
 
 
 def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
-    from ventbench.base.errors import InputError
     from ventbench.mechanics import identify
 
     breaths = read_recording(path, clip=clip, pad=pad)
@@ -122,8 +122,6 @@ def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
 def _lung(mechanics: Mechanics) -> dict[str, Any]:
     """Return JSON values; numbers that are not finite become null."""
     import dataclasses
-
-    from ventbench.base import files
 
     plain = dataclasses.asdict(mechanics) | {
         "settings": [setting.id for setting in mechanics.settings]
@@ -235,15 +233,12 @@ def diagnose(
 
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
     """
-    from ventbench.base import errors
-    from ventbench.base.errors import InputError
-
     if drive not in ("auto", "valve", "flow"):
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
     if simulated is not None and plant != "physics":
         raise InputError("--simulated stands in place of --plant; give one of them")
 
-    errors.require("jinja2", "rerun")
+    require("jinja2", "rerun")
     breaths = read_recording(recordings, clip=clip, pad=pad)
     diagnosis = _diagnose(breaths, simulator_of(plant, in_process), simulated, lung, patient, drive)
     written = diagnosis.save(out)

@@ -12,6 +12,7 @@ from typing import Any
 
 import typer
 
+from ventbench.base.errors import InputError
 from ventbench.cli.options import JsonFile, told
 
 #: Packages whose version matters to a score, and those of each extra.
@@ -84,7 +85,6 @@ def _version(package: str) -> str:
 
 
 def _sandbox(problems: list[str]) -> str:
-    from ventbench.base.errors import InputError
     from ventbench.sandbox.runner import SandboxRunner
 
     try:
@@ -102,7 +102,6 @@ def _sandbox(problems: list[str]) -> str:
 
 
 def _simulators(problems: list[str]) -> str:
-    from ventbench.base.errors import InputError
     from ventbench.plants import frozen
 
     try:

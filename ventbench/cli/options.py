@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn, TypeVar
 
 import typer
 
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 
@@ -35,8 +36,6 @@ ResultT = TypeVar("ResultT")
 
 def claim_out(folder: Path | None) -> Path | None:
     """Check a folder of results before anything is computed; see ``files.claim_folder``."""
-    from ventbench.base import files
-
     if folder is not None:
         files.claim_folder(folder)
     return folder
@@ -44,8 +43,6 @@ def claim_out(folder: Path | None) -> Path | None:
 
 def claim_json(path: Path | None) -> Path | None:
     """Check the file of ``--json`` before anything is computed; InputError if it cannot be one."""
-    from ventbench.base.errors import InputError
-
     if path is None or str(path) == "-":
         return path
     if path.is_dir():
@@ -162,7 +159,6 @@ def simulator_of(plant: str, in_process: bool) -> str | Fmu:
 
 def recordings_folder(given: Path | None) -> Path:
     """Return the folder of the public recordings; InputError if there is none."""
-    from ventbench.base.errors import InputError
     from ventbench.recordings import recordings_dir
 
     folder = given or recordings_dir()
@@ -174,8 +170,6 @@ def recordings_folder(given: Path | None) -> Path:
 
 def emit(value: object, target: Path | None) -> None:
     """Write the result of a command to the file of ``--json``, atomically."""
-    from ventbench.base import files
-
     if target is None:
         return
     if str(target) == "-":

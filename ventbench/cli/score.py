@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     Entries,
     InProcess,
@@ -109,8 +110,6 @@ def score(
     """
     from functools import partial
 
-    from ventbench.base import errors
-    from ventbench.base.errors import InputError
     from ventbench.entries.folder import open_submission
     from ventbench.entries.runs import DRAWS
     from ventbench.plants.catalog import load_simulators
@@ -121,7 +120,7 @@ def score(
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
     if report:
-        errors.require("jinja2", "rerun")
+        require("jinja2", "rerun")
     opened = [open_submission(name) for name in names]
     entries = [entry.manifest.name for entry in opened]
     if len(set(entries)) < len(entries):

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     Clip,
     JsonFile,
@@ -80,7 +82,6 @@ def coverage(
     """
     from dataclasses import asdict
 
-    from ventbench.base.errors import InputError
     from ventbench.board import record as records
     from ventbench.board import store
     from ventbench.plants import frozen
@@ -135,8 +136,6 @@ def simulate(
     Example: `ventbench simulate --lung R20C50 --controls commands.csv`
     """
     from ventbench import recordings, simulation
-    from ventbench.base import files
-    from ventbench.base.errors import InputError
 
     chosen = simulator_of(plant, in_process)
     with open(controls, encoding="utf-8-sig", errors="replace") as file:
@@ -180,7 +179,6 @@ def open_loop(
     import numpy as np
 
     from ventbench import open_loop_report
-    from ventbench.base.errors import InputError
 
     breaths = read_recording(recordings, clip=clip, pad=pad)
     if not np.isfinite(breaths.pressure).any():
@@ -245,7 +243,6 @@ def _read(folders: list[Path]) -> tuple[list[Trajectories], list[dict[str, Any]]
     import json
 
     from ventbench import trajectories
-    from ventbench.base.errors import InputError
 
     runs, scores = [], []
     for folder in folders:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     JsonFile,
     PlantName,
@@ -146,7 +147,6 @@ def residual(
 
     Example: `ventbench train residual --all --out runs/residual_all`
     """
-    from ventbench.base.errors import InputError
     from ventbench.train.plants import ALL
     from ventbench.train.residual import ResidualConfig, train_residual
 
@@ -220,7 +220,6 @@ def _train_policies(
     method: str, lung: str | None, all_lungs: bool, seeds: range, steps: int | None, out: Path,
     plant: str, json: Path | None,
 ) -> None:  # fmt: skip
-    from ventbench.base.errors import InputError
     from ventbench.train.plants import ALL
     from ventbench.train.rl.train import train_dqn, train_ppo
 

@@ -11,6 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     InProcess,
     JsonFile,
@@ -166,8 +168,6 @@ def pid(
 
     Example: `ventbench tune pid --all --out runs/pid`
     """
-    from ventbench.base.errors import InputError
-    from ventbench.base.files import write_json
     from ventbench.train.best_pid import tune_beyond
     from ventbench.train.pid_grid import RESULT, TABLE, tune_pid
 
@@ -180,7 +180,7 @@ def pid(
                 names, draws=draws, each=not robust, single=lung is None, simulator=plant,
                 progress=progress,
             )  # fmt: skip
-            write_json(out / RESULT, result)
+            files.write_json(out / RESULT, result)
             written = [RESULT]
         else:
             grid, result = tune_pid(
@@ -196,8 +196,6 @@ def pid(
 
 def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
     """Draw the picture if matplotlib is installed."""
-    from ventbench.base import files
-    from ventbench.base.errors import InputError
     from ventbench.pages.plots import gain_map_png
 
     try:
@@ -283,7 +281,7 @@ def adversary(
     """
     from dataclasses import asdict
 
-    from ventbench.base import compilation, files
+    from ventbench.base import compilation
     from ventbench.entries.adversary import adversary as search
 
     compilation.keep()

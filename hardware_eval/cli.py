@@ -24,19 +24,15 @@ from hardware_eval.commands import (
     register,
     told,
 )
-from ventbench import __version__
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
 
-app = typer.Typer(
-    name="ventbench-hardware",
-    help="Entries on a physical lung: run, check and compare; or an emulator of the bench.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
+app = options.program(
+    "ventbench-hardware",
+    "Entries on a physical lung: run, check and compare; or an emulator of the bench.",
 )
 
 Lungs = Annotated[
@@ -63,21 +59,6 @@ Skip = Annotated[
         "record says so, and without sensor or lung has no rank.",
     ),
 ]
-
-
-def _version(value: bool) -> None:
-    if value:
-        print(f"ventbench-hardware {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
-    ),
-) -> None:
-    pass
 
 
 @app.command()

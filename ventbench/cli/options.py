@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn, TypeVar
 
 import typer
 
+from ventbench import __version__
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
@@ -344,19 +345,46 @@ def waiting(text: str) -> Progress:
 INTERRUPTED = 130
 
 
-def run(app: Callable[[], object], program: str, *, stopped: str = "") -> None:
-    """Run a command line to its end.
+def program(name: str, about: str, *, completion: bool = True) -> typer.Typer:
+    """Return a command line without commands: its help, ``--version`` and ``--quiet``."""
+    app = typer.Typer(
+        name=name, help=about, no_args_is_help=True, add_completion=completion,
+        pretty_exceptions_enable=False, rich_markup_mode="markdown",
+    )  # fmt: skip
+
+    def show(value: bool) -> None:
+        if value:
+            print(f"{name} {__version__}")
+            raise typer.Exit
+
+    @app.callback()
+    def _root(
+        version: bool = typer.Option(
+            False, "--version", callback=show, is_eager=True, help="Print the version and exit."
+        ),
+        quiet: bool = typer.Option(
+            False, "--quiet", help="No progress and no notes on stderr; also behind any command."
+        ),
+    ) -> None:
+        be_quiet(quiet)
+
+    return app
+
+
+def run(app: typer.Typer, program: str, *, named: str | None = None, stopped: str = "") -> None:
+    """Run a command line with the arguments of the process to its end.
 
     Args:
-        app: runs the commands with the arguments of the process.
+        app: the commands.
         program: what the messages begin with.
+        named: what the help calls it, if another name than the process has.
         stopped: what is true after Ctrl-C, besides what a command keeps.
     """
     sys.unraisablehook = _interrupt_again
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _interrupt)
     try:
-        app()
+        app(quiet_first(sys.argv[1:]), prog_name=named)
     except (InputError, OSError) as error:
         # Messages quote files and records of others, which may hold commands to the terminal.
         text = str(error)

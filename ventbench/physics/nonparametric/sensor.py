@@ -58,9 +58,8 @@ class SensorShape(Lines):
             off = pressure + self.curve(values, pressure) - shown
             return pressure - off / slope, None
 
-        first = shown + sum(
-            0.0 * x for x in self.at_knots(values)
-        )  # in the shape that the steps have
+        # In the shape that the steps have.
+        first = shown + sum(0.0 * x for x in self.at_knots(values))
         return jax.lax.scan(nearer, first, None, length=_SENSOR_STEPS)[0]
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:

@@ -133,6 +133,9 @@ def residual(
             "--lambda", min=0.0, help="Weight of the size of the correction, cmH2O for each %."
         ),
     ] = 0.0,
+    round_robin: Annotated[
+        bool, typer.Option("--round-robin", help="Each update uses one lung at one PIP, in turn.")
+    ] = False,
     out: Annotated[
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/residual"),
@@ -154,7 +157,7 @@ def residual(
         raise InputError("give --lung ID or --all, not both")
     names = (ALL,) if every else None if lung is None else (lung,)
     updates = updates or ResidualConfig.updates
-    config = ResidualConfig(updates=updates, members=members, lam=penalty)
+    config = ResidualConfig(updates=updates, members=members, lam=penalty, round_robin=round_robin)
     with bars() as tell:
 
         def report(what: str, progress: tuple[int, int, float] | None) -> None:

@@ -60,6 +60,9 @@ class ResidualConfig:
     #: plants of each lung that are trained on, the nominal one first; all if None.
     members: int | None = None
     spread: float = 1.0  #: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
+    #: whether each update takes one lung at one PIP, in turn, as in the paper, instead of all of
+    #: them.
+    round_robin: bool = False
 
     def __post_init__(self) -> None:
         """Refuse numbers that cannot work.
@@ -248,7 +251,10 @@ def _advance(
         layers, state = carry
         member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
         # Lung and PIP of each run.
-        cell = jnp.repeat(jnp.arange(lungs * len(pips)), config.copies)
+        if config.round_robin:
+            cell = jnp.full(config.copies, number % (lungs * len(pips)))
+        else:
+            cell = jnp.repeat(jnp.arange(lungs * len(pips)), config.copies)
         lung, pip = cell // len(pips), cell % len(pips)
         member = jax.random.randint(member_key, lung.shape, 0, members)
         cells = draws.random_scenarios(scenario_key, pips[pip], spread=config.spread, smooth=True)

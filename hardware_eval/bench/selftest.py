@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.bench.drive import Commands, Driven, drive
 from hardware_eval.bench.identity import (
@@ -31,8 +30,6 @@ from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.task.metrics.open_loop import mae
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

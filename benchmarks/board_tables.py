@@ -20,12 +20,14 @@ PAGE = ROOT / "README.md"
 
 
 def markdown() -> str:
-    """The ranked entries as a table."""
-    titles = ["track", "rank", "entry", "normalised", "error", "stress", "runs survived"]
-    lines = [titles, ["---"] * len(titles)]
+    """The ranked entries as a table, a line for each, by the first track that ranks it."""
+    performance = ["performance", "rank", "error"]
+    robustness = ["robustness", "rank", "stress", "runs survived"]
+    titles = ["entry", *performance, *robustness]
     board = load_board(ROOT / "leaderboard")
     shown: Any = board[board["status"].isin(["ranked", "practice"])]
     newest = shown[shown["draws"] == shown["draws"].iloc[0]]
+    cells: dict[str, dict[str, list[str]]] = {}
     for row in newest.to_dict(orient="records"):
         ranked = row["status"] == "ranked"
         ranks = f"{row['rank']}" if ranked else "practice"
@@ -33,15 +35,20 @@ def markdown() -> str:
             ranks += f" ({row['rank_low']} to {row['rank_high']})"
         limits = f"[{row['normalised_low']:.1f}, {row['normalised_high']:.1f}]"
         stress = row["stress_cmH2O"]
+        told = (
+            [f"{row['score_cmH2O']:.3f}"] if row["track"] == "performance"
+            else [f"{stress:.2f}", f"{100 * row['stress_survived']:.0f} %"]
+            if math.isfinite(stress) else ["", ""]
+        )  # fmt: skip
+        score = f"**{row['normalised']:.1f}** {limits}"
+        cells.setdefault(row["name"], {})[row["track"]] = [score, ranks, *told]
+    lines = [titles, ["---"] * len(titles)]
+    for name, tracks in cells.items():
         lines.append(
             [
-                row["track"],
-                ranks,
-                row["name"],
-                f"**{row['normalised']:.1f}** {limits}",
-                f"{row['score_cmH2O']:.3f}",
-                f"{stress:.2f}" if math.isfinite(stress) else "",
-                f"{100 * row['stress_survived']:.0f} %" if math.isfinite(stress) else "",
+                name,
+                *tracks.get("performance", [""] * len(performance)),
+                *tracks.get("robustness", [""] * len(robustness)),
             ]
         )
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from hardware_eval.bench import safety, selftest
@@ -30,12 +29,11 @@ from hardware_eval.bench.drive import Driven
 from hardware_eval.bench.identity import KnownLung, measured_lung, white_noise
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Effect
 from proofs.challenge.stranger.rig import Rig
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.resume import WorkFolder
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS, RECORDED_LUNGS
 from ventbench.task.lungs import lung as parse_lung
-
-Floats = NDArray[np.float64]
 
 #: Step of the integration, s; steps of it in a control step.
 STEP = 1e-3
@@ -87,7 +85,7 @@ class Mounted:
     sensor: Floats
     flow: Floats
     noise: Floats
-    dead: NDArray[np.int64]
+    dead: Ints
 
 
 def draw(settings: Sequence[str], fault: str, rng: np.random.Generator) -> Mounted:

@@ -25,19 +25,17 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
 from ventbench.base import compilation, files, precision
+from ventbench.base.arrays import Floats
 from ventbench.entries.reference import published
 from ventbench.plants.rigs import load_rigs
 from ventbench.task import attainable, protocol
 from ventbench.task.attainable import COMMANDS
 from ventbench.task.draws import GAIN_QUANTILES
 from ventbench.task.metrics.score import normalised
-
-Floats = NDArray[np.float64]
 
 #: Shares of the gain's distribution that stand for it.
 QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)

@@ -25,10 +25,6 @@ LOAD = """
 from ventbench.recordings import load
 n = load(path).pressure.size
 """
-ITERATE = """
-from ventbench.recordings import iter_breaths
-n = sum(int(part.valid.sum()) for part in iter_breaths(path))
-"""
 CHECK = """
 from ventbench.recordings import check
 n = check(path).rows
@@ -88,7 +84,7 @@ def main() -> int:
         start = time.perf_counter()
         write_synthetic(path, options.breaths)
         print(f"wrote {path.stat().st_size / 1e6:.0f} MB in {time.perf_counter() - start:.1f} s")
-        bodies = {"plain pyarrow": PLAIN, "load": LOAD, "check": CHECK, "iter_breaths": ITERATE}
+        bodies = {"plain pyarrow": PLAIN, "load": LOAD, "check": CHECK}
         results = {name: measure(body, path) for name, body in bodies.items()}
     plain = results["plain pyarrow"][1]
     for name, (rows, seconds, peak) in results.items():

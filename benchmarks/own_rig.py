@@ -27,10 +27,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench import recordings
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.base.resume import WorkFolder
 from ventbench.controllers.pid import PID
 from ventbench.diagnosis.diagnose import diagnose
@@ -45,8 +45,6 @@ from ventbench.train.exploration import ExplorationRanges, SimulatedVentilator, 
 from ventbench.train.residual import ResidualConfig, train_residual
 from ventbench.train.rigs.fit import FitConfig
 from ventbench.train.rigs.train import RigConfig, train_rigs
-
-Floats = NDArray[np.float64]
 
 #: Label of the lung, which is true; no simulator of ours was made for it.
 LUNG = "R12C30"

@@ -21,10 +21,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from ventbench.base import compilation, precision
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import Hybrid
 from ventbench.recordings import Breaths, recordings_dir
@@ -40,8 +40,6 @@ from ventbench.train.rigs.data import (
 from ventbench.train.rigs.fit import FitConfig, Noise, fit, simulate
 from ventbench.train.rigs.parameters import Scales, centre, plants
 from ventbench.train.rigs.train import UNRECORDED_SLOPE
-
-Floats = NDArray[np.float64]
 
 #: Mean open-loop errors of the paper's networks, cmH2O, in the order of the lungs.
 PAPER = (0.64, 0.72, 0.39, 0.72, 0.60, 0.85)
@@ -99,10 +97,10 @@ class Judged:
     """Measured breaths of the scored rigs, n of them, and the errors of the frozen simulators."""
 
     data: InspirationData
-    lung: NDArray[np.int64]
-    session: NDArray[np.int64]
-    breath: NDArray[np.int64]
-    member: NDArray[np.int64]
+    lung: Ints
+    session: Ints
+    breath: Ints
+    member: Ints
 
 
 def breath_error(plant: Hybrid, data: InspirationData, deviation: dict[str, Any]) -> Floats:
@@ -127,7 +125,7 @@ def _error(plant: Any, data: InspirationData, deviation: dict[str, Any]) -> Any:
 
 
 def best(
-    plant: Hybrid, data: InspirationData, names: tuple[str, ...], group: NDArray[np.int64]
+    plant: Hybrid, data: InspirationData, names: tuple[str, ...], group: Ints
 ) -> tuple[Floats, dict[str, Floats]]:
     """Fit some quantities to every group of breaths by itself; returns errors and deviations."""
     at = {name: np.zeros(len(group)) for name in names}
@@ -166,13 +164,13 @@ def judged(recordings: RigRecordings, simulators: frozen.Frozen) -> Judged:
     return Judged(data, lung[chosen], session[chosen], chosen, member)
 
 
-def row(name: str, error: Floats, lung: NDArray[np.int64]) -> str:
+def row(name: str, error: Floats, lung: Ints) -> str:
     """One row of a Markdown table: mean / median by lung, and over all breaths."""
     cells = [f"{error[lung == k].mean():.2f} / {np.median(error[lung == k]):.2f}" for k in range(6)]
     return f"| {name} | {' | '.join(cells)} | {error.mean():.2f} / {np.median(error):.2f} |"
 
 
-def goals(error: Floats, lung: NDArray[np.int64]) -> str:
+def goals(error: Floats, lung: Ints) -> str:
     """On how many lungs the median and the mean are at or below the paper's figure."""
     at = [error[lung == k] for k in range(6)]
     pairs = list(zip(at, PAPER, strict=True))
@@ -282,7 +280,7 @@ def unseen_plants(recordings: RigRecordings, simulators: frozen.Frozen, chosen: 
     return out
 
 
-def _chosen(now: NDArray[np.bool_], plant: Hybrid, other: Hybrid) -> Hybrid:
+def _chosen(now: Bools, plant: Hybrid, other: Hybrid) -> Hybrid:
     def choose(a: Any, b: Any) -> Any:
         return np.where(now.reshape(-1, *(1,) * (np.ndim(a) - 1)), a, b)
 

@@ -15,15 +15,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import VALVE_KNOTS
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws, protocol
 from ventbench.train.rigs.label_test import resistance_and_compliance
-
-Floats = NDArray[np.float64]
 
 #: Command at which valves are compared, %.
 COMMAND = 20.0

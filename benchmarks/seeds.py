@@ -38,7 +38,7 @@ from ventbench.train.rl.train import CHUNKS, method_for, train
 ROOT = Path(__file__).parents[1]
 
 #: Round whose ranked draws and bounds the scores are of, and breaths that each training sees.
-ROUND, BREATHS = "rehearsal-2", 57_600
+ROUND, BREATHS = "rehearsal-3", 57_600
 
 METHODS = ("residual", "ppo", "dqn")
 

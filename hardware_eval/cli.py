@@ -24,18 +24,15 @@ from hardware_eval.commands import (
     register,
     told,
 )
-from ventbench import __version__
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
 
-app = typer.Typer(
-    name="ventbench-hardware",
-    help="Entries on a physical lung: run, check and compare; or an emulator of the bench.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
+app = options.program(
+    "ventbench-hardware",
+    "Entries on a physical lung: run, check and compare; or an emulator of the bench.",
 )
 
 Lungs = Annotated[
@@ -64,21 +61,6 @@ Skip = Annotated[
 ]
 
 
-def _version(value: bool) -> None:
-    if value:
-        print(f"ventbench-hardware {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
-    ),
-) -> None:
-    pass
-
-
 @app.command()
 def run(
     submissions: Annotated[
@@ -90,12 +72,8 @@ def run(
     ],
     port: Port,
     lung: Lungs,
-    pip: Annotated[
-        list[float] | None,
-        typer.Option("--pip", metavar="CMH2O", help="PIP; repeatable. Default: all six."),
-    ] = None,
     pips: Annotated[
-        str | None, typer.Option(metavar="LIST", help="PIPs separated by commas, such as 10,20,35.")
+        str | None, typer.Option(metavar="LIST", help="PIPs, such as 10,20,35. Default: all six.")
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, max=100, help="Runs of each lung and PIP.")] = 10,
     track: Annotated[
@@ -159,10 +137,9 @@ def run(
     from hardware_eval.bench.selftest import Sheet, chosen_parts
     from hardware_eval.bench.selftest import selftest as run_selftest
     from hardware_eval.results import evaluate as ev
-    from ventbench.base import files
     from ventbench.task import protocol
 
-    chosen = [*(pip or ()), *numbers("--pips", pips)] or list(protocol.PIPS)
+    chosen = numbers("--pips", pips) or list(protocol.PIPS)
     entries, track = ev.open_entries(submissions, track)
     if seed is None:
         begun = ev.begun_plan(out)
@@ -376,7 +353,7 @@ def collect(
     """
     from hardware_eval.bench import collect as collection
     from hardware_eval.results import evaluate as ev
-    from ventbench.cli.options import bars
+    from ventbench.cli.options import bar
     from ventbench.task import protocol
     from ventbench.task.lungs import scored_lung
     from ventbench.train.exploration import Limits
@@ -390,12 +367,11 @@ def collect(
     with bench_on(port, yes=yes) as (line, bench, person):
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
-        with bars() as shown:
-            bar = shown.add_task("exploring", total=breaths)
+        with bar("exploring") as exploring:
             done = collection.collect(
                 bench, label, breaths, out, seed=seed, limits=Limits(ease=ease),
                 about={"device": ev.device_about(line)},
-                progress=lambda number: shown.update(bar, completed=number),
+                progress=lambda number: exploring(number, breaths),
             )  # fmt: skip
     count = len(done.breaths)
     emit({"breaths": count, "recording": str(done.recording), "stopped": done.stopped}, json)

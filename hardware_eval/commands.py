@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.cli.options import JsonFile, emit, known_lungs
 
@@ -125,7 +126,6 @@ def calibrate(
     Example: `ventbench-hardware calibrate span --port /dev/ttyACM0 --reference 0,20,40,20,0`
     """
     from hardware_eval.bench import calibrate as calibration
-    from ventbench.base import files
     from ventbench.task.lungs import scored_lung
 
     values = numbers("--reference", reference)

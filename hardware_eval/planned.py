@@ -28,10 +28,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 from hardware_eval.emulation.simulated import breath_begun
 from ventbench.base import precision
+from ventbench.base.arrays import Floats
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.entries.scaffold import contents
 from ventbench.task import attainable as bound
@@ -39,8 +39,6 @@ from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Observation, Plant, Signals
-
-Floats = NDArray[np.float64]
 
 #: Steps that the starts of the search open the valve for: a short and a long rise.
 STARTS = (2, 8)

@@ -104,10 +104,12 @@ def _commands(
                 f"python -m proofs challenge make --generator {source} {seeds[-1]} "
                 f"--cases {draw.total} --out {where}"
             )
-            one = f"python -m proofs challenge answer {where} --diagnoser"
-            each = f"for who in {' '.join(diagnosers)}; do {one} $who; done"
-            answer.append(each if len(diagnosers) > 1 else f"{one} {diagnosers[0]}")
+            answer.append(f"python -m proofs challenge answer {where} --diagnoser {diagnosers[0]}")
             drawn.append(f"| `{source}` | `{draw.seed}` | `{draw.commitment}` |")
+    if len(diagnosers) > 1:
+        one = "python -m proofs challenge answer $where --diagnoser $who"
+        each = f"for who in {' '.join(diagnosers)}; do {one}; done"
+        answer = [f"for where in {' '.join(folders)}; do {each}; done"]
     who = f"--diagnoser {diagnosers[0]} " if last == "reveal" else ""
     end = f"python -m proofs challenge {last} {' '.join(folders)} {who}{' '.join(seeds)}"
     head = ["| world | seed | commitment |", "|---|---|---|"]
@@ -127,6 +129,9 @@ _BOARD = {
     "processor seconds, mean": "seconds",
 }
 
+#: Paired differences beside them.
+_PAIRED = ("log score", "isolation error")
+
 
 def board_section(result: Board) -> str:
     """Figures of all diagnosers side by side, and paired differences with their 95 % intervals."""
@@ -134,27 +139,18 @@ def board_section(result: Board) -> str:
     names = list(dict.fromkeys(row.diagnoser for row in every))
     drawn = {generator: rows[0].draws for generator, rows in result.tables.items()}
     lines = _commands(drawn, names, "board")
+    lines += ["", f"The last two columns are `{result.against}` minus the other, case by case."]
+    heads = ["diagnoser", "code", "cases", *_BOARD.values(), *(f"less: {what}" for what in _PAIRED)]
     for generator, rows in result.tables.items():
-        lines += [
-            "",
-            f"World `{generator}`:",
-            "",
-            f"| diagnoser | code | cases | {' | '.join(_BOARD.values())} |",
-        ]
-        lines.append("|---" * (len(_BOARD) + 3) + "|")
+        lines += ["", f"World `{generator}`:", "", f"| {' | '.join(heads)} |"]
+        lines.append("|---" * len(heads) + "|")
         for row in rows:
             figures = {figure.what: figure for figure in row.figures}
-            cells = " | ".join(_cell(figures[what]) for what in _BOARD)
+            compared = result.differences(row)
+            cells = [_cell(figures[what]) for what in _BOARD]
+            cells += [_cell(compared[what]) if compared else "" for what in _PAIRED]
             code = ", ".join(row.versions) or "–"
-            lines.append(f"| {row.diagnoser} | {code} | {len(row.cases)} | {cells} |")
-        compared = {row.diagnoser: d for row in rows if (d := result.differences(row))}
-        if compared:
-            what = next(iter(compared.values()))
-            words = f"`{result.against}` minus the other, case by case; below zero: it is better:"
-            lines += ["", words, "", f"| other | {' | '.join(what)} |"]
-            lines.append("|---" * (len(what) + 1) + "|")
-        for name, differences in compared.items():
-            lines.append(f"| {name} | {' | '.join(map(_cell, differences.values()))} |")
+            lines.append(f"| {row.diagnoser} | {code} | {len(row.cases)} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

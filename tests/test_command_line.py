@@ -168,7 +168,7 @@ def test_quiet_says_nothing_but_the_result(tmp_path):
     script = "import sys; from ventbench import cli; from ventbench.cli import options\n"
     script += "@cli.app.command()\ndef work():\n"
     script += "    options.notes().print('note')\n    print('result')\n"
-    script += "    with options.bars() as shown:\n        options.counted(shown, 'steps')(1, 2)\n"
+    script += "    with options.bar('steps') as steps:\n        steps(1, 2)\n"
     script += "sys.argv = ['ventbench', 'work', *sys.argv[2:]]\ncli.main()\n"
     loud, quiet = _run(script), _run(script, "--quiet")
     assert "note" in loud.stderr

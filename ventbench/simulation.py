@@ -76,9 +76,7 @@ class Simulation:
 
     def to_csv(self) -> str:
         """Text of a CSV file with the columns of :meth:`to_frame`."""
-        columns = zip(self.time, self.u_in, self.u_out, self.pressure, strict=True)
-        rows = [f"{t:.6f},{u:.6f},{int(o)},{p:.6f}" for t, u, o, p in columns]
-        return "\n".join(["time_step,u_in,u_out,pressure", *rows]) + "\n"
+        return self.to_frame().to_csv(index=False, float_format="%.6f", lineterminator="\n")
 
     def _repr_html_(self) -> str:
         """A line of text and the table, as a notebook shows it."""

@@ -6,9 +6,9 @@ import html
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -84,17 +84,8 @@ class Trajectories:
 
     def save(self, path: Path) -> None:
         """Write an ``.npz`` file in one step."""
-        arrays = {
-            "name": np.array(self.name),
-            "track": np.array(self.track),
-            "lungs": np.array(self.lungs),
-            "pips": np.array(self.pips),
-            "time": self.time,
-            "target": self.target,
-            "pressure": self.pressure,
-            "u_in": self.u_in,
-            "u_out": self.u_out,
-        }
+        names = [field.name for field in fields(self)]
+        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in names}
         files.write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from hardware_eval.bench.drive import Commands, Driven, drive
@@ -29,11 +28,10 @@ from hardware_eval.bench.selftest import hold, programs
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Reading
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
-
-Floats = NDArray[np.float64]
 
 FORMAT = "ventbench-calibration-1"
 

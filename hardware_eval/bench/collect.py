@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval import realtime
 from hardware_eval.bench import safety
@@ -23,14 +22,13 @@ from hardware_eval.bench.loop import Bench, BreathLog, EmergencyStop, answer_by,
 from hardware_eval.bench.plan import PlannedRun
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.write import write
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.train.exploration import RANGES, Limits, explore
-
-Floats = NDArray[np.float64]
 
 #: Rest before a breath in time constants of the labelled lung with its expiratory valve, and its
 #: limits, s.

@@ -8,14 +8,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.realtime import take_priority
+from ventbench.base.arrays import Floats
 from ventbench.task.interfaces import Task
-
-Floats = NDArray[np.float64]
 
 
 class ControllerFailedError(Exception):

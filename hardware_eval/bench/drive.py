@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval import realtime
 from hardware_eval.bench import safety
@@ -21,10 +20,9 @@ from hardware_eval.bench.loop import (
     sample_of,
 )
 from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
+from ventbench.base.arrays import Floats
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
-
-Floats = NDArray[np.float64]
 
 #: Chooses valves from the step and the pressure.
 Commands = Callable[[int, float], tuple[float, int]]

@@ -27,15 +27,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.bench.plan import CONTROL_GAINS
 from hardware_eval.bench.safety import VALVE_GAIN
+from ventbench.base.arrays import Floats
 from ventbench.mechanics.labels import APPARATUS, TOLERANCE_R
 from ventbench.task import protocol
 from ventbench.task.lungs import Lung
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

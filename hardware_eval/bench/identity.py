@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
 from hardware_eval.bench.drive import Driven
 from hardware_eval.bench.safety import VALVE_GAIN
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.mechanics import identify
 from ventbench.mechanics.labels import (
@@ -25,8 +25,6 @@ from ventbench.mechanics.labels import (
 from ventbench.recordings.breaths import make_breaths
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
-
-Floats = NDArray[np.float64]
 
 #: Steps from a command to the sample that its flow is in: at once, and two later as in the
 #: recordings.

@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval import realtime
 from hardware_eval.bench import fallback, safety
@@ -31,10 +30,9 @@ from hardware_eval.realtime import Clock
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import CAUSES, Flag, Reading
 from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
+from ventbench.base.arrays import Floats
 from ventbench.task import protocol, waveform
 from ventbench.task.lungs import lung as parse_lung
-
-Floats = NDArray[np.float64]
 
 #: When a controller must have answered, s after the step's deadline: what is left of 30 ms is for
 #: the command's way to the device, and for this loop.

@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.bench.drive import Commands, Driven, drive
 from hardware_eval.bench.identity import (
@@ -31,8 +30,6 @@ from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.task.metrics.open_loop import mae
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -193,8 +190,10 @@ def _number(value: float) -> float | None:
 #: every lung, and slow enough that a stiff lung under a soft label does not overshoot.
 _PROBES = ((15.0, 1.0, 2.0), (25.0, 1.0, 2.0), (15.0, 3.0, 1.0), (25.0, 0.3, 4.0))
 
-#: Openings of the sweep, %, for :data:`_PUFF` steps each.
-_SWEEP = (5.0, 10.0, 20.0, 40.0)
+#: Openings of the sweep, %, for :data:`_PUFF` steps each; of a lung with more resistance than this,
+#: cmH2O/(L/s), they are as much smaller and longer, so that no puff comes near the limit of
+#: pressure.
+_SWEEP, _SWEPT_RESISTANCE = (5.0, 10.0, 20.0, 40.0), 20.0
 _PUFF = 3
 
 #: Steps at rest before a puff, with both valves closed after it, and of those that count.
@@ -208,7 +207,7 @@ _SIGMAS = 2.6
 
 #: Rest before each part: time constants of the labelled lung behind valve and hose, whose
 #: resistance together may be this, cmH2O/(L/s); and its bounds, s.
-_TIME_CONSTANTS, _OUTLET, _REST = 5.0, 10.0, (3.0, 8.0)
+_TIME_CONSTANTS, _OUTLET, _REST = 5.0, 10.0, (3.0, 16.0)
 
 #: Pressure towards which the lung is filled, cmH2O; time constants of filling, behind a valve whose
 #: feedback acts as this resistance, cmH2O/(L/s), and their bounds, s. Steps until a closed lung is
@@ -250,11 +249,11 @@ def programs(lung: str, noise: float = 0.0) -> dict[str, list[Program]]:
         lung: the label.
         noise: standard deviation of the sensor's, cmH2O, which decides how long a leak takes.
     """
-    puffed, (closed, held) = _LEAD + _PUFF + _STILL, hold(lung, noise)
+    (openings, puff), (closed, held) = _openings(lung), hold(lung, noise)
     return {
         "sensor": [(lambda: lambda step, pressure: (0.0, 1), 34, 10.0)],
         "leak": [(partial(fill_and_close, closed - _STILL_AFTER), held, 30.0)],
-        "sweep": [(partial(_puff, u), puffed, 30.0) for u in (0.0, *_SWEEP)],
+        "sweep": [(partial(_puff, u, puff), _LEAD + puff + _STILL, 30.0) for u in (0.0, *openings)],
         "lung": [(partial(_probe, *probe), protocol.BREATH_STEPS, probe[0]) for probe in _PROBES],
     }
 
@@ -346,7 +345,7 @@ def judge(
     if driven.get("leak"):
         findings.append(_closed(driven["leak"][0], lung))
     if driven.get("sweep"):
-        findings += _sweep(driven["sweep"], noise, parse_lung(lung).C)
+        findings += _sweep(driven["sweep"], noise, lung)
     probes = list(driven.get("lung", ()))
     if not probes or any(probe.trips for probe in probes):
         return Sheet(lung, tuple(findings), skipped=skipped)
@@ -421,26 +420,33 @@ def _closed(held: Driven, lung: str) -> Finding:
     return Finding("leak", found.flow, not beyond, told)
 
 
-def _puff(u_in: float) -> Commands:
+def _puff(u_in: float, steps: int) -> Commands:
     def commands(step: int, pressure: float) -> tuple[float, int]:
-        return (u_in if _LEAD <= step < _LEAD + _PUFF else 0.0), int(step < _LEAD)
+        return (u_in if _LEAD <= step < _LEAD + steps else 0.0), int(step < _LEAD)
 
     return commands
 
 
-def _sweep(puffs: Sequence[Driven], noise: float, C: float) -> list[Finding]:
-    """Compare the rises of the puffs, of no opening and of :data:`_SWEEP`, with the noise."""
-    whole = [puff.pressure.size == _LEAD + _PUFF + _STILL for puff in puffs]
-    if whole != [True] * (1 + len(_SWEEP)):
+def _openings(lung: str) -> tuple[tuple[float, ...], int]:
+    """Openings of the sweep of a labelled lung, %, and steps of each puff."""
+    scale = min(1.0, _SWEPT_RESISTANCE / parse_lung(lung).R)
+    return tuple(scale * opening for opening in _SWEEP), math.ceil(_PUFF / scale)
+
+
+def _sweep(puffs: Sequence[Driven], noise: float, lung: str) -> list[Finding]:
+    """Compare the rises of the puffs, of no opening and of :func:`_openings`, with the noise."""
+    openings, steps = _openings(lung)
+    whole = [puff.pressure.size == _LEAD + steps + _STILL for puff in puffs]
+    if whole != [True] * (1 + len(openings)):
         return [Finding("valve_sweep", math.nan, False, "the sweep was stopped")]
     rises = [
         float(puff.pressure[-_SETTLED:].mean() - puff.pressure[1:_LEAD].mean()) for puff in puffs
     ]
     error = noise * math.sqrt(2.0 * (1.0 / _SETTLED + 1.0 / (_LEAD - 1)))  # of a difference of two
-    nominal = VALVE_GAIN * np.diff([0.0, *_SWEEP]) * _PUFF * protocol.DT / C
+    nominal = VALVE_GAIN * np.diff([0.0, *openings]) * steps * protocol.DT / parse_lung(lung).C
     further = np.diff(rises) > _LEAST_RISE * nominal - _SIGMAS * error
     opens = rises[-1] - rises[0] > _SIGMAS * error
-    text = ", ".join(f"{u:g} % {rise:+.2f}" for u, rise in zip(_SWEEP, rises[1:], strict=True))
+    text = ", ".join(f"{u:g} % {rise:+.2f}" for u, rise in zip(openings, rises[1:], strict=True))
     share = float(np.mean([*further, opens]))
     return [_finding("valve_sweep", share, f"{text} cmH2O (SE {error / math.sqrt(2.0):.2f})")]
 

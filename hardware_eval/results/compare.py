@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.bench.loop import BreathLog
 from hardware_eval.bench.plan import PlannedRun, progress
@@ -24,6 +23,7 @@ from hardware_eval.bench.raw_log import breaths, lines, recording
 from hardware_eval.results.evaluate import LOG, UNDISTURBED
 from hardware_eval.results.record import Jitter, jitter, plan_of
 from ventbench.base import files
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.board import record as records
 from ventbench.board.record import HardwareRecord
@@ -157,8 +157,6 @@ def _differences(
     return problems
 
 
-Floats = NDArray[np.float64]
-
 #: A waveform is told by its plateau: the mean pressure of the last third of the inspiration falls
 #: into one of these, cmH2O.
 _PLATEAUS = (0.0, 12.5, 17.5, 22.5, 27.5, 32.5, float("inf"))
@@ -272,7 +270,7 @@ def compare(
     return Comparison(breaths, tested.name, whole, waveforms, horizon, diagnoses)
 
 
-def _plateaus(breaths: Breaths) -> NDArray[np.int64]:
+def _plateaus(breaths: Breaths) -> Ints:
     inspired = np.where(breaths.inspiratory, breaths.pressure, np.nan)
     last = np.sum(breaths.inspiratory, axis=1)
     steps = np.arange(breaths.pressure.shape[1])
@@ -280,7 +278,7 @@ def _plateaus(breaths: Breaths) -> NDArray[np.int64]:
     return np.searchsorted(_PLATEAUS, np.nanmean(late, axis=1)) - 1
 
 
-def _distance(breaths: Breaths, simulated: Floats, index: NDArray[np.int64]) -> Distance:
+def _distance(breaths: Breaths, simulated: Floats, index: Ints) -> Distance:
     mask = breaths.inspiratory[index]
     measured, answer = breaths.pressure[index], simulated[index]
     difference = np.where(mask, measured - answer, np.nan)[:, 1:]

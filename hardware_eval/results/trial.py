@@ -24,16 +24,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.results.evaluate import LOG
 from hardware_eval.results.record import plan_of
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-
-Floats = NDArray[np.float64]
 
 #: Draws of the interval of rank agreement, and their seed.
 DRAWS, SEED = 4000, 0

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from proofs.cli import ResultsPage
-from ventbench.cli.options import JsonFile, Scheduler, bars, claim_out, emit
+from ventbench.cli.options import JsonFile, Scheduler, bar, bars, claim_out, emit
 
 app = typer.Typer(
     name="challenge",
@@ -66,12 +66,11 @@ def make(
     """
     from proofs.challenge.make import make as work
 
-    with bars() as shown:
-        task = shown.add_task("recording", total=cases)
+    with bar("recording") as recording:
         place = out if scheduler is None else out.resolve()
         hashed = work(
             seed, place, kind, cases, jobs=jobs, scheduler=scheduler, source=generator,
-            progress=lambda done: shown.update(task, completed=done),
+            progress=lambda done: recording(done, cases),
         )  # fmt: skip
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
 
@@ -107,12 +106,7 @@ def answer(
     from proofs.challenge.run import Limits, find
 
     who = find(diagnoser)
-    with bars() as shown:
-        task = shown.add_task("answering", total=None)
-
-        def progress(done: int, total: int) -> None:
-            shown.update(task, completed=done, total=total)
-
+    with bar("answering") as progress:
         place = folder if scheduler is None else folder.resolve()
         lost = work(
             ChallengeFolder(place, round_), who, limits=Limits(seconds, memory), jobs=jobs,
@@ -268,14 +262,7 @@ def round_(
         chain = own.frozen.chain
         content = beacon.read_bytes() if beacon else beacons.fetch(chain, own.number)
         own = rounds.draw(own, content)
-    tasks: dict[str, Any] = {}
-    with bars() as shown:
-
-        def tell(what: str, done: int, count: int) -> None:
-            if what not in tasks:
-                tasks[what] = shown.add_task(what, total=count)
-            shown.update(tasks[what], completed=done, total=count)
-
+    with bars() as tell:
         result = rounds.play(own, jobs=jobs, tell=tell)
     _told(result, json, page, "board of diagnosers", board_section(result))
 

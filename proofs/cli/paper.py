@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, RecordingsDir, Scheduler, Workers, bars, emit
+from ventbench.base import files
+from ventbench.cli.options import JsonFile, RecordingsDir, Scheduler, Workers, bar, told
 
 
 def paper(
@@ -50,21 +51,17 @@ def paper(
 
     Example: `python -m proofs paper --html paper.html --json paper.json`
     """
-    from rich.console import Console
     from rich.table import Table
 
     from proofs.paper.paper import reproduce_paper
-    from ventbench.base import files
 
-    with bars() as shown:
-        task = shown.add_task("paper", total=1.0)
+    with bar("paper") as progress:
         result, stored = reproduce_paper(
             recordings=recordings, full=full, out=out, seeds=seeds,
             workers=workers, scheduler=scheduler,
-            progress=lambda what, share: shown.update(task, completed=share, description=what),
+            progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
-    emit(result.to_json(), json)
-    console = Console(stderr=str(json) == "-")
+    console = told(result.to_json(), json)
     summary = result.summary()
     for part in (summary, *(table for section in result.sections for table in section.tables)):
         table = Table(title=part.caption, show_lines=part is summary)
@@ -74,7 +71,7 @@ def paper(
             table.add_row(*row)
         console.print(table)
     for place, what, why in result.not_reproduced:
-        console.print(f"not reproduced: {place}: {what}; {why}", markup=False, highlight=False)
+        console.print(f"not reproduced: {place}: {what}; {why}")
     written = []
     if page is not None:
         from proofs.paper.page import write_reproduction
@@ -87,4 +84,4 @@ def paper(
         files.write_json(store, stored)
         written.append(store)
     for path in written:
-        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"wrote {path}", soft_wrap=True)

@@ -7,8 +7,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from proofs.cli import ResultsPage, tabulated
-from ventbench.cli.options import JsonFile, RecordingsDir, bars, claim_out, emit, recordings_folder
+from proofs.cli import ResultsPage
+from ventbench.base import files
+from ventbench.base.errors import require
+from ventbench.cli.options import (
+    JsonFile,
+    RecordingsDir,
+    bar,
+    bars,
+    claim_out,
+    emit,
+    recordings_folder,
+    table_of,
+    told,
+)
 
 if TYPE_CHECKING:
     from proofs.real.rig import Proof
@@ -53,28 +65,22 @@ def rig(
 
     Example: `python -m proofs rig --recordings recordings --out runs/proof`
     """
-    from rich.console import Console
-
     from proofs.real.rig import prove
     from proofs.results_page import proof_section, write_section
-    from ventbench.base import compilation, errors
+    from ventbench.base import compilation
 
-    errors.require("jinja2", "rerun")
+    require("jinja2", "rerun")
     folder = recordings_folder(recordings)
     compilation.keep()
-    with bars() as shown:
-        tasks: dict[str, Any] = {}
-
-        def progress(part: str, what: str, share: float) -> None:
-            if part not in tasks:
-                tasks[part] = shown.add_task(part, total=1.0)
-            shown.update(tasks[part], completed=share, description=f"{part}: {what}")
-
-        result = prove(folder, out, lambda to, diagnosis: diagnosis.save(to), only or (), progress)
-    emit(result.as_dict(), json)
+    with bars() as tell:
+        result = prove(
+            folder, out, lambda to, diagnosis: diagnosis.save(to), only or (),
+            lambda part, what, share: tell(part, share, text=f"{part}: {what}"),
+        )  # fmt: skip
+    console = told(result.as_dict(), json)
     if page is not None:
         write_section(page, "proof", proof_section(result))
-    _show(Console(stderr=str(json) == "-"), result)
+    _show(console, result)
     if not result.met:
         raise typer.Exit(1)
 
@@ -82,12 +88,10 @@ def rig(
 def _show(console: Any, result: Proof) -> None:
     console.print(_table(result))
     for name, reason in result.impossible.items():
-        console.print(f"{name}: {reason}", markup=False, highlight=False)
+        console.print(f"{name}: {reason}")
     for claim in result.claims:
         verdict = "met" if claim.met else "missed"
-        console.print(
-            f"{claim.part}: {claim.what}: {verdict} ({claim.value})", markup=False, highlight=False
-        )
+        console.print(f"{claim.part}: {claim.what}: {verdict} ({claim.value})")
 
 
 def _table(result: Proof) -> Any:
@@ -103,9 +107,7 @@ def _table(result: Proof) -> Any:
         ))  # fmt: skip
     heads = ("part", "n", "before", "refit", "after", "cut", "named", "without a name",
              "label misfits")  # fmt: skip
-    return tabulated(
-        "Open-loop MAE on held-out real breaths, cmH2O", heads, rows, left=(0, 6, 7, 8)
-    )
+    return table_of("Open-loop MAE on held-out real breaths, cmH2O", heads, rows, left=heads[6:])
 
 
 def pairs(
@@ -137,16 +139,12 @@ def pairs(
     """
     from proofs.real import comparisons as work
     from proofs.results_page import pairs_section, write_section
-    from ventbench.base import compilation, files
+    from ventbench.base import compilation
 
     folder = recordings_folder(recordings)
     compilation.keep()
-    with bars() as shown:
-        task = shown.add_task("comparing", total=None)
-        answers = work.run(
-            folder, out, sealed=sealed, kinds=kind or (),
-            progress=lambda done, total: shown.update(task, completed=done, total=total),
-        )  # fmt: skip
+    with bar("comparing") as progress:
+        answers = work.run(folder, out, sealed=sealed, kinds=kind or (), progress=progress)
     text = work.report(answers)
     files.write_text(out / ("sealed.md" if sealed else "development.md"), text + "\n")
     if page is not None:

@@ -7,17 +7,20 @@ from typing import Annotated, Any
 
 import typer
 
-from proofs.cli import tabulated
+from ventbench.base import files
+from ventbench.base.errors import InputError, require
 from ventbench.base.files import json_values
 from ventbench.cli.options import (
     JsonFile,
     RecordingsDir,
     Scheduler,
     Workers,
+    bar,
     bars,
     claim_out,
-    emit,
     recordings_folder,
+    table_of,
+    told,
 )
 
 app = typer.Typer(
@@ -54,27 +57,18 @@ def samples(
     Example: `python -m proofs study samples --lung R20C50 --seeds 5`
     """
     from proofs.studies import samples as work
-    from ventbench.base import errors, files
     from ventbench.task.lungs import scored_lung
 
-    errors.require("matplotlib")
-    with bars() as shown:
-        tasks: dict[str, Any] = {}
-
-        def progress(method: str, done: float, best: float) -> None:
-            if method not in tasks:
-                tasks[method] = shown.add_task(method, total=1.0)
-            description = f"{method}: {best:.3f} cmH2O"
-            shown.update(tasks[method], completed=done, description=description)
-
+    require("matplotlib")
+    with bars() as tell:
         result = work.sample_efficiency(
-            scored_lung(lung), range(seeds), out, share=share, progress=progress
-        )
+            scored_lung(lung), range(seeds), out, share=share,
+            progress=lambda name, done, best: tell(name, done, text=f"{name}: {best:.3f} cmH2O"),
+        )  # fmt: skip
     picture = work.learning_curves_png(result)
     files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
     table = result.summary()
-    emit({"lung": result.lung, "methods": _plain(table)}, json)
-    _print(_summary(result, table), out, json)
+    _tell({"lung": result.lung, "methods": _plain(table)}, _summary(result, table), out, json)
 
 
 def _plain(table: Any) -> list[dict[str, Any]]:
@@ -96,7 +90,7 @@ def _summary(result: Any, frame: Any) -> Any:
     rows = [["-" if row[k] is None else str(row[k]) for k in heads] for row in _plain(frame)]
     caption = f"The corrected PID: {result.start:.3f}; best PID of the grid: {result.best_pid:.3f}."
     title = f"{result.lung}: nominal score, cmH2O, and experience"
-    return tabulated(title, heads.values(), rows, caption=caption)
+    return table_of(title, heads.values(), rows, caption=caption)
 
 
 @app.command()
@@ -128,15 +122,13 @@ def controllers(
     config = ResidualConfig(updates=updates)
     known = work.variants(config)
     _check(only, known)
-    with bars() as shown:
-        task = shown.add_task("controllers", total=1.0)
+    with bar("controllers") as progress:
         runs = work.compare(
             frozen.load(), out, range(seeds), config=config, only=only,
             workers=workers, scheduler=scheduler,
-            progress=lambda what, share: shown.update(task, completed=share, description=what),
+            progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
     table = work.summary(runs)
-    emit({"updates": updates, "variants": table.to_dict("records")}, json)
     meanings = {name: variant.meaning for name, variant in known.items()}
     rows = [
         (
@@ -148,7 +140,8 @@ def controllers(
     ]  # fmt: skip
     heads = ("variant", "what", *work.FIGURES, "difference to base")
     title = "Mean |pressure - target|, cmH2O, averaged over seeds"
-    _print(tabulated(title, heads, rows, left=(0, 1)), out, json)
+    values = {"updates": updates, "variants": table.to_dict("records")}
+    _tell(values, table_of(title, heads, rows, left=["what"]), out, json)
 
 
 @app.command()
@@ -174,14 +167,12 @@ def networks(
 
     folder = recordings_folder(recordings)
     _check(only, work.variants(work.ARCHITECTURE))
-    with bars() as shown:
-        task = shown.add_task("networks", total=1.0)
+    with bar("networks") as progress:
         breaths = work.compare(
             folder, out, only=only, workers=workers, scheduler=scheduler,
-            progress=lambda what, share: shown.update(task, completed=share, description=what),
+            progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
     table = work.summary(breaths)
-    emit({"variants": table.to_dict("records")}, json)
     rows = [
         (
             str(row["variant"]), f"{row['mean']:.3f}", f"{row['median']:.3f}",
@@ -190,12 +181,11 @@ def networks(
         for row in table.to_dict("records")
     ]  # fmt: skip
     heads = ("variant", "mean", "median", "difference to base", "95 %, paired by breath")
-    _print(tabulated("Held-out open-loop MAE, cmH2O", heads, rows), out, json)
+    shown = table_of("Held-out open-loop MAE, cmH2O", heads, rows)
+    _tell({"variants": table.to_dict("records")}, shown, out, json)
 
 
 def _check(only: list[str] | None, known: dict[str, Any]) -> None:
-    from ventbench.base.errors import InputError
-
     for name in only or ():
         if name not in known:
             raise InputError(
@@ -203,9 +193,7 @@ def _check(only: list[str] | None, known: dict[str, Any]) -> None:
             )
 
 
-def _print(shown: Any, out: Path, json: Any) -> None:
-    from rich.console import Console
-
-    console = Console(stderr=str(json) == "-")
+def _tell(values: Any, shown: Any, out: Path, json: Path | None) -> None:
+    console = told(values, json)
     console.print(shown)
-    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"wrote {out}", soft_wrap=True)

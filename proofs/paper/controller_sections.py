@@ -15,6 +15,7 @@ from scipy import stats
 from proofs.paper import published
 from proofs.paper.report import Cell, Chart, Line, Section, Table, Verdict
 from ventbench.base import precision
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.controllers.pid import PID
 from ventbench.plants import frozen
@@ -24,7 +25,6 @@ from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import figures
 from ventbench.train import pid_grid
 
-Floats = NDArray[np.float64]
 AnyFloats = NDArray[np.floating]
 
 #: P from the end of the paper's grid on and the values of I tried at each, %/cmH2O; and the rise of

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import ventbench
 from proofs.paper import controller_sections as controllers
@@ -22,6 +21,7 @@ from proofs.paper import published
 from proofs.paper import simulator_sections as simulators
 from proofs.paper.report import Reproduction
 from proofs.studies.networks import MEASURED
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.entries.scoring import score
@@ -30,8 +30,6 @@ from ventbench.plants.rigs import rigs_of
 from ventbench.plants.stacking import take
 from ventbench.task.lungs import LUNG_IDS, lung
 from ventbench.train import pid_grid
-
-Floats = NDArray[np.float64]
 
 #: File of stored results.
 STORED = Path(__file__).with_name("stored.json")
@@ -73,7 +71,7 @@ def reproduce_paper(
     sizes: StudySizes | None = None,
     workers: int = 0,
     scheduler: str | None = None,
-    gains: NDArray[np.float64] | None = None,
+    gains: Floats | None = None,
     stored: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> tuple[Reproduction, dict[str, Any]]:

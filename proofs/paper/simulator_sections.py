@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from proofs.paper import published
 from proofs.paper.report import Cell, Chart, Line, Section, Table, Verdict
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import nominal_plants, open_loop_breaths, take
@@ -25,7 +26,6 @@ from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import open_loop
 from ventbench.train.exploration import RANGES, SimulatedVentilator, explore
 
-Floats = NDArray[np.float64]
 AnyFloats = NDArray[np.floating]
 
 #: Kinds of simulators whose error is shown by horizon, as tables name them.

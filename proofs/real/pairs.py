@@ -24,9 +24,8 @@ from typing import Literal
 from ventbench import recordings
 from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import Mechanics, identify
-from ventbench.mechanics.respiraworks import breaths_of
+from ventbench.mechanics.respiraworks import RespiraWorksRun, breaths_of, load_respiraworks
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.respiraworks import RespiraWorksRun, load_respiraworks
 
 Split = Literal["development", "sealed"]
 

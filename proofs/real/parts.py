@@ -15,9 +15,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
 from ventbench.plants import frozen
@@ -29,8 +29,6 @@ from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings.breaths import Breaths
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNG_IDS, LUNGS
-
-Floats = NDArray[np.float64]
 
 #: Lungs of the parts that must also simulate a learned plant, which takes as long again: each C
 #: once, and both R. This rule chose them before anything was computed.

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from proofs.studies.networks import Progress, Tell, finish
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.base.resume import WorkFolder
 from ventbench.board.replay import spread
 from ventbench.plants import frozen
@@ -191,7 +191,7 @@ def score_controllers(
     controllers: Sequence[Controller],
     pips: Sequence[float] = protocol.PIPS,
     draws: int = DRAWS,
-) -> tuple[NDArray[np.float64], float, bool]:
+) -> tuple[Floats, float, bool]:
     """Score pure controllers.
 
     Args:

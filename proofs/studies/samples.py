@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import trim_mean
 
 from ventbench.base import files
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import require
 from ventbench.palette import RUNS
 from ventbench.plants import frozen
@@ -24,10 +25,8 @@ from ventbench.task.lungs import LUNG_IDS, Lung
 from ventbench.task.metrics import bootstrap
 from ventbench.train import pid_grid
 from ventbench.train.rl import episodes
-from ventbench.train.rl.policy_gradient import PolicyGradient
+from ventbench.train.rl.ppo import PolicyGradient
 from ventbench.train.rl.train import METHODS, Method, TrainedPolicies, method_for, train
-
-Floats = NDArray[np.float64]
 
 #: Share of the values that the interquartile mean cuts off at each end.
 CUT = 0.25
@@ -68,7 +67,7 @@ class LearningCurve:
     """One method: score against experience."""
 
     method: str  #: name.
-    episodes: NDArray[np.int64]  #: breaths that one training has seen, ``(points,)``.
+    episodes: Ints  #: breaths that one training has seen, ``(points,)``.
     seconds: Floats  #: computing time of all seeds together, without compiling, ``(points,)``.
     compile_seconds: float  #: time of compiling, s.
     scores: Floats  #: nominal, cmH2O, ``(seeds, points)``.

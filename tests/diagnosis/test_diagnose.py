@@ -270,3 +270,15 @@ def test_a_description_is_judged_by_what_it_corrects():
     nothing: Any = None
     comparison = _Comparison(nothing, {}, [], correction)
     assert comparison.error(data, np.array([False, True, True])) == pytest.approx(2.0)
+
+
+def test_efforts_that_differ_are_neither_doubted_nor_unexplained():
+    """Efforts of breaths to come are unknown, so that their errors object to nothing."""
+    effort = small.effect("patient_effort", amplitude=5.0, duration=0.8)
+    active = diagnose(small.made(effort, seed=4), patient=True, settings=small.SETTINGS)
+    (name,) = active.mechanisms
+    assert (name.name, name.explains) == ("patient_effort", 1.0)
+    errors = active.open_loop
+    assert errors.scatter_error > errors.noise_floor
+    assert errors.unexplained < 0.5 * errors.after.rmse
+    assert "patient_effort is worth" not in str(active)

@@ -102,7 +102,7 @@ def test_training_and_held_out_breaths_are_integrated_alike(active, fitted):
     assert marginal == pytest.approx(held_out, abs=4.0)
 
 
-def test_the_prediction_is_the_mean_over_efforts(active, fitted):
+def test_the_prediction_is_the_mean_over_efforts_with_their_spread(active, fitted):
     passive = active.fit(Hypothesis(), fitted.noise, fitted)
     values = active.transferred_values(fitted, active.held_out)
     simulator = active.held_out.predictor
@@ -113,6 +113,8 @@ def test_the_prediction_is_the_mean_over_efforts(active, fitted):
         answers.append(simulator.predict(values))
     expected = active.predict(fitted, active.held_out)
     assert expected == pytest.approx(np.mean(answers, axis=0))
+    spread = TERM.spread(fitted, simulator, values.copy())
+    np.testing.assert_allclose(spread, np.std(answers, axis=0), atol=1e-6)
     assert np.abs(expected - active.predict(passive, active.held_out)).max() > 0.2
 
 

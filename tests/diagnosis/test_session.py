@@ -151,5 +151,5 @@ def test_the_verdict_says_what_changes_by_how_much_from_which_breath_on():
     assert "the valve's gain rises by 2" in first
     assert f"from breath {found.traces.breaths.breath_id[BEFORE]} on" in first
     assert found.changes == ()
-    assert found.open_loop.gain_error == 0.0, "it is no scatter"
+    assert found.open_loop.scatter_error == 0.0, "it is no scatter"
     assert found.open_loop.after.rmse < 0.25 * found.open_loop.refit.rmse

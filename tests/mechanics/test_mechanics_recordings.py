@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from ventbench import mechanics
-from ventbench.recordings import RespiraWorksRun, load_respiraworks
+from ventbench.mechanics import RespiraWorksRun, load_respiraworks
 
 
 @pytest.fixture(scope="module")

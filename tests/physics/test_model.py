@@ -96,7 +96,8 @@ def test_gradients_are_finite_and_not_zero():
             return jax.grad(lambda p: jnp.mean(open_loop(p, start, *c) ** 2))(plant)
 
         for level in ("neutral", "mild"):
-            plant = everything(level=level).having(position=0.5, PEEP=5.0, gain=22.8, R_ex=5.0)
+            # a breath after the steps of a session
+            plant = everything(level=level).having(position=0.75, PEEP=5.0, gain=22.8, R_ex=5.0)
             by = dict(zip(plant.names, slope(plant).values, strict=True))
             assert all(np.isfinite(x) for x in by.values())
             dead = {name for name, x in by.items() if abs(x) < 1e-12}

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ventbench.base.errors import InputError
-from ventbench.recordings import Breaths, iter_breaths, join, load, make_breaths, write
+from ventbench.recordings import Breaths, join, load, make_breaths, write
 from ventbench.recordings.csv_source import CsvSource
 from ventbench.recordings.scan import ParquetSource, join_blocks, scan
 from ventbench.recordings.schema import ProblemLog
@@ -108,50 +108,20 @@ def test_padding(rows, write_csv):
     assert "Breaths have 4 to 6 samples." in breaths.notes
 
 
-@pytest.mark.parametrize("batch", [1, 2, 3, 7, 100])
-def test_batches_are_the_file_in_pieces(make, tmp_path, batch):
-    whole = make(10, optional=True)
-    for name in ("a.csv", "a.parquet"):
-        write(whole, tmp_path / name)
-        parts = list(iter_breaths(tmp_path / name, batch=batch))
-        assert [len(part) for part in parts[:-1]] == [batch] * (len(parts) - 1)
-        assert 1 <= len(parts[-1]) <= batch
-        for field in FIELDS:
-            joined = np.concatenate([getattr(part, field) for part in parts])
-            np.testing.assert_array_equal(joined, getattr(whole, field))
-
-
-@pytest.mark.parametrize("batch", [None, 1, 3, 16])
-def test_blocks_do_not_depend_on_how_much_is_read_at_a_time(make, tmp_path, batch):
+def test_blocks_do_not_depend_on_how_much_is_read_at_a_time(make, tmp_path):
     whole = make(40)
     paths = tmp_path / "a.csv", tmp_path / "a.parquet"
     for path in paths:
         write(whole, path)
     csv, parquet = (str(path) for path in paths)
     for source in (CsvSource(csv, "csv", block=700), ParquetSource(parquet, batch=11)):
-        blocks = list(scan(source, ProblemLog(source.file), batch=batch))
+        blocks = list(scan(source, ProblemLog(source.file)))
         assert len(blocks) > 1
-        if batch:
-            assert [len(block.lengths) for block in blocks][:-1] == [batch] * (len(blocks) - 1)
         joined = join_blocks(blocks)
         np.testing.assert_array_equal(joined.breath_id, whole.breath_id)
         np.testing.assert_array_equal(joined.times.time, whole.time.ravel())
         for name in ("u_in", "u_out", "pressure"):
             np.testing.assert_array_equal(joined.samples[name], getattr(whole, name).ravel())
-
-
-def test_batches_raise_when_they_reach_the_problem(rows, write_csv):
-    rows[14][5] = "200"
-    parts = iter_breaths(write_csv(rows), batch=1)
-    assert [int(next(parts).breath_id[0]) for _ in range(2)] == [1, 2]
-    with pytest.raises(ValueError, match=r"line 16, column u_in: 200 is outside"):
-        next(parts)
-    with pytest.raises(ValueError, match="breath 2 has 5 samples, the others have 6"):
-        list(iter_breaths(write_csv(rows[:11]), batch=1))
-    with pytest.raises(ValueError, match="no rows"):
-        list(iter_breaths(write_csv([])))
-    with pytest.raises(ValueError, match="batch is 0"):
-        next(iter_breaths(write_csv(rows), batch=0))
 
 
 finite = st.floats(-20.0, 120.0)

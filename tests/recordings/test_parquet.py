@@ -8,7 +8,8 @@ import pytest
 from pyarrow import parquet
 
 from ventbench.base.files import example
-from ventbench.recordings import RecordingError, check, load, load_respiraworks, write
+from ventbench.mechanics import load_respiraworks
+from ventbench.recordings import RecordingError, check, load, write
 
 
 @pytest.fixture

@@ -86,7 +86,7 @@ def _ranks(line: Line) -> str:
 
 def _family(line: Line) -> str:
     source = line.row.entry.source
-    return f"{line.row.record.manifest.family}{f', derived from {source}' if source else ''}"
+    return f"{line.row.record.manifest.family}{f', commands as of {source}' if source else ''}"
 
 
 def _compared(name: str) -> Callable[[Line], Interval | None]:

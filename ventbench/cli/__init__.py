@@ -6,11 +6,6 @@ Heavy packages are imported inside the commands, so that ``ventbench --help`` an
 
 from __future__ import annotations
 
-import sys
-
-import typer
-
-from ventbench import __version__
 from ventbench.cli import (
     board,
     data,
@@ -24,32 +19,7 @@ from ventbench.cli import (
     tune,
 )
 
-app = typer.Typer(
-    name="ventbench",
-    help="A benchmark for the control of mechanical ventilators.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-)
-
-
-def _version(value: bool) -> None:
-    if value:
-        print(f"ventbench {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
-    ),
-    quiet: bool = typer.Option(
-        False, "--quiet", help="No progress and no notes on stderr; also behind any command."
-    ),
-) -> None:
-    options.be_quiet(quiet)
-
+app = options.program("ventbench", "A benchmark for the control of mechanical ventilators.")
 
 for _module in (score, tune, simulators, diagnose):
     for _command in _module.COMMANDS:
@@ -61,4 +31,4 @@ for _module in (tune, train, board, round, data):
 
 def main() -> None:
     """Entry point of the console script."""
-    options.run(lambda: app(options.quiet_first(sys.argv[1:])), "ventbench")
+    options.run(app, "ventbench")

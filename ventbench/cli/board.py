@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ventbench.base.errors import InputError
+from ventbench.base.text import plain
 from ventbench.cli.options import (
     JsonFile,
     Scheduler,
     Sources,
-    bars,
-    counted,
+    bar,
+    console_of,
     emit,
     known_lungs,
     notes,
@@ -81,7 +83,6 @@ def add(
 
     Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
     """
-    from ventbench.base.errors import InputError
     from ventbench.board import create, store
     from ventbench.plants import frozen
 
@@ -95,8 +96,7 @@ def add(
         supersedes = store.find_record(store.load(folder), supersedes).sha256
     done = []
     try:
-        with bars() as shown:
-            replaying = counted(shown, "replaying records")
+        with bar("replaying records") as replaying:
             for path in paths:
                 new = create.amend(path, supersedes=supersedes, reason=reason, source=about)
                 done.append(store.add(folder, new, frozen.load()))
@@ -137,7 +137,6 @@ def sign(
     """
     import os
 
-    from ventbench.base.errors import InputError
     from ventbench.board import attestation, store
 
     secret = os.environ.get(attestation.SECRET, "")
@@ -214,23 +213,20 @@ def verify(
     """
     import dataclasses
 
-    from ventbench.base.errors import InputError
-    from ventbench.base.text import plain
     from ventbench.board import verify as verifier
     from ventbench.plants import frozen
 
     if records and not rerun:
         raise InputError("records are chosen for --rerun; without it all are verified")
-    with bars() as shown:
-        progress = counted(shown, "replaying records")
-        report = verifier.verify(folder, frozen.load, progress=progress)
+    with bar("replaying records") as replaying:
+        report = verifier.verify(folder, frozen.load, progress=replaying)
     if rerun and not report.problems:  # else the records are not what they were
         _rerun(report, folder, records or [], source or [], jobs, scheduler)
     console = told(dataclasses.asdict(report), json)
     for note in report.notes:
-        console.print(f"note: {plain(note)}", markup=False, highlight=False)
+        console.print(f"note: {plain(note)}")
     for problem in report.problems:
-        console.print(plain(problem), style="red", markup=False, highlight=False, soft_wrap=True)
+        console.print(plain(problem), style="red", soft_wrap=True)
     _summary(console, report)
     if report.problems:
         raise typer.Exit(1)
@@ -266,8 +262,6 @@ def _summary(console: Console, report: Report) -> None:
     console.print(
         f"{state}: {report.records} records, {report.replayed} replayed "
         f"(largest difference {report.deviation:.1e} cmH2O){reproduced}",
-        markup=False,
-        highlight=False,
         soft_wrap=True,
     )
 
@@ -311,19 +305,15 @@ def show(
 
 def tables_of(folder: Path, name: str, *, err: bool = False) -> None:
     """Print the tables of a round."""
-    from rich.console import Console
-
     from ventbench.board import frames
 
     for track in frames.load_tracks(folder):
         if track.draws == name:
-            _print_track(Console(stderr=err), track)
+            _print_track(console_of(err), track)
 
 
 def _print_track(console: Console, track: Track) -> None:
     """Print the ranking of a track, why others are not ranked, and the ranking under stress."""
-    from ventbench.base.text import plain
-
     if not track.rows:
         return
     console.print(_table(track))
@@ -332,7 +322,7 @@ def _print_track(console: Console, track: Track) -> None:
             reasons = row.entry.reasons
             said = any(reason.startswith(status) for reason in reasons)
             why = plain("; ".join(reasons if said else (status, *reasons))[:300])
-            console.print(f"{row.record.name}: {why}", markup=False, highlight=False)
+            console.print(f"{row.record.name}: {why}")
     if track.stress:
         console.print(_stress_table(track))
 
@@ -343,7 +333,6 @@ def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
 
     Example: `ventbench board records`
     """
-    from ventbench.base.text import plain
     from ventbench.board import frames
 
     folder = at_hand(folder)

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
+from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     Clip,
     JsonFile,
     Pad,
     PlantName,
-    bars,
-    counted,
+    bar,
     emit,
     known_lungs,
     waiting,
@@ -45,8 +45,7 @@ def check(
     """
     from ventbench import recordings
 
-    with bars() as shown:
-        reading = counted(shown, f"reading {file}")
+    with bar(f"reading {file}") as reading:
         report = recordings.check(file, clip=clip, pad=pad, progress=reading)
     emit(report.to_dict(), json)
     for line in report.lines():
@@ -163,8 +162,6 @@ def import_(
 
 def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
     """Split ``NAME=VALUE``."""
-    from ventbench.base.errors import InputError
-
     pairs = {}
     for text in given or ():
         name, equals, value = text.rpartition("=")
@@ -176,8 +173,6 @@ def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
 
 def _offsets(given: list[str] | None) -> dict[str, float]:
     """Numbers of ``ROLE=VALUE``."""
-    from ventbench.base.errors import InputError
-
     pairs = _pairs(given, "--offset")
     try:
         return {role: float(value) for role, value in pairs.items()}
@@ -215,8 +210,7 @@ def explore(
     ventilator = exploration.SimulatedVentilator(
         chosen, min(breaths, _TOGETHER), noise=noise, seed=seed
     )
-    with bars() as shown:
-        exploring = counted(shown, f"exploring {lung}")
+    with bar(f"exploring {lung}") as exploring:
         made = exploration.explore(ventilator, lung, breaths, seed=seed, progress=exploring)
     recordings.write(made, out)
     for note in made.notes:

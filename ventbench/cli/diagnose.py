@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ventbench.base import files
+from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     Clip,
     JsonFile,
     Pad,
     PlantName,
     TrustFmu,
-    bars,
+    bar,
     claim_out,
-    counted,
     known_lungs,
     notes,
+    read_recording,
     simulator_of,
     table_of,
     told,
@@ -51,8 +53,8 @@ def mechanics(
     Example: `ventbench mechanics lab.csv`
     """
     if _is_respiraworks(recordings):
-        with bars() as shown:
-            runs = _survey(recordings, counted(shown, f"identifying the lungs of {recordings}"))
+        with bar(f"identifying the lungs of {recordings}") as identifying:
+            runs = _survey(recordings, identifying)
         _say_runs(told([_run(run) for run in runs], json), runs)
         return
     named = _of_session(recordings, clip=clip, pad=pad)
@@ -60,7 +62,7 @@ def mechanics(
     console.print(_table(named))
     for name, lung in named.items():
         for note in lung.notes:
-            console.print(f"{name}: {note}", markup=False, highlight=False)
+            console.print(f"{name}: {note}")
 
 
 def _is_respiraworks(path: Path) -> bool:
@@ -79,7 +81,6 @@ def _is_respiraworks(path: Path) -> bool:
 
 
 def _survey(path: Path, progress: Callable[[int, int], None]) -> tuple[SurveyedRun, ...]:
-    from ventbench.base.errors import InputError
     from ventbench.mechanics import survey
 
     runs = survey(path, progress)
@@ -93,31 +94,27 @@ def _of_session(path: Path, *, clip: bool, pad: bool) -> dict[str, Mechanics]:
     from ventbench.mechanics import share_faults
     from ventbench.recordings.read import session_files
 
-    files = session_files(path)
+    paths = session_files(path)
     found = {
-        f"{file.stem}: {lung.label}" if len(files) > 1 else lung.label: lung
-        for file in files
+        f"{file.stem}: {lung.label}" if len(paths) > 1 else lung.label: lung
+        for file in paths
         for lung in _identify(file, clip=clip, pad=pad)
     }
     return dict(zip(found, share_faults(list(found.values())), strict=True))
 
 
 def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
-    from ventbench import recordings
-    from ventbench.base.errors import InputError
     from ventbench.mechanics import identify
 
-    with bars() as shown:
-        reading = counted(shown, f"reading {path}")
-        breaths = recordings.load(path, clip=clip, pad=pad, progress=reading)
+    breaths = read_recording(path, clip=clip, pad=pad)
     if breaths.flow is None and breaths.volume is None:
         raise InputError(
             f"{path}: there is neither a column flow (mL/s) nor volume (mL); record one of them, "
             "or use `ventbench diagnose`, which needs the pressure only"
         )
     try:
-        with bars() as shown:
-            return identify(breaths, counted(shown, f"identifying the lungs of {path}"))
+        with bar(f"identifying the lungs of {path}") as identifying:
+            return identify(breaths, identifying)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -125,8 +122,6 @@ def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
 def _lung(mechanics: Mechanics) -> dict[str, Any]:
     """Return JSON values; numbers that are not finite become null."""
     import dataclasses
-
-    from ventbench.base import files
 
     plain = dataclasses.asdict(mechanics) | {
         "settings": [setting.id for setting in mechanics.settings]
@@ -144,13 +139,12 @@ def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
     from ventbench.mechanics import survey_table
 
     # Lines of a Markdown table must not be broken.
-    console.print(survey_table(runs), markup=False, highlight=False, soft_wrap=True)
+    console.print(survey_table(runs), soft_wrap=True)
     known = [run.mechanics for run in runs if run.mechanics is not None]
     holds = sum(lung.match.label_matches for lung in known)
     console.print(
         f"\nThe label holds in {holds} of {len(known)} runs; {len(runs) - len(known)} more have "
-        "neither flow nor volume.",
-        highlight=False,
+        "neither flow nor volume."
     )
 
 
@@ -173,9 +167,6 @@ def _table(lungs: dict[str, Mechanics]) -> Any:
         left=columns, caption=f"A label holds with {tolerance_text()}, beyond the intervals.",
     )  # fmt: skip
 
-
-#: Share of a diagnosis before which its remaining time is a guess.
-_TOO_EARLY = 0.15
 
 if TYPE_CHECKING:
     from ventbench.diagnosis.result import Diagnosis
@@ -224,7 +215,6 @@ def diagnose(
             "option the lung is a test lung, which makes no effort.",
         ),
     ] = False,
-    passive: Annotated[bool, typer.Option("--passive", hidden=True)] = False,
     in_process: TrustFmu = False,
     clip: Clip = False,
     pad: Pad = False,
@@ -243,33 +233,22 @@ def diagnose(
 
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
     """
-    from ventbench import recordings as files
-    from ventbench.base import errors
-    from ventbench.base.errors import InputError
-
     if drive not in ("auto", "valve", "flow"):
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
     if simulated is not None and plant != "physics":
         raise InputError("--simulated stands in place of --plant; give one of them")
 
-    if patient and passive:
-        raise InputError("--patient and --passive contradict each other; choose one of them")
-    errors.require("jinja2", "rerun")
-    said = notes()
-    with bars() as shown:
-        reading = counted(shown, f"reading {recordings}")
-        breaths = files.load(recordings, clip=clip, pad=pad, progress=reading)
-    for note in breaths.notes:
-        said.print(f"note: {note}", markup=False, highlight=False)
+    require("jinja2", "rerun")
+    breaths = read_recording(recordings, clip=clip, pad=pad)
     diagnosis = _diagnose(breaths, simulator_of(plant, in_process), simulated, lung, patient, drive)
     written = diagnosis.save(out)
     console = told(diagnosis.as_dict(), json)
     verdict, *others = str(diagnosis).splitlines()
-    console.print(verdict, style="bold", markup=False, highlight=False)
+    console.print(verdict, style="bold")
     for text in others:
-        console.print(text, markup=False, highlight=False)
+        console.print(text)
     for path in written:
-        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"wrote {path}", soft_wrap=True)
 
 
 def _diagnose(
@@ -277,32 +256,19 @@ def _diagnose(
     drive: str,
 ) -> Diagnosis:  # fmt: skip
     """Diagnose with a progress bar that says what is done and how long it will take."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from ventbench.base import compilation
     from ventbench.diagnosis.diagnose import diagnose as find
     from ventbench.plants.catalog import load_simulated, load_simulators
 
     compilation.keep()
     simulators = load_simulated(simulated, breaths) if simulated else load_simulators(plant)
-    console = notes()
     lungs = 1 if lung is not None else len(breaths.by_lung_index)
-    console.print(expected_time(len(breaths), lungs, compilation.is_warm()), highlight=False)
-    columns = (
-        TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"),
-    )  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as shown:
-        task = shown.add_task("diagnosing", total=1.0, left="")
-
-        def progress(what: str, share: float) -> None:
-            left = remaining(shown.tasks[task].elapsed or 0.0, share)
-            shown.update(task, description=what, completed=share, left=left)
-
+    notes().print(expected_time(len(breaths), lungs, compilation.is_warm()))
+    with bar("diagnosing") as diagnosing:
         return find(
             breaths, simulator=simulators, lung=lung, patient=patient,
             drive=drive,  # type: ignore[arg-type]
-            progress=progress,
+            progress=lambda what, share: diagnosing(share, text=what),
         )  # fmt: skip
 
 
@@ -315,16 +281,6 @@ def expected_time(breaths: int, lungs: int, warm: bool) -> str:
     if not warm:
         text += "; the first run on a machine compiles for half a minute more"
     return f"{text}. Ctrl-C stops it; nothing is written before the end."
-
-
-def remaining(elapsed: float, share: float) -> str:
-    """Remaining time in words, from the time so far and the share that is done."""
-    if share < _TOO_EARLY or elapsed < 1.0:
-        return ""
-    left = elapsed * (1.0 - share) / share
-    if left < 90.0:
-        return f"about {max(left, 1.0):.0f} s left"
-    return f"about {left / 60.0:.0f} min left"
 
 
 def isolability(
@@ -364,7 +320,7 @@ def isolability(
     console = told(found.as_dict(), json)
     for group in found.groups:
         apart = "told from all others" if len(group) == 1 else "not told apart"
-        console.print(f"{', '.join(group)}: {apart}", highlight=False)
+        console.print(f"{', '.join(group)}: {apart}")
     nothing = "nothing that is known"
     rows = [
         (" / ".join(pair.names), f"{pair.nats:.1f}", pair.remedy or nothing, f"{pair.gained:.1f}")

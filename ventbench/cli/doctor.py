@@ -12,6 +12,7 @@ from typing import Any
 
 import typer
 
+from ventbench.base.errors import InputError
 from ventbench.cli.options import JsonFile, told
 
 #: Packages whose version matters to a score, and those of each extra.
@@ -36,16 +37,15 @@ def doctor(json: JsonFile = None) -> None:
 
     Example: `ventbench doctor`
     """
-    from rich.markup import escape
     from rich.table import Table
 
     report = examine()
     console, table = told(report, json), Table(show_header=False)
     for name, value in report["facts"].items():
-        table.add_row(escape(name), escape(value))
+        table.add_row(name, value)
     console.print(table)
     for problem in report["problems"]:
-        console.print(f"- {problem}", markup=False, highlight=False)
+        console.print(f"- {problem}")
     if report["problems"]:
         raise typer.Exit(1)
     console.print("Nothing needs attention.")
@@ -85,7 +85,6 @@ def _version(package: str) -> str:
 
 
 def _sandbox(problems: list[str]) -> str:
-    from ventbench.base.errors import InputError
     from ventbench.sandbox.runner import SandboxRunner
 
     try:
@@ -103,7 +102,6 @@ def _sandbox(problems: list[str]) -> str:
 
 
 def _simulators(problems: list[str]) -> str:
-    from ventbench.base.errors import InputError
     from ventbench.plants import frozen
 
     try:

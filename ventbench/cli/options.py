@@ -9,31 +9,34 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn, TypeVar
 
 import typer
 
+from ventbench import __version__
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress, ProgressColumn
+    from rich.progress import Progress, ProgressColumn, TaskID
     from rich.table import Table
 
     from ventbench.entries.folder import Submission
     from ventbench.plants.fmu import Fmu
+    from ventbench.recordings.breaths import Breaths
 
 ResultT = TypeVar("ResultT")
 
 
 def claim_out(folder: Path | None) -> Path | None:
     """Check a folder of results before anything is computed; see ``files.claim_folder``."""
-    from ventbench.base import files
-
     if folder is not None:
         files.claim_folder(folder)
     return folder
@@ -41,8 +44,6 @@ def claim_out(folder: Path | None) -> Path | None:
 
 def claim_json(path: Path | None) -> Path | None:
     """Check the file of ``--json`` before anything is computed; InputError if it cannot be one."""
-    from ventbench.base.errors import InputError
-
     if path is None or str(path) == "-":
         return path
     if path.is_dir():
@@ -159,7 +160,6 @@ def simulator_of(plant: str, in_process: bool) -> str | Fmu:
 
 def recordings_folder(given: Path | None) -> Path:
     """Return the folder of the public recordings; InputError if there is none."""
-    from ventbench.base.errors import InputError
     from ventbench.recordings import recordings_dir
 
     folder = given or recordings_dir()
@@ -171,8 +171,6 @@ def recordings_folder(given: Path | None) -> Path:
 
 def emit(value: object, target: Path | None) -> None:
     """Write the result of a command to the file of ``--json``, atomically."""
-    from ventbench.base import files
-
     if target is None:
         return
     if str(target) == "-":
@@ -181,12 +179,17 @@ def emit(value: object, target: Path | None) -> None:
         files.write_json(target, value)
 
 
-def told(value: object, json: Path | None) -> Console:
-    """Write a result as of :func:`emit`; return the console for people, beside that of the JSON."""
+def console_of(err: bool, *, quiet: bool = False) -> Console:
+    """Return the console on stdout or stderr; it shows texts, also those of others, as they are."""
     from rich.console import Console
 
+    return Console(stderr=err, quiet=quiet, markup=False, highlight=False)
+
+
+def told(value: object, json: Path | None) -> Console:
+    """Write a result as of :func:`emit`; return the console for people, beside that of the JSON."""
     emit(value, json)
-    return Console(stderr=str(json) == "-")
+    return console_of(str(json) == "-")
 
 
 def table_of(
@@ -223,13 +226,16 @@ def quiet_first(arguments: list[str]) -> list[str]:
 
 def notes() -> Console:
     """Return the console on stderr for progress and notes; it says nothing after ``--quiet``."""
-    from rich.console import Console
-
-    return Console(stderr=True, quiet=_quiet)
+    return console_of(True, quiet=_quiet)
 
 
-def bars() -> Progress:
-    """Return progress bars on stderr: the finished share, the time taken and the time left."""
+@contextmanager
+def bars() -> Iterator[Callable[..., None]]:
+    """Show progress bars on stderr: the finished share, the time taken and the time left.
+
+    Yields what moves them: a function of the name of a bar, which comes when it is first told of,
+    how much is done, how much in all (1; None if nobody knows), and a text in place of the name.
+    """
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import TimeRemainingColumn as Remaining
 
@@ -240,7 +246,23 @@ def bars() -> Progress:
         TextColumn("left"),
         Remaining(),
     )
-    return _progress(*columns)
+    tasks: dict[str, TaskID] = {}
+    with _progress(*columns) as shown:
+
+        def tell(name: str, done: float, total: float | None = 1.0, text: str = "") -> None:
+            if name not in tasks:
+                tasks[name] = shown.add_task(name, total=total)
+            shown.update(tasks[name], completed=done, total=total, description=text or name)
+
+        yield tell
+
+
+@contextmanager
+def bar(name: str) -> Iterator[Callable[..., None]]:
+    """Show one of :func:`bars` from the start; yields a function of how much is done and in all."""
+    with bars() as tell:
+        tell(name, 0, None)
+        yield partial(tell, name)
 
 
 def _progress(*columns: ProgressColumn) -> Progress:
@@ -248,17 +270,21 @@ def _progress(*columns: ProgressColumn) -> Progress:
 
     console = notes()
     # Where stderr is a file, bars would leave nothing but an empty line.
-    return Progress(*columns, transient=True, console=console, disable=not console.is_terminal)
+    return Progress(
+        *columns, transient=True, console=console, disable=not console.is_terminal,
+        speed_estimate_period=600.0,  # of long work whose steps take minutes
+    )  # fmt: skip
 
 
-def counted(shown: Progress, text: str) -> Callable[[int, int], None]:
-    """Add a bar and return what moves it: a function of how much is done and of how much in all."""
-    task = shown.add_task(text, total=None)
+def read_recording(path: Path, *, clip: bool, pad: bool) -> Breaths:
+    """Read a recording with a bar; its notes go to stderr."""
+    from ventbench import recordings
 
-    def progress(done: int, total: int) -> None:
-        shown.update(task, completed=done, total=total)
-
-    return progress
+    with bar(f"reading {path}") as reading:
+        breaths = recordings.load(path, clip=clip, pad=pad, progress=reading)
+    for note in breaths.notes:
+        notes().print(f"note: {note}")
+    return breaths
 
 
 def of_each_entry(
@@ -281,8 +307,6 @@ def of_each_entry(
         workers: processes; 0 for this one.
         scheduler: address of a Dask scheduler instead.
     """
-    from functools import partial
-
     from ventbench.base import compilation
     from ventbench.base.executor import executor, in_order
 
@@ -290,12 +314,10 @@ def of_each_entry(
         compilation.keep()
         done = []
         for job in jobs:
-            with bars() as shown:
-                progress = counted(shown, f"{what} {job[0].label}, {job[1]}")
+            with bar(f"{what} {job[0].label}, {job[1]}") as progress:
                 done.append(work(*job, progress=progress))
         return done
-    with bars() as shown, executor(workers, scheduler) as pool:
-        progress = counted(shown, f"{what}, {len(jobs)} jobs")
+    with bar(f"{what}, {len(jobs)} jobs") as progress, executor(workers, scheduler) as pool:
         return in_order(pool, partial(_keeping, work), jobs, progress)
 
 
@@ -323,19 +345,46 @@ def waiting(text: str) -> Progress:
 INTERRUPTED = 130
 
 
-def run(app: Callable[[], object], program: str, *, stopped: str = "") -> None:
-    """Run a command line to its end.
+def program(name: str, about: str, *, completion: bool = True) -> typer.Typer:
+    """Return a command line without commands: its help, ``--version`` and ``--quiet``."""
+    app = typer.Typer(
+        name=name, help=about, no_args_is_help=True, add_completion=completion,
+        pretty_exceptions_enable=False, rich_markup_mode="markdown",
+    )  # fmt: skip
+
+    def show(value: bool) -> None:
+        if value:
+            print(f"{name} {__version__}")
+            raise typer.Exit
+
+    @app.callback()
+    def _root(
+        version: bool = typer.Option(
+            False, "--version", callback=show, is_eager=True, help="Print the version and exit."
+        ),
+        quiet: bool = typer.Option(
+            False, "--quiet", help="No progress and no notes on stderr; also behind any command."
+        ),
+    ) -> None:
+        be_quiet(quiet)
+
+    return app
+
+
+def run(app: typer.Typer, program: str, *, named: str | None = None, stopped: str = "") -> None:
+    """Run a command line with the arguments of the process to its end.
 
     Args:
-        app: runs the commands with the arguments of the process.
+        app: the commands.
         program: what the messages begin with.
+        named: what the help calls it, if another name than the process has.
         stopped: what is true after Ctrl-C, besides what a command keeps.
     """
     sys.unraisablehook = _interrupt_again
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _interrupt)
     try:
-        app()
+        app(quiet_first(sys.argv[1:]), prog_name=named)
     except (InputError, OSError) as error:
         # Messages quote files and records of others, which may hold commands to the terminal.
         text = str(error)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ventbench.base.errors import InputError
+from ventbench.base.text import plain
 from ventbench.cli.board import FOLDER, Folder, at_hand, tables_of
 from ventbench.cli.options import JsonFile, Scheduler, Sources, Workers, bars, emit
 
@@ -115,7 +117,6 @@ def draw(
 
     Example: `ventbench round draw 2027-1`
     """
-    from ventbench.base.errors import InputError
     from ventbench.board import beacon as beacons
     from ventbench.board import rounds
 
@@ -163,14 +164,7 @@ def score(
             err=str(json) == "-",
         )
         return
-    tasks = {}
-    with bars() as shown, executor(workers, scheduler) as pool:
-
-        def tell(what: str, done: int, count: int) -> None:
-            if what not in tasks:
-                tasks[what] = shown.add_task(what, total=count)
-            shown.update(tasks[what], completed=done, total=count)
-
+    with bars() as tell, executor(workers, scheduler) as pool:
         made = official_runs.score(
             folder, name, pool, out / name, places=[folder.parent / "submissions", *(source or [])],
             secret=os.environ.get(attestation.SECRET) or None, progress=tell,
@@ -224,8 +218,6 @@ def _about(own: Round) -> dict[str, object]:
 
 def _told(own: Round, json: Path | None) -> None:
     """Say how far a round is, and what comes next."""
-    from ventbench.base.text import plain
-
     about, err = _about(own), str(json) == "-"
     emit(about, json)
     kind = "rehearsal" if own.opened.rehearsal else "round"

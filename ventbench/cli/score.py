@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     Entries,
     InProcess,
@@ -16,9 +17,8 @@ from ventbench.cli.options import (
     PlantName,
     Scheduler,
     Workers,
-    bars,
+    bar,
     claim_out,
-    counted,
     emit,
     known_entries,
     notes,
@@ -110,8 +110,6 @@ def score(
     """
     from functools import partial
 
-    from ventbench.base import errors
-    from ventbench.base.errors import InputError
     from ventbench.entries.folder import open_submission
     from ventbench.entries.runs import DRAWS
     from ventbench.plants.catalog import load_simulators
@@ -122,7 +120,7 @@ def score(
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
     if report:
-        errors.require("jinja2", "rerun")
+        require("jinja2", "rerun")
     opened = [open_submission(name) for name in names]
     entries = [entry.manifest.name for entry in opened]
     if len(set(entries)) < len(entries):
@@ -176,14 +174,14 @@ def score(
         typer.secho(failure.message, fg="red", err=True)
     if out is not None:
         for path in _keep(out, scores, report):
-            console.print(f"wrote {path}", markup=False, highlight=False)
+            console.print(f"wrote {path}", soft_wrap=True)
     if record is not None:
         from ventbench.board import create
         from ventbench.plants import frozen
 
         drafts = [create.create(result, frozen.load()) for result in scores]
         for path in [draft.save(record) for draft in drafts]:
-            console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+            console.print(f"wrote {path}", soft_wrap=True)
     if failures:
         raise typer.Exit(1)
 
@@ -271,8 +269,6 @@ def _why_corrected(console: Console, origin: Mapping[str, Any], given: str, plan
         f"They differ because {given} lacks what the recording has: {lacks}. A controller that was "
         f"tuned on {given} does not know it: tune on the corrected simulator, "
         f"`ventbench tune pid --plant {plant}`.",
-        highlight=False,
-        markup=False,
         soft_wrap=True,  # the command can be copied
     )
 
@@ -334,8 +330,7 @@ def _compare(console: Console, scores: list[Score]) -> None:
         if math.isfinite(difference):
             console.print(
                 f"{score.submission.manifest.name} less {first.submission.manifest.name}: "
-                f"{difference:+.3f} cmH2O, paired 95 % interval {low:+.3f}..{high:+.3f}",
-                highlight=False,
+                f"{difference:+.3f} cmH2O, paired 95 % interval {low:+.3f}..{high:+.3f}"
             )
 
 
@@ -374,6 +369,8 @@ def transfer(
 
     Example: `ventbench transfer pid_best residual_mlp --json transfer.json`
     """
+    from rich.text import Text
+
     from ventbench.entries import scoring as transfers
     from ventbench.entries.folder import open_submission
     from ventbench.entries.runner import runner_of
@@ -383,9 +380,8 @@ def transfer(
     rigs, results = load_rigs(), []
     for entry in opened:
         chosen = track or entry.manifest.tracks[0]
-        with bars() as shown:
+        with bar(f"running {entry.label}") as running:
             runner = runner_of(entry, sandbox=not in_process)
-            running = counted(shown, f"running {entry.label}")
             runs = transfers.transfer(entry, rigs, track=chosen, runner=runner, progress=running)
         groups = transfers.by_group(runs, rigs)
         results.append({"name": entry.manifest.name, "track": chosen, "groups": groups})
@@ -399,7 +395,7 @@ def transfer(
     for result, own in zip(results, errors, strict=True):
         texts = ("-" if value is None else f"{value:.3f}" for value in own)
         cells = (
-            f"[bold]{text}[/bold]" if value == least else text
+            Text(text, "bold") if value == least else text
             for text, value, least in zip(texts, own, best, strict=True)
         )
         rows.append((f"{result['name']}, {result['track']}", *cells))
@@ -461,12 +457,9 @@ def check(
     from ventbench.entries import contract
     from ventbench.entries.runner import InProcessRunner
 
-    with bars() as shown:
-        report = contract.check(
-            submission,
-            InProcessRunner() if in_process else None,
-            progress=counted(shown, f"running {submission}"),
-        )
+    runner = InProcessRunner() if in_process else None
+    with bar(f"running {submission}") as running:
+        report = contract.check(submission, runner, progress=running)
     emit(report.to_json(), json)
     for line in report.lines():
         typer.echo(line, err=str(json) == "-")

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     Clip,
     JsonFile,
     Pad,
     PlantName,
     TrustFmu,
-    bars,
-    counted,
+    bar,
     known_lungs,
-    notes,
+    read_recording,
     simulator_of,
     table_of,
     told,
@@ -64,7 +65,7 @@ def lungs(json: JsonFile = None) -> None:
         label = official.sessions.table[session].lung
         if label in known:
             text = f"not scored: session {session} of {label}: {reason}"
-            console.print(text, markup=False, highlight=False, soft_wrap=True)
+            console.print(text, soft_wrap=True)
 
 
 def coverage(
@@ -81,7 +82,6 @@ def coverage(
     """
     from dataclasses import asdict
 
-    from ventbench.base.errors import InputError
     from ventbench.board import record as records
     from ventbench.board import store
     from ventbench.plants import frozen
@@ -136,8 +136,6 @@ def simulate(
     Example: `ventbench simulate --lung R20C50 --controls commands.csv`
     """
     from ventbench import recordings, simulation
-    from ventbench.base import files
-    from ventbench.base.errors import InputError
 
     chosen = simulator_of(plant, in_process)
     with open(controls, encoding="utf-8-sig", errors="replace") as file:
@@ -181,28 +179,20 @@ def open_loop(
     import numpy as np
 
     from ventbench import open_loop_report
-    from ventbench import recordings as files
-    from ventbench.base.errors import InputError
 
-    said = notes()
-    with bars() as shown:
-        reading = counted(shown, f"reading {recordings}")
-        breaths = files.load(recordings, clip=clip, pad=pad, progress=reading)
-    for note in breaths.notes:
-        said.print(f"note: {note}", markup=False, highlight=False)
+    breaths = read_recording(recordings, clip=clip, pad=pad)
     if not np.isfinite(breaths.pressure).any():
         raise InputError(
             f"{recordings}: all pressures are blank; fill them in: there is nothing to compare a "
             "simulator with"
         )
-    with bars() as shown:
-        simulating = counted(shown, f"simulating {len(breaths)} breaths")
+    with bar(f"simulating {len(breaths)} breaths") as simulating:
         chosen = simulator_of(plant, in_process)
         result = open_loop_report.open_loop(breaths, chosen, progress=simulating)
     console = told(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
     for line in result.misfit_lines():
-        console.print(line, markup=False, highlight=False)
+        console.print(line)
 
 
 def _open_loop_table(result: dict[str, Any]) -> Any:
@@ -253,7 +243,6 @@ def _read(folders: list[Path]) -> tuple[list[Trajectories], list[dict[str, Any]]
     import json
 
     from ventbench import trajectories
-    from ventbench.base.errors import InputError
 
     runs, scores = [], []
     for folder in folders:

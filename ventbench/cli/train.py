@@ -8,10 +8,12 @@ from typing import Annotated, Any
 
 import typer
 
+from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     JsonFile,
     PlantName,
     RecordingsDir,
+    bar,
     bars,
     claim_out,
     known_lungs,
@@ -80,14 +82,11 @@ def simulator(
 
     folder = recordings_folder(recordings)
     listed = None if lungs is None else [name.strip() for name in lungs.split(",")]
-    with bars() as shown:
-        task = shown.add_task("learning", total=1.0)
-
-        def progress(what: str, share: float) -> None:
-            shown.update(task, description=what, completed=share)
-
-        config = RigConfig(laminar_share=laminar_share)
-        train_rigs(folder, out, lungs=listed, config=config, progress=progress)
+    with bar("learning") as learning:
+        train_rigs(
+            folder, out, lungs=listed, config=RigConfig(laminar_share=laminar_share),
+            progress=lambda what, share: learning(share, text=what),
+        )  # fmt: skip
     typer.echo(f"wrote {out}")
 
 
@@ -109,11 +108,8 @@ def population(
     from ventbench.train.rigs.population import train_population
 
     folder = recordings_folder(recordings)
-    with bars() as shown:
-        task = shown.add_task("fitting the population", total=1.0)
-        train_population(
-            folder, simulators, progress=lambda share: shown.update(task, completed=share)
-        )
+    with bar("fitting the population") as progress:
+        train_population(folder, simulators, progress=progress)
     typer.echo(f"wrote {simulators / 'population.npz'}")
 
 
@@ -131,14 +127,6 @@ def residual(
             min=1, help="Plants of each lung, 1 for the reference rig alone; default: all."
         ),
     ] = None,
-    randomise: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=4.0,
-            help="Random deviations (noise, R, C, ...), as a multiple of the ranges of the draws.",
-        ),
-    ] = 1.0,
     penalty: Annotated[
         float,
         typer.Option(
@@ -162,46 +150,28 @@ def residual(
 
     Example: `ventbench train residual --all --out runs/residual_all`
     """
-    from ventbench.base.errors import InputError
     from ventbench.train.plants import ALL
-    from ventbench.train.residual import ResidualConfig
+    from ventbench.train.residual import ResidualConfig, train_residual
 
     if lung is not None and every:
         raise InputError("give --lung ID or --all, not both")
     names = (ALL,) if every else None if lung is None else (lung,)
-    config = ResidualConfig(
-        updates=updates or ResidualConfig.updates,
-        members=members,
-        spread=randomise,
-        lam=penalty,
-        round_robin=round_robin,
-    )
-    result = _train_residual(names, out, config, seed, plant)
-    console = told(result, json)
-    console.print(_residual_table(result))
-    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
+    updates = updates or ResidualConfig.updates
+    config = ResidualConfig(updates=updates, members=members, lam=penalty, round_robin=round_robin)
+    with bars() as tell:
 
-
-def _train_residual(
-    names: tuple[str, ...] | None, out: Path, config: Any, seed: int, plant: str
-) -> dict[str, Any]:
-    from ventbench.train.residual import train_residual
-
-    with bars() as shown:
-        tasks: dict[str, Any] = {}
-
-        def report(what: str, progress: Any) -> None:
-            if what not in tasks:
-                tasks[what] = shown.add_task(what, total=None)
-            if progress is not None:
-                done, total, loss = progress
-                text = f"{what}: {loss:.3f} cmH2O"
-                shown.update(tasks[what], description=text, completed=done, total=total)
+        def report(what: str, progress: tuple[int, int, float] | None) -> None:
+            if progress is None:
+                tell(what, 0, None)
+            else:
+                tell(what, *progress[:2], text=f"{what}: {progress[2]:.3f} cmH2O")
 
         trained = train_residual(
             names, out, config=config, seed=seed, simulator=plant, progress=report
         )
-    return trained.report
+    console = told(trained.report, json)
+    console.print(_residual_table(trained.report))
+    console.print(f"wrote {out}", soft_wrap=True)
 
 
 def _residual_table(result: dict[str, Any]) -> Any:
@@ -253,7 +223,6 @@ def _train_policies(
     method: str, lung: str | None, all_lungs: bool, seeds: range, steps: int | None, out: Path,
     plant: str, json: Path | None,
 ) -> None:  # fmt: skip
-    from ventbench.base.errors import InputError
     from ventbench.train.plants import ALL
     from ventbench.train.rl.train import train_dqn, train_ppo
 
@@ -261,19 +230,16 @@ def _train_policies(
         raise InputError("give --lung ID or --all, not both; neither trains all seven networks")
     networks = (ALL,) if all_lungs else None if lung is None else (lung,)
     work = {"ppo": train_ppo, "dqn": train_dqn}[method]
-    with bars() as shown:
-        tasks: dict[str, Any] = {}
-
-        def progress(label: str, share: float, best: float) -> None:
-            if label not in tasks:
-                tasks[label] = shown.add_task(label, total=1.0)
-            description = f"{method}, {label}: {best:.3f} cmH2O"
-            shown.update(tasks[label], completed=share, description=description)
-
-        trained = work(networks, out, seeds=seeds, steps=steps, simulator=plant, progress=progress)
+    with bars() as tell:
+        trained = work(
+            networks, out, seeds=seeds, steps=steps, simulator=plant,
+            progress=lambda label, share, best: tell(
+                label, share, text=f"{method}, {label}: {best:.3f} cmH2O"
+            ),
+        )  # fmt: skip
     console = told(trained.report, json)
     console.print(_trained(trained.report))
-    console.print(f"wrote {out}", markup=False, highlight=False)
+    console.print(f"wrote {out}", soft_wrap=True)
 
 
 def _trained(about: dict[str, Any]) -> Any:

@@ -11,6 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     InProcess,
     JsonFile,
@@ -18,9 +20,8 @@ from ventbench.cli.options import (
     PlantName,
     Scheduler,
     Workers,
-    bars,
+    bar,
     claim_out,
-    counted,
     emit,
     known_entries,
     known_lungs,
@@ -75,18 +76,17 @@ def headroom(
         result = references.checked(computed, plants, cells, every=_EVERY)
         console = told(result, json)
         for key, value in result.items():
-            console.print(f"{key}: {value}", highlight=False)
+            console.print(f"{key}: {value}")
         if not result["sound"]:
             raise typer.Exit(1)
         return
     parts = out.with_suffix(".parts")
-    with bars() as progress:
-        pids = best_pids(rigs, progress=counted(progress, "best PID of each lung"))
-        with executor(workers, scheduler) as pool:
-            computed = references.compute(
-                plants, cells, pids.gains, about, folder=parts, pool=pool,
-                progress=counted(progress, "best attainable"),
-            )  # fmt: skip
+    with bar("best PID of each lung") as progress:
+        pids = best_pids(rigs, progress=progress)
+    with bar("best attainable") as progress, executor(workers, scheduler) as pool:
+        computed = references.compute(
+            plants, cells, pids.gains, about, folder=parts, pool=pool, progress=progress
+        )
     sha256 = computed.save(out)
     shutil.rmtree(parts)  # they are in the file now
     summary = {
@@ -106,7 +106,6 @@ def headroom(
         f"wrote {out}\nmean over cells, first step left out: best attainable "
         f"{summary['attainable']:.3f} cmH2O (at least {summary['lower']:.3f}), best PID "
         f"{summary['pid']:.3f}\nSHA-256 {sha256}",
-        highlight=False,
         soft_wrap=True,
     )
 
@@ -169,38 +168,34 @@ def pid(
 
     Example: `ventbench tune pid --all --out runs/pid`
     """
-    from ventbench.base.errors import InputError
-    from ventbench.base.files import write_json
     from ventbench.train.best_pid import tune_beyond
     from ventbench.train.pid_grid import RESULT, TABLE, tune_pid
 
     if (lung is not None) + every + robust != 1:
         raise InputError("give exactly one of --lung LUNG, --all and --robust")
     names = None if lung is None else (lung,)
-    with bars() as shown:
+    with bar("PIDs") as progress:
         if beyond:
             result = tune_beyond(
                 names, draws=draws, each=not robust, single=lung is None, simulator=plant,
-                progress=counted(shown, "PIDs"),
+                progress=progress,
             )  # fmt: skip
-            write_json(out / RESULT, result)
+            files.write_json(out / RESULT, result)
             written = [RESULT]
         else:
             grid, result = tune_pid(
                 names, out, draws=draws, workers=workers, scheduler=scheduler, each=not robust,
-                simulator=plant, progress=counted(shown, "trajectories"),
+                simulator=plant, progress=progress,
             )  # fmt: skip
             written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
     console = told(result, json)
     console.print(_table(result))
     for name in written:
-        console.print(f"wrote {out / name}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"wrote {out / name}", soft_wrap=True)
 
 
 def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
     """Draw the picture if matplotlib is installed."""
-    from ventbench.base import files
-    from ventbench.base.errors import InputError
     from ventbench.pages.plots import gain_map_png
 
     try:
@@ -286,7 +281,7 @@ def adversary(
     """
     from dataclasses import asdict
 
-    from ventbench.base import compilation, files
+    from ventbench.base import compilation
     from ventbench.entries.adversary import adversary as search
 
     compilation.keep()

@@ -25,7 +25,7 @@ from ventbench.diagnosis.findings import (
     Traces,
     Verdict,
 )
-from ventbench.diagnosis.hypothesis import make_partition
+from ventbench.diagnosis.hypothesis import make_partition, varies_by_breath
 from ventbench.diagnosis.identification import (
     IdentifiedModel,
     Split,
@@ -292,11 +292,12 @@ def _diagnose(
     # A simulator that is more than a lung and a valve may know the gains of its rigs, and gains
     # that have an order in time do not scatter.
     scatters = simulators.is_base_physics and not any(c.of == "gain" for c in adequacy.changes)
-    gain_error = conclusion.gain_sd * np.abs(gain) if scatters else None
+    gain_error = conclusion.gain_sd * np.abs(gain) * scatters
+    scatter_error = np.hypot(gain_error, recording_model.effort_spread(data))
     sensor = sensor_noise(breaths)
     open_loop = compare_open_loop(
         breaths, uses.judging, pressures,
-        noise_floor(float(noise.sigma[0]), sensor), gain_error, sensor,
+        noise_floor(float(noise.sigma[0]), sensor), scatter_error, sensor,
     )  # fmt: skip
     if adequacy.changes:  # breaths that err more because of a change are no outliers
         open_loop = replace(open_loop, usual=open_loop.after.rmse)
@@ -490,7 +491,8 @@ def _missing_mechanism(
 ) -> MissingMechanism:
     """A missing mechanism; ``left`` are the error and what is shown to be no noise of it, cmH2O."""
     conclusion = recording_model.conclusion
-    worth = conclusion.worths.get(name, float("nan"))
+    # Nobody knows the efforts of breaths to come: their errors do not tell what efforts are worth.
+    worth = float("nan") if varies_by_breath(name) else conclusion.worths.get(name, float("nan"))
     alternatives = conclusion.alternatives.get(name, Alternatives((), 1.0, ()))
     own = {}
     if simulator_model is not None and changed:

@@ -125,9 +125,9 @@ class OpenLoopComparison:
     #: errors of parts of the breath and of lungs, by group and stage, such as ``{"lung R5C10":
     #: {"before": OpenLoopError(...), ...}}``.
     groups: dict[str, dict[str, OpenLoopError]]
-    #: root-mean-square error, cmH2O, that a breath to come has because the valve's gain differs
-    #: from breath to breath; 0 if it does not.
-    gain_error: float = 0.0
+    #: root-mean-square error, cmH2O, that a breath to come has because the valve's gain or an
+    #: effort differs from breath to breath; 0 if nothing does.
+    scatter_error: float = 0.0
     #: root-mean-square error of the corrected simulator, cmH2O, without the tenth of the breaths
     #: that err most; NaN if unknown.
     usual: float = float("nan")
@@ -138,11 +138,11 @@ class OpenLoopComparison:
     @property
     def least_error(self) -> float:
         """Root-mean-square error of a simulator that lacks nothing, cmH2O."""
-        return float(np.hypot(self.noise_floor, self.gain_error))
+        return float(np.hypot(self.noise_floor, self.scatter_error))
 
     @property
     def unexplained(self) -> float:
-        """Usual error of the corrected simulator beyond the noise and the gain's scatter, cmH2O."""
+        """Usual error of the corrected simulator beyond noise and scatter, cmH2O."""
         usual = self.usual if np.isfinite(self.usual) else self.after.rmse
         beyond = usual**2 - self.least_error**2
         return float(np.sqrt(max(beyond, 0.0))) if np.isfinite(beyond) else float("nan")

@@ -207,6 +207,16 @@ class IdentifiedModel:
         slopes = partition.predictor.derivatives(values, (gain, len(names)))[1][:, :, 0]
         return slopes[:, 0] * values[:, gain, None], slopes[:, 1]
 
+    def effort_spread(self, data: Data) -> Floats:
+        """Standard deviation of the pressures of breaths to come, as efforts differ, cmH2O.
+
+        ``(n, T)``, or a zero that stands for all where there is no effort.
+        """
+        evaluator, model = self.evaluator, self.conclusion.full
+        partition = make_partition(data, evaluator.training.predictor.names, evaluator.settings)
+        values = evaluator.transferred_values(model, partition)
+        return evaluator.breath_term(model).spread(model, partition.predictor, values)[:, 0]
+
     def plants(self) -> dict[str, Plant]:
         """The identified plant of each lung, by label; it answers as :meth:`pressures` does."""
         return estimates.plants_of(self.conclusion.full, self.evaluator)

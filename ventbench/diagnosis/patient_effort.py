@@ -81,6 +81,10 @@ class BreathTerm(Protocol):
         """Expected readings of breaths to come, ``(n, c, T)``, at values ``(n, P + 1)``."""
         ...
 
+    def spread(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
+        """Standard deviation of these, as nobody knows what a breath to come has of its own."""
+        ...
+
 
 def breath_term(names: Iterable[str]) -> BreathTerm:
     """The breath term of a hypothesis with the terms ``names``."""
@@ -107,6 +111,10 @@ class NoBreathTerm:
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Simulate the values as they are."""
         return predictor.predict(values)
+
+    def spread(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
+        """Return a zero for all: ``(1, 1, 1)``."""
+        return np.zeros((1, 1, 1))
 
 
 class Evidence(NamedTuple):
@@ -191,12 +199,24 @@ class PatientEffortTerm:
 
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Mean over the efforts of the fitted breaths: nobody knows the effort of a new breath."""
+        return self._moments(fitted, predictor, values)[0]
+
+    def spread(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
+        """Standard deviation over the efforts of the fitted breaths."""
+        mean, square = self._moments(fitted, predictor, values)
+        return np.sqrt(np.maximum(square - mean**2, 0.0))
+
+    def _moments(
+        self, fitted: FittedModel, predictor: Predictor, values: Floats
+    ) -> tuple[Floats, Floats]:
         columns = [predictor.names.index(path) for path in (AMPLITUDE, ONSET)]
-        total, efforts = 0.0, zip(fitted.column(AMPLITUDE), fitted.column(ONSET), strict=True)
-        for effort in efforts:
+        mean, square = 0.0, 0.0
+        count = len(fitted.column(AMPLITUDE))
+        for effort in zip(fitted.column(AMPLITUDE), fitted.column(ONSET), strict=True):
             values[:, columns] = effort
-            total = total + predictor.predict(values)
-        return np.asarray(total) / len(fitted.column(AMPLITUDE))
+            pressure = predictor.predict(values)
+            mean, square = mean + pressure / count, square + pressure**2 / count
+        return np.asarray(mean), np.asarray(square)
 
     def evidence(
         self, linearisations: list[Linearisation], duration: float | None = None

@@ -205,8 +205,9 @@ def worth(findings: Findings) -> str:
     if errors.noise_floor > findings.settings.residuals.absorbed * errors.sensor_noise:
         quiet = rounded(errors.sensor_noise, 2)
         noise = f"{noise} (quiet readings scatter by {quiet}: some of it may be unexplained too)"
-    if errors.gain_error:
-        noise = f"{noise} and the {rounded(errors.gain_error, 2)} of the valve's scattering gain"
+    if errors.scatter_error:
+        scatter = rounded(errors.scatter_error, 2)
+        noise = f"{noise} and the {scatter} of what differs from breath to breath"
     beyond = rounded(errors.unexplained, 2)
     left = f"{beyond} cmH2O stay unexplained beyond the noise of {noise}"
     if not math.isfinite(errors.unexplained):

@@ -64,7 +64,7 @@ def compare_open_loop(
     held_out: Bools,
     pressures: dict[str, Floats],
     noise_floor: float,
-    gain_error: Floats | None = None,
+    scatter_error: Floats | None = None,
     sensor: float = float("nan"),
 ) -> OpenLoopComparison:
     """Open-loop errors of a simulator before and after its correction.
@@ -75,8 +75,8 @@ def compare_open_loop(
         pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
             T)``.
         noise_floor: standard deviation of the noise, cmH2O.
-        gain_error: standard deviation of the pressure because gains differ from breath to breath,
-            cmH2O, ``(n, T)``; None if they do not.
+        scatter_error: standard deviation of the pressure because gains or efforts differ from
+            breath to breath, cmH2O, ``(n, T)``; None if nothing does.
         sensor: that of :func:`sensor_noise`.
     """
     # The first sample is where every simulation starts.
@@ -102,7 +102,9 @@ def compare_open_loop(
             parts[f"lung {name}"] = inspiration & of_lung[:, None]
     ids = tuple(int(i) for i in breaths.breath_id[held_out])
     groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
-    scatter = 0.0 if gain_error is None else float(np.sqrt(np.mean(gain_error[inspiration] ** 2)))
+    scatter = 0.0
+    if scatter_error is not None:
+        scatter = float(np.sqrt(np.mean(scatter_error[inspiration] ** 2)))
     error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
     usual = _usual_error(error)
     return OpenLoopComparison(

@@ -277,7 +277,7 @@ def _open_loop(comparison: OpenLoopComparison) -> dict[str, Any]:
         "after": _error(comparison.after),
         "noise_floor": comparison.noise_floor,
         "sensor_noise": comparison.sensor_noise,
-        "gain_error": comparison.gain_error,
+        "scatter_error": comparison.scatter_error,
         "usual": comparison.usual,
         "unexplained": comparison.unexplained,
         "groups": {

@@ -1,4 +1,8 @@
-"""The runs of the RespiraWorks recordings as breaths, and the mechanics of each run."""
+"""Recordings of the RespiraWorks ventilator: another schema, 100 Hz; the mechanics of each run.
+
+Its valves are not those of the ventilator that ventbench simulates: its commands are kept as they
+are and not converted to u_in and u_out. Lung mechanics follow from pressure and flow.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,70 @@ import numpy as np
 
 from ventbench.mechanics.identify import Mechanics, identify, share_faults
 from ventbench.mechanics.labels import label_texts, value_text
-from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
-from ventbench.recordings.respiraworks import RespiraWorksRun, load_respiraworks
+from ventbench.recordings.breaths import Breaths, arranged
+from ventbench.recordings.scan import kind_of
+from ventbench.recordings.schema import fail
+
+#: Signals of a run and their units.
+SIGNALS = {"pressure": "cmH2O", "flow": "mL/s", "volume": "mL", "target": "cmH2O"} | dict.fromkeys(
+    ("cmd_inh_valve", "cmd_exh_valve", "cmd_psol", "dp_inhale", "dp_exhale"), "as logged"
+)
+_LABELS = ("run", "test", "breath", "time_step", "R", "C", "drive")
 
 #: Shortest breath that is kept, s.
 _SHORTEST = 0.5
 
 #: Start of a breath before its inspiration, s, so that the breath includes the whole steep rise.
 _LEAD = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class RespiraWorksRun:
+    """One test of one day: consecutive breaths on one lung."""
+
+    name: str  #: name of the test day or gas supply.
+    test: int  #: number of the ISO test condition.
+    drive: str  #: source of the gas, such as a blower.
+    R: float  #: resistance that the operators noted, cmH2O/(L/s).
+    C: float  #: compliance that the operators noted, mL/cmH2O.
+    breath: np.ndarray  #: number of each sample's breath, int64, (T,).
+    time: np.ndarray  #: s, float64, (T,).
+    #: signals by the names of `SIGNALS`, float64, NaN where not logged, each (T,).
+    signals: dict[str, np.ndarray]
+
+
+def load_respiraworks(path: str | os.PathLike[str]) -> tuple[RespiraWorksRun, ...]:
+    """Read the runs of a RespiraWorks Parquet file, in its order.
+
+    Raises:
+        RecordingError: if the file cannot be read, lacks a column, or its times do not increase.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    name = str(path)
+    if kind_of(path) != "parquet":
+        raise fail(name, "this is not a Parquet file", "RespiraWorks recordings are Parquet.")
+    try:
+        frame = parquet.read_table(name).to_pandas()
+    except (pa.ArrowException, OSError) as error:
+        raise fail(name, f"the Parquet file cannot be read ({error})", "Copy it again.") from None
+    missing = [column for column in (*_LABELS, *SIGNALS) if column not in frame.columns]
+    if missing:
+        advice = "Name a RespiraWorks file; other recordings are read with load."
+        raise fail(name, f"missing columns {', '.join(missing)}", advice)
+    runs = []
+    for (run, test), rows in frame.groupby(["run", "test"], sort=False):
+        time = rows["time_step"].to_numpy(np.float64)
+        if not (np.diff(time) > 0.0).all():
+            what = f"time_step does not increase in run {run}, test {test}"
+            raise fail(name, what, "Write the file again in time order.")
+        signals = {column: rows[column].to_numpy(np.float64) for column in SIGNALS}
+        first = rows.iloc[0]
+        label, breath = (float(first["R"]), float(first["C"])), rows["breath"].to_numpy(np.int64)
+        drive = str(first["drive"])
+        runs.append(RespiraWorksRun(str(run), int(str(test)), drive, *label, breath, time, signals))
+    return tuple(runs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +107,10 @@ def breaths_of(run: RespiraWorksRun) -> Breaths:
     for name in ("flow", "volume"):
         if np.isfinite(run.signals[name]).any():
             samples[name] = run.signals[name][rows]
-    arrays = {name: stack(values, lengths, FILL[name]) for name, values in samples.items()}
     starts = np.concatenate([run.time[p] - run.time[p[0]] for p in pieces])
-    time, dt = stack_times(starts, lengths)
-    n = len(pieces)
-    return Breaths(
-        breath_id=np.array([run.breath[p[-1]] for p in pieces]), R=np.full(n, run.R),
-        C=np.full(n, run.C), time=time, dt=dt, valid=valid_mask(lengths),
-        time_inferred=np.zeros(n, bool), u_in=arrays["u_in"], u_out=arrays["u_out"],
-        pressure=arrays["pressure"], flow=arrays.get("flow"), volume=arrays.get("volume"),
-    )  # fmt: skip
+    ids, n = np.array([run.breath[p[-1]] for p in pieces]), len(pieces)
+    R, C = np.full(n, run.R), np.full(n, run.C)
+    return arranged(lengths, starts, samples, breath_id=ids, R=R, C=C)
 
 
 def survey(

@@ -14,14 +14,12 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism
 from ventbench.physics.mechanism import Mechanism, Network, Pair, Values, View
 from ventbench.physics.parameters import BASE_PARAMETERS
-
-Floats = NDArray[np.float64]
 
 #: Points of a static curve and of a response in time.
 _STATIC, _STEPS = 241, 160

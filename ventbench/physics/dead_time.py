@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.physics.mechanism import apply_if_active
 
 #: Substeps of a sample of about 30 ms, and past samples that a dead time may reach back over.
@@ -32,7 +32,7 @@ def resolution(dt: float) -> tuple[int, int]:
     return max(4, round(dt / LONGEST_SUBSTEP + 0.4)), math.ceil(LONGEST_DEAD_TIME / dt) + 1
 
 
-def resolution_of(dt: NDArray[np.float64]) -> tuple[int, int]:
+def resolution_of(dt: Floats) -> tuple[int, int]:
     """Numbers of substeps and of past samples that unevenly spaced samples need.
 
     Args:

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
-from ventbench.physics.mechanisms.leak import Leak
-from ventbench.physics.mechanisms.relief_leak import ReliefLeak
+from ventbench.physics.mechanisms.circuit import Leak, ReliefLeak
 
 _LOST_SOURCE = (
     "Messages on a bus are lost, or come late and are overtaken (J. Nilsson, Real-Time "

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from ventbench.base.arrays import Floats
 
 #: Flow of the PVP's inspiratory valve, mL/s per % (137 L/min fully open).
 VALVE_GAIN = 22.8
@@ -80,7 +82,7 @@ class Parameter:
         positive = (0.3 * self.mild, self.mild, self.strong)
         return (*positive, *(-value for value in positive if -value >= self.low))
 
-    def coordinate(self, value: ArrayLike) -> NDArray[np.float64]:
+    def coordinate(self, value: ArrayLike) -> Floats:
         """Coordinate of a physical value in a fit: its logarithm on a log scale, else the value.
 
         A linear scale lets a fit reach ``neutral`` at a bound, with a derivative that is not zero.
@@ -88,12 +90,12 @@ class Parameter:
         value = np.asarray(value, float)
         return np.log(value) if self.scale == "log" else value
 
-    def physical(self, coordinate: ArrayLike) -> NDArray[np.float64]:
+    def physical(self, coordinate: ArrayLike) -> Floats:
         """Inverse of :meth:`coordinate`."""
         coordinate = np.asarray(coordinate, float)
         return np.exp(coordinate) if self.scale == "log" else coordinate
 
-    def slope(self, value: ArrayLike) -> NDArray[np.float64]:
+    def slope(self, value: ArrayLike) -> Floats:
         """Derivative of the physical value with respect to the coordinate."""
         value = np.asarray(value, float)
         return value if self.scale == "log" else np.ones_like(value)

@@ -33,10 +33,11 @@ from typing import Any, Protocol, TypeAlias
 
 import jax
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ventbench import recordings
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
@@ -50,8 +51,6 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import read_simulated
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNGS, Lung, lung
-
-Floats = NDArray[np.float64]
 
 
 class Stepping(Protocol):

@@ -1,9 +1,9 @@
-"""Reading recordings: whole, by batches, only to check; and tables of simulated pressures."""
+"""Reading recordings: whole, or only to check; and tables of simulated pressures."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -289,55 +289,6 @@ def check(
         refused = role_problems(source.file, tally)["refused"]
     suspicious = tuple(found for found in report.suspicious if found not in refused)
     return replace(report, problems=refused, problem_count=len(refused), suspicious=suspicious)
-
-
-def iter_breaths(
-    path: FilePath, *, batch: int = 1024, clip: bool = False, pad: bool = False
-) -> Iterator[Breaths]:
-    """Read a recording of any size in batches.
-
-    Needs the memory of a batch and about 100 bytes for each breath read so far. If a breath has no
-    times, the file is read once more to estimate its interval from all breaths, as `load` does.
-
-    Args:
-        path: the file.
-        batch: breaths in each result; the last may have fewer.
-        clip: see `load`.
-        pad: see `load`, but only up to the longest breath of each batch.
-
-    Yields:
-        Breaths in file order, without `sha256`.
-
-    Raises:
-        ValueError: if batch is below 1.
-        RecordingError: if the next batch cannot be used; those before it are sound.
-    """
-    if batch < 1:
-        raise ValueError(f"batch is {batch}, but at least 1 is needed")
-    source = open_source(path)
-    log = ProblemLog(source.file)
-    table: IntervalTable | None = None
-    expected = 0
-    for block in scan(source, log, clip=clip, batch=batch):
-        tally = Tally()
-        tally.add(block)
-        check_lengths(tally, log, pad=pad, expected=expected)
-        expected = expected or int(np.bincount(block.lengths).argmax())
-        if block.times.blank.any() and table is None:
-            table = _table_of(path, clip=clip)
-        if table is not None and table.overall is None:
-            check_inferable(tally, log)
-        log.raise_problems(partial(locate, source), source.place)
-        yield _assemble(block, table or tally.table(), source.file)
-    if expected == 0:
-        raise _no_rows(source)
-
-
-def _table_of(path: FilePath, *, clip: bool) -> IntervalTable:
-    tally = Tally()
-    for block in scan(open_source(path), ProblemLog(str(path)), clip=clip):
-        tally.add(block)
-    return tally.table()
 
 
 def _check_whole(source: Source, tally: Tally, log: ProblemLog, *, pad: bool) -> None:

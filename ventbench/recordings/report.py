@@ -209,8 +209,8 @@ class Tally:
         return {breath: dt for breath, dt in estimates.items() if dt is not None}
 
 
-def check_lengths(tally: Tally, log: ProblemLog, *, pad: bool, expected: int = 0) -> None:
-    """Check that all breaths have ``expected`` samples; for 0, as many as is most common.
+def check_lengths(tally: Tally, log: ProblemLog, *, pad: bool) -> None:
+    """Check that all breaths have as many samples as is most common.
 
     With ``pad`` they may be shorter, unless padding would need far more memory than the file.
     """
@@ -230,7 +230,7 @@ def check_lengths(tally: Tally, log: ProblemLog, *, pad: bool, expected: int = 0
             advice = "Put breaths of very different lengths into files of their own."
             log.add(first_row[at], "breath_id", what, advice, values=ids[at])
         return
-    usual = expected or int(np.bincount(lengths).argmax())
+    usual = int(np.bincount(lengths).argmax())
     for length in np.unique(lengths[lengths != usual]):
         at = np.flatnonzero(lengths == length)
         what = f"breath {{value}} has {length} samples, the others have {usual}"

@@ -50,28 +50,19 @@ class Rows(Chunk):
         return np.diff(self.starts, append=len(self))
 
 
-def whole_breaths(chunks: Iterable[Chunk], batch: int | None = None) -> Iterator[Rows]:
-    """Regroup chunks of a file, in order, so that none ends inside a breath.
-
-    ``batch`` is the number of breaths in each group (the last may have fewer); None for any.
-    """
+def whole_breaths(chunks: Iterable[Chunk]) -> Iterator[Rows]:
+    """Regroup chunks of a file, in order, so that none ends inside a breath."""
     held: list[Chunk] = []
-    held_breaths = 0
     for chunk in chunks:
-        if held and held[-1].columns["breath_id"][-1] == chunk.columns["breath_id"][0]:
-            held_breaths -= 1
         held.append(chunk)
-        held_breaths += len(_starts(chunk))
-        if held_breaths > (batch or 1):
+        if held[0].columns["breath_id"][0] != chunk.columns["breath_id"][-1]:
             rows = _join(held)
-            stops = _stops(rows, batch)
-            yield from _cut(rows, stops)
-            rest = rows.cut(int(stops[-1]), len(rows))
-            held, held_breaths = [rest], len(_starts(rest))
+            # The last breath may continue in the next chunk.
+            last = int(_starts(rows)[-1])
+            yield _whole(rows.cut(0, last))
+            held = [rows.cut(last, len(rows))]
     if held:
-        rows = _join(held)
-        stops = _stops(rows, batch) if batch else np.zeros(0, dtype=np.int64)
-        yield from _cut(rows, np.append(stops, len(rows)))
+        yield _whole(_join(held))
 
 
 def _starts(chunk: Chunk) -> np.ndarray:
@@ -79,19 +70,8 @@ def _starts(chunk: Chunk) -> np.ndarray:
     return np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1)
 
 
-def _stops(rows: Chunk, batch: int | None) -> np.ndarray:
-    """Rows at which groups can end: the last breath may continue in the next chunk."""
-    starts = _starts(rows)
-    return starts[-1:] if batch is None else starts[batch::batch]
-
-
-def _cut(rows: Chunk, stops: np.ndarray) -> Iterator[Rows]:
-    start = 0
-    for stop in stops:
-        if stop > start:
-            part = rows.cut(start, int(stop))
-            yield Rows(part.row0, part.columns, part.blank_id, _starts(part))
-        start = int(stop)
+def _whole(rows: Chunk) -> Rows:
+    return Rows(rows.row0, rows.columns, rows.blank_id, _starts(rows))
 
 
 def _join(chunks: list[Chunk]) -> Chunk:

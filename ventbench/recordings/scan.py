@@ -1,4 +1,4 @@
-"""A file as checked blocks of whole breaths, which `load`, `iter_breaths` and `check` share.
+"""A file as checked blocks of whole breaths, which `load` and `check` share.
 
 Parquet is read here in batches, CSV in :mod:`ventbench.recordings.csv_source`.
 
@@ -339,10 +339,8 @@ class Block:
     samples: dict[str, np.ndarray]
 
 
-def scan(
-    source: Source, log: ProblemLog, *, clip: bool = False, batch: int | None = None
-) -> Iterator[Block]:
-    """Read and check a file: blocks in its order, of ``batch`` breaths, or any number for None.
+def scan(source: Source, log: ProblemLog, *, clip: bool = False) -> Iterator[Block]:
+    """Read and check a file: blocks in its order, of any number of breaths.
 
     The log receives all problems and warnings except those of the whole file (unequal lengths).
     There are blocks after a problem too; their values must not be used. ``clip`` brings u_in into
@@ -353,7 +351,7 @@ def scan(
     """
     seen: dict[int, int] = {}
     last: int | None = None
-    for rows in whole_breaths(source.chunks(), batch):
+    for rows in whole_breaths(source.chunks()):
         check_ids(rows, log, seen)
         check_single(rows, log)
         check_lung(rows, log)

@@ -264,7 +264,7 @@ def _advice(names: Sequence[str], missing: Sequence[str]) -> str:
     if set(names) >= _RESPIRAWORKS:
         return (
             "This is a RespiraWorks file, of another ventilator and with other columns: read it "
-            "with ventbench.recordings.load_respiraworks."
+            "with ventbench.mechanics.load_respiraworks."
         )
     if len(names) == 1 and any(mark in names[0] for mark in ";\t|"):
         return "The columns must be separated by commas; `ventbench data import` reads others."

@@ -13,8 +13,6 @@ from ventbench.system_id.noise import Noise as Noise
 from ventbench.system_id.noise import robust_noise as robust_noise
 from ventbench.system_id.predictor import START as START
 from ventbench.system_id.predictor import Predictor as Predictor
-from ventbench.system_id.problem import Problem as Problem
 from ventbench.system_id.problem import Unknowns as Unknowns
-from ventbench.system_id.problem import free_paths as free_paths
 from ventbench.system_id.problem import make_unknowns as make_unknowns
 from ventbench.system_id.problem import parameter_values as parameter_values

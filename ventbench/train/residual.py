@@ -232,15 +232,6 @@ def run_chunks(
     return carry
 
 
-def _cells(number: Array, lungs: int, pips: int, config: ResidualConfig) -> tuple[Array, Array]:
-    """Lung and PIP of each run of an update."""
-    if config.round_robin:
-        cell = jnp.full(config.copies, number % (lungs * pips))
-    else:
-        cell = jnp.repeat(jnp.arange(lungs * pips), config.copies)
-    return cell // pips, cell % pips
-
-
 @partial(jax.jit, static_argnames="config")
 def _advance(
     carry: tuple[Any, Any],
@@ -259,7 +250,12 @@ def _advance(
     def update(carry: tuple[Any, Any], number: Array) -> tuple[tuple[Any, Any], Array]:
         layers, state = carry
         member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
-        lung, pip = _cells(number, lungs, len(protocol.PIPS), config)
+        # Lung and PIP of each run.
+        if config.round_robin:
+            cell = jnp.full(config.copies, number % (lungs * len(pips)))
+        else:
+            cell = jnp.repeat(jnp.arange(lungs * len(pips)), config.copies)
+        lung, pip = cell // len(pips), cell % len(pips)
         member = jax.random.randint(member_key, lung.shape, 0, members)
         cells = draws.random_scenarios(scenario_key, pips[pip], spread=config.spread, smooth=True)
         those = jax.tree.map(lambda leaf: leaf[member, lung], plants)

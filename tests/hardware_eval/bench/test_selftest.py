@@ -90,11 +90,13 @@ def test_a_wrongly_set_lung_is_a_no_go_that_names_it(bench: Bench) -> None:
 SETTINGS = [(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0)]
 
 
-def analytic(u_in: float, R: float, C: float, gain: float, draw: Any, noise: float) -> Driven:
+def analytic(
+    u_in: float, puff: int, R: float, C: float, gain: float, draw: Any, noise: float
+) -> Driven:
     """A puff into a lung of R and C, seen by the converter of the PVP."""
     volume, pressures = 0.0, []
-    commands = selftest_module._puff(u_in)
-    for step in range(selftest_module._LEAD + selftest_module._PUFF + selftest_module._STILL):
+    commands = selftest_module._puff(u_in, puff)
+    for step in range(selftest_module._LEAD + puff + selftest_module._STILL):
         command, u_out = commands(step, 0.0)
         flow = 0.0 if u_out else gain * 22.8 * command
         pressures.append(5.0 + volume / C + R * flow / 1000.0)
@@ -109,12 +111,14 @@ def analytic(u_in: float, R: float, C: float, gain: float, draw: Any, noise: flo
 def test_the_sweep_knows_its_error_rates(noise: float) -> None:
     draw, trials = np.random.default_rng(0), 100
     for R, C in SETTINGS:
-        go = {"right": 0, "stuck": 0}
+        label, go = f"R{R:g}C{C:g}", {"right": 0, "stuck": 0}
+        openings, steps = selftest_module._openings(label)
         for kind, gain in (("right", 0.87), ("stuck", 0.0)):
             for _ in range(trials):
-                puffs = [analytic(u, R, C, gain, draw, noise) for u in (0.0, 5.0, 10, 20, 40)]
+                puffs = [analytic(u, steps, R, C, gain, draw, noise) for u in (0.0, *openings)]
+                assert max(puff.pressure.max() for puff in puffs) < 45.0  # the limit is 65
                 measured = noise * (1.0 + draw.normal(0.0, 0.17))  # from 17 samples
-                go[kind] += selftest_module._sweep(puffs, measured, C)[0].ok
+                go[kind] += selftest_module._sweep(puffs, measured, label)[0].ok
         assert go["right"] >= trials - 4  # 1 % and its chance
         assert go["stuck"] <= 0.05 * trials
 

@@ -24,12 +24,11 @@ from ventbench.task.lungs import LUNGS
 from ventbench.train.rl import episodes
 from ventbench.train.rl import train as parallel
 from ventbench.train.rl.dqn import DQN
-from ventbench.train.rl.policy_gradient import PolicyGradient
-from ventbench.train.rl.ppo import PPO
+from ventbench.train.rl.ppo import PPO, PolicyGradient
 
 PG = PolicyGradient(breaths=6, iterations=160, widths=(8,), learning_rate=1e-2)
 SMALL_PPO = PPO(breaths=12, iterations=4, widths=(8,), epochs=2, minibatches=2)
-SMALL_DQN = DQN(breaths=6, iterations=8, widths=(8,), updates=1, batch=16, memory=24, steps=3)
+SMALL_DQN = DQN(breaths=6, iterations=8, widths=(8,), updates=1, batch=16, memory=24)
 METHODS = {"pg": PG, "ppo": SMALL_PPO, "dqn": SMALL_DQN}
 
 
@@ -159,16 +158,16 @@ def test_ppo_and_dqn_improve_on_the_pid(method):
 
 
 def test_the_replay_holds_the_last_breaths_and_their_following_features(iterations):
-    steps, breaths, after = episodes.STEPS, SMALL_DQN.breaths, SMALL_DQN.steps
+    steps, breaths = episodes.STEPS, SMALL_DQN.breaths
     count = breaths * steps
     first = iterations["dqn"](SMALL_DQN.init(jax.random.key(0)), plant(0))
     replay = jax.tree.map(np.asarray, first.replay)
     seen = replay.features[:count].reshape(steps, breaths, -1)
     following = replay.following[:count].reshape(steps, breaths, -1)
-    np.testing.assert_array_equal(following[:-after], seen[after:])
+    np.testing.assert_array_equal(following[:-1], seen[1:])
     discount = replay.discount[:count].reshape(steps, breaths)
-    np.testing.assert_allclose(discount[:-after], SMALL_DQN.discount**after, rtol=1e-6)
-    assert not discount[-after:].any()
+    np.testing.assert_allclose(discount[:-1], SMALL_DQN.discount, rtol=1e-6)
+    assert not discount[-1].any()
     assert not replay.features[count:].any()
     for _ in range(4):  # the fifth overwrites the first of four
         first = iterations["dqn"](first, plant(0))

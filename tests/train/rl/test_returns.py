@@ -34,12 +34,6 @@ def test_advantages_with_full_trace_are_returns_minus_values():
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("n", [1, 3, 10])
-def test_n_step_stops_at_the_end(n):
-    wanted = [sum(0.9**k * REWARDS[t + k] for k in range(min(n, 7 - t))) for t in range(7)]
-    np.testing.assert_allclose(episodes.n_step(jnp.asarray(REWARDS), 0.9, n), wanted, rtol=1e-5)
-
-
 def test_double_q_takes_the_targets_value_of_the_online_choice():
     online = jnp.array([[1.0, 3.0, 2.0], [5.0, 4.0, 0.0]])
     target = jnp.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])

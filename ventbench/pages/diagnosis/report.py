@@ -117,8 +117,8 @@ def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
             about += f"; expiration {' → '.join(ends)}"
         told.append(("What is mending it worth?", worth, about))
     noise = f"beyond the measurement's noise of {_number(errors.noise_floor)}"
-    if errors.gain_error:
-        noise += f" and the {_number(errors.gain_error)} of the valve's scattering gain"
+    if errors.scatter_error:
+        noise += f" and the {_number(errors.scatter_error)} of what differs from breath to breath"
     told.append(("What stays unexplained?", f"{_number(errors.unexplained)} cmH2O", noise))
     return told
 

@@ -1,1 +1,1 @@
-"""One module a mechanism, or several alike: classes with a description, and their physics."""
+"""One module a place in the rig: classes with a description, and their physics."""

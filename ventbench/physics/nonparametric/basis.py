@@ -8,34 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.physics.mechanism import Mechanism, Values
 from ventbench.physics.parameters import Parameter
 
 Number = Array | float
-Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class PiecewiseLinear:
-    """Straight lines from knot to knot, and constant beyond the first and the last."""
-
-    knots: tuple[float, ...]  #: rising.
-
-    def __call__(self, x: Array, at: Sequence[Number]) -> Array:
-        """Value at ``x``, given the values at the knots."""
-        value = at[0] + 0.0 * x
-        for j, (a, b) in _pairs(self.knots):
-            value = value + (at[j + 1] - at[j]) / (b - a) * _within(x, a, b)
-        return value
-
-    def slope(self, x: Array, at: Sequence[Number]) -> Array:
-        """Derivative by ``x``."""
-        slope = 0.0 * x
-        for j, (a, b) in _pairs(self.knots):
-            slope = slope + (at[j + 1] - at[j]) / (b - a) * ((x > a) & (x <= b))
-        return slope
 
 
 @dataclass(frozen=True)
@@ -104,6 +82,36 @@ class BasisTerm(Mechanism):
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Curves for a plot, given the own and the base parameters."""
         raise NotImplementedError
+
+
+class Lines(BasisTerm):
+    """Straight lines from knot to knot, and constant beyond the first and the last.
+
+    The coefficients are the values at the knots but those where the curve is fixed at zero.
+    """
+
+    knots: tuple[float, ...]  #: rising.
+    fixed: tuple[float, ...]  #: knots at which the curve is zero.
+
+    def at_knots(self, values: Values) -> list[Number]:
+        """Values at the knots."""
+        free = iter(self.coefficients(values))
+        return [0.0 if knot in self.fixed else next(free) for knot in self.knots]
+
+    def curve(self, values: Values, x: Array) -> Array:
+        """Value at ``x``."""
+        at = self.at_knots(values)
+        value = at[0] + 0.0 * x
+        for j, (a, b) in _pairs(self.knots):
+            value = value + (at[j + 1] - at[j]) / (b - a) * _within(x, a, b)
+        return value
+
+    def slope(self, values: Values, x: Array) -> Array:
+        """Derivative by ``x``."""
+        at, slope = self.at_knots(values), 0.0 * x
+        for j, (a, b) in _pairs(self.knots):
+            slope = slope + (at[j + 1] - at[j]) / (b - a) * ((x > a) & (x <= b))
+        return slope
 
 
 class FilterBank(BasisTerm):

@@ -11,7 +11,7 @@ from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
     FilterBank,
-    PiecewiseLinear,
+    Lines,
     PiecewiseQuadratic,
     coefficients,
     per_state,
@@ -99,7 +99,7 @@ class FlowShape(BasisTerm):
 _VOLUME_KNOTS = (5.0, 9.0, 14.0, 20.0, 30.0, 45.0)
 
 
-class VolumeResistance(BasisTerm):
+class VolumeResistance(Lines):
     """A factor of R, straight between knots; it is 1 at V / C = 5 cmH2O and below: there R is R."""
 
     description = Description(
@@ -113,20 +113,18 @@ class VolumeResistance(BasisTerm):
         signature="The drop at edges of the flow depends on the volume at which they occur.",
         confusable=("turbulent_resistance", "nonlinear_compliance"),
     )  # fmt: skip
+    knots, fixed = _VOLUME_KNOTS, _VOLUME_KNOTS[:1]
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Resistance at the volume that the last flow leads to."""
         filled = view.elastance * (view.volume + view.length * view.flow)
-        return network.plus(resistance=view.resistance * self._excess(values, filled))
+        return network.plus(resistance=view.resistance * self.curve(values, filled))
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Resistance over volume."""
         s = np.linspace(5.0, 45.0, 161)
-        y = base["R"] * np.asarray(self._excess(values, jnp.asarray(s)))
+        y = base["R"] * np.asarray(self.curve(values, jnp.asarray(s)))
         return (Curve(s * base["C"], y, "volume, mL", "extra resistance, cmH2O/(L/s)", (0,)),)
-
-    def _excess(self, values: Values, filled: Array) -> Array:
-        return PiecewiseLinear(_VOLUME_KNOTS)(filled, [0.0, *self.coefficients(values)])
 
 
 class DirectionResistance(BasisTerm):

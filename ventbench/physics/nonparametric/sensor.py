@@ -9,10 +9,9 @@ from jax import Array
 
 from ventbench.physics.mechanism import Description, Pair, Values
 from ventbench.physics.nonparametric.basis import (
-    BasisTerm,
     Curve,
     FilterBank,
-    PiecewiseLinear,
+    Lines,
     coefficients,
 )
 
@@ -26,7 +25,7 @@ _SENSOR_FIXED = (5.0, 20.0)
 _SENSOR_STEPS, _SENSOR_LEAST = 6, 0.2
 
 
-class SensorShape(BasisTerm):
+class SensorShape(Lines):
     """An error of the reading that depends on the pressure.
 
     It is zero at 5 and at 20 cmH2O: an offset is one of PEEP and of the start, and a gain, from
@@ -45,38 +44,29 @@ class SensorShape(BasisTerm):
         confusable=("nonlinear_compliance", "leak"),
     )  # fmt: skip
     rank = 2
+    knots, fixed = _SENSOR_KNOTS, _SENSOR_FIXED
 
     def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
         """Add the error."""
-        return pressure + self._curve(pressure, values)
+        return pressure + self.curve(values, pressure)
 
     def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
         """Pressure of a reading, by Newton's method."""
-        at = self._at(values)
 
         def nearer(pressure: Array, _: None) -> tuple[Array, None]:
-            slope = jnp.maximum(
-                1.0 + PiecewiseLinear(_SENSOR_KNOTS).slope(pressure, at), _SENSOR_LEAST
-            )
-            return pressure - (
-                pressure + PiecewiseLinear(_SENSOR_KNOTS)(pressure, at) - shown
-            ) / slope, None
+            slope = jnp.maximum(1.0 + self.slope(values, pressure), _SENSOR_LEAST)
+            off = pressure + self.curve(values, pressure) - shown
+            return pressure - off / slope, None
 
-        first = shown + sum(0.0 * x for x in at)  # in the shape that the steps have
+        # In the shape that the steps have.
+        first = shown + sum(0.0 * x for x in self.at_knots(values))
         return jax.lax.scan(nearer, first, None, length=_SENSOR_STEPS)[0]
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Error over pressure."""
         p = np.linspace(0.0, 45.0, 181)
-        y = np.asarray(self._curve(jnp.asarray(p), values))
+        y = np.asarray(self.curve(values, jnp.asarray(p)))
         return (Curve(p, y, "airway pressure, cmH2O", "error of the reading, cmH2O", (0, 1)),)
-
-    def _curve(self, pressure: Array, values: Values) -> Array:
-        return PiecewiseLinear(_SENSOR_KNOTS)(pressure, self._at(values))
-
-    def _at(self, values: Values) -> list:
-        free = iter(self.coefficients(values))
-        return [0.0 if p in _SENSOR_FIXED else next(free) for p in _SENSOR_KNOTS]
 
 
 #: Time constants, s.
@@ -122,7 +112,7 @@ class SensorMemory(FilterBank):
 _DRIFT_KNOTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
-class DriftShape(BasisTerm):
+class DriftShape(Lines):
     """An offset of the reading; that of the first breath is zero, as PEEP absorbs it."""
 
     description = Description(
@@ -137,21 +127,19 @@ class DriftShape(BasisTerm):
         confusable=("sensor_drift",),
     )  # fmt: skip
     rank = 3
+    knots, fixed = _DRIFT_KNOTS, _DRIFT_KNOTS[:1]
     uses_position = True
 
     def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
         """Add the offset."""
-        return pressure + self._offset(values, position)
+        return pressure + self.curve(values, position)
 
     def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
         """Take it away."""
-        return shown - self._offset(values, position)
+        return shown - self.curve(values, position)
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Offset over the recording."""
         x = np.linspace(0.0, 1.0, 101)
-        y = np.asarray(self._offset(values, jnp.asarray(x)))
+        y = np.asarray(self.curve(values, jnp.asarray(x)))
         return (Curve(x, y, "position in the recording, 0..1", "offset, cmH2O", (0,)),)
-
-    def _offset(self, values: Values, position: Array) -> Array:
-        return PiecewiseLinear(_DRIFT_KNOTS)(position, [0.0, *self.coefficients(values)])

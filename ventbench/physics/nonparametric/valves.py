@@ -11,7 +11,7 @@ from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
     FilterBank,
-    PiecewiseLinear,
+    Lines,
     coefficients,
     per_state,
 )
@@ -19,12 +19,12 @@ from ventbench.physics.nonparametric.basis import (
 #: Commands where the curve bends, %; at the fourth it is zero. Closest where valves begin to open.
 _VALVE_KNOTS = (0.0, 1.0, 3.0, 6.0, 12.0, 20.0, 35.0, 60.0, 100.0)
 
-#: The knot at which the curve is zero: what is left there is the valve's gain.
-_VALVE_FIXED = 20.0
-_VALVE_FREE = tuple(u for u in _VALVE_KNOTS[1:] if u != _VALVE_FIXED)
+#: Knots at which the curve is zero: what is left at the second is the valve's gain.
+_VALVE_FIXED = (0.0, 20.0)
+_VALVE_FREE = tuple(u for u in _VALVE_KNOTS if u not in _VALVE_FIXED)
 
 
-class ValveShape(BasisTerm):
+class ValveShape(Lines):
     """A change of the effective command, which keeps it within 0..2 u.
 
     It is zero at 0 and at 20 %, as a common factor of all flows is the valve's gain, or, from
@@ -46,22 +46,17 @@ class ValveShape(BasisTerm):
         confusable=("valve_curve", "valve_dead_band", "command_rounding"),
     )  # fmt: skip
     rank = 5
+    knots, fixed = _VALVE_KNOTS, _VALVE_FIXED
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Add the curve to the command."""
-        return u_in + self._change(values, u_in), memory
+        return u_in + self.curve(values, u_in), memory
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Change of the flow over the command."""
         u = np.linspace(0.0, 100.0, 401)
-        y = base["gain"] * np.asarray(self._change(values, jnp.asarray(u)))
+        y = base["gain"] * np.asarray(self.curve(values, jnp.asarray(u)))
         return (Curve(u, y, "command, %", "extra flow, mL/s", (1,)),)
-
-    def _change(self, values: Values, u: Array) -> Array:
-        free = iter(self.coefficients(values))
-        return PiecewiseLinear(_VALVE_KNOTS)(
-            u, [0.0 if x in (0.0, _VALVE_FIXED) else next(free) for x in _VALVE_KNOTS]
-        )
 
 
 #: Time constants, s.
@@ -185,11 +180,11 @@ class SupplyMemory(FilterBank):
 
 #: p - PEEP where the factor bends, cmH2O; where it is 1, the conductance is 1 / R_ex.
 _OUTLET_KNOTS = (0.0, 2.0, 5.0, 10.0, 20.0)
-_OUTLET_FIXED = 5.0
-_OUTLET_FREE = tuple(d for d in _OUTLET_KNOTS if d != _OUTLET_FIXED)
+_OUTLET_FIXED = (5.0,)
+_OUTLET_FREE = tuple(d for d in _OUTLET_KNOTS if d not in _OUTLET_FIXED)
 
 
-class OutletShape(BasisTerm):
+class OutletShape(Lines):
     """A factor of the open valve's conductance, by the pressure across it.
 
     The factor is 1 at 5 cmH2O above PEEP: there R_ex is R_ex.
@@ -209,23 +204,18 @@ class OutletShape(BasisTerm):
         confusable=("exhalation_valve_delay", "inertance"),
     )  # fmt: skip
     rank = 1  # a factor of how far the valve is open, however late that is
+    knots, fixed = _OUTLET_KNOTS, _OUTLET_FIXED
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Conductance at the last pressure."""
-        excess = self._excess(values, view.pressure - view.peep)
+        excess = self.curve(values, view.pressure - view.peep)
         return network.plus(outlet=network.outlet * excess)
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Conductance over pressure."""
         d = np.linspace(0.0, 30.0, 121)
-        y = 1e3 / base["R_ex"] * np.asarray(self._excess(values, jnp.asarray(d)))
+        y = 1e3 / base["R_ex"] * np.asarray(self.curve(values, jnp.asarray(d)))
         return (Curve(d, y, "p - PEEP, cmH2O", "extra conductance, mL/s per cmH2O", (0,)),)
-
-    def _excess(self, values: Values, above: Array) -> Array:
-        free = iter(self.coefficients(values))
-        return PiecewiseLinear(_OUTLET_KNOTS)(
-            above, [0.0 if d == _OUTLET_FIXED else next(free) for d in _OUTLET_KNOTS]
-        )
 
 
 #: Time constants of the opening, s.

@@ -1,4 +1,4 @@
-"""DQN: values of discrete corrections, learned from a replay buffer, double and n-step."""
+"""DQN: values of discrete corrections, learned from a replay buffer by double Q-learning."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from jax import Array
 
 from ventbench.controllers import rl_policy
 from ventbench.controllers.rl_policy import CHOICES, GreedyPolicy, Parameters, TanhNetwork
-from ventbench.task import protocol
 from ventbench.train.rl import episodes
 
 
@@ -23,8 +22,8 @@ class Replay:
 
     features: Array  #: features before the choice, ``(N, features)``.
     choice: Array  #: index into the corrections, ``(N,)``.
-    reward: Array  #: discounted sum of the next rewards, ``(N,)``.
-    discount: Array  #: discount of what follows them; 0 where the breath ends, ``(N,)``.
+    reward: Array  #: the next reward, ``(N,)``.
+    discount: Array  #: discount of what follows it; 0 where the breath ends, ``(N,)``.
     following: Array  #: features then, ``(N, features)``.
 
 
@@ -47,13 +46,11 @@ class DQN:
     breaths: int = 24  #: breaths of an iteration, three an episode.
     iterations: int = 2400  #: iterations of a training, over which the learning rate falls to zero.
     learning_rate: float = 3e-3  #: initial learning rate of Adam.
-    vary: bool = True  #: draw cells with noise and deviations; false for nominal ones.
     widths: tuple[int, ...] = (64, 64)  #: hidden layers of the network.
     updates: int = 8  #: updates of an iteration.
     batch: int = 256  #: steps of an update.
     memory: int = 2400  #: breaths that the replay holds.
     discount: float = 0.95  #: factor of a reward one step later.
-    steps: int = 1  #: rewards that are summed before the value of the next state is added.
     #: share by which the target network moves to the online network at each update.
     follow: float = 0.01
     #: share of random choices, at the start and at the end.
@@ -112,9 +109,7 @@ class DQN:
 
     def _collect(self, state: DQNState, plants: episodes.Lungs, key: Array) -> Replay:
         cells_key, roll_key = jax.random.split(key)
-        count = self.breaths // protocol.BREATHS
-        first = state.iteration * max(count // plants.count, 1)
-        drawn = episodes.draw(cells_key, plants, count, first, self.vary)
+        drawn = episodes.of_iteration(cells_key, plants, self.breaths, state.iteration)
         start, end = self.explore
         progress = jnp.minimum(state.iteration / (self.explored * self.iterations), 1.0)
         share = start + (end - start) * progress
@@ -128,15 +123,14 @@ class DQN:
             return base + jnp.asarray(CHOICES, base.dtype)[choice], choice
 
         x, choice, rewards = episodes.roll(drawn, act, roll_key)
-        steps = jnp.arange(episodes.STEPS) + self.steps
-        inside = steps < episodes.STEPS
-        discount = jnp.where(inside, self.discount**self.steps, 0.0)
+        following = jnp.arange(episodes.STEPS) + 1
+        discount = jnp.where(following < episodes.STEPS, self.discount, 0.0)
         replay = Replay(
             x,
             choice.astype(jnp.int32),
-            episodes.n_step(rewards, self.discount, self.steps),
+            rewards,
             jnp.broadcast_to(discount[:, None], rewards.shape),
-            x[jnp.minimum(steps, episodes.STEPS - 1)],
+            x[jnp.minimum(following, episodes.STEPS - 1)],
         )
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), replay)
 

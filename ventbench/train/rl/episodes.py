@@ -84,6 +84,12 @@ def draw(
     return Episodes(plants, cells, lungs.weights[lung, pip])
 
 
+def of_iteration(key: Array, lungs: Lungs, breaths: int, iteration: Array) -> Episodes:
+    """Draw the episodes of an iteration, three breaths each; the PIPs come in turn."""
+    count = breaths // protocol.BREATHS
+    return draw(key, lungs, count, iteration * max(count // lungs.count, 1))
+
+
 def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
     """Run episodes.
 
@@ -171,14 +177,6 @@ def advantages(rewards: Array, values: Array, discount: float, trace: float) -> 
     """
     following = jnp.concatenate([values[1:], jnp.zeros_like(values[:1])])
     return discounted(rewards + discount * following - values, discount * trace)
-
-
-def n_step(rewards: Array, discount: float, n: int) -> Array:
-    """Discounted sum of the next ``n`` rewards, fewer at the end; shape of ``rewards``."""
-    padded = jnp.concatenate([rewards, jnp.zeros_like(rewards[:1].repeat(n, axis=0))])
-    return sum(
-        (discount**k * padded[k : k + len(rewards)] for k in range(n)), jnp.zeros_like(rewards)
-    )
 
 
 def double_q_target(reward: Array, discount: Array, online: Array, target: Array) -> Array:

@@ -1,4 +1,8 @@
-"""PPO: proximal policy optimisation of a Gaussian correction."""
+"""Two ways to improve a correction: through the simulator's derivatives, and PPO without them.
+
+The policy gradient differentiates the error of whole breaths; proximal policy optimisation samples
+commands from a Gaussian around the network's output.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +16,65 @@ import optax
 from jax import Array
 
 from ventbench.controllers import rl_policy
-from ventbench.controllers.rl_policy import SCALE, GaussianPolicy, TanhNetwork
-from ventbench.task import protocol
+from ventbench.controllers.rl_policy import SCALE, GaussianPolicy, Parameters, TanhNetwork
 from ventbench.train.rl import episodes
 
 
 @flax.struct.dataclass
-class PPOState:
-    """One training: parameters of both networks and the spread, optimiser, key, iteration."""
+class State:
+    """One training: parameters, the optimiser's state, key, number of the iteration."""
 
-    parameters: dict[str, Any]
+    parameters: Any  #: of the network; for PPO of both networks and the spread, by name.
     optimiser: Any
     key: Array
     iteration: Array
+
+
+@dataclass(frozen=True)
+class PolicyGradient:
+    """Settings of the policy gradient; one iteration is one update."""
+
+    breaths: int = 6  #: breaths of an update, three an episode, PIPs in turn.
+    iterations: int = 1600  #: iterations of a training, over which the learning rate falls to zero.
+    learning_rate: float = 3e-3  #: initial learning rate of Adam.
+    widths: tuple[int, ...] = (32, 32)  #: hidden layers of the network.
+
+    @property
+    def network(self) -> TanhNetwork:
+        """One output."""
+        return TanhNetwork(self.widths, 1)
+
+    @property
+    def _optimiser(self) -> optax.GradientTransformation:
+        schedule = optax.cosine_decay_schedule(self.learning_rate, self.iterations)
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+
+    def init(self, key: Array) -> State:
+        """Return the state at the start of a training."""
+        network_key, key = jax.random.split(key)
+        parameters = rl_policy.init_parameters(self.network, network_key)
+        return State(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
+
+    def iterate(self, state: State, plants: episodes.Lungs) -> State:
+        """One update on lungs."""
+        cells_key, roll_key, key = jax.random.split(state.key, 3)
+        drawn = episodes.of_iteration(cells_key, plants, self.breaths, state.iteration)
+
+        def loss(parameters: Parameters) -> Array:
+            def act(key: Array, x: Array, base: Array) -> tuple[Array, None]:
+                mean: Array = self.network.apply(parameters, x)  # type: ignore[assignment]
+                return base + SCALE * mean[..., 0], None
+
+            return -jnp.mean(episodes.roll(drawn, act, roll_key)[2])
+
+        gradient = jax.grad(loss)(state.parameters)
+        updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.parameters)
+        parameters = optax.apply_updates(state.parameters, updates)
+        return State(parameters, optimiser, key, state.iteration + 1)
+
+    def policy(self, state: State) -> GaussianPolicy:
+        """The learned policy."""
+        return GaussianPolicy(state.parameters, self.network)
 
 
 @flax.struct.dataclass
@@ -51,12 +101,11 @@ def clipped_loss(ratio: Array, advantage: Array, clip: float) -> Array:
 
 @dataclass(frozen=True)
 class PPO:
-    """Settings; one iteration is one batch of breaths, used ``epochs`` times."""
+    """Settings of PPO; one iteration is one batch of breaths, used ``epochs`` times."""
 
     breaths: int = 96  #: breaths of an iteration, three an episode.
     iterations: int = 600  #: iterations of a training, over which the learning rate falls to zero.
     learning_rate: float = 1e-3  #: initial learning rate of Adam.
-    vary: bool = True  #: draw cells with noise and deviations; false for nominal ones.
     widths: tuple[int, ...] = (32, 32)  #: hidden layers of both networks.
     epochs: int = 6  #: passes over a batch.
     minibatches: int = 4  #: minibatches of a pass.
@@ -64,7 +113,6 @@ class PPO:
     trace: float = 0.9  #: lambda of the generalised advantage estimates.
     clip: float = 0.2  #: limit of the change of the ratio of probabilities.
     spread: float = 0.3  #: initial standard deviation of the policy, in units of ``SCALE``.
-    entropy: float = 0.0  #: weight of the entropy in the loss.
 
     @property
     def network(self) -> TanhNetwork:
@@ -81,7 +129,7 @@ class PPO:
         schedule = optax.linear_schedule(self.learning_rate, 0.0, updates)
         return optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule, eps=1e-5))
 
-    def init(self, key: Array) -> PPOState:
+    def init(self, key: Array) -> State:
         """Return the state at the start of a training."""
         actor_key, critic_key, key = jax.random.split(key, 3)
         parameters = {
@@ -89,9 +137,9 @@ class PPO:
             "critic": rl_policy.init_parameters(self._critic, critic_key),
             "log_spread": jnp.log(jnp.asarray(self.spread)),
         }
-        return PPOState(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
+        return State(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
 
-    def iterate(self, state: PPOState, plants: episodes.Lungs) -> PPOState:
+    def iterate(self, state: State, plants: episodes.Lungs) -> State:
         """Collect breaths on lungs and learn from them."""
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         batch = self._collect(state, plants, collect_key)
@@ -105,9 +153,9 @@ class PPO:
 
         keys = jax.random.split(learn_key, self.epochs)
         (parameters, optimiser), _ = jax.lax.scan(epoch, (state.parameters, state.optimiser), keys)
-        return PPOState(parameters, optimiser, key, state.iteration + 1)
+        return State(parameters, optimiser, key, state.iteration + 1)
 
-    def policy(self, state: PPOState) -> GaussianPolicy:
+    def policy(self, state: State) -> GaussianPolicy:
         """The learned policy: its mean."""
         return GaussianPolicy(state.parameters["actor"], self.network)
 
@@ -117,12 +165,10 @@ class PPO:
     def _value(self, parameters: Any, x: Array) -> Array:
         return self._critic.apply(parameters["critic"], x)[..., 0]  # type: ignore[index]
 
-    def _collect(self, state: PPOState, plants: episodes.Lungs, key: Array) -> PPOBatch:
+    def _collect(self, state: State, plants: episodes.Lungs, key: Array) -> PPOBatch:
         parameters = state.parameters
         cells_key, roll_key = jax.random.split(key)
-        count = self.breaths // protocol.BREATHS
-        first = state.iteration * max(count // plants.count, 1)
-        drawn = episodes.draw(cells_key, plants, count, first, self.vary)
+        drawn = episodes.of_iteration(cells_key, plants, self.breaths, state.iteration)
 
         def act(key: Array, x: Array, base: Array) -> tuple[Array, tuple[Array, Array]]:
             mean = self._mean(parameters, x)
@@ -151,4 +197,4 @@ class PPO:
         policy = jnp.mean(clipped_loss(ratio, advantage, self.clip))
         wanted = part.value + part.advantage
         critic = jnp.mean((self._value(parameters, part.features) - wanted) ** 2)
-        return policy + 0.5 * critic - self.entropy * log_spread
+        return policy + 0.5 * critic

@@ -37,8 +37,7 @@ from ventbench.train.plants import (
 )
 from ventbench.train.rl import episodes
 from ventbench.train.rl.dqn import DQN
-from ventbench.train.rl.policy_gradient import PolicyGradient
-from ventbench.train.rl.ppo import PPO
+from ventbench.train.rl.ppo import PPO, PolicyGradient
 
 
 class Learner(Protocol):

@@ -1,0 +1,168 @@
+"""The pressure sensor and the clocks: a lag, a bent curve, an offset, and different rates."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from ventbench.physics.mechanism import (
+    Description,
+    Mechanism,
+    Pair,
+    Parameter,
+    Values,
+)
+
+
+class SensorLag(Mechanism):
+    """The reading follows the airway's pressure through one lag or two."""
+
+    description = Description(
+        name="sensor_lag", title="lag of the pressure sensor", site="sensor",
+        equation="tau dx/dt = p - x, second dy/dt = x - y",
+        parameters=(
+            Parameter("tau", "s", "time constant", 0.0, 0.25, 0.0, 0.05, 0.12),
+            Parameter("second", "s",
+                      "time constant of a lag behind the first, as of a filter behind a sampling "
+                      "line",
+                      0.0, 0.25, 0.0, 0.0, 0.0, shape=True),
+        ),
+        source="Low-pass filter of sensor, sampling line and electronics: 5 to 120 ms.",
+        signature="All edges of pressure are rounded, in inspiration and at the start of "
+        "expiration alike, whatever R is.",
+        confusable=("valve_lag", "circuit_compliance", "valve_delay"), detectable=0.019,
+        least=0.012, least_reason="a third of a sample: less is an offset between two clocks",
+        special_case_of=("sensor_memory",),
+        interchangeable=(("tau", "second"),),
+    )  # fmt: skip
+    stateful = True
+
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
+        """Pressure behind each lag, cmH2O."""
+        return jnp.stack([pressure + 0.0 * flow] * 2)
+
+    def reading(self, values: Values, pressure: Array, state: Array, length: Array) -> Pair:
+        """Implicit step towards the pressure; a lag of 0 s is there at once."""
+        first = (values["tau"] * state[0] + length * pressure) / (values["tau"] + length)
+        # So written, a second lag of 0 s changes no bit.
+        after = first + values["second"] / (values["second"] + length) * (state[1] - first)
+        return after, jnp.stack([first, after])
+
+
+#: Pressure at which the bent curve meets the straight one again, cmH2O.
+SPAN = 40.0
+
+#: Distance from either end of the span up to which the parabola is followed, cmH2O.
+_BEYOND = 20.0
+
+#: Least slope of the curve, which must rise everywhere; pressures beyond follow the tangent.
+_LEAST_SLOPE = 0.2
+
+
+class SensorCurve(Mechanism):
+    """A parabola on top of the true pressure."""
+
+    description = Description(
+        name="sensor_curve", title="bent characteristic of the pressure sensor", site="sensor",
+        equation="y = p + 4 bend p / 40 (1 - p / 40)",
+        parameters=(
+            Parameter("bend", "cmH2O",
+                      "error at 20 cmH2O of a sensor that is right at 0 and at 40 cmH2O",
+                      -6.0, 6.0, 0.0, 0.9, 1.4),
+        ),
+        source="Terminal-base nonlinearity of piezoresistive sensors: 0.1 to 1 % of full scale if "
+        "compensated, several percent if not.",
+        signature="An error by pressure alone, in inspiration and expiration alike, whatever flow "
+        "and volume are.",
+        confusable=("nonlinear_compliance", "supply_pressure"), least=0.25,
+        least_reason="half a percent of a usual sensor's full scale",
+        special_case_of=("sensor_shape",),
+    )  # fmt: skip
+
+    def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
+        """Bent pressure."""
+        steepness = 4.0 * values["bend"] / SPAN
+        # The parabola where it rises and pressures are usual, its tangent beyond.
+        low, high = _rising(steepness)
+        inside = jnp.clip(pressure, low, high)
+        slope = 1.0 + steepness * (1.0 - 2.0 * inside / SPAN)
+        return inside + steepness * inside * (1.0 - inside / SPAN) + slope * (pressure - inside)
+
+    def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
+        """True pressure of a reading, by Newton's method, which the tangents make safe."""
+        steepness = 4.0 * values["bend"] / SPAN
+        low, high = _rising(steepness)
+        pressure = shown
+        for _ in range(8):
+            inside = jnp.clip(pressure, low, high)
+            slope = 1.0 + steepness * (1.0 - 2.0 * inside / SPAN)
+            off = self.sensor_output(values, pressure, position) - shown
+            pressure = pressure - off / slope
+        return pressure
+
+
+def _rising(steepness: Array) -> tuple[Array, Array]:
+    """Ends of the pressures at which the parabola is steep enough, cmH2O."""
+    # Slope 1 + s (1 - 2 p / 40) = least at p = 20 (1 + (1 - least) / s).
+    size = jnp.maximum(jnp.abs(steepness), 1e-6)
+    reach = 0.5 * SPAN * (1.0 - _LEAST_SLOPE) / size
+    middle = 0.5 * SPAN
+    low = jnp.where(steepness < 0, jnp.maximum(middle - reach, -_BEYOND), -_BEYOND)
+    high = jnp.where(steepness > 0, jnp.minimum(middle + reach, SPAN + _BEYOND), SPAN + _BEYOND)
+    return low, high
+
+
+class ClockOffset(Mechanism):
+    """One dead time of all commands: that of a path or clock that all readings share."""
+
+    description = Description(
+        name="clock_offset", title="delay between commands and pressure", site="sensor",
+        equation="y(t) = p(t - offset): both commands act late by one time",
+        parameters=(
+            Parameter("offset", "s", "common dead time",
+                      0.0, 0.15, 0.0, 0.03, 0.06, scan=tuple(0.01 * k for k in range(16)),
+                      kinked=True),
+        ),
+        source="Clocks that are not aligned, a buffer of one to three samples before the log, or a "
+        "sensor with a dead time.",
+        signature="All that happens in pressure comes late by one time, at edges of both valves "
+        "alike.",
+        confusable=("valve_delay", "exhalation_valve_delay", "sensor_lag"), least=0.008,
+        least_reason="a quarter of a sample: less is within the time stamps of a log",
+    )  # fmt: skip
+
+    def dead_time(self, values: Values, time: Array) -> Array:
+        """The delay, s."""
+        return values["offset"]
+
+    def outlet_dead_time(self, values: Values, u_out: Array, time: Array) -> Array:
+        """The delay, s; before the breath, nothing leaves, as the lung is at rest."""
+        return jnp.where((time < values["offset"]) & (u_out < 0.5), 0.0, values["offset"])
+
+
+class ClockSkew(Mechanism):
+    """A common dead time that grows through each breath."""
+
+    description = Description(
+        name="clock_skew", title="clocks of commands and pressure that run apart", site="sensor",
+        equation="y(t) = p(t - skew t), t = time since the start of the breath",
+        parameters=(
+            Parameter("skew", "1", "share of the time by which pressure falls behind",
+                      0.0, 0.04, 0.0, 0.01, 0.025, scan=(0.0, 0.003, 0.006, 0.012, 0.02, 0.03),
+                      kinked=True, share=True),
+        ),
+        source="Quartz clocks agree to 0.01 %; those of operating systems, and rates that are "
+        "given as rounded numbers, to 0.1 to 4 %.",
+        signature="Early edges are on time; others come late in proportion to the time in the "
+        "breath.",
+        confusable=("clock_offset", "exhalation_valve_delay", "valve_delay"), least=0.002,
+        least_reason="4 ms at the end of a breath of 2 s",
+    )  # fmt: skip
+
+    def dead_time(self, values: Values, time: Array) -> Array:
+        """The delay of a command at a time in the breath, s."""
+        return values["skew"] * time
+
+    def outlet_dead_time(self, values: Values, u_out: Array, time: Array) -> Array:
+        """The delay of a command at a time in the breath, s."""
+        return values["skew"] * time

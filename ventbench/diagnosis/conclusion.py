@@ -162,7 +162,7 @@ def conclude(
         if unnamed is None and term.name in SWINGS:
             swing, gained = _swing(evaluator, full, term)
             if passes_heldout_test(
-                gained, evaluator.settings.held_out_test, evaluator.settings.search.swing_nats
+                gained, evaluator.settings.held_out_test, evaluator.settings.search.course_nats
             ):
                 place = SWINGS[term.name][0]
                 unnamed = UnnamedEffect(

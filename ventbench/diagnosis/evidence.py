@@ -36,7 +36,7 @@ from ventbench.diagnosis.linearised import (
     simulate,
     within,
 )  # fmt: skip
-from ventbench.physics.catalogue import basis_terms, library
+from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.system_id.data import Data
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import parameter_of
@@ -51,7 +51,7 @@ MUSCLES = ("cough", "unknown:muscles")
 
 #: Prior odds of a term, of an unknown at a place beside those of a name, and the power of the
 #: likelihood: no model has what neighbouring samples share.
-_ODDS, _PLACE, _WARMTH = 0.7, 0.3, 0.2
+_ODDS, _PLACE, _WARMTH = 0.7, 0.1, 0.2
 
 #: Standard deviations of the logarithm of the breaths' gains that are compared.
 _SCATTERS = (0.003, SCATTER, 0.03, 0.1)
@@ -110,9 +110,15 @@ def hypothesis_of(terms: Iterable[Term]) -> tuple[Hypothesis, dict[str, float]]:
     return Hypothesis(tuple(names), tuple(free), tuple(fixed)), start
 
 
-def prior(names: Iterable[str]) -> float:
-    """Log prior of a set of names."""
-    one, unknown = np.log(_ODDS / len(library())), np.log(_PLACE)
+def prior(names: Iterable[str], warmth: float = 1.0) -> float:
+    """Log prior of a set of names.
+
+    Args:
+        names: the set.
+        warmth: power of the likelihood that it is weighed against. Beside a whole likelihood, which
+            is surer than any model is, an unknown at a place must be as much less likely.
+    """
+    one, unknown = np.log(_ODDS / len(library())), np.log(_PLACE) / warmth
     return float(sum(one + unknown * (n in basis_terms() or ":" in n) for n in names))
 
 
@@ -158,7 +164,7 @@ def enumerate_sets(
 
     def score(terms: Set) -> float:
         key, value = names_of(terms), evidence(G, b, terms)
-        total = value + prior(key)
+        total = value + prior(key, _WARMTH)
         if len(key) == len(terms) and (key not in best or total > best[key][0]):
             best[key] = (total, terms)
         return value
@@ -236,25 +242,54 @@ class _Search:
             points = [t for n in also for t in around.terms if t.name == n]
             terms = tuple({t.name: t for t in reversed(points)}.values())
             self.attempt(around, noise, terms, self.base)
+        seen: dict[frozenset[str], tuple[Simulated, Noise]] = {frozenset(): (around, noise)}
         for _ in range(2 * self.settings.most_terms):
-            best = self.ordered()[0]
-            if not best.terms or len(best.terms) >= self.settings.most_terms:
+            chosen = next((s for s in self.leading() if names_of(s.terms) not in seen), None)
+            if chosen is None:
                 break
-            around, own = self.around(best.fitted), names_of(best.terms)
-            noise = self.known(around, best.fitted, noise, best.terms, loose=True).left
-            one = self.known(around, best.fitted, noise, best.terms)
-            more = enumerate_sets(one, (), 1, self.settings.beam)
-            for terms in [t for _, t in more if t and not names_of(t) & own][:3]:
-                self.attempt(around, noise, (*best.terms, *terms), best.fitted)
-            for term in best.terms:
-                rest = tuple(t for t in best.terms if t is not term)
-                self.attempt(around, noise, rest, best.fitted)
+            seen[names_of(chosen.terms)] = self.extend(chosen, noise)
+            around, noise = seen.get(names_of(self.ordered()[0].terms), (around, noise))
             self.rescore(around, noise)
-            if names_of(self.ordered()[0].terms) == own:
-                break
         ordered = self.ordered()
         ranked = main.ways[main.scatters.index(ordered[0].scatter)]
         return Posterior(tuple(ordered), weigh(ordered, ranked), self.base, ordered[0].scatter)
+
+    def leading(self) -> list[Known]:
+        """The likeliest set, and the likeliest of names alone if it is not far behind."""
+        ordered = self.ordered()
+        named = [s for s in ordered if not names_of(s.terms) & basis_terms().keys()]
+        near = [s for s in named[:1] if ordered[0].evidence - s.evidence < self.settings.much]
+        return [ordered[0], *near]
+
+    def extend(self, chosen: Known, noise: Noise) -> tuple[Simulated, Noise]:
+        """Fit sets with one term more, less or other, and return what they were chosen by."""
+        around, own = self.around(chosen.fitted), names_of(chosen.terms)
+        noise = self.known(around, chosen.fitted, noise, chosen.terms, loose=True).left
+        if len(own) < self.settings.most_terms:
+            known = self.known(around, chosen.fitted, noise, chosen.terms)
+            more = enumerate_sets(known, (), 1, self.settings.beam)
+            for terms in [t for _, t in more if t and not names_of(t) & own][:3]:
+                self.attempt(around, noise, (*chosen.terms, *terms), chosen.fitted)
+        for term in chosen.terms:
+            rest = tuple(t for t in chosen.terms if t is not term)
+            self.attempt(around, noise, rest, chosen.fitted)
+            if term.name in basis_terms():
+                self.name(term.name, rest, noise)
+        return around, noise
+
+    def name(self, unknown: str, rest: Set, noise: Noise) -> None:
+        """Fit the likeliest mechanisms in the place of a basis term that contains them."""
+        left = self.tried.get(names_of(rest))
+        if left is None:
+            return
+        around = self.around(left.fitted)
+        known = self.known(around, left.fitted, noise, rest)
+        special = {
+            n for n in self.names if unknown in mechanism(n).description.special_case_of
+        } - names_of(rest)
+        terms = [t[0] for _, t in enumerate_sets(known, (), 1, 1) if t and t[0].name in special]
+        for term in terms[: self.settings.fits - 1]:
+            self.attempt(around, noise, (*rest, term), left.fitted)
 
     def around(self, fitted: FittedModel) -> Simulated:
         """All candidates, simulated around a fit."""
@@ -360,7 +395,9 @@ class _Search:
 
     def ordered(self) -> list[Known]:
         """Sets that were fitted, likeliest first."""
-        return sorted(self.tried.values(), key=lambda s: -s.evidence - prior(names_of(s.terms)))
+        return sorted(
+            self.tried.values(), key=lambda s: -s.evidence - prior(names_of(s.terms), _WARMTH)
+        )
 
 
 def told_posterior(
@@ -387,7 +424,10 @@ def weigh(
 ) -> dict[frozenset[str], float]:
     """Posterior of each set of names; the likeliest that was not fitted is a nat behind."""
     logs = {names_of(s.terms): _WARMTH * s.evidence for s in scored}
-    at = {names_of(terms): _WARMTH * (value - prior(names_of(terms))) for value, terms in linear}
+    at = {}
+    for value, terms in linear:
+        names = names_of(terms)
+        at[names] = _WARMTH * (value - prior(names, _WARMTH))
     logs = {names: value + prior(names) for names, value in logs.items()}
     offset = max(logs.values()) - 1.0 - max(value + prior(k) for k, value in at.items())
     for names, value in at.items():

@@ -103,7 +103,7 @@ def in_time(
             terms.append(_likeliest_swing(known, name, ways))
     if "lost_commands" not in excluded:
         terms += _commands(known, partition, around, settings)
-    return terms
+    return [replace(term, odds=term.odds - settings.search.course_nats) for term in terms]
 
 
 def _of_some_breaths(known: Known, partition: Partition, excluded: Collection[str]) -> list[Term]:

@@ -231,7 +231,7 @@ def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _Found | None:
 
 def _least(evaluator: Evaluator) -> float:
     """Log-likelihood that an effect must gain, nats: as much as any course in time."""
-    return evaluator.settings.search.swing_nats
+    return evaluator.settings.search.course_nats
 
 
 def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_Found]:

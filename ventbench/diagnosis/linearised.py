@@ -23,7 +23,7 @@ from ventbench.system_id.problem import parameter_of
 #: Standard deviations: of a characteristic and of what every rig has of a basis term, as shares of
 #: their spread; of a mechanism, as a share of the least strength that is named, and of one
 #: that every rig has.
-_FORM, _REST, _LEAST, _UBIQUITOUS = 0.15, 0.01, 0.2, 0.5
+_FORM, _REST, _LEAST, _UBIQUITOUS = 0.15, 0.01, 0.1, 0.3
 
 #: Standard deviation of the logarithm of the valve's gain from breath to breath.
 SCATTER = 0.01
@@ -108,7 +108,7 @@ class Simulated:
                 width = np.array([self.basis[j][1] for j in own])
                 A = np.stack([self.columns[j].reshape(-1) for j in own], axis=1) * width
                 ridge = 1e-3 * np.trace(A.T @ A) / len(own) * np.eye(len(own))
-                c = width * np.linalg.solve(A.T @ A + ridge, A.T @ effect.reshape(-1))
+                c = width * (np.linalg.pinv(A.T @ A + ridge) @ (A.T @ effect.reshape(-1)))
                 found |= dict(zip(own, (_FORM * np.abs(c) + 1e-12).tolist(), strict=True))
         return found
 
@@ -175,7 +175,7 @@ def simulate(
     move({"gain": 1.01 * values[:, order.index("gain")]})
     basis: dict[int, tuple[str, float]] = {}
     of_basis: dict[str, list[int]] = {}
-    for name in (n for n in unnamed if n not in around.names):
+    for name in unnamed:
         for p in mechanism(name).description.parameters:
             path, spread = f"{name}.{p.name}", p.spread or 1.0
             k = move({path: values[:, order.index(path)] + 0.1 * spread})

@@ -68,9 +68,9 @@ class SearchSettings:
     #: factor between a refitted R or C and its label beyond which sets are also enumerated around
     #: the label: strong lags let a refit take R to nothing.
     label_factor: float = 1.3
-    #: held-out log-likelihood, nats, from which a periodic input is accepted: more than for a term,
-    #: since places and frequencies are searched.
-    swing_nats: float = 8.0
+    #: log-likelihood, nats, that a course in time must gain: more than a term, since breaths and
+    #: frequencies are searched.
+    course_nats: float = 8.0
     #: root mean square, cmH2O, of the error that a nonparametric term beside mechanisms explains,
     #: to be kept: less may be their form, or what every rig has.
     least_change: float = 0.1

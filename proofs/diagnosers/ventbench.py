@@ -35,7 +35,7 @@ _SITES = {
 }  # fmt: skip
 
 #: Share that held-out breaths have beside the posterior of the search, and share of all places.
-_ACCEPTED, _UNSURE = 0.5, 0.05
+_ACCEPTED, _UNSURE = 0.8, 0.02
 
 #: Most hypotheses.
 _MOST = 100

@@ -269,10 +269,12 @@ class _Search:
             known = self.known(around, chosen.fitted, noise, chosen.terms)
             more = enumerate_sets(known, (), 1, self.settings.beam)
             for terms in [t for _, t in more if t and not names_of(t) & own][:3]:
-                self.attempt(around, noise, (*chosen.terms, *terms), chosen.fitted)
+                if names_of(terms) | own not in self.tried:
+                    self.attempt(around, noise, (*chosen.terms, *terms), chosen.fitted)
         for term in chosen.terms:
             rest = tuple(t for t in chosen.terms if t is not term)
-            self.attempt(around, noise, rest, chosen.fitted)
+            if names_of(rest) not in self.tried:
+                self.attempt(around, noise, rest, chosen.fitted)
             if term.name in basis_terms():
                 self.name(term.name, rest, noise)
         return around, noise
@@ -289,7 +291,8 @@ class _Search:
         } - names_of(rest)
         terms = [t[0] for _, t in enumerate_sets(known, (), 1, 1) if t and t[0].name in special]
         for term in terms[: self.settings.fits - 1]:
-            self.attempt(around, noise, (*rest, term), left.fitted)
+            if names_of(rest) | {term.name} not in self.tried:
+                self.attempt(around, noise, (*rest, term), left.fitted)
 
     def around(self, fitted: FittedModel) -> Simulated:
         """All candidates, simulated around a fit."""

@@ -6,6 +6,7 @@ Its posterior is passed on, beside what held-out breaths accept of it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,16 @@ _SITES = {
     "command": "inspiratory_valve", "expiratory valve": "expiratory_valve",
 }  # fmt: skip
 
-#: Share that held-out breaths have beside the posterior of the search, and share of all places.
-_ACCEPTED, _UNSURE = 0.8, 0.02
+
+@dataclass(frozen=True)
+class Calibration:
+    """Shares of the probability, fitted on opened cases (``benchmarks/adapter_calibration.py``)."""
+
+    accepted: float = 0.8  #: of what held-out breaths accept, beside the posterior of the search.
+    unsure: float = 0.02  #: of all places together.
+
+
+CALIBRATION = Calibration()
 
 #: Most hypotheses.
 _MOST = 100
@@ -77,12 +86,15 @@ def _predictions(found: Any, seen: Any, observed: Any) -> Any:
     )
 
 
-def hypotheses(found: Mapping[str, Any], vocabulary: Mapping[str, Any]) -> list[dict[str, Any]]:
+def hypotheses(
+    found: Mapping[str, Any], vocabulary: Mapping[str, Any], shares: Calibration = CALIBRATION
+) -> list[dict[str, Any]]:
     """Probabilities of a diagnosis: the posterior of its search, and what held-out breaths accept.
 
     Args:
         found: a diagnosis as JSON values.
         vocabulary: that of the case.
+        shares: weights of both.
     """
     always, places = _session(found), vocabulary["places"]
     known = vocabulary["names"].keys() | {f"unknown:{place}" for place in places}
@@ -93,18 +105,18 @@ def hypotheses(found: Mapping[str, Any], vocabulary: Mapping[str, Any]) -> list[
         odds[terms] = odds.get(terms, 0.0) + probability
 
     for place in places:
-        add(frozenset({f"unknown:{place}"}), _UNSURE / len(places))
+        add(frozenset({f"unknown:{place}"}), shares.unsure / len(places))
     whole = sum(each["probability"] for each in found["posterior"])
     for each in found["posterior"]:
         terms = frozenset(_public(name) for name in each["terms"])
-        add(terms, (1.0 - _UNSURE) * (1.0 - _ACCEPTED) * each["probability"] / whole)
+        add(terms, (1.0 - shares.unsure) * (1.0 - shares.accepted) * each["probability"] / whole)
     named = frozenset(missing["name"] for missing in found["mechanisms"])
     unknown = {} if found["slot"] is None else _by_place(found["slot"])
     if not named and not unknown and found["verdict"] == "unnamed":
         unknown = dict.fromkeys(places, 1.0 / len(places))
     for place, weight in (unknown or {"": 1.0}).items():
         terms = named | {f"unknown:{place}"} if place else named
-        add(terms, (1.0 - _UNSURE) * _ACCEPTED * weight)
+        add(terms, (1.0 - shares.unsure) * shares.accepted * weight)
     kept = sorted(odds.items(), key=lambda pair: -pair[1])[:_MOST]
     total = sum(probability for _, probability in kept)
     return [{"terms": sorted(terms), "probability": p / total} for terms, p in kept]

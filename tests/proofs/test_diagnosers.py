@@ -22,7 +22,7 @@ from proofs.diagnosers import classifier, lisdd
 from proofs.diagnosers.common import Templates
 from proofs.diagnosers.gaussian_process import _Process
 from proofs.diagnosers.sindy import thresholded_least_squares
-from proofs.diagnosers.ventbench import hypotheses
+from proofs.diagnosers.ventbench import CALIBRATION, hypotheses
 
 
 def test_the_project_enters_itself_and_its_rivals() -> None:
@@ -107,17 +107,19 @@ def terms(*names: str) -> frozenset[str]:
 
 
 def test_the_posterior_is_passed_on_beside_what_held_out_breaths_accept() -> None:
+    accepted, sure = CALIBRATION.accepted, 1.0 - CALIBRATION.unsure
     silent = told("nothing_missing")
-    assert silent[terms()] == pytest.approx(0.95)
-    assert silent[terms("unknown:lung")] == pytest.approx(0.05 / 9)
+    assert silent[terms()] == pytest.approx(sure)
+    assert silent[terms("unknown:lung")] == pytest.approx((1.0 - sure) / 9)
     two = [{"terms": ["leak", "recoil_shape"], "probability": 0.2},
            {"terms": ["valve_dead_band"], "probability": 0.6}]  # fmt: skip
     both = told("named", "leak", posterior=two)
-    assert both[terms("leak")] > both[terms("valve_dead_band")] > 0.25
+    assert both[terms("leak")] == pytest.approx(sure * accepted)
+    assert both[terms("valve_dead_band")] == pytest.approx(sure * (1.0 - accepted) * 0.75)
     ratio = both[terms("valve_dead_band")] / both[terms("leak", "unknown:lung")]
     assert ratio == pytest.approx(3.0)
     changed = told("named", changes=[{"of": "gain", "drifts": False}], saturated={})
-    assert changed[terms("gain_step", "saturation")] == pytest.approx(0.95)
+    assert changed[terms("gain_step", "saturation")] == pytest.approx(sure)
 
 
 def test_an_effect_without_a_name_is_at_its_places() -> None:

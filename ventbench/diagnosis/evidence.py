@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 from ventbench.base.arrays import Floats
 from ventbench.diagnosis.evaluator import Evaluator, estimate_noise
@@ -162,8 +163,16 @@ def enumerate_sets(
     G, b = known.products(known.rows(np.stack(columns, axis=1) * weight))
     best: dict[frozenset[str], tuple[float, Set]] = {frozenset(): (0.0, ())}
 
+    beside = {term.name: _integrated_out(G, b, term) for term in numbered}
+
     def score(terms: Set) -> float:
-        key, value = names_of(terms), evidence(G, b, terms)
+        wide = max(terms, key=lambda term: len(term.latent))
+        if len(wide.latent):
+            own, left, rest = beside[wide.name]
+            value = own + evidence(left, rest, tuple(term for term in terms if term is not wide))
+        else:
+            value = evidence(G, b, terms)
+        key = names_of(terms)
         total = value + prior(key, _WARMTH)
         if len(key) == len(terms) and (key not in best or total > best[key][0]):
             best[key] = (total, terms)
@@ -193,6 +202,15 @@ def enumerate_sets(
     return sorted(best.values(), key=lambda pair: -pair[0])
 
 
+def _integrated_out(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
+    """Log evidence of a term, and what is left of the products beside its coefficients."""
+    at, sd = list(term.main), np.array(term.spread)
+    L = np.linalg.cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
+    R = linalg.solve_triangular(L, sd[:, None] * np.column_stack([G[at], b[at]]), lower=True)
+    left = R.T @ R
+    return evidence(G, b, (term,)), G - left[:-1, :-1], b - left[:-1, -1]
+
+
 class _View(NamedTuple):
     """A linearisation, and its sets of terms."""
 
@@ -218,6 +236,7 @@ class _Search:
         if self.unnamed is None:
             self.unnamed = tuple(basis_terms())
         self.tried: dict[frozenset[str], Known] = {}
+        self.near: set[frozenset[str]] = set()  # of those, what is not far behind
 
     def run(self, also: Sequence[str]) -> Posterior:
         """Search."""
@@ -237,6 +256,7 @@ class _Search:
         )
         around, noise, self.scatters = main.around, main.noise, main.scatters
         self.tried[frozenset()] = self.known(around, self.base, noise)
+        self.near.add(frozenset())
         self.rescore(around, noise)
         if also:
             points = [t for n in also for t in around.terms if t.name == n]
@@ -390,17 +410,21 @@ class _Search:
             or self.known(around, before.fitted, noise, terms).evidence < made.evidence
         ):
             self.tried[names_of(terms)] = made
+            self.near.add(names_of(terms))
 
     def rescore(self, around: Simulated, noise: Noise) -> None:
-        """Score all sets alike."""
-        for key, s in self.tried.items():
+        """Score all sets alike, but for those that are far behind."""
+        for key in self.near:
+            s = self.tried[key]
             self.tried[key] = self.known(around, s.fitted, noise, s.terms)
+        most = max(self.tried[key].evidence for key in self.near)
+        far = self.settings.far_behind
+        self.near = {key for key in self.near if self.tried[key].evidence > most - far}
 
     def ordered(self) -> list[Known]:
-        """Sets that were fitted, likeliest first."""
-        return sorted(
-            self.tried.values(), key=lambda s: -s.evidence - prior(names_of(s.terms), _WARMTH)
-        )
+        """Sets that were fitted and are not far behind, likeliest first."""
+        near = [self.tried[key] for key in self.near]
+        return sorted(near, key=lambda s: -s.evidence - prior(names_of(s.terms), _WARMTH))
 
 
 def told_posterior(

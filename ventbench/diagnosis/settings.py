@@ -65,6 +65,7 @@ class SearchSettings:
     beam: int = 24  #: sets of each size that are extended by another term.
     fits: int = 4  #: sets of the linear problem that are fitted.
     most_terms: int = 5  #: most terms of a set.
+    far_behind: float = 500.0  #: log evidence, nats, by which a set is behind that is given up.
     #: factor between a refitted R or C and its label beyond which sets are also enumerated around
     #: the label: strong lags let a refit take R to nothing.
     label_factor: float = 1.3

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.selection.acceptance import (
+from ventbench.diagnosis.acceptance import (
     excludes_neutral,
     explained_share,
     is_consistent,

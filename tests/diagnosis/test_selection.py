@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from hardware_eval.emulation.cases import Base
+from ventbench.diagnosis import acceptance
+from ventbench.diagnosis.acceptance import passes_heldout_test
 from ventbench.diagnosis.evaluator import (
     estimate_noise,
     fit_with_noise,
 )
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.selection import acceptance
-from ventbench.diagnosis.selection.acceptance import passes_heldout_test
 from ventbench.diagnosis.settings import HeldOutTestSettings
 from ventbench.system_id import Noise
 

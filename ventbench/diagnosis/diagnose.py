@@ -13,6 +13,7 @@ import numpy as np
 from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
+from ventbench.diagnosis.acceptance import explained_share
 from ventbench.diagnosis.adequacy import check_residuals, detection_limits
 from ventbench.diagnosis.conclusion import Alternatives, Conclusion
 from ventbench.diagnosis.corrected import Correction, correct
@@ -46,7 +47,6 @@ from ventbench.diagnosis.residual_analysis import (
     sensor_noise,
 )
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.diagnosis.selection.acceptance import explained_share
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
     describe_otherwise,

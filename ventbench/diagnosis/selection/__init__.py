@@ -1,1 +1,0 @@
-"""Selection of the mechanisms that a recording needs."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from ventbench.diagnosis.evaluator import (
 from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
 from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
-from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
+from ventbench.diagnosis.linearised import EFFORT, Known, Term, gaussian, names_of
 from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.noise import Noise, robust_noise
@@ -136,16 +136,11 @@ def conclude(
     found = evidence.search(
         replace(evaluator, training=every), () if earlier is None else earlier.names
     )
-    best = found.best
     tell("comparing with held-out breaths")
     base = fit_with_noise(evaluator, Hypothesis())
-    full = _fitted(evaluator, found)
-    gain_sd = _gain_sd(evaluator, full, found.scatter)
-    if gain_sd:
-        evaluator = replace(evaluator, gain_sd=gain_sd)
-        full = fit_with_noise(evaluator, full.hypothesis, full)
-    whole = full
-    full, gains, worths = _supported(evaluator, full)
+    judged = _judge(evaluator, found, found.undecided(evaluator.settings.held_out_test.threshold))
+    best, evaluator, whole, full, gains, worths = judged
+    names = names_of(best.terms)
     unknown = [name for name in full.names if name in basis_terms()]
     if len(unknown) > 1:  # one of them is told
         unknown.sort(key=gains.__getitem__)
@@ -155,8 +150,9 @@ def conclude(
         term = unknown[-1]
         named = fit_with_noise(evaluator, full.hypothesis.without(term), full)
         unnamed = UnnamedEffect(
-            component_of(term), term, None, gains[term], _places(found, component_of(term), term)
-        )
+            component_of(term), term, None, gains[term],
+            _places(found, names, component_of(term), term),
+        )  # fmt: skip
     noise = full.noise
     for term in best.terms:
         if unnamed is None and term.name in SWINGS:
@@ -166,8 +162,9 @@ def conclude(
             ):
                 place = SWINGS[term.name][0]
                 unnamed = UnnamedEffect(
-                    place, None, swing, float(gained.sum()), _places(found, place, term.name)
-                )
+                    place, None, swing, float(gained.sum()),
+                    _places(found, names, place, term.name),
+                )  # fmt: skip
                 noise = swing.noise
     return Conclusion(
         base,
@@ -176,17 +173,47 @@ def conclude(
         unnamed,
         noise,
         {name: gains[name] for name in named.names},
-        {name: _alternatives(evaluator, found, named, name) for name in named.names},
-        gain_sd,
+        {name: _alternatives(evaluator, found, names, named, name) for name in named.names},
+        evaluator.gain_sd,
         unnamed is None and not named.names and _is_unresolved(evaluator, whole),
         {name: worths[name] for name in named.names},
         found.weights,
     )
 
 
-def _fitted(evaluator: Evaluator, found: Posterior) -> FittedModel:
-    """The likeliest set fitted to all training breaths, with their noise."""
-    best = found.best
+class _Judged(NamedTuple):
+    """A set after held-out breaths had their say."""
+
+    known: Known  #: the set.
+    evaluator: Evaluator  #: with the scatter of the gains.
+    whole: FittedModel  #: all of its terms that are parameters of a fit.
+    left: FittedModel  #: those that are accepted.
+    gains: dict[str, float]  #: of each of these, held-out log-likelihood, nats.
+    worths: dict[str, float]  #: of each of these, root-mean-square error, cmH2O.
+
+
+def _judge(evaluator: Evaluator, found: Posterior, known: Known) -> _Judged:
+    """Let held-out breaths judge a set, and what is likelier than the rest of it in its stead."""
+    rejected: set[str] = set()
+    while True:
+        whole, now = _fitted(evaluator, known), evaluator
+        gain_sd = _gain_sd(evaluator, whole, found.scatter)
+        if gain_sd:
+            now = replace(evaluator, gain_sd=gain_sd)
+            whole = fit_with_noise(now, whole.hypothesis, whole)
+        judged = _Judged(known, now, whole, *_supported(now, whole))
+        dropped = frozenset(whole.names) - frozenset(judged.left.names)
+        rejected |= dropped
+        rest = names_of(known.terms) - dropped
+        others = (s for s in found.fitted if not names_of(s.terms) & rejected)
+        likelier = next((s for s in others if len(s.terms) <= len(rest)), None)
+        if not dropped or likelier is None or names_of(likelier.terms) == rest:
+            return judged
+        known = likelier
+
+
+def _fitted(evaluator: Evaluator, best: Known) -> FittedModel:
+    """A set fitted to all training breaths, with their noise."""
     hypothesis = best.fitted.hypothesis
     if EFFORT in names_of(best.terms):
         hypothesis = hypothesis.plus(Hypothesis((EFFORT,)))
@@ -324,10 +351,12 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
     return Swing(told, sd, course, beside.noise, nats), gained
 
 
-def _places(found: Posterior, place: str, term: str) -> tuple[tuple[str, float], ...]:
+def _places(
+    found: Posterior, names: frozenset[str], place: str, term: str
+) -> tuple[tuple[str, float], ...]:
     """Posterior weights of the places of an unnamed effect, the largest first."""
     odds = {place: 1.0}
-    for name, each in found.swaps(names_of(found.best.terms), term).items():
+    for name, each in found.swaps(names, term).items():
         where = SWINGS[name][0] if name in SWINGS else None
         where = component_of(name) if name in basis_terms() else where
         if where is not None and each > _NEAR:
@@ -337,10 +366,9 @@ def _places(found: Posterior, place: str, term: str) -> tuple[tuple[str, float],
 
 
 def _alternatives(
-    evaluator: Evaluator, found: Posterior, named: FittedModel, name: str
+    evaluator: Evaluator, found: Posterior, names: frozenset[str], named: FittedModel, name: str
 ) -> Alternatives:
-    """Other names of the posterior in the place of one."""
-    names = names_of(found.best.terms)
+    """Other names of the posterior in the place of one of a set."""
     odds = {
         other: each
         for other, each in found.swaps(names, name).items()

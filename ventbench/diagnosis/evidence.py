@@ -79,8 +79,14 @@ class Posterior:
 
     @cached_property
     def best(self) -> Known:
-        """The set of the largest evidence: held-out breaths have their say."""
+        """The likeliest set."""
         return self.fitted[0]
+
+    def undecided(self, nats: float) -> Known:
+        """The likeliest set that has the best one's terms and more, and is so little behind."""
+        names, most = names_of(self.best.terms), _log_posterior(self.best)
+        near = (s for s in self.fitted if names_of(s.terms) > names)
+        return next((s for s in near if most - _log_posterior(s) < nats), self.best)
 
 
 def search(wide: Evaluator, also: Sequence[str] = ()) -> Posterior:
@@ -202,6 +208,11 @@ def enumerate_sets(
     return sorted(best.values(), key=lambda pair: -pair[0])
 
 
+def _log_posterior(known: Known) -> float:
+    """Log posterior of a set that was fitted, but for a constant, nats."""
+    return known.evidence + prior(names_of(known.terms), _WARMTH)
+
+
 def _integrated_out(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
     """Log evidence of a term, and what is left of the products beside its coefficients."""
     at, sd = list(term.main), np.array(term.spread)
@@ -219,6 +230,7 @@ class _View(NamedTuple):
     noise: Noise
     scatters: tuple[float, ...]  #: of the gains, that are compared.
     ways: tuple[list[tuple[float, Set]], ...]  #: ranked sets at each scatter.
+    latent: Sequence[Term]  #: what may act in time.
 
 
 class _Search:
@@ -255,6 +267,7 @@ class _Search:
             views, key=lambda view: view.noise.sigma[0] * (1.0 - view.noise.ar[0] ** 2) ** 0.5
         )
         around, noise, self.scatters = main.around, main.noise, main.scatters
+        self.muscles = [term for term in main.latent if term.name in (EFFORT, MUSCLES[0])]
         self.tried[frozenset()] = self.known(around, self.base, noise)
         self.near.add(frozenset())
         self.rescore(around, noise)
@@ -297,6 +310,9 @@ class _Search:
                 self.attempt(around, noise, rest, chosen.fitted)
             if term.name in basis_terms():
                 self.name(term.name, rest, noise)
+            for other in self.muscles if term.name == MUSCLES[-1] else ():
+                if names_of((*rest, other)) not in self.tried:
+                    self.attempt(around, noise, (*rest, other), self.base)
         return around, noise
 
     def name(self, unknown: str, rest: Set, noise: Noise) -> None:
@@ -376,7 +392,7 @@ class _Search:
             )
             for scatter in self.scatters
         ]  # fmt: skip
-        return _View(base, around, noise, self.scatters, tuple(ways))
+        return _View(base, around, noise, self.scatters, tuple(ways), latent)
 
     def is_far_from_label(self, base: FittedModel) -> bool:
         """Whether the base model makes up for much by R or C."""
@@ -423,8 +439,7 @@ class _Search:
 
     def ordered(self) -> list[Known]:
         """Sets that were fitted and are not far behind, likeliest first."""
-        near = [self.tried[key] for key in self.near]
-        return sorted(near, key=lambda s: -s.evidence - prior(names_of(s.terms), _WARMTH))
+        return sorted((self.tried[key] for key in self.near), key=_log_posterior, reverse=True)
 
 
 def told_posterior(

@@ -1,154 +1,79 @@
-"""Rows of a file as flat arrays: chunks as they are read, regrouped into whole breaths, checked.
+"""Rows of a recording as flat arrays, checked.
 
 Checks of values, breaths and times only add to a `ProblemLog`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ventbench.recordings.schema import COLUMNS, Column, Kind, ProblemLog, RecordingProblem
+from ventbench.recordings.schema import COLUMNS, Column, ProblemLog
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 
 @dataclass(frozen=True)
-class Chunk:
-    """Consecutive rows of a file, as read."""
+class Rows:
+    """The rows of a recording; row 0 is the first data row of the file."""
 
-    row0: int  #: the first row's number in the file, 0 for the first data row.
     #: arrays by column name, each (m,): int64 for id and breath_id, float64 with NaN for blank
     #: otherwise, in the units of the schema.
     columns: dict[str, np.ndarray]
     #: rows with a blank breath_id, (m,) bool; breath_id then repeats the one before.
     blank_id: np.ndarray
 
-    def __len__(self) -> int:
-        """Number of rows m."""
-        return len(self.blank_id)
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Each breath's first row, (k,), k >= 1."""
+        ids = self.columns["breath_id"]
+        return np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1)
 
-    def cut(self, start: int, stop: int) -> Chunk:
-        """Rows start..stop-1, as views."""
-        columns = {name: values[start:stop] for name, values in self.columns.items()}
-        return Chunk(self.row0 + start, columns, self.blank_id[start:stop])
-
-
-@dataclass(frozen=True)
-class Rows(Chunk):
-    """Rows of whole breaths."""
-
-    starts: np.ndarray  #: index of each breath's first row, (k,), k >= 1.
-
-    @property
+    @cached_property
     def lengths(self) -> np.ndarray:
         """Rows in each breath, (k,)."""
-        return np.diff(self.starts, append=len(self))
+        return np.diff(self.starts, append=len(self.blank_id))
+
+    @cached_property
+    def breath(self) -> np.ndarray:
+        """Number of each row's breath, from 0, (m,)."""
+        return np.repeat(np.arange(len(self.starts)), self.lengths)
 
 
-def whole_breaths(chunks: Iterable[Chunk]) -> Iterator[Rows]:
-    """Regroup chunks of a file, in order, so that none ends inside a breath."""
-    held: list[Chunk] = []
-    for chunk in chunks:
-        held.append(chunk)
-        if held[0].columns["breath_id"][0] != chunk.columns["breath_id"][-1]:
-            rows = _join(held)
-            # The last breath may continue in the next chunk.
-            last = int(_starts(rows)[-1])
-            yield _whole(rows.cut(0, last))
-            held = [rows.cut(last, len(rows))]
-    if held:
-        yield _whole(_join(held))
+def rows_of(batches: Iterable[pa.RecordBatch]) -> Rows:
+    """Convert all Arrow batches of a file, of known columns in any numeric type.
 
-
-def _starts(chunk: Chunk) -> np.ndarray:
-    ids = chunk.columns["breath_id"]
-    return np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1)
-
-
-def _whole(rows: Chunk) -> Rows:
-    return Rows(rows.row0, rows.columns, rows.blank_id, _starts(rows))
-
-
-def _join(chunks: list[Chunk]) -> Chunk:
-    if len(chunks) == 1:
-        return chunks[0]
-    columns = {
-        name: np.concatenate([chunk.columns[name] for chunk in chunks])
-        for name in chunks[0].columns
-    }
-    blank = np.concatenate([chunk.blank_id for chunk in chunks])
-    return Chunk(chunks[0].row0, columns, blank)
-
-
-@dataclass
-class Source:
-    """A file, or a table in memory, that is read once, in order."""
-
-    file: str  #: the path as the caller wrote it.
-    kind: Kind  #: format.
-    names: tuple[str, ...] = field(default=(), init=False)  #: column names.
-    #: about columns that are ignored.
-    warnings: tuple[RecordingProblem, ...] = field(default=(), init=False)
-    #: SHA-256 of the file on disk; None until all chunks are read.
-    sha256: str | None = field(default=None, init=False)
-    place: str = field(default="line", init=False)  #: what messages count in: ``line`` or ``row``.
-    size: int = field(default=0, init=False)  #: bytes, or rows of Parquet.
-    done: int = field(default=0, init=False)  #: how much of that has been read.
-
-    def chunks(self) -> Iterator[Chunk]:
-        """Yield the rows in order.
-
-        Raises:
-            RecordingError: the file is damaged, or not of numbers.
-        """
-        raise NotImplementedError
-
-
-def chunks_of(batches: Iterable[pa.RecordBatch]) -> Iterator[Chunk]:
-    """Convert the Arrow batches of a file, in order; empty ones are left out."""
-    row0, last_id = 0, None
-    for batch in batches:
-        if batch.num_rows:
-            chunk = _chunk_of_batch(batch, row0, last_id)
-            yield chunk
-            row0 += len(chunk)
-            last_id = int(chunk.columns["breath_id"][-1])
-
-
-def _chunk_of_batch(batch: pa.RecordBatch, row0: int, last_id: int | None) -> Chunk:
-    """Convert a batch of known columns in any numeric type.
-
-    A blank breath_id at its start is ``last_id``, that of the row before, or the first one known.
+    A blank breath_id is that of the row before; at the start of the file, the first one known.
     """
-    columns = {}
-    blank_id = np.zeros(batch.num_rows, dtype=bool)
-    for name in batch.schema.names:
-        values, blank = _numpy(batch.column(name), COLUMNS[name].whole)
-        if name == "breath_id" and blank is not None:
-            blank_id = blank
-            before = np.maximum.accumulate(np.where(blank, -1, np.arange(len(values))))
-            first = values[int(np.argmin(blank))] if last_id is None else last_id
-            values = np.where(before < 0, first, values[before])
-        columns[name] = values
-    return Chunk(row0, columns, blank_id)
+    parts: dict[str, list[np.ndarray]] = {}
+    blanks = [np.zeros(0, bool)]
+    for batch in batches:
+        for name in batch.schema.names:
+            parts.setdefault(name, []).append(_numpy(batch.column(name), COLUMNS[name].whole))
+        blanks.append(batch.column("breath_id").is_null().to_numpy(zero_copy_only=False))
+    # One column after the other is copied and let go.
+    columns = {name: np.concatenate(parts.pop(name)) for name in list(parts)}
+    blank = np.concatenate(blanks)
+    if blank.any():
+        before = np.maximum.accumulate(
+            np.where(blank, int(np.argmin(blank)), np.arange(len(blank)))
+        )
+        columns["breath_id"] = columns["breath_id"][before]
+    return Rows(columns, blank)
 
 
-def _numpy(array: pa.Array, whole: bool) -> tuple[np.ndarray, np.ndarray | None]:
+def _numpy(array: pa.Array, whole: bool) -> np.ndarray:
     import pyarrow as pa
 
     if whole:
-        blank = array.is_null().to_numpy(zero_copy_only=False) if array.null_count else None
-        filled = array.fill_null(0) if array.null_count else array
-        return filled.cast(pa.int64()).to_numpy(zero_copy_only=False), blank
-    if array.type != pa.float64():
-        array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
-        array = array.cast(pa.float64())
-    return array.to_numpy(zero_copy_only=False), None
+        return array.fill_null(0).cast(pa.int64()).to_numpy(zero_copy_only=False)
+    array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
+    return array.cast(pa.float64()).to_numpy(zero_copy_only=False)
 
 
 #: Rows from which a value that is repeated is reported once.
@@ -172,7 +97,7 @@ def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str
         if infinite.any():
             at = np.flatnonzero(infinite)
             what = "{value} is infinite"
-            log.add(rows.row0 + at, name, what, "Fix the row.", values=values[at])
+            log.add(at, name, what, "Fix the row.", values=values[at])
         outside = _outside(values, column) & ~infinite
         if not outside.any():
             continue
@@ -187,28 +112,28 @@ def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str
         elif column.positive:
             what = f"{{value}} is not in {column.span}"
         if name in ("R", "C"):  # the label of a whole recording: one mistake, not one a row
-            _add_once(rows.row0 + at, name, what, advice, values[at], log)
+            _add_once(at, name, what, advice, values[at], log)
         else:
-            log.add(rows.row0 + at, name, what, advice, values=values[at], level=level)
+            log.add(at, name, what, advice, values=values[at], level=level)
     return columns
 
 
 def _add_once(
     at: np.ndarray, name: str, what: str, advice: str, values: np.ndarray, log: ProblemLog
 ) -> None:
-    """Report a value that many rows repeat once, whatever blocks the file is read in."""
+    """Report a value that many rows repeat once."""
     kinds, first, counts = np.unique(values, return_index=True, return_counts=True)
     often = counts >= _OFTEN
     single = ~np.isin(values, kinds[often])
     log.add(at[single], name, what, advice, values=values[single])
-    for row, value in zip(first[often], kinds[often], strict=True):
-        log.add_once(int(at[row]), name, f"{what}, here and in more rows", advice, value)
+    what = f"{what}, here and in more rows"
+    log.add(at[first[often]], name, what, advice, values=kinds[often])
 
 
 def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: np.ndarray) -> None:
     if blank.any():
         what = f"the cell is blank, but {name} is needed in every row"
-        at = rows.row0 + np.flatnonzero(blank)
+        at = np.flatnonzero(blank)
         values = np.full(len(at), np.nan)
         log.add(at, name, what, "Fill it in or remove the breath.", values=values)
 
@@ -220,41 +145,31 @@ def _outside(values: np.ndarray, column: Column) -> np.ndarray:
     return low | (values > column.high)
 
 
-def check_ids(rows: Rows, log: ProblemLog, seen: dict[int, int]) -> None:
-    """Check that the rows of each breath follow one another.
-
-    ``seen`` holds the first row of each breath so far, by breath_id; new breaths are added.
-    """
-    again, first = [], []
-    starts = rows.row0 + rows.starts
+def check_ids(rows: Rows, log: ProblemLog) -> None:
+    """Check that the rows of each breath follow one another."""
     ids = rows.columns["breath_id"][rows.starts]
-    for breath, row in zip(ids.tolist(), starts.tolist(), strict=True):
-        earlier = seen.setdefault(breath, row)
-        if earlier != row:
-            again.append(row)
-            first.append(earlier)
+    _, first, which = np.unique(ids, return_index=True, return_inverse=True)
+    again = np.flatnonzero(first[which] != np.arange(len(ids)))
     what = "breath {value} comes again, it is already at {other}"
     advice = "Keep the rows of a breath together, and give each breath an id of its own."
-    at = np.array(again, dtype=np.int64)
-    values, others = rows.columns["breath_id"][at - rows.row0], np.array(first, dtype=np.int64)
-    log.add(at, "breath_id", what, advice, values=values, others=others)
+    others = rows.starts[first[which[again]]]
+    log.add(rows.starts[again], "breath_id", what, advice, values=ids[again], others=others)
 
 
 def check_lung(rows: Rows, log: ProblemLog) -> None:
     """Check that R and C stay the same within each breath."""
-    breath = np.repeat(np.arange(len(rows.starts)), rows.lengths)
     for name in ("R", "C"):
         values = rows.columns[name]
-        first = values[rows.starts][breath]
+        first = np.repeat(values[rows.starts], rows.lengths)
         with np.errstate(invalid="ignore"):
             at = np.flatnonzero((values != first) & ~np.isnan(values) & ~np.isnan(first))
         if len(at) == 0:
             continue
-        at = at[np.unique(breath[at], return_index=True)[1]]
+        at = at[np.unique(rows.breath[at], return_index=True)[1]]
         what = f"{name} changes to {{value}} within the breath, which starts at {{other}}"
         advice = "A breath has one lung: give the second part its own breath_id, or fix the row."
-        others = rows.row0 + rows.starts[breath[at]]
-        log.add(rows.row0 + at, name, what, advice, values=values[at], others=others)
+        others = rows.starts[rows.breath[at]]
+        log.add(at, name, what, advice, values=values[at], others=others)
 
 
 def check_single(rows: Rows, log: ProblemLog) -> None:
@@ -262,21 +177,16 @@ def check_single(rows: Rows, log: ProblemLog) -> None:
     at = rows.starts[rows.lengths == 1]
     what = "breath {value} has one sample, at least two are needed"
     advice = "Remove it, or keep the rows of a breath together."
-    log.add(rows.row0 + at, "breath_id", what, advice, values=rows.columns["breath_id"][at])
+    log.add(at, "breath_id", what, advice, values=rows.columns["breath_id"][at])
 
 
-def check_row_ids(rows: Rows, log: ProblemLog, last: int | None) -> int:
-    """Warn where the column id, which is not used otherwise, does not increase.
-
-    Takes the id of the row before, None at the start, and returns the last id.
-    """
+def check_row_ids(rows: Rows, log: ProblemLog) -> None:
+    """Warn where the column id, which is not used otherwise, does not increase."""
     ids = rows.columns["id"]
-    before = np.concatenate([ids[:1] - 1 if last is None else [last], ids[:-1]])
-    at = np.flatnonzero(ids <= before)
+    at = np.flatnonzero(ids[1:] <= ids[:-1]) + 1
     what = "id {value} is not greater than the one before"
     advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
-    log.add(rows.row0 + at, "id", what, advice, values=ids[at], level="warning")
-    return int(ids[-1])
+    log.add(at, "id", what, advice, values=ids[at], level="warning")
 
 
 _SORT = "Sort the rows of the breath by time_step, and remove rows that are there twice."
@@ -288,8 +198,7 @@ def check_times(rows: Rows, log: ProblemLog) -> None:
     Repeated rows are reported as such. In breaths without times, a row is a repeat if it equals the
     row before in every column, including `id`.
     """
-    time = rows.columns["time_step"]
-    breath = np.repeat(np.arange(len(rows.starts)), rows.lengths)
+    time, breath = rows.columns["time_step"], rows.breath
     known = np.flatnonzero(np.isfinite(time))
     previous, here = known[:-1], known[1:]
     late = (time[here] <= time[previous]) & (breath[here] == breath[previous])
@@ -312,8 +221,7 @@ def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarr
         (~equal, "time goes back to {value} s from {other}"),
     ):
         at, before = here[chosen], previous[chosen]
-        log.add(rows.row0 + at, "time_step", what, _SORT, values=time[at],
-                     others=rows.row0 + before)  # fmt: skip
+        log.add(at, "time_step", what, _SORT, values=time[at], others=before)
 
 
 def _add_repeat(
@@ -321,13 +229,12 @@ def _add_repeat(
     values: np.ndarray,
 ) -> None:  # fmt: skip
     what, advice = "the row repeats {other}", "Remove one of the two."
-    others = rows.row0 + previous
-    log.add(rows.row0 + here, column, what, advice, values=values[here], others=others)
+    log.add(here, column, what, advice, values=values[here], others=previous)
 
 
-def _same(rows: Rows, first: np.ndarray, other: np.ndarray, names: object) -> np.ndarray:
+def _same(rows: Rows, first: np.ndarray, other: np.ndarray, names: Iterable[str]) -> np.ndarray:
     same = np.ones(len(first), dtype=bool)
-    for name in names:  # type: ignore[attr-defined]
+    for name in names:
         a, b = rows.columns[name][first], rows.columns[name][other]
         same &= (a == b) | ((a != a) & (b != b))
     return same

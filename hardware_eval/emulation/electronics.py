@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from hardware_eval import realtime
 from hardware_eval.device import deadman
-from hardware_eval.device.hal import Hal, Identity, Sample
+from hardware_eval.device.program import Hal, Identity, Sample
 from hardware_eval.emulation.faults import FaultKind, LungFault, active
 from ventbench.base.errors import InputError
 

@@ -6,8 +6,7 @@ import heapq
 from dataclasses import dataclass
 from itertools import count
 
-from hardware_eval.device.hal import Hal
-from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings
+from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
 from hardware_eval.emulation.faults import Line
 from hardware_eval.realtime import VirtualClock
 from hardware_eval.wire.parser import DisconnectedError

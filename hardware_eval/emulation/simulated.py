@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from hardware_eval.device.hal import Identity, Sample
+from hardware_eval.device.program import Identity, Sample
 from hardware_eval.emulation.faults import FaultKind, LungFault, active
 from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
@@ -115,7 +115,7 @@ class SimulatedHal:
         self._last = Sample(0.0, protocol.PEEP)
 
     def sample(self, now: float) -> Sample:
-        """Pressure and flow by now; see :class:`~hardware_eval.device.hal.Hal`."""
+        """Pressure and flow by now; see :class:`~hardware_eval.device.program.Hal`."""
         kinds = active(self.faults, now)
         if FaultKind.BUS_BLOCKED in kinds:
             return self._last
@@ -153,7 +153,7 @@ class SimulatedHal:
         return self._last
 
     def actuate(self, now: float, u_in: float, u_out: int) -> None:
-        """Hold a command from now on; see :class:`~hardware_eval.device.hal.Hal`."""
+        """Hold a command from now on; see :class:`~hardware_eval.device.program.Hal`."""
         if self._since is None:
             self._since = now
         changed = (u_in, u_out) != self._command

@@ -114,8 +114,3 @@ class LoopbackDevice:
             state, last = self.service.state, self.actuations[-1]
             if (state.u_in, state.u_out) != (last.u_in, last.u_out):
                 self.actuations.append(Actuation(now, state.u_in, state.u_out))
-
-
-def loopback(hal: Hal, settings: DeviceSettings | None = None) -> LoopbackDevice:
-    """Start a device on a virtual clock of its own."""
-    return LoopbackDevice(hal, settings)

@@ -26,7 +26,7 @@ from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
 from hardware_eval.emulation.faults import FaultKind, LungFault
-from hardware_eval.emulation.loopback import LoopbackDevice, loopback
+from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Reading
@@ -225,7 +225,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     random = np.random.default_rng(0)
-    device = loopback(simulated_lung(given.lung, noise=0.1, quantum=0.0703))
+    device = LoopbackDevice(simulated_lung(given.lung, noise=0.1, quantum=0.0703))
     rows = []
     for fault in (fault for fault in FAULTS if given.only in fault.name):
         done: dict[str, list[float]] = {}

@@ -18,7 +18,7 @@ from collections import Counter
 import numpy as np
 
 from hardware_eval.device import program
-from hardware_eval.device.hal import Identity, Sample
+from hardware_eval.device.program import Identity, Sample
 from hardware_eval.wire.messages import (
     Arm,
     Capability,

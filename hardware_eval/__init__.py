@@ -8,10 +8,10 @@ or to a :class:`~hardware_eval.emulation.loopback.LoopbackDevice`, which runs th
 in the same process on a virtual clock, faster than real time::
 
     from hardware_eval.wire.client import Client
-    from hardware_eval.emulation.loopback import loopback
+    from hardware_eval.emulation.loopback import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
 
-    device = loopback(simulated_lung("R20C50"))
+    device = LoopbackDevice(simulated_lung("R20C50"))
     client = Client(device, device.clock)
     welcome = client.hello()  # session, identity, limits; the lung is vented
     client.arm()  # from here on the watchdog waits for commands

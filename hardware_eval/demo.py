@@ -25,9 +25,8 @@ from hardware_eval.bench.loop import Bench, Operator, SilentOperator, run_once
 from hardware_eval.bench.plan import Plan, make_plan
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.bench.safety import DEFAULT
-from hardware_eval.emulation.concealed import conceal, reveal
-from hardware_eval.emulation.loopback import loopback
-from hardware_eval.emulation.simulated import SimulatedHal
+from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.simulated import SimulatedHal, conceal, reveal
 from hardware_eval.planned import plan_controller
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results.compare import Comparison, compare, scored_plants
@@ -285,7 +284,7 @@ def error_on(
         lung: its label, which the entry is told.
         pips: cmH2O.
     """
-    device = loopback(hal)
+    device = LoopbackDevice(hal)
     client = Client(device, device.clock)
     client.hello()
     bench = Bench(client, device.clock, DEFAULT, SilentOperator(), rest=_REST)
@@ -330,7 +329,7 @@ def _line(
     """A line to the emulated lung: in its own process, or in this one on a virtual clock."""
     if not real_time:
         hal = SimulatedHal(plant, name=f"emulated {lung}", noise=NOISE, quantum=QUANTUM)
-        device = loopback(hal)
+        device = LoopbackDevice(hal)
         client = Client(device, device.clock)
         client.hello()
         yield Line(client, device.clock)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ventbench.base import files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators, names
@@ -338,13 +339,11 @@ def summary(prefix: str, error: Floats) -> dict[str, Any]:
         ``breaths``, with the prefix; null where there is no breath.
     """
     estimate = bootstrap.summary(error)
-    return {
-        f"{prefix}mae": _number(estimate.mean),
-        f"{prefix}median_mae": _number(estimate.median),
-        f"{prefix}ci95": [_number(limit) for limit in estimate.ci95],
-        f"{prefix}breaths": estimate.count,
-    }
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return files.json_values(
+        {
+            f"{prefix}mae": estimate.mean,
+            f"{prefix}median_mae": estimate.median,
+            f"{prefix}ci95": estimate.ci95,
+            f"{prefix}breaths": estimate.count,
+        }
+    )

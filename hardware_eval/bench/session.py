@@ -249,7 +249,7 @@ def dry_run(
         What went wrong, one sentence each, empty if the plan is safe there; and entry, lung, PIP
         and error, cmH2O, of each run that completed.
     """
-    from hardware_eval.emulation.loopback import loopback
+    from hardware_eval.emulation.loopback import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
 
     problems: list[str] = []
@@ -262,7 +262,7 @@ def dry_run(
             continue
         seen.add(key)
         if bench is None or run.lung != mounted:
-            device, mounted = loopback(simulated_lung(run.lung)), run.lung
+            device, mounted = LoopbackDevice(simulated_lung(run.lung)), run.lung
             client = Client(device, device.clock)
             client.hello()
             bench = Bench(client, device.clock, settings, SilentOperator(), rest=rest)

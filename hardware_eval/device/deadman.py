@@ -24,8 +24,7 @@ from subprocess import Popen
 from typing import Protocol
 
 from hardware_eval import realtime
-from hardware_eval.device.hal import Identity, Sample
-from hardware_eval.device.program import PERIOD
+from hardware_eval.device.program import PERIOD, Identity, Sample
 
 #: Time without an order after which the valves are vented, s: ten periods of the program.
 DEADMAN = 0.050

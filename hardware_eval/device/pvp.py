@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_eval.device.hal import Identity, Sample
+from hardware_eval.device.program import Identity, Sample
 from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
 

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from hardware_eval import realtime
 from hardware_eval.device import deadman
-from hardware_eval.device.hal import Hal, Identity, Sample
+from hardware_eval.device.program import Hal, Identity, Sample
 from hardware_eval.emulation.faults import FaultKind, LungFault, active
 from ventbench.base.errors import InputError
 
@@ -274,14 +274,12 @@ def emulated_lung(
     Raises:
         InputError: if there is none.
     """
-    from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
+    from hardware_eval.emulation import simulated
 
     if conceal is None:
-        return simulated_lung(lung, plant, **sensor)
-    from hardware_eval.emulation.concealed import conceal as make
-
-    concealed = make(conceal, plant)
-    hal = SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
+        return simulated.simulated_lung(lung, plant, **sensor)
+    concealed = simulated.conceal(conceal, plant)
+    hal = simulated.SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
     hal.told = f"{hal.identity.name}, with physics {concealed.seal['commitment'][:16]}..."
     if seal:
         concealed.write(seal)

@@ -22,7 +22,7 @@ from typing import Any
 
 from cobs import cobs
 
-from hardware_eval.device.hal import Sample
+from hardware_eval.device.program import Sample
 from hardware_eval.emulation import electronics
 from hardware_eval.emulation.faults import LungFault
 from hardware_eval.wire.messages import (

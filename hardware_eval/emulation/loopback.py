@@ -6,8 +6,7 @@ import heapq
 from dataclasses import dataclass
 from itertools import count
 
-from hardware_eval.device.hal import Hal
-from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings
+from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
 from hardware_eval.emulation.faults import Line
 from hardware_eval.realtime import VirtualClock
 from hardware_eval.wire.parser import DisconnectedError
@@ -115,8 +114,3 @@ class LoopbackDevice:
             state, last = self.service.state, self.actuations[-1]
             if (state.u_in, state.u_out) != (last.u_in, last.u_out):
                 self.actuations.append(Actuation(now, state.u_in, state.u_out))
-
-
-def loopback(hal: Hal, settings: DeviceSettings | None = None) -> LoopbackDevice:
-    """Start a device on a virtual clock of its own."""
-    return LoopbackDevice(hal, settings)

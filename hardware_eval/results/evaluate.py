@@ -115,12 +115,12 @@ def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
 
     if not port.startswith(VIRTUAL):
         return Link(port), RealClock()
-    from hardware_eval.emulation.loopback import loopback
+    from hardware_eval.emulation.loopback import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
 
     # With the noise and the converter of a PVP: without them all repeats would be one.
     lung = simulated_lung(port.removeprefix(VIRTUAL), noise=0.1, quantum=0.0703)
-    device = loopback(lung)
+    device = LoopbackDevice(lung)
     return device, device.clock
 
 

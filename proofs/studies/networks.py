@@ -18,8 +18,8 @@ import pandas as pd
 
 from ventbench import open_loop_report
 from ventbench.base import files
-from ventbench.base.executor import InProcess, executor, results
-from ventbench.base.resume import WorkFolder
+from ventbench.base.executor import InProcess, executor
+from ventbench.base.resume import WorkFolder, kept_results
 from ventbench.plants.learned import Architecture
 from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings import Breaths, join, load
@@ -234,20 +234,12 @@ def finish(
     def tell(name: str, share: float) -> None:
         progress(name, (done + share) / len(jobs))
 
-    missing = {}
-    for name, arguments in jobs.items():
-        if work.has(name):
-            tell(name, 0.0)
-            done += 1
-        else:
-            missing[name] = arguments
     with executor(workers, scheduler) as pool:
         here = isinstance(pool, InProcess)
         told = {
             name: (*arguments, partial(tell, name) if here else None)
-            for name, arguments in missing.items()
+            for name, arguments in jobs.items()
         }
-        for name, result in results(pool, function, told):
-            work.put(name, result)
+        for name, _ in kept_results(work, pool, function, told):
             done += 1
             tell(name, 0.0)

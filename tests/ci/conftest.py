@@ -28,13 +28,17 @@ PATH = "submissions/demo"
 class Repository:
     """Commits are made with plumbing alone, so that trees may hold what `git add` refuses."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, base: str | None = None):
         self.folder = folder
-        self.git("init", "--quiet", "--bare", "--initial-branch=main")
+        self.base = base or self._begin()
+
+    def _begin(self) -> str:
+        self.git("init", "--quiet", "--bare", "--initial-branch=main", "--template=")
         self.git("config", "uploadpack.allowFilter", "true")
         self.git("config", "uploadpack.allowAnySHA1InWant", "true")
-        self.base = self.commit({"README.md": b"the benchmark", "ventbench/a.py": b"x = 1\n"})
-        self.git("update-ref", "refs/heads/main", self.base)
+        base = self.commit({"README.md": b"the benchmark", "ventbench/a.py": b"x = 1\n"})
+        self.git("update-ref", "refs/heads/main", base)
+        return base
 
     @property
     def url(self) -> str:
@@ -85,13 +89,17 @@ class Repository:
         return self.commit_tree(tree, parent)
 
 
-@pytest.fixture
-def repository(tmp_path: Path) -> Repository:
+@pytest.fixture(scope="session")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Repository:
+    """What every test begins with a copy of."""
     if shutil.which("git") is None:
         pytest.skip("no git here")
-    folder = tmp_path / "repository.git"
-    folder.mkdir()
-    return Repository(folder)
+    return Repository(tmp_path_factory.mktemp("begun"))
+
+
+@pytest.fixture
+def repository(begun: Repository, tmp_path: Path) -> Repository:
+    return Repository(shutil.copytree(begun.folder, tmp_path / "repository.git"), begun.base)
 
 
 @pytest.fixture

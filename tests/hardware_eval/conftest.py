@@ -9,7 +9,7 @@ import pytest
 
 from hardware_eval.bench.loop import Bench, SilentOperator
 from hardware_eval.bench.safety import DEFAULT
-from hardware_eval.emulation.loopback import LoopbackDevice, loopback
+from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire import link
@@ -28,7 +28,7 @@ def _ports_are_patient() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def shared_device() -> LoopbackDevice:
-    return loopback(simulated_lung(LUNG, "physics"))
+    return LoopbackDevice(simulated_lung(LUNG, "physics"))
 
 
 @pytest.fixture

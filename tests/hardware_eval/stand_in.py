@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from random import Random
 
-from hardware_eval.device.hal import Identity, Sample
+from hardware_eval.device.program import Identity, Sample
 from hardware_eval.wire.messages import Capability
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hardware_eval.demo import demo
-from hardware_eval.emulation.concealed import reveal
+from hardware_eval.emulation.simulated import reveal
 
 #: Words of the manual's table, and what they conceal.
 WORDS = {

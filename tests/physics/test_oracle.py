@@ -38,7 +38,7 @@ def assert_close(found, solved, tolerance):
     assert np.sqrt(np.mean(error**2)) < tolerance[1]
 
 
-@pytest.mark.parametrize("level", ["mild", "strong"])
+@pytest.mark.parametrize("level", [pytest.param("mild", marks=pytest.mark.slow), "strong"])
 @pytest.mark.parametrize("name", library())
 def test_each_mechanism(name, level, predicted):
     m = cases.strengths(name, level)

@@ -1,4 +1,4 @@
-"""The container, padding, batches, round trips and joins."""
+"""The container, padding, round trips and joins."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ventbench.base.errors import InputError
-from ventbench.recordings import Breaths, join, load, make_breaths, write
-from ventbench.recordings.csv_source import CsvSource
-from ventbench.recordings.scan import ParquetSource, join_blocks, scan
-from ventbench.recordings.schema import ProblemLog
+from ventbench.recordings import Breaths, join, load, make_breaths, sources, write
 
 FIELDS = [
     "breath_id",
@@ -108,20 +105,18 @@ def test_padding(rows, write_csv):
     assert "Breaths have 4 to 6 samples." in breaths.notes
 
 
-def test_blocks_do_not_depend_on_how_much_is_read_at_a_time(make, tmp_path):
+def test_breaths_do_not_depend_on_how_much_is_read_at_a_time(make, tmp_path, monkeypatch):
     whole = make(40)
-    paths = tmp_path / "a.csv", tmp_path / "a.parquet"
-    for path in paths:
+    monkeypatch.setattr(sources, "BLOCK", 700)
+    monkeypatch.setattr(sources, "BATCH", 11)
+    for name in ("a.csv", "a.parquet"):
+        path, told = tmp_path / name, []
         write(whole, path)
-    csv, parquet = (str(path) for path in paths)
-    for source in (CsvSource(csv, "csv", block=700), ParquetSource(parquet, batch=11)):
-        blocks = list(scan(source, ProblemLog(source.file)))
-        assert len(blocks) > 1
-        joined = join_blocks(blocks)
-        np.testing.assert_array_equal(joined.breath_id, whole.breath_id)
-        np.testing.assert_array_equal(joined.times.time, whole.time.ravel())
-        for name in ("u_in", "u_out", "pressure"):
-            np.testing.assert_array_equal(joined.samples[name], getattr(whole, name).ravel())
+        again = load(path, progress=lambda *counts, told=told: told.append(counts))
+        assert len(told) > 1
+        np.testing.assert_array_equal(again.breath_id, whole.breath_id)
+        for field in ("time", "u_in", "u_out", "pressure"):
+            np.testing.assert_array_equal(getattr(again, field), getattr(whole, field))
 
 
 finite = st.floats(-20.0, 120.0)

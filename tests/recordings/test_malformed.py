@@ -9,7 +9,7 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.recordings import RecordingError, check, load
-from ventbench.recordings.csv_source import BLOCK
+from ventbench.recordings.sources import BLOCK
 
 ID, BREATH, R, C, TIME, U_IN, U_OUT, PRESSURE = range(8)
 NAMES = ["id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure"]

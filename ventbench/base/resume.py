@@ -13,7 +13,8 @@ import json
 import shutil
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -23,6 +24,7 @@ import numpy as np
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.base.executor import results
 
 TreeT = TypeVar("TreeT")
 
@@ -121,6 +123,28 @@ class WorkFolder:
     def delete(self) -> None:
         """Delete the folder, once all results are used."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def kept_results(
+    work: WorkFolder | None,
+    pool: Executor,
+    function: Callable[..., Any],
+    jobs: Mapping[str, tuple[Any, ...]],
+    format: Format = JSON,
+) -> Iterator[tuple[str, Any]]:
+    """Yield name and result of each job: what the folder has, then the others, which it keeps.
+
+    Errors as of :meth:`WorkFolder.read` and :func:`ventbench.base.executor.results`.
+    """
+    finished = [name for name in jobs if work is not None and work.has(name, format)]
+    for name in finished:
+        assert work is not None
+        yield name, work.read(name, format)
+    waiting = {name: jobs[name] for name in jobs if name not in finished}
+    for name, result in results(pool, function, waiting):
+        if work is not None:
+            work.put(name, result, format)
+        yield name, result
 
 
 class Checkpoint:

@@ -24,7 +24,7 @@ from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.base.resume import WorkFolder
+from ventbench.base.resume import WorkFolder, kept_results
 from ventbench.board import attestation, canonical, create, rounds, schema, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.record import Record, RecordStress
@@ -368,16 +368,16 @@ def score(
         f"{entry}-{track}": (leaderboard.resolve(), name, code[entry], track, work.resolve(),
                              load, runner)
         for entry, track in runs
-        if not done.has(f"{entry}-{track}")
     }  # fmt: skip
-    tell("entries", len(runs) - len(jobs), len(runs))
-    for count, (job, scored) in enumerate(results(pool, _score_entry, jobs), 1):
-        done.put(job, scored)
-        tell("entries", len(runs) - len(jobs) + count, len(runs))
+    tell("entries", 0, len(runs))
+    made: dict[str, dict[str, str]] = {}
+    for job, scored in kept_results(done, pool, _score_entry, jobs):
+        made[job] = scored
+        tell("entries", len(made), len(runs))
     records: dict[str, str] = {}
     failed: dict[str, str] = {}
     for at, (entry, track) in enumerate(runs):
-        scored, key = done.read(f"{entry}-{track}"), f"{entry} ({track})"
+        scored, key = made[f"{entry}-{track}"], f"{entry} ({track})"
         if "failed" in scored:
             failed[key] = scored["failed"][: schema.MAX_TEXT]
             continue

@@ -70,7 +70,7 @@ def _is_respiraworks(path: Path) -> bool:
     import pyarrow as pa
     from pyarrow import parquet
 
-    from ventbench.recordings.scan import kind_of
+    from ventbench.recordings.sources import kind_of
 
     if path.is_dir() or kind_of(path) != "parquet":
         return False

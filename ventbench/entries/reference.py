@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike
 from ventbench.base import files, precision
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.base.executor import InProcess, results
-from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
+from ventbench.base.executor import InProcess
+from ventbench.base.resume import ARRAY, WorkFolder, fingerprint, kept_results
 from ventbench.controllers.pid import PID
 from ventbench.task import attainable, protocol, rollouts
 from ventbench.task.attainable import second_optimum
@@ -249,19 +249,13 @@ def compute(
     report = progress or (lambda done, total: None)
     parts: dict[str, Floats] = {}
     jobs: dict[str, tuple[Any, ...]] = {}
-    names = [f"draw-{draw}" for draw in range(draws)]
-    for draw, name in enumerate(names):
-        if work is not None and work.has(name, ARRAY):
-            parts[name] = work.read(name, ARRAY)
-        else:
-            own, cell = jax.tree.map(lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells))
-            jobs[name] = (own, cell, np.asarray(gains), starts)
-    for name, part in results(pool or InProcess(), _part, jobs):
+    for draw in range(draws):
+        own, cell = jax.tree.map(lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells))
+        jobs[f"draw-{draw}"] = (own, cell, np.asarray(gains), starts)
+    for name, part in kept_results(work, pool or InProcess(), _part, jobs, ARRAY):
         parts[name] = part
-        if work is not None:
-            work.put(name, part, ARRAY)
         report(len(parts) * lungs * pips, lungs * draws * pips)
-    stacked = np.stack([parts[name] for name in names], axis=1)
+    stacked = np.stack([parts[name] for name in jobs], axis=1)
     columns = {name: stacked[..., k] for k, name in enumerate(_COLUMNS)}
     commands = stacked[..., len(_COLUMNS) :]
     commands = commands.reshape(*commands.shape[:3], len(protocol.SCORED_BREATHS), -1)

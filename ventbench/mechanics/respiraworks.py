@@ -15,8 +15,8 @@ import numpy as np
 from ventbench.mechanics.identify import Mechanics, identify, share_faults
 from ventbench.mechanics.labels import label_texts, value_text
 from ventbench.recordings.breaths import Breaths, arranged
-from ventbench.recordings.scan import kind_of
 from ventbench.recordings.schema import fail
+from ventbench.recordings.sources import kind_of
 
 #: Signals of a run and their units.
 SIGNALS = {"pressure": "cmH2O", "flow": "mL/s", "volume": "mL", "target": "cmH2O"} | dict.fromkeys(

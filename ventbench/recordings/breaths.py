@@ -97,29 +97,20 @@ class Breaths:
         """One row a sample in the public schema, which :func:`ventbench.load_recording` takes."""
         import pandas as pd
 
-        return pd.DataFrame(self.columns(slice(0, len(self)), blank_inferred=True))
+        return pd.DataFrame(self.columns(blank_inferred=True))
 
-    def columns(self, span: slice, *, blank_inferred: bool) -> dict[str, NDArray[Any]]:
-        """Columns of the public schema, one value a sample.
-
-        Args:
-            span: breaths.
-            blank_inferred: give NaN for times that were inferred and not read.
-        """
-        valid, time = self.valid[span], self.time[span]
-        lengths = valid.sum(axis=1)
+    def columns(self, *, blank_inferred: bool) -> dict[str, NDArray[Any]]:
+        """Columns of the public schema, one value a sample; NaN for times that were inferred."""
+        lengths, time = self.valid.sum(axis=1), self.time
         if blank_inferred:
-            time = np.where(self.time_inferred[span, None], np.nan, time)
-        start = 1 + int(np.count_nonzero(self.valid[: span.start]))
-        columns = {
-            "id": np.arange(start, start + int(lengths.sum())),
-            "breath_id": np.repeat(self.breath_id[span], lengths),
-            "R": np.repeat(self.R[span], lengths),
-            "C": np.repeat(self.C[span], lengths),
-            "time_step": time[valid],
+            time = np.where(self.time_inferred[:, None], np.nan, time)
+        columns = {"id": np.arange(1, 1 + int(lengths.sum()))}
+        columns |= {
+            name: np.repeat(getattr(self, name), lengths) for name in ("breath_id", "R", "C")
         }
         signals = {name: getattr(self, name) for name in ("u_in", "u_out", "pressure", *OPTIONAL)}
-        return columns | {k: x[span][valid] for k, x in signals.items() if x is not None}
+        signals = {"time_step": time} | signals
+        return columns | {k: x[self.valid] for k, x in signals.items() if x is not None}
 
     def plot(self) -> Figure:
         """Draw pressure and commands of all breaths, a column a lung, as a matplotlib figure.

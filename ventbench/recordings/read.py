@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,22 +15,14 @@ from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, arranged
 from ventbench.recordings.report import (
     RecordingReport,
-    Tally,
     check_inferable,
     check_lengths,
     describe,
     role_problems,
 )
-from ventbench.recordings.scan import (
-    Block,
-    IntervalTable,
-    Source,
-    join_blocks,
-    locate,
-    open_source,
-    scan,
-)
-from ventbench.recordings.schema import ProblemLog, RecordingError, RecordingProblem, fail
+from ventbench.recordings.scan import Progress, Scanned, scan
+from ventbench.recordings.schema import ProblemLog, RecordingError, RecordingProblem
+from ventbench.recordings.sources import Source, locate, open_source
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -143,10 +134,6 @@ FilePath = str | os.PathLike[str]
 SESSION, _SUFFIXES = "recording.csv.gz", (".csv", ".csv.gz", ".parquet", ".pq")
 
 
-#: What is told how much of a file has been read, and of how much: bytes, or rows of Parquet.
-Progress = Callable[[int, int], object]
-
-
 def load(
     path: FilePath | pd.DataFrame | Breaths,
     *,
@@ -162,7 +149,7 @@ def load(
             returned as they are.
         clip: clip u_in to 0..100 %.
         pad: accept breaths of unequal length and pad the short ones (see `Breaths`).
-        progress: called with how much has been read and of how much, block by block.
+        progress: called with how much has been read, and of how much.
 
     Returns:
         All breaths; `notes` says what was inferred, interpolated or ignored.
@@ -186,22 +173,11 @@ def load(
         path = first
     source = open_source(path)
     log = ProblemLog(source.file)
-    tally = Tally()
-    blocks: list[Block] = []
-    for block in scan(source, log, clip=clip):
-        tally.add(block)
-        if progress is not None:
-            progress(source.done, source.size)
-        if log.counts["problem"]:
-            blocks.clear()
-        else:
-            blocks.append(block)
-    _check_whole(source, tally, log, pad=pad)
+    scanned = scan(source, log, clip=clip, progress=progress)
+    _check_whole(scanned, log, pad=pad)
     log.raise_problems(partial(locate, source), source.place)
-    notes = _report(source, log, tally).notes()
-    whole = join_blocks(blocks)
-    blocks.clear()
-    breaths = _assemble(whole, tally.table(), source.file)
+    notes = _report(source, log, scanned).notes()
+    breaths = _assemble(scanned, source.file)
     file = None if source.kind == "table" else source.file
     return replace(breaths, source=file, sha256=source.sha256, notes=notes)
 
@@ -244,7 +220,7 @@ def _joined(files: tuple[Path, ...], *, clip: bool, progress: Progress | None) -
 def check(
     path: FilePath, *, clip: bool = False, pad: bool = False, progress: Progress | None = None
 ) -> RecordingReport:
-    """Check a recording; needs about 300 bytes of memory a breath.
+    """Check a recording.
 
     Args:
         path: the file.
@@ -257,16 +233,12 @@ def check(
         without pressure, or whose columns are surely not what they are called, is reported as a
         problem, though `load` takes it.
     """
-    tally = Tally()
     log = ProblemLog(str(path))
     source: Source | None = None
     try:
         source = open_source(path)
-        for block in scan(source, log, clip=clip):
-            tally.add(block)
-            if progress is not None:
-                progress(source.done, source.size)
-        _check_whole(source, tally, log, pad=pad)
+        scanned = scan(source, log, clip=clip, progress=progress)
+        _check_whole(scanned, log, pad=pad)
     except RecordingError as error:
         kind = source.kind if source else None
         warnings = source.warnings if source else ()
@@ -278,7 +250,7 @@ def check(
             warnings=warnings,
             warning_count=len(warnings),
         )
-    report = _report(source, log, tally)
+    report = _report(source, log, scanned)
     if not report.ok:
         return report
     if report.blank_pressures == report.rows:
@@ -286,26 +258,20 @@ def check(
         advice = "Fill in the pressure in cmH2O: there is nothing to compare a simulator with."
         refused = (RecordingProblem(source.file, what, advice, column="pressure"),)
     else:
-        refused = role_problems(source.file, tally)["refused"]
+        refused = role_problems(source.file, scanned)["refused"]
     suspicious = tuple(found for found in report.suspicious if found not in refused)
     return replace(report, problems=refused, problem_count=len(refused), suspicious=suspicious)
 
 
-def _check_whole(source: Source, tally: Tally, log: ProblemLog, *, pad: bool) -> None:
-    if len(tally) == 0:
-        raise _no_rows(source)
-    check_lengths(tally, log, pad=pad)
-    check_inferable(tally, log)
+def _check_whole(scanned: Scanned, log: ProblemLog, *, pad: bool) -> None:
+    check_lengths(scanned, log, pad=pad)
+    check_inferable(scanned, log)
 
 
-def _no_rows(source: Source) -> RecordingError:
-    return fail(source.file, "the file has a header but no rows", "Write at least one breath.")
-
-
-def _report(source: Source, log: ProblemLog, tally: Tally) -> RecordingReport:
+def _report(source: Source, log: ProblemLog, scanned: Scanned) -> RecordingReport:
     find = partial(locate, source)
     sound = log.counts["problem"] == 0
-    roles = role_problems(source.file, tally) if sound else {}
+    roles = role_problems(source.file, scanned) if sound else {}
     warnings = source.warnings + log.listed("warning", find, source.place)
     return RecordingReport(
         source.file,
@@ -316,25 +282,20 @@ def _report(source: Source, log: ProblemLog, tally: Tally) -> RecordingReport:
         warnings,
         len(source.warnings) + log.counts["warning"],
         roles.get("refused", ()) + roles.get("suspicious", ()),
-        **describe(tally),
+        **describe(scanned),
     )
 
 
-def _assemble(block: Block, table: IntervalTable, file: str) -> Breaths:
-    """Make breaths of a sound block; blank times are inferred."""
-    time = block.times.time
-    blank = np.flatnonzero(block.times.blank)
-    if len(blank):
-        time = time.copy()
-        starts = np.cumsum(block.lengths) - block.lengths
-        for i in blank:
-            length = int(block.lengths[i])
-            dt = table.estimate(int(block.n_inspiratory[i]), length)
-            assert dt is not None  # check_inferable
-            time[starts[i] : starts[i] + length] = dt * np.arange(length)
+def _assemble(scanned: Scanned, file: str) -> Breaths:
+    """Make breaths without problems; blank times are inferred."""
+    time = scanned.times.time.copy()
+    for i, dt in scanned.inferred.items():
+        assert dt is not None  # check_inferable
+        start, length = scanned.starts[i], scanned.lengths[i]
+        time[start : start + length] = dt * np.arange(length)
     return arranged(
-        block.lengths, time, block.samples, breath_id=block.breath_id, R=block.R, C=block.C,
-        time_inferred=block.times.blank, source=file,
+        scanned.lengths, time, scanned.samples, breath_id=scanned.breath_id, R=scanned.R,
+        C=scanned.C, time_inferred=scanned.times.blank, source=file,
     )  # fmt: skip
 
 

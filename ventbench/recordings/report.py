@@ -1,4 +1,4 @@
-"""The report of a check: what a file holds, counted block by block, and what is wrong with it."""
+"""The report of a check: what a file holds, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ventbench.recordings.roles import breath_figures, few_breaths, findings
-from ventbench.recordings.scan import Block, IntervalTable, interval_table
-from ventbench.recordings.schema import ProblemLog, RecordingProblem
+from ventbench.recordings.scan import Scanned
+from ventbench.recordings.schema import OPTIONAL, ProblemLog, RecordingProblem
 from ventbench.task.lungs import Lung
 
 PAD_LIMIT = 10
@@ -107,31 +107,30 @@ class RecordingReport:
         return lines
 
 
-def describe(tally: Tally) -> dict[str, Any]:
+def describe(scanned: Scanned) -> dict[str, Any]:
     """Return the fields of a report that describe the content of a file."""
-    lengths = tally.column("lengths")
-    pairs, counts = np.unique(
-        np.column_stack([tally.column("R"), tally.column("C")]), axis=0, return_counts=True
-    )
+    lengths, times, samples = scanned.lengths, scanned.times, scanned.samples
+    pairs, counts = np.unique(np.column_stack([scanned.R, scanned.C]), axis=0, return_counts=True)
     return {
         "rows": int(lengths.sum()),
-        "breaths": len(tally),
-        "lengths": (int(lengths.min()), int(lengths.max())) if len(tally) else (0, 0),
+        "breaths": len(lengths),
+        "lengths": (int(lengths.min()), int(lengths.max())),
         "lungs": {Lung(*pair).id: int(n) for pair, n in zip(pairs.tolist(), counts, strict=True)},
-        "interval": _intervals(tally),
-        "time_inferred": tally.inferred(),
-        "time_interpolated": int(tally.column("interpolated").sum()),
-        "time_shifted": int(tally.column("shifted").sum()),
-        "blank_pressures": tally.blank_pressures,
-        "optional": tally.optional,
+        "interval": _intervals(scanned),
+        "time_inferred": {
+            int(scanned.breath_id[i]): dt for i, dt in scanned.inferred.items() if dt is not None
+        },
+        "time_interpolated": int(times.interpolated.sum()),
+        "time_shifted": int(times.shifted.sum()),
+        "blank_pressures": int(np.isnan(samples["pressure"]).sum()),
+        "optional": tuple(name for name in OPTIONAL if name in samples),
     }
 
 
-def role_problems(file: str, tally: Tally) -> dict[str, tuple[RecordingProblem, ...]]:
+def role_problems(file: str, scanned: Scanned) -> dict[str, tuple[RecordingProblem, ...]]:
     """What the physics of a ventilated lung says about the columns, by its level."""
-    found = findings(
-        tally.figures(), tally.column("interval"), tally.column("R"), tally.column("C")
-    )
+    figures = breath_figures(scanned.times.time, scanned.samples, scanned.starts)
+    found = findings(figures, scanned.interval, scanned.R, scanned.C)
     return {
         level: tuple(
             RecordingProblem(file, f.what, f.advice, column=f.column, value=f"{f.value:g}")
@@ -142,82 +141,25 @@ def role_problems(file: str, tally: Tally) -> dict[str, tuple[RecordingProblem, 
     }
 
 
-def _intervals(tally: Tally) -> dict[str, float]:
-    means = tally.column("interval")
-    means = means[np.isfinite(means)]
-    if len(means) == 0 or tally.dt_min > tally.dt_max:
+def _intervals(scanned: Scanned) -> dict[str, float]:
+    with np.errstate(invalid="ignore"):  # infinite values are problems already
+        steps = np.diff(scanned.times.time)
+    steps[scanned.starts[1:] - 1] = np.nan
+    steps = steps[np.isfinite(steps)]
+    means = scanned.interval[np.isfinite(scanned.interval)]
+    if not (len(means) and len(steps)):
         return {}
     p5, median, p95 = (float(q) for q in np.quantile(means, [0.05, 0.5, 0.95]))
-    return {"min": tally.dt_min, "p5": p5, "median": median, "p95": p95, "max": tally.dt_max}
+    least, most = float(steps.min()), float(steps.max())
+    return {"min": least, "p5": p5, "median": median, "p95": p95, "max": most}
 
 
-@dataclass
-class Tally:
-    """Counts over the blocks that were added; keeps a few numbers a breath and no samples."""
-
-    blank_pressures: int = 0  #: samples without pressure.
-    dt_min: float = float("inf")  #: shortest known interval between two samples, s.
-    dt_max: float = float("-inf")  #: longest known interval, s.
-    optional: tuple[str, ...] = ()  #: optional columns in the file.
-    _parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    _figures: list[dict[str, np.ndarray]] = field(default_factory=list)
-
-    def add(self, block: Block) -> None:
-        """Count a block."""
-        for name in ("breath_id", "R", "C", "first_row", "lengths", "n_inspiratory", "interval"):
-            self._parts.setdefault(name, []).append(getattr(block, name))
-        for name in ("blank", "interpolated", "shifted"):
-            self._parts.setdefault(name, []).append(getattr(block.times, name))
-        self.blank_pressures += int(np.isnan(block.samples["pressure"]).sum())
-        self.optional = tuple(name for name in ("flow", "volume") if name in block.samples)
-        with np.errstate(invalid="ignore"):
-            steps = np.diff(block.times.time)
-        steps[np.cumsum(block.lengths)[:-1] - 1] = np.nan
-        steps = steps[np.isfinite(steps)]
-        self.dt_min = min(self.dt_min, float(steps.min(initial=np.inf)))
-        self.dt_max = max(self.dt_max, float(steps.max(initial=-np.inf)))
-        starts = (np.cumsum(block.lengths) - block.lengths).astype(np.int64)
-        with np.errstate(all="ignore"):  # infinite values are problems already
-            self._figures.append(breath_figures(block.times.time, block.samples, starts))
-
-    def figures(self) -> dict[str, np.ndarray]:
-        """Figures by which roles are checked, (n,) each."""
-        return {k: np.concatenate([part[k] for part in self._figures]) for k in self._figures[0]}
-
-    def column(self, name: str) -> np.ndarray:
-        """One number a breath, (n,), by the name of a field of `Block` or `KnownTimes`."""
-        parts = self._parts.get(name)
-        return np.concatenate(parts) if parts else np.zeros(0)
-
-    def __len__(self) -> int:
-        """Number of breaths."""
-        return sum(len(part) for part in self._parts.get("breath_id", []))
-
-    def table(self) -> IntervalTable:
-        """Sampling intervals of the breaths whose times are known."""
-        return interval_table(self.column("n_inspiratory"), self.column("interval"))
-
-    def inferred(self) -> dict[int, float]:
-        """Interval, s, estimated for each breath without times, by breath_id."""
-        table = self.table()
-        at = np.flatnonzero(self.column("blank"))
-        columns = (self.column(name)[at] for name in ("breath_id", "n_inspiratory", "lengths"))
-        estimates = {
-            int(breath): table.estimate(int(n_inspiratory), int(length))
-            for breath, n_inspiratory, length in zip(*columns, strict=True)
-        }
-        return {breath: dt for breath, dt in estimates.items() if dt is not None}
-
-
-def check_lengths(tally: Tally, log: ProblemLog, *, pad: bool) -> None:
+def check_lengths(scanned: Scanned, log: ProblemLog, *, pad: bool) -> None:
     """Check that all breaths have as many samples as is most common.
 
     With ``pad`` they may be shorter, unless padding would need far more memory than the file.
     """
-    lengths, first_row = tally.column("lengths").astype(np.int64), tally.column("first_row")
-    if len(lengths) == 0:
-        return
-    ids = tally.column("breath_id")
+    lengths, ids = scanned.lengths, scanned.breath_id
     if pad:
         longest = int(lengths.max())
         size = longest * len(lengths)
@@ -228,26 +170,22 @@ def check_lengths(tally: Tally, log: ProblemLog, *, pad: bool) -> None:
                 f"would make {size} samples of {lengths.sum()}"
             )
             advice = "Put breaths of very different lengths into files of their own."
-            log.add(first_row[at], "breath_id", what, advice, values=ids[at])
+            log.add(scanned.starts[at], "breath_id", what, advice, values=ids[at])
         return
     usual = int(np.bincount(lengths).argmax())
     for length in np.unique(lengths[lengths != usual]):
         at = np.flatnonzero(lengths == length)
         what = f"breath {{value}} has {length} samples, the others have {usual}"
         advice = "Fix the breath, or pass --pad to fill short ones."
-        log.add(first_row[at], "breath_id", what, advice, values=ids[at])
+        log.add(scanned.starts[at], "breath_id", what, advice, values=ids[at])
 
 
-def check_inferable(tally: Tally, log: ProblemLog) -> None:
+def check_inferable(scanned: Scanned, log: ProblemLog) -> None:
     """Check that the interval of every breath without times can be inferred."""
-    blank = tally.column("blank").astype(bool)
-    if not blank.any():
-        return
-    ids, first_row = tally.column("breath_id"), tally.column("first_row")
-    for at in np.flatnonzero(blank & ~np.isin(ids, np.array(list(tally.inferred()), np.int64))):
+    for at in (i for i, dt in scanned.inferred.items() if dt is None):
         what = (
-            f"the times of breath {ids[at]} are blank and cannot be inferred: no breath of the "
-            "file has times, and u_out does not switch from 0 to 1 in this one"
+            f"the times of breath {scanned.breath_id[at]} are blank and cannot be inferred: no "
+            "breath of the file has times, and u_out does not switch from 0 to 1 in this one"
         )
-        advice = "Fill in time_step, in seconds."
-        log.add(first_row[at : at + 1], "time_step", what, advice, values=np.array([np.nan]))
+        advice, first = "Fill in time_step, in seconds.", scanned.starts[at : at + 1]
+        log.add(first, "time_step", what, advice, values=np.array([np.nan]))

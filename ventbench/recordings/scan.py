@@ -1,6 +1,6 @@
-"""A file as checked blocks of whole breaths, which `load` and `check` share.
+"""A file as checked breaths, which `load` and `check` share.
 
-Parquet is read here in batches, CSV in :mod:`ventbench.recordings.csv_source`.
+Checks of values, breaths and times only add to a `ProblemLog`.
 
 Blank times: a few in a breath are interpolated, those of a whole breath are inferred. Inspiration
 lasts 1.0 s, so a breath whose first n samples have u_out = 0 has an interval near 1.0 s / n. The
@@ -13,220 +13,243 @@ ms. If u_out never switches, n says nothing and the median of all breaths is tak
 
 from __future__ import annotations
 
-import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ventbench.base.errors import InputTypeError, require
-from ventbench.base.files import sha256
-from ventbench.recordings.csv_source import CsvSource, locate_rows
-from ventbench.recordings.rows import (
-    Chunk,
-    Rows,
-    Source,
-    check_ids,
-    check_lung,
-    check_row_ids,
-    check_single,
-    check_times,
-    check_values,
-    chunks_of,
-    whole_breaths,
-)
-from ventbench.recordings.schema import (
-    COLUMNS,
-    Kind,
-    Place,
-    ProblemLog,
-    RecordingError,
-    RecordingProblem,
-    check_header,
-    fail,
-)
+from ventbench.recordings.schema import COLUMNS, Column, ProblemLog, fail
+from ventbench.recordings.sources import Source
 
 if TYPE_CHECKING:
-    import pandas as pd
     import pyarrow as pa
 
-
-#: What messages call a table in memory.
-_TABLE = "the table"
-
-BATCH = 1 << 17
-"""Rows read at a time."""
+#: What is told how much of a file has been read, and of how much: bytes, or rows of Parquet.
+Progress = Callable[[int, int], object]
 
 
-@dataclass
-class ParquetSource(Source):
-    """A Parquet file, a spreadsheet, or a table in memory."""
+@dataclass(frozen=True)
+class Rows:
+    """The rows of a recording; row 0 is the first data row of the file."""
 
-    kind: Kind = "parquet"
-    table: pa.Table | None = None  #: the table in memory; None for Parquet.
-    batch: int = BATCH  #: rows that are read at a time.
+    #: arrays by column name, each (m,): int64 for id and breath_id, float64 with NaN for blank
+    #: otherwise, in the units of the schema.
+    columns: dict[str, np.ndarray]
+    #: rows with a blank breath_id, (m,) bool; breath_id then repeats the one before.
+    blank_id: np.ndarray
 
-    def __post_init__(self) -> None:
-        """Read and check names and types.
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Each breath's first row, (k,), k >= 1."""
+        ids = self.columns["breath_id"]
+        return np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1)
 
-        Raises:
-            RecordingError: the file is damaged, or its columns are not those of a recording.
-        """
-        import pyarrow as pa
-        from pyarrow import parquet
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """Rows in each breath, (k,)."""
+        return np.diff(self.starts, append=len(self.blank_id))
 
-        self.place = "row"
-        try:
-            schema = parquet.read_schema(self.file) if self.table is None else self.table.schema
-        except (pa.ArrowException, OSError) as error:
-            raise _damaged(self.file, error) from None
-        self.names = tuple(schema.names)
-        self.warnings = check_header(self.file, self.names, None)
-        problems = [
-            problem
-            for name in self.names
-            if name in COLUMNS
-            for problem in _check_type(self.file, name, schema.field(name).type)
-        ]
-        if problems:
-            raise RecordingError(problems)
-
-    def chunks(self) -> Iterator[Chunk]:
-        """Yield the rows in order; see :class:`Source`."""
-        import pyarrow as pa
-
-        known = [name for name in COLUMNS if name in self.names]
-        try:
-            for chunk in chunks_of(self._batches(known)):
-                self.done = chunk.row0 + len(chunk)
-                yield chunk
-            self.sha256 = None if self.kind == "table" else sha256(Path(self.file))
-        except (pa.ArrowException, OSError) as error:
-            raise _damaged(self.file, error) from None
-
-    def _batches(self, columns: list[str]) -> Iterator[pa.RecordBatch]:
-        from pyarrow import parquet
-
-        if self.table is not None:
-            self.size = self.table.num_rows
-            yield from self.table.select(columns).to_batches(self.batch)
-            return
-        with parquet.ParquetFile(self.file) as stream:
-            self.size = stream.metadata.num_rows
-            yield from stream.iter_batches(self.batch, columns=columns)
+    @cached_property
+    def breath(self) -> np.ndarray:
+        """Number of each row's breath, from 0, (m,)."""
+        return np.repeat(np.arange(len(self.starts)), self.lengths)
 
 
-def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[RecordingProblem]:
-    from pyarrow import types
+def rows_of(batches: Iterable[pa.RecordBatch]) -> Rows:
+    """Convert all Arrow batches of a file, of known columns in any numeric type.
 
-    if COLUMNS[name].whole:
-        good, needed = types.is_integer(kind), "int64"
-    else:
-        good, needed = types.is_integer(kind) or types.is_floating(kind), "double"
-        good = good or (name == "u_out" and types.is_boolean(kind))
-    if not good:
-        what = f"the column has type {kind}, but numbers are needed"
-        yield RecordingProblem(file, what, f"Write it as {needed}.", None, name, str(kind), "row")
-
-
-def _damaged(file: str, error: Exception) -> RecordingError:
-    text = str(error).strip().splitlines()[0].rstrip(".")
-    return fail(file, f"the Parquet file cannot be read ({text})", "Write or copy it again.")
-
-
-def open_source(path: str | os.PathLike[str] | pd.DataFrame) -> Source:
-    """Open a file, or a table in memory, and check its header.
-
-    Raises:
-        InputTypeError: it is neither.
-        RecordingError: the file cannot be read or is no recording.
+    A blank breath_id is that of the row before; at the start of the file, the first one known.
     """
-    if not isinstance(path, str | os.PathLike):
-        return _table_source(path)
-    kind = kind_of(path)
-    if kind == "xlsx":
-        return _spreadsheet_source(str(path))
-    return ParquetSource(str(path)) if kind == "parquet" else CsvSource(str(path), kind)
-
-
-def _table_source(frame: object, file: str = _TABLE, kind: Kind = "table") -> ParquetSource:
-    import pandas as pd
-    import pyarrow as pa
-
-    if not isinstance(frame, pd.DataFrame):
-        raise InputTypeError(
-            "recording", frame, "a path, a pandas table in the public schema or Breaths"
+    parts: dict[str, list[np.ndarray]] = {}
+    blanks = [np.zeros(0, bool)]
+    for batch in batches:
+        for name in batch.schema.names:
+            parts.setdefault(name, []).append(_numpy(batch.column(name), COLUMNS[name].whole))
+        blanks.append(batch.column("breath_id").is_null().to_numpy(zero_copy_only=False))
+    # One column after the other is copied and let go.
+    columns = {name: np.concatenate(parts.pop(name)) for name in list(parts)}
+    blank = np.concatenate(blanks)
+    if blank.any():
+        before = np.maximum.accumulate(
+            np.where(blank, int(np.argmin(blank)), np.arange(len(blank)))
         )
-    named = frame.rename(columns=str)
-    try:
-        table = pa.Table.from_pandas(named, preserve_index=False)
-    except (pa.ArrowException, ValueError) as error:
-        what = f"the table cannot be read ({str(error).splitlines()[0]})"
-        raise fail(file, what, "Write numbers in every column.") from None
-    return ParquetSource(file, kind, table)
+        columns["breath_id"] = columns["breath_id"][before]
+    return Rows(columns, blank)
 
 
-def _spreadsheet_source(file: str) -> ParquetSource:
-    """First sheet of a workbook; its rows count from the header."""
-    import zipfile
+def _numpy(array: pa.Array, whole: bool) -> np.ndarray:
+    import pyarrow as pa
 
-    import pandas as pd
-
-    require("openpyxl", extra="excel", what="spreadsheets")
-    try:
-        frame = pd.read_excel(file)
-    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
-        what = f"the spreadsheet cannot be read ({str(error).splitlines()[0]})"
-        raise fail(file, what, "Save it again, or as CSV.") from None
-    return _table_source(frame, file, "xlsx")
+    if whole:
+        return array.fill_null(0).cast(pa.int64()).to_numpy(zero_copy_only=False)
+    array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
+    return array.cast(pa.float64()).to_numpy(zero_copy_only=False)
 
 
-def locate(source: Source, rows: Collection[int]) -> Mapping[int, Place]:
-    """Find data rows (0 for the first) in a file: CSV lines and cells, or Parquet rows from 1."""
-    if isinstance(source, ParquetSource):
-        return {row: (row + 1 + (source.kind == "xlsx"), {}) for row in rows}
-    return locate_rows(source.file, source.kind, source.names, rows)
+#: Rows from which a value that is repeated is reported once.
+_OFTEN = 10
 
 
-def kind_of(path: str | os.PathLike[str]) -> Kind:
-    """Return the format of a file by its first bytes; its name only improves the error message.
+def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str, np.ndarray]:
+    """Check each cell: blank, infinite, out of range. Return the columns.
 
-    Raises:
-        RecordingError: no such file, a folder, no permission, empty, or another format.
+    With ``clip``, u_in is clipped to 0..100 % with a warning; otherwise it is a problem.
     """
-    name = str(path)
-    try:
-        if Path(path).is_dir():
-            raise fail(name, "this is a folder", "Name one file in it.")
-        with open(path, "rb") as stream:
-            first = stream.read(4)
-    except FileNotFoundError:
-        raise fail(name, "there is no such file", "Check the path.") from None
-    except OSError as error:
-        advice = "Check its permissions."
-        raise fail(name, f"the file cannot be read ({error.strerror})", advice) from None
-    if not first:
-        raise fail(name, "the file is empty", "Write a header and at least one breath.")
-    if first == b"PAR1":
-        return "parquet"
-    if name.endswith((".parquet", ".pq")):
-        advice = "Write it again, or name it .csv if it is text."
-        raise fail(name, "this is not a Parquet file", advice)
-    if first.startswith(b"\x1f\x8b"):
-        return "csv.gz"
-    if first.startswith(b"PK\x03\x04") and name.endswith(".xlsx"):
-        return "xlsx"
-    if first.startswith(b"PK\x03\x04"):
-        raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
-    if first.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise fail(name, "this is UTF-16 text", "Save the file as UTF-8.")
-    if first in (b"MATL", b"\x89HDF"):
-        what = "MATLAB" if first == b"MATL" else "HDF5 (MATLAB 7.3)"
-        advice = "Bring it into the schema with `ventbench data import`."
-        raise fail(name, f"this is a {what} file", advice)
-    return "csv"
+    columns = dict(rows.columns)
+    _add_blank(rows, log, "breath_id", rows.blank_id)
+    for name, values in rows.columns.items():
+        column = COLUMNS[name]
+        if column.whole:
+            continue
+        if not column.blank:
+            _add_blank(rows, log, name, np.isnan(values))
+        infinite = np.isinf(values)
+        if infinite.any():
+            at = np.flatnonzero(infinite)
+            what = "{value} is infinite"
+            log.add(at, name, what, "Fix the row.", values=values[at])
+        outside = _outside(values, column) & ~infinite
+        if not outside.any():
+            continue
+        at = np.flatnonzero(outside)
+        level, advice = "problem", column.advice
+        what = f"{{value}} is outside {column.span}"
+        if name == "u_in" and clip:
+            level, advice = "warning", "It was clipped."
+            columns[name] = np.where(infinite, values, np.clip(values, column.low, column.high))
+        elif name == "u_out":
+            what = "{value} is neither 0 nor 1"
+        elif column.positive:
+            what = f"{{value}} is not in {column.span}"
+        if name in ("R", "C"):  # the label of a whole recording: one mistake, not one a row
+            _add_once(at, name, what, advice, values[at], log)
+        else:
+            log.add(at, name, what, advice, values=values[at], level=level)
+    return columns
+
+
+def _add_once(
+    at: np.ndarray, name: str, what: str, advice: str, values: np.ndarray, log: ProblemLog
+) -> None:
+    """Report a value that many rows repeat once."""
+    kinds, first, counts = np.unique(values, return_index=True, return_counts=True)
+    often = counts >= _OFTEN
+    single = ~np.isin(values, kinds[often])
+    log.add(at[single], name, what, advice, values=values[single])
+    what = f"{what}, here and in more rows"
+    log.add(at[first[often]], name, what, advice, values=kinds[often])
+
+
+def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: np.ndarray) -> None:
+    if blank.any():
+        what = f"the cell is blank, but {name} is needed in every row"
+        at = np.flatnonzero(blank)
+        values = np.full(len(at), np.nan)
+        log.add(at, name, what, "Fill it in or remove the breath.", values=values)
+
+
+def _outside(values: np.ndarray, column: Column) -> np.ndarray:
+    if column.name == "u_out":
+        return (values != 0.0) & (values != 1.0) & ~np.isnan(values)
+    low = values <= column.low if column.positive else values < column.low
+    return low | (values > column.high)
+
+
+def check_ids(rows: Rows, log: ProblemLog) -> None:
+    """Check that the rows of each breath follow one another."""
+    ids = rows.columns["breath_id"][rows.starts]
+    _, first, which = np.unique(ids, return_index=True, return_inverse=True)
+    again = np.flatnonzero(first[which] != np.arange(len(ids)))
+    what = "breath {value} comes again, it is already at {other}"
+    advice = "Keep the rows of a breath together, and give each breath an id of its own."
+    others = rows.starts[first[which[again]]]
+    log.add(rows.starts[again], "breath_id", what, advice, values=ids[again], others=others)
+
+
+def check_lung(rows: Rows, log: ProblemLog) -> None:
+    """Check that R and C stay the same within each breath."""
+    for name in ("R", "C"):
+        values = rows.columns[name]
+        first = np.repeat(values[rows.starts], rows.lengths)
+        with np.errstate(invalid="ignore"):
+            at = np.flatnonzero((values != first) & ~np.isnan(values) & ~np.isnan(first))
+        if len(at) == 0:
+            continue
+        at = at[np.unique(rows.breath[at], return_index=True)[1]]
+        what = f"{name} changes to {{value}} within the breath, which starts at {{other}}"
+        advice = "A breath has one lung: give the second part its own breath_id, or fix the row."
+        others = rows.starts[rows.breath[at]]
+        log.add(at, name, what, advice, values=values[at], others=others)
+
+
+def check_single(rows: Rows, log: ProblemLog) -> None:
+    """Check that each breath has at least two samples."""
+    at = rows.starts[rows.lengths == 1]
+    what = "breath {value} has one sample, at least two are needed"
+    advice = "Remove it, or keep the rows of a breath together."
+    log.add(at, "breath_id", what, advice, values=rows.columns["breath_id"][at])
+
+
+def check_row_ids(rows: Rows, log: ProblemLog) -> None:
+    """Warn where the column id, which is not used otherwise, does not increase."""
+    ids = rows.columns["id"]
+    at = np.flatnonzero(ids[1:] <= ids[:-1]) + 1
+    what = "id {value} is not greater than the one before"
+    advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
+    log.add(at, "id", what, advice, values=ids[at], level="warning")
+
+
+_SORT = "Sort the rows of the breath by time_step, and remove rows that are there twice."
+
+
+def check_times(rows: Rows, log: ProblemLog) -> None:
+    """Check that the known times increase within each breath.
+
+    Repeated rows are reported as such. In breaths without times, a row is a repeat if it equals the
+    row before in every column, including `id`.
+    """
+    time, breath = rows.columns["time_step"], rows.breath
+    known = np.flatnonzero(np.isfinite(time))
+    previous, here = known[:-1], known[1:]
+    late = (time[here] <= time[previous]) & (breath[here] == breath[previous])
+    if late.any():
+        _add_order(rows, log, previous[late], here[late])
+    blank = np.isnan(time)
+    at = np.flatnonzero(blank[1:] & blank[:-1] & (breath[1:] == breath[:-1])) + 1
+    at = at[_same(rows, at - 1, at, rows.columns)] if len(at) else at
+    _add_repeat(rows, log, at - 1, at, "id", rows.columns["id"])
+
+
+def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarray) -> None:
+    time = rows.columns["time_step"]
+    equal = time[previous] == time[here]
+    names = [name for name in rows.columns if name != "id"]
+    repeat = equal & _same(rows, previous, here, names)
+    _add_repeat(rows, log, previous[repeat], here[repeat], "time_step", time)
+    for chosen, what in (
+        (equal & ~repeat, "two rows of the breath have the time {value} s, the other is {other}"),
+        (~equal, "time goes back to {value} s from {other}"),
+    ):
+        at, before = here[chosen], previous[chosen]
+        log.add(at, "time_step", what, _SORT, values=time[at], others=before)
+
+
+def _add_repeat(
+    rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarray, column: str,
+    values: np.ndarray,
+) -> None:  # fmt: skip
+    what, advice = "the row repeats {other}", "Remove one of the two."
+    log.add(here, column, what, advice, values=values[here], others=previous)
+
+
+def _same(rows: Rows, first: np.ndarray, other: np.ndarray, names: Iterable[str]) -> np.ndarray:
+    same = np.ones(len(first), dtype=bool)
+    for name in names:
+        a, b = rows.columns[name][first], rows.columns[name][other]
+        same &= (a == b) | ((a != a) & (b != b))
+    return same
 
 
 ENOUGH = 3
@@ -323,13 +346,13 @@ def _interpolate(time: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Block:
+class Scanned:
     """k whole breaths with m samples in all."""
 
     breath_id: np.ndarray  #: (k,) int64.
     R: np.ndarray  #: cmH2O/(L/s), (k,).
     C: np.ndarray  #: mL/cmH2O, (k,).
-    first_row: np.ndarray  #: each breath's first data row in the file, from 0, (k,).
+    starts: np.ndarray  #: each breath's first sample, which is its data row in the file, (k,).
     lengths: np.ndarray  #: samples, (k,).
     n_inspiratory: np.ndarray  #: leading samples with u_out = 0, (k,).
     interval: np.ndarray  #: mean sampling interval, s, NaN if times are blank, (k,).
@@ -338,57 +361,59 @@ class Block:
     #: each (m,).
     samples: dict[str, np.ndarray]
 
+    @cached_property
+    def intervals(self) -> IntervalTable:
+        """Sampling intervals of the breaths whose times are known."""
+        return interval_table(self.n_inspiratory, self.interval)
 
-def scan(source: Source, log: ProblemLog, *, clip: bool = False) -> Iterator[Block]:
-    """Read and check a file: blocks in its order, of any number of breaths.
+    @cached_property
+    def inferred(self) -> dict[int, float | None]:
+        """Interval, s, estimated for each breath without times, by its place; None without one."""
+        return {
+            i: self.intervals.estimate(int(self.n_inspiratory[i]), int(self.lengths[i]))
+            for i in np.flatnonzero(self.times.blank).tolist()
+        }
+
+
+def scan(
+    source: Source, log: ProblemLog, *, clip: bool = False, progress: Progress | None = None
+) -> Scanned:
+    """Read and check a file.
 
     The log receives all problems and warnings except those of the whole file (unequal lengths).
-    There are blocks after a problem too; their values must not be used. ``clip`` brings u_in into
-    0..100 %.
+    After a problem the values must not be used. ``clip`` brings u_in into 0..100 %.
 
     Raises:
-        RecordingError: the file cannot be parsed.
+        RecordingError: the file cannot be parsed, or has no rows.
     """
-    seen: dict[int, int] = {}
-    last: int | None = None
-    for rows in whole_breaths(source.chunks()):
-        check_ids(rows, log, seen)
-        check_single(rows, log)
-        check_lung(rows, log)
-        check_times(rows, log)
-        last = check_row_ids(rows, log, last)
-        columns = check_values(rows, log, clip=clip)
-        with np.errstate(all="ignore"):  # infinite values are problems already
-            block = _block(rows, columns)
-        yield block
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        for batch in source.batches():
+            yield batch
+            if progress is not None:
+                progress(source.done, source.size)
+
+    rows = rows_of(batches())
+    if not len(rows.blank_id):
+        what = "the file has a header but no rows"
+        raise fail(source.file, what, "Write at least one breath.")
+    for check in (check_ids, check_single, check_lung, check_times, check_row_ids):
+        check(rows, log)
+    columns = check_values(rows, log, clip=clip)
+    with np.errstate(all="ignore"):  # infinite values are problems already
+        return _scanned(rows, columns)
 
 
-def _block(rows: Rows, columns: dict[str, np.ndarray]) -> Block:
+def _scanned(rows: Rows, columns: dict[str, np.ndarray]) -> Scanned:
     starts, lengths = rows.starts, rows.lengths
     times = known_times(columns["time_step"], starts, lengths)
     keep = ("u_in", "pressure", "flow", "volume")
     samples = {name: columns[name] for name in keep if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
-    return Block(
+    return Scanned(
         breath_id=columns["breath_id"][starts], R=columns["R"][starts], C=columns["C"][starts],
-        first_row=rows.row0 + starts, lengths=lengths,
+        starts=starts, lengths=lengths,
         n_inspiratory=leading_zeros(samples["u_out"], starts, lengths),
         interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1), times=times,
         samples=samples,
     )  # fmt: skip
-
-
-def join_blocks(blocks: Sequence[Block]) -> Block:
-    """Join one block or more, in order."""
-    if len(blocks) == 1:
-        return blocks[0]
-
-    def merged(parts: Sequence[Any]) -> Any:
-        if isinstance(parts[0], np.ndarray):
-            return np.concatenate(parts)
-        if isinstance(parts[0], dict):
-            return {name: merged([part[name] for part in parts]) for name in parts[0]}
-        names = [field.name for field in fields(parts[0])]
-        return type(parts[0])(*(merged([getattr(part, name) for part in parts]) for name in names))
-
-    return merged(blocks)

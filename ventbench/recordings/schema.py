@@ -4,8 +4,8 @@ One row is one sample. The rows of a breath follow one another, in time order. T
 `id,breath_id,R,C,time_step,u_in,u_out,pressure`, and `flow` or `volume` may be added. Parquet files
 have columns of the same names.
 
-Checks collect problems by row while a file is read; only the few that are shown are looked up in
-the file afterwards, for their line and the cell as it is written.
+Checks collect problems by row; only the few that are shown are looked up in the file afterwards,
+for their line and the cell as it is written.
 """
 
 from __future__ import annotations
@@ -138,12 +138,6 @@ class ProblemLog:
             kept.append(_Entry(int(row), column, value, what, advice, other))
         kept.sort(key=lambda entry: entry.row)
         del kept[SHOWN:]
-
-    def add_once(self, row: int, column: str, what: str, advice: str, value: np.generic) -> None:
-        """Add a problem of many rows, unless the same value of the column is listed already."""
-        known = {(entry.column, entry.value, entry.what) for entry in self._kept["problem"]}
-        if (column, _text(value), what) not in known:
-            self.add(np.array([row]), column, what, advice, values=np.array([value]))
 
     def listed(self, level: Level, locate: Locate, place: str) -> tuple[RecordingProblem, ...]:
         """Return up to `SHOWN` problems of a level, in file order, each with its line or row."""

@@ -29,8 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 from ventbench.base import files, precision
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.base.executor import InProcess, executor, in_order, results
-from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
+from ventbench.base.executor import InProcess, executor, in_order
+from ventbench.base.resume import ARRAY, WorkFolder, fingerprint, kept_results
 from ventbench.controllers.pid import PID
 from ventbench.plants.catalog import Given
 from ventbench.plants.rigs import Rigs, load_rigs
@@ -197,24 +197,19 @@ def search(
     about = {"simulators": dict(settings), "gains": fingerprint(grid), "part": part}
     work = None if folder is None else WorkFolder(folder, about)
     finished: dict[str, NDArray[np.float32]] = {}
-    jobs = {}
+    jobs: dict[str, tuple[Any, Floats]] = {}
     for lung, plant in plants.items():
         plain = jax.tree.map(np.asarray, plant)
-        for first in firsts:
-            name, some = f"{lung}-{first}", grid[first : first + part]
-            if work is not None and work.has(name, ARRAY):
-                finished[name] = _read_part(work, name, len(some))
-            else:
-                jobs[name] = (plain, some)
-    done = sum(error.size for error in finished.values())
-    report = progress or (lambda done, total: None)
+        jobs |= {f"{lung}-{first}": (plain, grid[first : first + part]) for first in firsts}
+    done, report = 0, progress or (lambda done, total: None)
     report(done, total)
-    for name, error in results(pool or InProcess(), errors_of or _part_errors, jobs):
-        if name in finished:
-            raise RuntimeError(f"part {name} came back twice")
+    compute = errors_of or _part_errors
+    for name, error in kept_results(work, pool or InProcess(), compute, jobs, ARRAY):
+        shape = (len(jobs[name][1]), len(protocol.PIPS))
+        if error.shape != shape or error.dtype != np.float32:
+            path = name if work is None else work.path(name, ARRAY)
+            raise InputError(f"{path} holds {error.dtype} {error.shape}, not float32 {shape}")
         finished[name] = error
-        if work is not None:
-            work.put(name, error, ARRAY)
         done += error.size
         report(done, total)
     error = np.stack(
@@ -226,14 +221,6 @@ def search(
 def _part_errors(plant: Plant, gains: Floats) -> NDArray[np.float32]:
     stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], plant)
     return errors(stacked, gains)[0]
-
-
-def _read_part(work: WorkFolder, name: str, gains: int) -> NDArray[np.float32]:
-    error, shape = work.read(name, ARRAY), (gains, len(protocol.PIPS))
-    if error.shape != shape or error.dtype != np.float32:
-        path = work.path(name, ARRAY)
-        raise InputError(f"{path} holds {error.dtype} {error.shape}, not float32 {shape}")
-    return error
 
 
 @jax.jit

@@ -321,13 +321,12 @@ def test_a_result_without_scored_breaths_has_no_error() -> None:
 @pytest.mark.slow
 def test_six_lungs_survive_three_crashes_and_two_cables(tmp_path: Path) -> None:
     """A plan over all lungs: every breath that ended is in the log, and every run is done once."""
-    from hardware_eval.emulation.loopback import loopback
     from hardware_eval.emulation.simulated import simulated_lung
     from hardware_eval.wire.client import Client
     from ventbench.task.lungs import LUNG_IDS
 
     lungs = {name: simulated_lung(name, "physics") for name in LUNG_IDS}
-    device = loopback(simulated_lung(LUNG, "physics"))
+    device = LoopbackDevice(simulated_lung(LUNG, "physics"))
     client = Client(device, device.clock)
     client.hello()
     everything = make_plan(["pid"], LUNG_IDS, pips=(10.0,), repeats=2, control_every=0)

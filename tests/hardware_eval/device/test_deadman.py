@@ -15,9 +15,8 @@ import pytest
 
 from hardware_eval.device import deadman
 from hardware_eval.device.deadman import BOUND, DEADMAN, Deadman, SupervisedHal
-from hardware_eval.device.hal import Identity, Sample
 from hardware_eval.device.port import Guard, Port
-from hardware_eval.device.program import DeviceService, DeviceSettings
+from hardware_eval.device.program import DeviceService, DeviceSettings, Identity, Sample
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Flag, Mode

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hardware_eval.device import program
-from hardware_eval.device.hal import Sample
+from hardware_eval.device.program import Sample
 from hardware_eval.wire.messages import (
     Arm,
     Command,

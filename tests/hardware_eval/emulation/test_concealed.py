@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hardware_eval.emulation.cases import LIBRARY
-from hardware_eval.emulation.concealed import _LEFT_OUT, conceal, reveal
+from hardware_eval.emulation.simulated import _LEFT_OUT, conceal, reveal
 from ventbench.base.errors import InputError
 from ventbench.plants.corrected import Corrected
 

@@ -20,7 +20,7 @@ import pytest
 
 from hardware_eval.device import deadman
 from hardware_eval.device.deadman import MONOSTABLE
-from hardware_eval.device.hal import Sample
+from hardware_eval.device.program import Sample
 from hardware_eval.emulation.electronics import Electronics
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.wire.client import Client

@@ -14,8 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hardware_eval.device.hal import Hal, Identity, Sample
-from hardware_eval.device.program import DeviceSettings
+from hardware_eval.device.program import DeviceSettings, Hal, Identity, Sample
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.wire.messages import Mode, microseconds
 

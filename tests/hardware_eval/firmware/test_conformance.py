@@ -10,8 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hardware_eval import cli
-from hardware_eval.device.hal import Identity
-from hardware_eval.device.program import DeviceService, DeviceSettings
+from hardware_eval.device.program import DeviceService, DeviceSettings, Identity
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.wire.conformance import CLAUSES, NOT_TRIED, Clause, conformance, vectors

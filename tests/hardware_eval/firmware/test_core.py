@@ -11,7 +11,7 @@ from random import Random
 import pytest
 
 from hardware_eval.device import program
-from hardware_eval.device.hal import Identity, Sample
+from hardware_eval.device.program import Identity, Sample
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import (
     Arm,

@@ -85,7 +85,7 @@ def plain():
     base = draw_base(5.0, 10.0, rng)
     one = Case("", 5.0, 10.0, base=base, noise=0.0, step=0.0, breaths=6, samples=45)
     breaths = record(one, rng, steps=8)
-    return base, breaths, replay(one, breaths, np.full(6, base.peep), 0)
+    return base, breaths, replay(one, breaths, np.full(6, base.peep), 0, steps=4)
 
 
 @pytest.mark.parametrize(("name", "form"), EVERY)
@@ -95,7 +95,8 @@ def test_each_effect_is_there_and_stronger_is_more(plain, name, form):
     def change(strength):
         item = draw_effect(name, strength, np.random.default_rng(4), form)
         one = Case("", 5.0, 10.0, (item,), base, breaths=6)
-        return np.sqrt(np.mean((replay(one, breaths, np.full(6, base.peep), 0) - without) ** 2))
+        moved = replay(one, breaths, np.full(6, base.peep), 0, steps=4) - without
+        return np.sqrt(np.mean(moved**2))
 
     mild, strong = change("mild"), change("strong")
     assert strong > 0.01

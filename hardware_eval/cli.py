@@ -141,6 +141,7 @@ def run(
 
     chosen = numbers("--pips", pips) or list(protocol.PIPS)
     entries, track = ev.open_entries(submissions, track)
+    files.claim_folder(out)
     if seed is None:
         begun = ev.begun_plan(out)
         seed = secrets.randbits(32) if begun is None else int(begun["seed"])
@@ -238,13 +239,16 @@ def selftest(
 
     Example: `ventbench-hardware selftest --port /dev/ttyACM0 --lung R20C50`
     """
+    from hardware_eval.bench.selftest import chosen_parts
     from hardware_eval.bench.selftest import selftest as run_selftest
+    from ventbench.plants.catalog import load_simulators
     from ventbench.task.lungs import scored_lung
 
-    label = scored_lung(lung).id
+    label, simulators = scored_lung(lung).id, load_simulators(plant)
+    left_out = chosen_parts(skip or ())
     with bench_on(port, yes=True) as (line, bench, _):
         known = known_by(calibration_of(line, calibration))
-        sheet = run_selftest(bench, label, simulator=plant, skip=skip or (), **known)
+        sheet = run_selftest(bench, label, simulator=simulators, skip=left_out, **known)
     emit(sheet.as_dict(), json)
     print(sheet, file=told(json))
     if not sheet.go:
@@ -265,7 +269,6 @@ def conformance(
 
     Example: `ventbench-hardware conformance --port /dev/ttyACM0`
     """
-    from hardware_eval.results import evaluate as ev
     from hardware_eval.wire import conformance as judge
 
     if vectors:
@@ -273,6 +276,8 @@ def conformance(
         return
     if port is None:
         raise InputError("--port: give the device's serial port, such as /dev/ttyACM0")
+    from hardware_eval.results import evaluate as ev
+
     shown = told(json)
     transport, clock = ev.carrier(port)
     try:

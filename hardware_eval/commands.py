@@ -130,6 +130,7 @@ def calibrate(
 
     values = numbers("--reference", reference)
     label = scored_lung(lung).id
+    files.claim_folder(out.parent)  # what a person reads off instruments must not be lost
     with bench_on(port, yes=yes) as (line, bench, person):
         device = calibration.device_of(line.client)
         kept = calibration.load(out, device, stale=True).parts if out.exists() else {}

@@ -246,7 +246,7 @@ class RerunView:
         target: ``"live"`` for a viewer that is started, else the path of an ``.rrd`` file.
 
     Raises:
-        InputError: if rerun is not installed.
+        InputError: if rerun is not installed, or the file cannot be written.
     """
 
     def __init__(self, target: str) -> None:
@@ -255,10 +255,13 @@ class RerunView:
 
         self._rr: Any = rr
         self._stream = rr.RecordingStream("ventbench-hardware")
-        if target == "live":
-            self._stream.spawn()
-        else:
-            self._stream.save(target)
+        try:
+            if target == "live":
+                self._stream.spawn()
+            else:
+                self._stream.save(target)
+        except RuntimeError as error:  # whatever its core meets
+            raise InputError(f"--rerun {target}: {error}") from None
         self._elapsed = 0.0
 
     def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:

@@ -120,7 +120,7 @@ def make_plan(
         if not values:
             raise InputError(f"the plan has no {name}; give one at least")
         if len(set(values)) != len(values):
-            raise InputError(f"the plan names a {name} twice: {', '.join(map(str, values))}")
+            raise InputError(f"the plan names one {name} twice: {', '.join(map(str, values))}")
     for pip in pips:
         if pip not in protocol.PIPS:
             raise InputError(f"PIP {pip:g} cmH2O is not one of {_listed(protocol.PIPS)}")

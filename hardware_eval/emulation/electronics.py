@@ -210,6 +210,7 @@ def serve(
         log: file for every change of what the valves do: time of ``time.monotonic``, s, u_in, %,
             u_out, and what decided it.
     """
+    written = log.open("w", buffering=1) if log else None
     hal: Any = make()
     realtime.prefer()  # not while it compiles: nobody else would get on
     powered = True
@@ -221,7 +222,6 @@ def serve(
     signal.signal(signal.SIGUSR1, fail)
     bus.send((hal.identity, getattr(hal, "told", hal.identity.name)))
     state = Electronics(normally_open, monostable, beat=time.monotonic())
-    written = log.open("w", buffering=1) if log else None
     last: tuple[float, int, str] | None = None
     sources: list[Any] = [bus, wire]
     asked, left, rest = False, float("inf"), b""
@@ -292,7 +292,7 @@ def _main() -> None:
     about = {name: given.pop(name) for name in ("begun", "normally_open", "monostable", "log")}
     try:
         serve(bus, wire, lambda: emulated_lung(**given), **about)
-    except InputError as error:
+    except (InputError, OSError) as error:  # of the lung, of --log or --seal
         bus.send(str(error))
 
 

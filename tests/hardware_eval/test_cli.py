@@ -68,6 +68,9 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
     assert messages[5]["pressure"] == logged[0].pressure[5]
     assert again.exit_code == 0, again.output
     assert "2 of 2 runs are done" in again.output
+    unwritten = invoke("replay", str(out), "--rerun", str(file / "session.rrd"))
+    assert isinstance(unwritten.exception, InputError)
+    assert str(unwritten.exception).startswith(f"--rerun {file}")
     # The drawn seed is the plan's, so that the same command finds it done.
     assert evaluate.begun_plan(out) is not None
     analysed = invoke("trial", str(out))
@@ -171,3 +174,22 @@ def test_pressures_that_would_not_ease_are_refused_before_the_port_is_opened(
     assert isinstance(done.exception, InputError)
     assert f"--ease {ease} cmH2O: give more than 5 and at most" in str(done.exception)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("run pid_best --lung R5C20 --out {file}", "is a file, not a folder"),
+        ("calibrate zero --out {file}/calibration.json", "is a file, not a folder"),
+        ("selftest --lung R5C20 --plant nothing", "--plant 'nothing'"),
+        ("selftest --lung R5C20 --skip nothing", "no part 'nothing'"),
+    ],
+)
+def test_what_would_be_lost_at_the_end_is_refused_before_the_port_is_opened(
+    line: str, said: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    done = invoke(*line.format(file=file).split(), "--port", "/dev/nothing")
+    assert isinstance(done.exception, InputError)
+    assert said in str(done.exception)

@@ -8,12 +8,14 @@ import os
 import random
 import re
 import signal
+import socket
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing import Pipe
 from pathlib import Path
 
 import pytest
@@ -21,6 +23,7 @@ import pytest
 from hardware_eval.device import deadman
 from hardware_eval.device.deadman import MONOSTABLE
 from hardware_eval.device.program import Sample
+from hardware_eval.emulation import electronics
 from hardware_eval.emulation.electronics import Electronics
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.wire.client import Client
@@ -28,6 +31,7 @@ from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Mode
 from hardware_eval.wire.parser import LinkError, RefusedError
 from tests.hardware_eval.stand_in import Bench
+from ventbench.base.errors import InputError
 
 #: Patience with a busy machine, s.
 PATIENCE = 600.0
@@ -43,6 +47,19 @@ def test_what_the_valves_do_when_nobody_orders_anything(normally_open: bool) -> 
     unpowered = Electronics(normally_open, MONOSTABLE, (50.0, 0), beat=1.0, powered=False)
     # Closed without current, nothing can open it.
     assert unpowered.valves(1.0) == (0.0, int(normally_open), "supply")
+
+
+def test_a_log_that_cannot_be_written_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here, there), (pins, wire) = Pipe(), socket.socketpair()
+    log = tmp_path / "nowhere" / "log.csv"
+    here.send({"begun": 0.0, "normally_open": True, "monostable": MONOSTABLE, "log": log})
+    monkeypatch.setattr("sys.argv", ["", *(str(os.dup(x.fileno())) for x in (there, wire))])
+    with pins, wire, there, here:
+        electronics._main()
+        with pytest.raises(InputError, match=r"nowhere/log\.csv"):
+            electronics.introduced(here)
 
 
 class Layers(Bench):

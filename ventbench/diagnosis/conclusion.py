@@ -26,10 +26,10 @@ from ventbench.diagnosis.evaluator import (
     cross_validated_gain,
     fit_with_noise,
 )
-from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior
+from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior, Scored
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
 from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
-from ventbench.diagnosis.linearised import EFFORT, Known, Term, gaussian, names_of
+from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
 from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.noise import Noise, robust_noise
@@ -184,7 +184,7 @@ def conclude(
 class _Judged(NamedTuple):
     """A set after held-out breaths had their say."""
 
-    known: Known  #: the set.
+    chosen: Scored  #: the set.
     evaluator: Evaluator  #: with the scatter of the gains.
     whole: FittedModel  #: all of its terms that are parameters of a fit.
     left: FittedModel  #: those that are accepted.
@@ -192,7 +192,7 @@ class _Judged(NamedTuple):
     worths: dict[str, float]  #: of each of these, root-mean-square error, cmH2O.
 
 
-def _judge(evaluator: Evaluator, found: Posterior, known: Known) -> _Judged:
+def _judge(evaluator: Evaluator, found: Posterior, chosen: Scored) -> _Judged:
     """Let held-out breaths judge a set, and what is likelier than the rest of it.
 
     Of these, the one is taken whose open-loop error on held-out breaths is least: coloured noise
@@ -201,24 +201,24 @@ def _judge(evaluator: Evaluator, found: Posterior, known: Known) -> _Judged:
     rejected: set[str] = set()
     each: list[tuple[float, _Judged]] = []
     while True:
-        whole, now = _fitted(evaluator, known), evaluator
+        whole, now = _fitted(evaluator, chosen), evaluator
         gain_sd = _gain_sd(evaluator, whole, found.scatter)
         if gain_sd:
             now = replace(evaluator, gain_sd=gain_sd)
             whole = fit_with_noise(now, whole.hypothesis, whole)
-        judged = _Judged(known, now, whole, *_supported(now, whole))
+        judged = _Judged(chosen, now, whole, *_supported(now, whole))
         each.append((_square(now, judged.left), judged))
         dropped = frozenset(whole.names) - frozenset(judged.left.names)
         rejected |= dropped
-        rest = names_of(known.terms) - dropped
+        rest = names_of(chosen.terms) - dropped
         others = (s for s in found.fitted if not names_of(s.terms) & rejected)
         likelier = next((s for s in others if len(s.terms) <= len(rest)), None)
         if not dropped or likelier is None or names_of(likelier.terms) == rest:
             return min(each, key=lambda pair: pair[0])[1]
-        known = likelier
+        chosen = likelier
 
 
-def _fitted(evaluator: Evaluator, best: Known) -> FittedModel:
+def _fitted(evaluator: Evaluator, best: Scored) -> FittedModel:
     """A set fitted to all training breaths, with their noise."""
     hypothesis = best.fitted.hypothesis
     if EFFORT in names_of(best.terms):

@@ -58,11 +58,26 @@ _ODDS, _PLACE, _WARMTH = 0.7, 0.1, 0.2
 _SCATTERS = (0.003, SCATTER, 0.03, 0.1)
 
 
+class Scored(NamedTuple):
+    """A set of terms with its fit and its evidence, without the linear problem of either."""
+
+    fitted: FittedModel  #: fit of what of the terms is a parameter of the model.
+    terms: Set
+    noise: Noise
+    scatter: float  #: standard deviation of the logarithm of the breaths' gains.
+    evidence: float  #: log evidence, nats.
+
+    @classmethod
+    def of(cls, known: Known) -> Scored:
+        """From a linearised fit."""
+        return cls(known.fitted, known.terms, known.noise, known.scatter, known.evidence)
+
+
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """What the search has found."""
 
-    fitted: tuple[Known, ...]  #: sets that were fitted, likeliest first.
+    fitted: tuple[Scored, ...]  #: sets that were fitted, likeliest first.
     weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
     base: FittedModel  #: the base model.
     scatter: float  #: standard deviation of the logarithm of the breaths' gains.
@@ -78,11 +93,11 @@ class Posterior:
         return dict(sorted(odds.items(), key=lambda pair: -pair[1]))
 
     @cached_property
-    def best(self) -> Known:
+    def best(self) -> Scored:
         """The likeliest set."""
         return self.fitted[0]
 
-    def undecided(self, nats: float) -> Known:
+    def undecided(self, nats: float) -> Scored:
         """The likeliest set that has the best one's terms and more, and is so little behind."""
         names, most = names_of(self.best.terms), _log_posterior(self.best)
         near = (s for s in self.fitted if names_of(s.terms) > names)
@@ -208,9 +223,9 @@ def enumerate_sets(
     return sorted(best.values(), key=lambda pair: -pair[0])
 
 
-def _log_posterior(known: Known) -> float:
+def _log_posterior(scored: Scored) -> float:
     """Log posterior of a set that was fitted, but for a constant, nats."""
-    return known.evidence + prior(names_of(known.terms), _WARMTH)
+    return scored.evidence + prior(names_of(scored.terms), _WARMTH)
 
 
 def _integrated_out(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
@@ -247,7 +262,7 @@ class _Search:
         self.unnamed = self.settings.nonparametric_terms
         if self.unnamed is None:
             self.unnamed = tuple(basis_terms())
-        self.tried: dict[frozenset[str], Known] = {}
+        self.tried: dict[frozenset[str], Scored] = {}
         self.near: set[frozenset[str]] = set()  # of those, what is not far behind
 
     def run(self, also: Sequence[str]) -> Posterior:
@@ -268,7 +283,7 @@ class _Search:
         )
         around, noise, self.scatters = main.around, main.noise, main.scatters
         self.muscles = [term for term in main.latent if term.name in (EFFORT, MUSCLES[0])]
-        self.tried[frozenset()] = self.known(around, self.base, noise)
+        self.tried[frozenset()] = Scored.of(self.known(around, self.base, noise))
         self.near.add(frozenset())
         self.rescore(around, noise)
         if also:
@@ -287,14 +302,14 @@ class _Search:
         ranked = main.ways[main.scatters.index(ordered[0].scatter)]
         return Posterior(tuple(ordered), weigh(ordered, ranked), self.base, ordered[0].scatter)
 
-    def leading(self) -> list[Known]:
+    def leading(self) -> list[Scored]:
         """The likeliest set, and the likeliest of names alone if it is not far behind."""
         ordered = self.ordered()
         named = [s for s in ordered if not names_of(s.terms) & basis_terms().keys()]
         near = [s for s in named[:1] if ordered[0].evidence - s.evidence < self.settings.much]
         return [ordered[0], *near]
 
-    def extend(self, chosen: Known, noise: Noise) -> tuple[Simulated, Noise]:
+    def extend(self, chosen: Scored, noise: Noise) -> tuple[Simulated, Noise]:
         """Fit sets with one term more, less or other, and return what they were chosen by."""
         around, own = self.around(chosen.fitted), names_of(chosen.terms)
         noise = self.known(around, chosen.fitted, noise, chosen.terms, loose=True).left
@@ -425,19 +440,19 @@ class _Search:
             before is None
             or self.known(around, before.fitted, noise, terms).evidence < made.evidence
         ):
-            self.tried[names_of(terms)] = made
+            self.tried[names_of(terms)] = Scored.of(made)
             self.near.add(names_of(terms))
 
     def rescore(self, around: Simulated, noise: Noise) -> None:
         """Score all sets alike, but for those that are far behind."""
         for key in self.near:
             s = self.tried[key]
-            self.tried[key] = self.known(around, s.fitted, noise, s.terms)
+            self.tried[key] = Scored.of(self.known(around, s.fitted, noise, s.terms))
         most = max(self.tried[key].evidence for key in self.near)
         far = self.settings.far_behind
         self.near = {key for key in self.near if self.tried[key].evidence > most - far}
 
-    def ordered(self) -> list[Known]:
+    def ordered(self) -> list[Scored]:
         """Sets that were fitted and are not far behind, likeliest first."""
         return sorted((self.tried[key] for key in self.near), key=_log_posterior, reverse=True)
 
@@ -462,7 +477,7 @@ def without_spikes(fitted: FittedModel, data: Data) -> Data:
 
 
 def weigh(
-    scored: Sequence[Known], linear: Sequence[tuple[float, Set]]
+    scored: Sequence[Scored], linear: Sequence[tuple[float, Set]]
 ) -> dict[frozenset[str], float]:
     """Posterior of each set of names; the likeliest that was not fitted is a nat behind."""
     logs = {names_of(s.terms): _WARMTH * s.evidence for s in scored}

@@ -301,8 +301,9 @@ def t_quantile(freedom: float) -> float:
     return float(special.stdtrit(freedom, 0.975))
 
 
-#: Most refits towards an end of an interval: to bracket it, and then to bisect.
-_BRACKETING, _BISECTIONS = 14, 8
+#: Most refits towards an end of an interval, to bracket it and then to find it; and to what share
+#: of the last stride it is found.
+_BRACKETING, _REFITS, _RESOLVED = 14, 8, 0.01
 
 #: First stride for a kinked parameter, as a share of its range: at a steep wall of the likelihood
 #: the curvature says nothing.
@@ -407,29 +408,35 @@ def _plateau(fit: Fit, path: str, group: int) -> ConfidenceInterval | None:
 
 def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
     """Coordinate beyond which the profile cost exceeds ``allowed``, or the bound."""
+    from scipy import optimize  # here, as it takes long to import
+
     low, high = fit.problem.unknowns.bounds()
     bound = low[unknown] if stride < 0 else high[unknown]
-    inside, point = fit.minimum.x[unknown], fit.minimum.x
-    outside = None
+    inside, point = float(fit.minimum.x[unknown]), fit.minimum.x
+    wanted = float(np.sqrt(allowed - fit.minimum.cost))
+    known = {inside: -wanted}
+
+    def beyond(x: float) -> float:
+        """Root of the cost, which a parabola makes linear, beyond the wanted one."""
+        nonlocal point
+        if x not in known:
+            cost, end = _pinned(fit, point, unknown, x)
+            point = end if cost <= allowed else point
+            known[x] = float(np.sqrt(max(cost - fit.minimum.cost, 0.0))) - wanted
+        return known[x]
+
     for _ in range(_BRACKETING):
         trial = float(np.clip(inside + stride, low[unknown], high[unknown]))
-        cost, end = _pinned(fit, point, unknown, trial)
-        if cost > allowed:
-            outside = trial
-            break
-        inside, point, stride = trial, end, 1.6 * stride
+        if beyond(trial) > 0.0:
+            between = optimize.brentq(
+                beyond, inside, trial, xtol=_RESOLVED * abs(stride), maxiter=_REFITS,
+                full_output=True, disp=False,
+            )  # fmt: skip
+            return float(between[0])
+        inside, stride = trial, 1.6 * stride
         if trial == bound:
             return float(bound)
-    if outside is None:
-        return float(inside)
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (inside + outside)
-        cost, end = _pinned(fit, point, unknown, middle)
-        if cost > allowed:
-            outside = middle
-        else:
-            inside, point = middle, end
-    return float(0.5 * (inside + outside))
+    return inside
 
 
 def _pinned(fit: Fit, x: Floats, unknown: int, value: float) -> tuple[float, Floats]:

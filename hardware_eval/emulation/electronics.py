@@ -287,13 +287,13 @@ def emulated_lung(
 
 
 def _main() -> None:
-    bus, wire = Connection(int(sys.argv[1])), socket.socket(fileno=int(sys.argv[2]))
-    given = bus.recv()
-    about = {name: given.pop(name) for name in ("begun", "normally_open", "monostable", "log")}
-    try:
-        serve(bus, wire, lambda: emulated_lung(**given), **about)
-    except (InputError, OSError) as error:  # of the lung, of --log or --seal
-        bus.send(str(error))
+    with Connection(int(sys.argv[1])) as bus, socket.socket(fileno=int(sys.argv[2])) as wire:
+        given = bus.recv()
+        about = {name: given.pop(name) for name in ("begun", "normally_open", "monostable", "log")}
+        try:
+            serve(bus, wire, lambda: emulated_lung(**given), **about)
+        except (InputError, OSError) as error:  # of the lung, of --log or --seal
+            bus.send(str(error))
 
 
 if __name__ == "__main__":

@@ -88,6 +88,7 @@ def test_a_beating_heart_is_at_the_alveolus():
     assert (found.unnamed.name, found.unnamed.term) == (ALVEOLUS, None)
     assert found.unnamed.swing is not None
     assert found.unnamed.swing.frequency == pytest.approx(1.4, abs=0.2)
+    assert 0.0 < found.unnamed.swing.frequency_sd < 0.2
     assert found.unnamed.nats > 20.0
     assert found.full is found.named
     shown = nonparametric_term(found)

@@ -353,7 +353,8 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
     _, sizes, _, course = at(frequency, beside, training)
     power = np.mean(sizes**2, axis=0).reshape(2, -1).sum(axis=0)  # of each harmonic
     told = frequency * (1 + int(np.argmax(power)))
-    sd = told / frequency * float(max(curvature, 1e-9) ** -0.5)
+    # Where it is likeliest at an end, no parabola says more than the range.
+    sd = told / frequency * min(float(max(curvature, 1e-9) ** -0.5), float(np.ptp(near)))
     nats = evaluator.held_out_log_likelihood(beside) + at(frequency, beside, held_out)[0]
     gained = nats - evaluator.held_out_log_likelihood(fitted)
     return Swing(told, sd, course, beside.noise, nats), gained

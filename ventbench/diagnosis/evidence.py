@@ -98,9 +98,12 @@ class Posterior:
         return self.fitted[0]
 
     def undecided(self, nats: float) -> Scored:
-        """The likeliest set that has the best one's terms and more, and is so little behind."""
-        names, most = names_of(self.best.terms), _log_posterior(self.best)
-        near = (s for s in self.fitted if names_of(s.terms) > names)
+        """The likeliest term, if none at all is likelier by so little; else the best set.
+
+        A further term beside others may be no more than their form.
+        """
+        most = _log_posterior(self.best)
+        near = (s for s in self.fitted[1:] if len(s.terms) == 1 and not self.best.terms)
         return next((s for s in near if most - _log_posterior(s) < nats), self.best)
 
 

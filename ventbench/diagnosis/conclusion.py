@@ -348,8 +348,10 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
     near = frequency + step * np.arange(-4, 5)
     each = np.array([float(at(f, beside, training)[0].sum()) for f in near])
     best = int(np.clip(np.argmax(each), 1, len(near) - 2))
-    frequency = float(near[best])
-    curvature = (2.0 * each[best] - each[best - 1] - each[best + 1]) / step**2
+    below, top, above = each[best - 1 : best + 2]
+    curvature = (2.0 * top - below - above) / step**2
+    beyond = 0.5 * (above - below) / step / max(curvature, 1e-9)  # the top of their parabola
+    frequency = float(near[best] + np.clip(beyond, -step, step))
     _, sizes, _, course = at(frequency, beside, training)
     power = np.mean(sizes**2, axis=0).reshape(2, -1).sum(axis=0)  # of each harmonic
     told = frequency * (1 + int(np.argmax(power)))

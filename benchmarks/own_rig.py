@@ -140,7 +140,7 @@ def trained_on(
         [LUNG],
         out,
         config=ResidualConfig(updates=updates, members=1),
-        seed=seed,
+        seeds=[seed],
         gains=np.array([best]),  # the grid was searched before
         simulator=simulator,
     )

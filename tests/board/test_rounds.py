@@ -203,8 +203,20 @@ def _pid_bounds(own, simulators, pool, folder, **options):
 
 
 def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -> None:
-    """Two entries, one of which cannot be run; the second time nothing runs again."""
+    """Two entries, one of which cannot be run; the second time nothing runs again.
+
+    Of the other one's seeds, one is the entry itself, one a PID of half its gains, and one ends.
+    """
     monkeypatch.setattr(official_runs, "bounds_of", _pid_bounds)
+    baseline = fresh.parent / "submissions/pid_robust"
+    code = (baseline / "controller.py").read_text()
+    for seed, text in (
+        ("0", code),
+        ("1", code.replace("GAINS = (10.0", "GAINS = (5.0")),
+        ("2", "raise ValueError('no')"),
+    ):
+        (baseline / "seeds" / seed).mkdir(parents=True)
+        (baseline / "seeds" / seed / "controller.py").write_text(text)
     one = fresh.parent / "submissions/one/controller.py"
     one.write_text("raise ValueError('no')\n" + one.read_text())
     submissions = fresh.parent / "submissions"
@@ -243,6 +255,12 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
     report = verify(fresh, lambda: simulators)
     assert report.problems == []
     assert report.replayed == len(done.result.records)
+    for record in store.load(fresh).scores:
+        key = f"{record.name} ({record.track})"
+        same, other = done.result.seeds[key]
+        assert same == pytest.approx(record.ranked_values.mean(), abs=1e-9)
+        assert abs(other - same) > 1
+        assert "no" in done.result.failed[f"{key}, seed 2"]
     _proposed(fresh, checkout, simulators)
 
 

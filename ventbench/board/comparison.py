@@ -229,6 +229,13 @@ def interquartile_mean(cells: Floats, rig: Ints) -> tuple[float, float, float]:
     return float(stats.trim_mean(flat, 0.25)), float(low), float(high)
 
 
+def over_seeds(scores: Sequence[float]) -> tuple[float, float, float]:
+    """Interquartile mean of the scores of seeds, with its 95 % bootstrap interval over seeds."""
+    drawn = np.random.default_rng(_SEED).choice(np.sort(scores), (_RESAMPLES, len(scores)))
+    low, high = np.quantile(stats.trim_mean(drawn, 0.25, axis=1), (0.025, 0.975))
+    return float(stats.trim_mean(scores, 0.25)), float(low), float(high)
+
+
 @functools.lru_cache(maxsize=4)
 def _taken(rig: tuple[tuple[int, ...], ...]) -> Floats:
     """How often resamples of the rigs of each lung take each draw, ``(_RESAMPLES, K, L)``."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
-from ventbench.board import pages, ranking, store
+from ventbench.board import comparison, pages, ranking, store
 from ventbench.board.ranking import Interval, Row, Track
 from ventbench.board.record import Record, Withdrawal, created_of
 from ventbench.entries.manifest import TRACKS
@@ -100,6 +100,15 @@ def _held_out_gap(line: Line) -> float:
     return float(line.row.record.ranked_values.mean() - seen.mean()) if seen.size else math.nan
 
 
+def _seeds(line: Line) -> Interval | None:
+    """Of the entry that the round scored, if its folder holds seeds."""
+    result, key = line.track.round and line.track.round.result, line.row.record.name
+    key += f" ({line.track.name})"
+    if not result or result.records.get(key) != line.row.record.sha256 or key not in result.seeds:
+        return None
+    return Interval(*comparison.over_seeds(result.seeds[key]))
+
+
 def _stress(line: Line) -> Interval | None:
     own = line.row.record.stress
     if own is None:
@@ -154,6 +163,9 @@ COLUMNS = (
     Column(_of_three("middle"), _compared("middle"),
            "Mean of the normalised score over the middle half of all runs (IQM)",
            title="Middle half", digits=1),
+    Column(_of_three("seeds"), _seeds,
+           "Interquartile mean of the normalised score over seeds of the training",
+           title="Seeds", digits=1),
     Column(("derived_from",), lambda x: x.row.entry.source,
            "earlier entry whose commands it follows nearly everywhere"),
     Column(("clipped_share",), lambda x: x.row.record.clipped_share,

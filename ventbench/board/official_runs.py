@@ -11,10 +11,13 @@ of the stress track. No file of an earlier run is trusted; several processes can
 
 from __future__ import annotations
 
+import math
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -31,7 +34,14 @@ from ventbench.board.record import Record, RecordStress
 from ventbench.board.replay import ReplayPlants, draws_of
 from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
 from ventbench.entries import reference as references
-from ventbench.entries.folder import Submission, combined_hash, file_hashes, open_submission
+from ventbench.entries.folder import (
+    SEEDS,
+    Submission,
+    combined_hash,
+    file_hashes,
+    open_submission,
+    seeds,
+)
 from ventbench.entries.reference import Reference
 from ventbench.entries.runner import Runner
 from ventbench.entries.runs import DRAWS, Runs
@@ -369,18 +379,30 @@ def score(
                              load, runner)
         for entry, track in runs
     }  # fmt: skip
-    tell("entries", 0, len(runs))
-    made: dict[str, dict[str, str]] = {}
+    jobs |= {
+        f"{entry}-{track}-seed{at}": (*jobs[f"{entry}-{track}"], seed.name)
+        for entry, track in runs
+        for at, seed in enumerate(seeds(code[entry]))
+    }
+    tell("entries and their seeds", 0, len(jobs))
+    made: dict[str, dict[str, Any]] = {}
     for job, scored in kept_results(done, pool, _score_entry, jobs):
         made[job] = scored
-        tell("entries", len(made), len(runs))
+        tell("entries and their seeds", len(made), len(jobs))
     records: dict[str, str] = {}
     failed: dict[str, str] = {}
+    by_seed: dict[str, list[float]] = {}
     for at, (entry, track) in enumerate(runs):
         scored, key = made[f"{entry}-{track}"], f"{entry} ({track})"
         if "failed" in scored:
             failed[key] = scored["failed"][: schema.MAX_TEXT]
             continue
+        for seed in range(len(seeds(code[entry]))):
+            one = made[f"{entry}-{track}-seed{seed}"]
+            if "failed" in one:
+                failed[f"{key}, seed {seed}"] = one["failed"][: schema.MAX_TEXT]
+            else:
+                by_seed.setdefault(key, []).append(one["score"])
         path = Path(scored["record"])
         kept = leaderboard / canonical.RECORDS / path.name
         if not kept.exists():
@@ -389,16 +411,20 @@ def score(
             attestation.sign(leaderboard, path.stem, secret)
         records[key] = path.stem
         tell("records", at + 1, len(runs))
-    content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed)))
+    content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))
     files.write_atomically(own.folder / RESULT, lambda file: file.write(content))
     return rounds.load(leaderboard, name)
 
 
 def _score_entry(
     leaderboard: Path, name: str, code: Path, track: str, work: Path, load: Load,
-    runner: Callable[[], Runner],
-) -> dict[str, str]:  # fmt: skip
-    """Score one entry on one track; return the path of its record's draft, or why it failed."""
+    runner: Callable[[], Runner], seed: str = "",
+) -> dict[str, Any]:  # fmt: skip
+    """Score one entry on one track, or the same with the files of one of its seeds.
+
+    Returns:
+        The path of its record's draft, the ranked score of a seed, or why it failed.
+    """
     own, simulators = rounds.load(leaderboard, name), load()
     rigs = rigs_of(simulators)
     drawn = own.draws(rigs)
@@ -406,10 +432,20 @@ def _score_entry(
         submission = open_submission(str(code))
         if not own.entered(submission.manifest.name, track, submission.sha256 or ""):
             raise InputError(f"{code} was changed while the round was scored")
-        result = run_protocol(
-            submission, rigs, track=track, drawn=drawn, reference=own.bounds(),
-            stress=DRAWS if track == "robustness" else 0, runner=runner(),
-        )  # fmt: skip
+        with TemporaryDirectory() as place:
+            if seed:
+                other = Path(place) / code.name
+                shutil.copytree(code, other, ignore=shutil.ignore_patterns(SEEDS))
+                shutil.copytree(code / SEEDS / seed, other, dirs_exist_ok=True)
+                submission = open_submission(str(other))
+            result = run_protocol(
+                submission, rigs, track=track, drawn=drawn, reference=own.bounds(),
+                stress=DRAWS if track == "robustness" and not seed else 0, runner=runner(),
+            )  # fmt: skip
+        if seed:
+            assert result.normalised is not None
+            value = float(result.normalised[:, 1:][:, result.ranked].mean())
+            return {"failed": "a cell failed"} if math.isnan(value) else {"score": value}
         about: Mapping[str, Any] = {"round": name, "frozen": own.frozen_sha256}
         draft = create.create(result, simulators, source=about)
         path = draft.save(work / "drafts")

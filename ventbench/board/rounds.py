@@ -99,11 +99,15 @@ class Frozen(schema.Table, frozen=True):
 
 
 class Result(schema.Table, frozen=True):
-    """Content of ``result.json``: by entry and track a record, or why there is none."""
+    """Content of ``result.json``: by entry and track a record, or why there is none.
+
+    ``seeds`` are the ranked scores of an entry with the files of each of its seeds.
+    """
 
     bounds: schema.Sha256
     records: dict[str, schema.Sha256]
     failed: dict[str, str] = msgspec.field(default_factory=dict)
+    seeds: dict[str, list[float]] = msgspec.field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,8 @@ def population(
 def residual(
     lung: Lung = None,
     every: All = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of weights and deviations.")] = 0,
+    seed: Seed = 0,
+    seeds: Seeds = 1,
     updates: Annotated[
         int | None, typer.Option(min=1, help="Updates of each network; default: 3000.")
     ] = None,
@@ -167,8 +168,9 @@ def residual(
                 tell(what, *progress[:2], text=f"{what}: {progress[2]:.3f} cmH2O")
 
         trained = train_residual(
-            names, out, config=config, seed=seed, simulator=plant, progress=report
-        )
+            names, out, config=config, seeds=range(seed, seed + seeds), simulator=plant,
+            progress=report,
+        )  # fmt: skip
     console = told(trained.report, json)
     console.print(_residual_table(trained.report))
     console.print(f"wrote {out}", soft_wrap=True)

@@ -35,6 +35,10 @@ from ventbench.task.interfaces import API_VERSION, Task
 MAX_BYTES = 5_000_000
 MAX_FILES = 1000
 
+#: Folder of a submission with a folder for each seed of its training, and most of them: the files
+#: of one stand for those of the submission, so that a round tells how much a seed is worth.
+SEEDS, MAX_SEEDS = "seeds", 10
+
 # Written by Python and by desktops, not by the author.
 _IGNORED_FOLDERS, _IGNORED_FILES = {"__pycache__"}, {".DS_Store"}
 
@@ -77,6 +81,12 @@ def resolve(name: str) -> Path:
     raise SubmissionError(f"{name}: no such folder and no bundled submission of that name; {hint}")
 
 
+def seeds(folder: Path) -> list[Path]:
+    """Folders of the seeds of a submission's training, by name; empty if it has none."""
+    inside = (folder / SEEDS).iterdir() if (folder / SEEDS).is_dir() else ()
+    return sorted(path for path in inside if path.is_dir() and path.name not in _IGNORED_FOLDERS)
+
+
 def open_submission(name: str) -> Submission:
     """Find a submission as :func:`resolve` does, and check its folder and manifest.
 
@@ -102,6 +112,8 @@ def open_submission(name: str) -> Submission:
             break
     if size > MAX_BYTES:
         problems.append(f"{name}: {size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:g} MB are accepted")
+    if len(seeds(folder)) > MAX_SEEDS:
+        problems.append(f"{name}: more than {MAX_SEEDS} folders in {SEEDS}")
     for required in (CONTROLLER, MANIFEST):
         if not (folder / required).is_file():
             problems.append(f"{name}: {required} is missing")

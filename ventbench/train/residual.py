@@ -39,6 +39,8 @@ from ventbench.task.interfaces import Controller, Plant
 from ventbench.task.metrics.score import run_error
 from ventbench.train.pid_grid import tune_pid
 from ventbench.train.plants import ALL, TrainedControllers, check_names, plants_to_train_on
+from ventbench.train.rl import episodes
+from ventbench.train.rl.train import fresh_error
 
 
 @dataclass(frozen=True)
@@ -358,15 +360,17 @@ def train_residual(
     out: Path | str = "runs/residual",
     *,
     config: ResidualConfig | None = None,
-    seed: int = 0,
+    seeds: Sequence[int] = (0,),
     gains: Floats | None = None,
     simulator: Given = "frozen",
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train corrections of the best PIDs by differentiating through simulators.
 
-    Writes ``weights.npz``, as ``submissions/residual_mlp`` reads it, and ``training.json``. An
-    interrupted training continues where it was; a finished one is repeated, to the same bytes.
+    Writes ``weights.npz``, as ``submissions/residual_mlp`` reads it, ``training.json`` and, of each
+    of several seeds, ``weights-SEED.npz``. Of the trainings of a network the one with the lowest
+    error on freshly drawn cells is kept. An interrupted training continues where it was; a finished
+    one is repeated, to the same bytes.
 
     Example::
 
@@ -378,7 +382,7 @@ def train_residual(
             network for each lung of the simulators if not given.
         out: folder.
         config: settings of the training.
-        seed: seed of the weights and the random deviations, common to all networks.
+        seeds: seeds of the weights and the random deviations, of the trainings of each network.
         gains: grid of P, I, D, %/cmH2O, shape ``(G, 3)``, of which each network corrects the best
             PID; the paper's grid if not given.
         simulator: simulators with plants to train through, see :func:`ventbench.load_simulators`;
@@ -400,6 +404,7 @@ def train_residual(
     official = trained_on.nominal
     lungs = {name: take(official, index) for index, name in enumerate(known)}
     _, tuned = tune_pid(known if ALL in names else names, gains=gains, simulator=simulator)
+    each: dict[int, dict[str, Residual]] = {seed: {} for seed in seeds}
     controllers, about = {}, {}
     for name in names:
         best = tuple(tuned["single"]["gains"] if name == ALL else tuned["lungs"][name]["gains"])
@@ -407,40 +412,49 @@ def train_residual(
         plants = jax.tree.map(
             lambda leaf, where=where: np.asarray(leaf)[:, where], trained_on.plants
         )
-        started = time.perf_counter()
-        with precision.float32():
-            controllers[name] = fit(
-                plants,
-                best,
-                config=config,
-                seed=seed,
-                checkpoint=_checkpoint(out, name),
-                progress=lambda *how_far, name=name: progress(f"network {name}", how_far),
-                keep=True,
-                weights=trained_on.weights[where],
-            )
+        weights = trained_on.weights[where]
+        started, fresh = time.perf_counter(), []
+        for seed in seeds:
+            about_it = f"network {name}, seed {seed}" if len(seeds) > 1 else f"network {name}"
+            with precision.float32():
+                each[seed][name] = fit(
+                    plants, best, config=config, seed=seed, keep=True, weights=weights,
+                    checkpoint=_checkpoint(out, name, seed),
+                    progress=lambda *how_far, about_it=about_it: progress(about_it, how_far),
+                )  # fmt: skip
+                fresh.append(float(_fresh(episodes.Lungs(plants, weights), each[seed][name])))
+        chosen = seeds[int(np.argmin(fresh))]
+        controllers[name] = each[chosen][name]
         about[name] = {
             "gains": list(best),
+            "seed": chosen,
             "seconds": round(time.perf_counter() - started, 1),
+            "error_fresh": fresh,
             "error_pid": _errors(PID(*best), lungs, where),
             "error": _errors(controllers[name], lungs, where),
         }
     save_weights(out / WEIGHTS, controllers)
+    for seed in seeds if len(seeds) > 1 else ():
+        save_weights(out / f"weights-{seed}.npz", each[seed])
     report = {
         "networks": about,
         "recipe": dataclasses.asdict(config),
-        "seed": seed,
+        "seeds": list(seeds),
         "simulators": dict(trained_on.about),
         "weights_sha256": files.sha256(out / WEIGHTS),
     }
     files.write_json(out / RESULT, report)
     for name in names:
-        _checkpoint(out, name).unlink(missing_ok=True)
+        for seed in seeds:
+            _checkpoint(out, name, seed).unlink(missing_ok=True)
     return TrainedControllers(controllers, report, out)
 
 
-def _checkpoint(out: Path, name: str) -> Path:
-    return out / PARTS / f"{name}.npz"
+_fresh = jax.jit(fresh_error)
+
+
+def _checkpoint(out: Path, name: str, seed: int) -> Path:
+    return out / PARTS / f"{name}-{seed}.npz"
 
 
 def _errors(

@@ -115,8 +115,8 @@ def nominal_error(lungs: episodes.Lungs, policy: Any) -> Array:
     return jnp.mean(episodes.errors(drawn, policy))
 
 
-def _fresh_error(lungs: episodes.Lungs, policy: Any) -> Array:
-    """Error on fresh cells, weighted as in the training."""
+def fresh_error(lungs: episodes.Lungs, policy: Any) -> Array:
+    """Error of a policy on fresh cells of its lungs, weighted as in the training, cmH2O."""
     count = VALIDATION_CELLS * lungs.count
     key = jax.random.key(VALIDATION_SEED)
     return jnp.mean(episodes.errors(episodes.draw(key, lungs, count), policy))
@@ -132,7 +132,7 @@ def _advance(method: Learner, runs: _Run, plants: episodes.Lungs, count: int) ->
 
         state, _ = jax.lax.scan(iterate, run.state, None, length=count)
         policy = method.policy(state)
-        fresh = _fresh_error(plant, policy)
+        fresh = fresh_error(plant, policy)
         better = fresh < run.error
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), policy, run.best)
         errors = jnp.stack([nominal_error(plant, policy), fresh])
@@ -240,8 +240,8 @@ Method = PolicyGradient | PPO | DQN
 _ONE_LUNG: dict[str, Method] = {"policy-gradient": PolicyGradient(), "ppo": PPO(), "dqn": DQN()}
 _ALL_LUNGS: dict[str, Method] = {
     "policy-gradient": PolicyGradient(breaths=36),
-    "ppo": PPO(breaths=288, widths=(64, 64)),
-    "dqn": DQN(breaths=72, memory=7200, widths=(128, 128)),
+    "ppo": PPO(breaths=288, iterations=1200, widths=(64, 64)),
+    "dqn": DQN(breaths=72, iterations=4800, memory=7200, widths=(128, 128)),
 }
 
 #: Called with what is trained, the share that is done and the best error so far, cmH2O.
@@ -260,9 +260,10 @@ def train_ppo(
 ) -> TrainedControllers:
     """Train corrections of a PID by proximal policy optimisation.
 
-    Writes ``weights.npz``, as ``submissions/ppo`` reads it, and ``training.json``. Of the trainings
-    of a network the one with the lowest error on freshly drawn cells is kept; the published draws
-    have no part in that choice. An interrupted training continues where it was.
+    Writes ``weights.npz``, as ``submissions/ppo`` reads it, ``training.json`` and, of each of
+    several seeds, ``weights-SEED.npz``. Of the trainings of a network the one with the lowest error
+    on freshly drawn cells is kept; the published draws have no part in that choice. An interrupted
+    training continues where it was.
 
     Example::
 
@@ -373,7 +374,9 @@ def _train(
         for group in groups
     ]
     report = progress or (lambda *_: None)
-    policies, about, checkpoints, used = {}, {}, [], {}
+    about, checkpoints, used = {}, [], {}
+    policies: dict[str, Any] = {}
+    each: dict[int, dict[str, Any]] = {seed: {} for seed in seeds}
     for group, settings in zip(groups, methods, strict=True):
         label, kind = ", ".join(group.names), "all" if ALL in group.names else "one"
         checkpoints.append(out / f".{name}-{kind}.npz")
@@ -390,9 +393,11 @@ def _train(
         pids = _pid_errors(plants)
         used[kind] = asdict(settings)
         for index, network in enumerate(group.names):
-            about[network], best = _best_run(trained, index, seeds)
+            about[network] = _best_run(trained, index, seeds)
             about[network]["error_pid"] = pids[index * len(seeds)]
-            policies[network] = jax.tree.map(lambda leaf, best=best: leaf[best], trained.policies)
+            for run, seed in enumerate(seeds, index * len(seeds)):
+                each[seed][network] = jax.tree.map(lambda x, run=run: x[run], trained.policies)
+            policies[network] = each[about[network]["seed"]][network]
     result = {
         "method": name,
         "recipes": used,
@@ -402,6 +407,8 @@ def _train(
         "seconds": round(time.perf_counter() - began, 1),
     }
     rl_policy.save_weights(out / "weights.npz", policies)
+    for seed in seeds if len(seeds) > 1 else ():
+        rl_policy.save_weights(out / f"weights-{seed}.npz", each[seed])
     files.write_json(out / "training.json", result)
     for checkpoint in checkpoints:
         checkpoint.unlink(missing_ok=True)
@@ -430,18 +437,14 @@ def _pid_errors(lungs: episodes.Lungs) -> list[float]:
         return [float(error) for error in errors]
 
 
-def _best_run(
-    trained: TrainedPolicies, network: int, seeds: Sequence[int]
-) -> tuple[dict[str, Any], int]:
-    """Entries of a network in the report, and the index of its best run."""
+def _best_run(trained: TrainedPolicies, network: int, seeds: Sequence[int]) -> dict[str, Any]:
+    """Entries of a network in the report, of which ``seed`` is that of its best run."""
     first = network * len(seeds)
     rows = slice(first, first + len(seeds))
-    best = first + int(np.argmin(trained.validation[rows]))
-    about = {
-        "seed": int(seeds[best - first]),
+    return {
+        "seed": int(seeds[int(np.argmin(trained.validation[rows]))]),
         "error_fresh": [float(value) for value in trained.validation[rows]],
         "error_nominal_at_end": [float(value) for value in trained.curves[rows, -1]],
         "breaths": int(trained.episodes[-1]),
         "training_seconds": round(float(trained.seconds[-1]), 1),
     }
-    return about, best

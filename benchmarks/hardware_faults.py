@@ -6,7 +6,7 @@ fault's beginning until the device holds the inspiratory valve closed and the ex
 
     python benchmarks/hardware_faults.py [--trials 10] [--lung R20C20] [--json FILE]
 
-Prints the table of ``hardware_eval/README.md``.
+Prints the table of ``hardware_eval/README.md``, and what a self-test says of each fault.
 """
 
 from __future__ import annotations

@@ -41,10 +41,8 @@ def table(scores: list[dict[str, Any]]) -> str:
         row("", lambda e: e["name"]),
         "|---|" + "---|" * len(scores),
         row("stress score, cmH2O", scored),
-        row("rise, cmH2O", lambda e: f"{e['rise']:+.2f}"),
         row("survived", lambda e: f"{e['survived']:.1%}"),
         row(f"unsafe of {scores[0]['stressed_runs']} runs", lambda e: f"{e['unsafe_runs']}"),
-        row("worst condition, cmH2O", lambda e: f"{e['worst_error']:.1f}"),
         row("stressors held out of tuning, cmH2O", lambda e: f"{e['held_out_score']:.2f}"),
     ]
     return "\n".join(lines)

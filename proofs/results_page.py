@@ -120,13 +120,10 @@ def _commands(
 _BOARD = {
     "log score, nats": "log score, nats",
     "isolation accuracy": "isolation accuracy",
-    "calibration error (ECE)": "calibration error",
     "detected, where something is missing": "detected",
     "false alarms, where nothing is missing": "false alarms",
     "right name and size": "right name and size",
     "a confident wrong name": "confident wrong name",
-    "withheld inspirations, error, cmH2O": "inspirations, cmH2O",
-    "processor seconds, mean": "seconds",
 }
 
 #: Paired differences beside them.
@@ -140,17 +137,18 @@ def board_section(result: Board) -> str:
     drawn = {generator: rows[0].draws for generator, rows in result.tables.items()}
     lines = _commands(drawn, names, "board")
     lines += ["", f"The last two columns are `{result.against}` minus the other, case by case."]
-    heads = ["diagnoser", "code", "cases", *_BOARD.values(), *(f"less: {what}" for what in _PAIRED)]
+    heads = ["world", "diagnoser", "code", "cases", *_BOARD.values()]
+    heads += [f"less: {what}" for what in _PAIRED]
+    lines += ["", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for generator, rows in result.tables.items():
-        lines += ["", f"World `{generator}`:", "", f"| {' | '.join(heads)} |"]
-        lines.append("|---" * len(heads) + "|")
         for row in rows:
             figures = {figure.what: figure for figure in row.figures}
             compared = result.differences(row)
-            cells = [_cell(figures[what]) for what in _BOARD]
-            cells += [_cell(compared[what]) if compared else "" for what in _PAIRED]
             code = ", ".join(row.versions) or "–"
-            lines.append(f"| {row.diagnoser} | {code} | {len(row.cases)} | {' | '.join(cells)} |")
+            cells = [f"`{generator}`", row.diagnoser, code, str(len(row.cases))]
+            cells += [_cell(figures[what]) for what in _BOARD]
+            cells += [_cell(compared[what]) if compared else "" for what in _PAIRED]
+            lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -74,10 +74,10 @@ def test_the_board_has_a_column_and_a_difference_for_each() -> None:
     draws = (Draw("words", "abc123", 5, 5),)
     rows = (Judged("ours", "faults", draws, ours), Judged("flat", "faults", draws, other))
     text = board_section(Board("ours", {"faults": rows}))
-    assert "\n| ours | – | 5 | 0 (0..0) | 1 (1..1) |" in text
-    assert "\n| flat | – | 3 | 6.91 (6.91..6.91) | 0 (0..0) |" in text
+    assert "\n| `faults` | ours | – | 5 | 0 (0..0) | 1 (1..1) |" in text
+    assert "\n| `faults` | flat | – | 3 | 6.91 (6.91..6.91) | 0 (0..0) |" in text
     assert text.endswith(" | -6.91 (-6.91..-6.91) | -1 (-1..-1) |")
-    assert text.count("\n| ours |") == 1
+    assert text.count("| ours |") == 1
     assert "| `faults` | `words` | `abc123` |" in text
     assert "for where in runs/faults; do for who in ours flat; do python -m proofs" in text
     assert text.count("challenge board runs/faults --seed=words\n") == 1

@@ -95,7 +95,7 @@ def _sandbox(problems: list[str]) -> str:
     if missing:
         problems.append(
             f"scores made here are not official: the sandbox lacks {', '.join(missing)} "
-            "(see docs/security_manual.md)"
+            "(see docs/security.md)"
         )
         return f"no: the sandbox lacks {', '.join(missing)}"
     return "yes: every layer of the sandbox is in force"

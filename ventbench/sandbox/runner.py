@@ -38,7 +38,7 @@ _PROBE_S = 30.0
 _WITHOUT = {
     ("empty-root", "landlock"): (
         "read every file of this user",
-        "allow user namespaces (docs/security_manual.md) or boot a kernel with Landlock",
+        "allow user namespaces (docs/security.md) or boot a kernel with Landlock",
     ),
     ("seccomp",): (
         "reach the network and other processes",

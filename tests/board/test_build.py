@@ -138,3 +138,10 @@ def test_a_correction_takes_the_place_of_its_record(leaderboard, out, draft, sim
     assert f"records/{old.sha256}.json" in page
     rows = csv.DictReader(io.StringIO((out / "leaderboard.csv").read_text()))
     assert [row["record"] for row in rows if row["name"] == "softer"] == [new.sha256]
+
+
+def test_what_the_maintainers_say_of_entries_is_text(leaderboard: Path, out: Path) -> None:
+    notes = leaderboard / "rounds/r1/notes.toml"
+    notes.write_text('[entries]\npid_best = "its <b>grid</b> ends"\n')
+    build.build(leaderboard, out)
+    assert "<dd>its &lt;b&gt;grid&lt;/b&gt; ends</dd>" in (out / "index.html").read_text()

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import frames, store
+from ventbench.board import canonical, frames, store
 from ventbench.task.lungs import LUNG_IDS
 
 
@@ -40,6 +40,24 @@ def test_scores_of_lungs_give_the_score(full: Path) -> None:
     for kind in ("score", "nominal"):
         lungs = board[[f"{kind}_{lung}_cmH2O" for lung in LUNG_IDS]]
         np.testing.assert_allclose(lungs.mean(axis=1, skipna=False), board[f"{kind}_cmH2O"])
+
+
+def test_seeds_stand_beside_the_entry_that_the_round_scored(leaderboard: Path) -> None:
+    path = leaderboard / "rounds/r1/result.json"
+    result = canonical.parse(path.read_bytes(), "result")
+    key = "pid_best (performance)"
+    before = frames.load_board(leaderboard).set_index(["name", "track"])
+    result["records"] = {key: before.loc[("pid_best", "performance"), "record"]}
+    result["seeds"] = {key: [60.0, 62.0, 61.0, 63.0, 90.0]}
+    path.write_bytes(canonical.canonical(result))
+    board = frames.load_board(leaderboard).set_index(["name", "track"])
+    own = board.loc[("pid_best", "performance")]
+    assert own["seeds"] == 62.0  # of the middle three
+    assert 60.0 <= own["seeds_low"] < 62.0 < own["seeds_high"] <= 90.0
+    assert board["seeds"].drop(("pid_best", "performance")).isna().all()
+    result["records"][key] = "0" * 64
+    path.write_bytes(canonical.canonical(result))
+    assert frames.load_board(leaderboard)["seeds"].isna().all()
 
 
 def test_cells_are_those_of_the_records(full: Path) -> None:

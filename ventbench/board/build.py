@@ -139,6 +139,7 @@ def _round(own: Round) -> dict[str, Any]:
         "entries": frozen.entries if frozen else [],
         "left_out": sorted(frozen.left_out.items()) if frozen else [],
         "failed": sorted(result.failed.items()) if result else [],
+        "notes": list(own.notes().items()),
     }
 
 

@@ -34,6 +34,9 @@ ROUND_FILES = (
     "round.toml", "protocol.json", "frozen.toml", "beacon.json", "bounds.npz", "result.json",
 )  # fmt: skip
 
+#: Of a round too: what the maintainers say of entries.
+NOTES = "notes.toml"
+
 #: What a build writes: the page of the board, its CSV, pages of rounds, and pages of entries.
 INDEX, CSV = "index.html", "leaderboard.csv"
 BUILT = re.compile(
@@ -43,7 +46,7 @@ BUILT = re.compile(
 
 _PART = re.compile(
     rf"{RECORDS}/[0-9a-f]{{64}}\.(json|actions|sig)|"
-    rf"{ROUNDS}/{ROUND_NAME}/({'|'.join(map(re.escape, ROUND_FILES))})"
+    rf"{ROUNDS}/{ROUND_NAME}/({'|'.join(map(re.escape, (*ROUND_FILES, NOTES)))})"
 )
 
 

@@ -7,7 +7,8 @@ A round is a folder ``rounds/NAME/`` of the leaderboard; each file is bound by t
 - ``frozen.toml``: hashes of the two, the time, and of each entry account and hash of its files;
 - ``beacon.json``: the beacon's first value after freeze and delay;
 - ``bounds.npz``: best attainable and best PID of the draws, once the entries were scored;
-- ``result.json``: its hash, and what became of each entry.
+- ``result.json``: its hash, and what became of each entry;
+- ``notes.toml``, if the maintainers have written it: why an entry is where it is, a sentence each.
 
 The seed of the draws is HMAC-SHA256 of the hash of ``frozen.toml`` with the beacon's randomness as
 the key. Nobody can know it before the freeze, and nobody can choose it: the number of the value is
@@ -110,6 +111,12 @@ class Result(schema.Table, frozen=True):
     seeds: dict[str, list[float]] = msgspec.field(default_factory=dict)
 
 
+class Notes(schema.Table, frozen=True):
+    """Content of ``notes.toml``: a sentence by entry; no rank or figure follows from it."""
+
+    entries: dict[schema.EntryName, schema.Text]
+
+
 @dataclass(frozen=True)
 class Round:
     """A round as far as it has come; make one with :func:`load`."""
@@ -159,6 +166,11 @@ class Round:
     def draws(self, rigs: Rigs) -> Draws:
         """Draws of the round."""
         return rigs.draws(draw_tables.COUNT, seed=self.seed, name=self.name)
+
+    def notes(self) -> dict[str, str]:
+        """Why an entry is where it is, by name; empty if nobody has said."""
+        path = self.folder / canonical.NOTES
+        return _toml(path, Notes).entries if path.exists() else {}
 
     def bounds(self) -> Reference:
         """Best attainable and best PID of the draws.

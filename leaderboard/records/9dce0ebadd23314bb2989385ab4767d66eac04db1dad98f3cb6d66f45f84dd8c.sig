@@ -1,1 +1,0 @@
-{"key":"c19dd706c3fb8c94","record":"9dce0ebadd23314bb2989385ab4767d66eac04db1dad98f3cb6d66f45f84dd8c","signature":"3272d4a9ebc40a8febbaf593ed740239ccefdef55606bb3bfebf79ea4ef38666b13eda1d30b022a73a082cce29fbd9c2f9bdf0d69fb6ce8ff4b16854e507df07"}

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.base.text import number
-from ventbench.pages import panels, report, write_figure, write_report
+from ventbench.pages import panels, report, write_report
 from ventbench.pages import panels as shared
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
@@ -115,9 +114,8 @@ def test_failed_cells(failed: Trajectories, best: Trajectories, tmp_path: Path) 
 
 
 def test_equal_input_gives_equal_bytes(best: Trajectories, robust: Trajectories, tmp_path: Path):
-    for write in (write_report, write_figure):
-        one, two = (write(tmp_path / name, [best, robust]).read_bytes() for name in "ab")
-        assert one == two
+    one, two = (write_report(tmp_path / name, [best, robust]).read_bytes() for name in "ab")
+    assert one == two
 
 
 def test_score_files(best: Trajectories, robust: Trajectories, tmp_path: Path) -> None:
@@ -193,24 +191,6 @@ def test_path_breaks_at_gaps() -> None:
     line = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, np.nan], [3.0, 3.0], [4.0, 2.5]])
     assert panels.path(line) == "M0 0l1 1M3 3l1-.5"
     assert panels.area(line, line) == ""
-
-
-def test_figure(
-    best: Trajectories, robust: Trajectories, failed: Trajectories, tmp_path: Path
-) -> None:
-    matplotlib = pytest.importorskip("matplotlib", reason="needs the extra ventbench[view]")
-    image = pytest.importorskip("PIL.Image")
-    before = dict(matplotlib.rcParams)
-    path = write_figure(tmp_path / "figure.png", [best, robust, failed])
-    assert dict(matplotlib.rcParams) == before
-    assert path.stat().st_size < 300_000
-    picture = image.open(io.BytesIO(path.read_bytes()))
-    assert picture.width == 1800
-    pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
-    for color in ((0, 0x65, 0xB3), (0x80, 0x80, 0x80)):
-        near = np.abs(pixels.astype(int) - color).max(axis=1) < 12
-        assert near.sum() > 1000, "each run is drawn"
-    assert (pixels > 250).all(axis=1).mean() > 0.4
 
 
 def test_protocol_is_the_shown_one(best: Trajectories, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from ventbench.base.errors import InputError
 from ventbench.pages import panels as shared
 from ventbench.trajectories import Trajectories
 
-WRITERS = (pages.write_rerun, pages.write_report, pages.write_figure)
+WRITERS = (pages.write_rerun, pages.write_report)
 Writer = Callable[[Path, Sequence[Trajectories]], Path]
 
 
@@ -78,7 +78,7 @@ def test_labels_are_short_printable_and_distinct(best: Trajectories) -> None:
 
 @pytest.mark.parametrize(
     ("write", "module"),
-    list(zip(WRITERS, ("rerun", "jinja2", "matplotlib"), strict=True)),
+    list(zip(WRITERS, ("rerun", "jinja2"), strict=True)),
 )
 def test_missing_extra(
     write: Writer,

@@ -289,9 +289,6 @@ def report(
         Path | None,
         typer.Option(metavar="FILE", help="File to write; default: report.html in the first RUN."),
     ] = None,
-    figure: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also write the panels as a PNG.")
-    ] = None,
 ) -> None:
     """Write a self-contained HTML report of scored runs.
 
@@ -301,8 +298,6 @@ def report(
 
     loaded, scores = _read(runs)
     typer.echo(f"wrote {pages.write_report(out or runs[0] / 'report.html', loaded, scores)}")
-    if figure is not None:
-        typer.echo(f"wrote {pages.write_figure(figure, loaded)}")
 
 
 COMMANDS = (lungs, coverage, simulate, open_loop, fmu, view, report)

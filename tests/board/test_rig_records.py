@@ -319,18 +319,12 @@ def test_pages_show_both_scores(built):
     assert "--protocol" not in page
 
 
-def test_frames_and_cells(board):
+def test_a_frame_of_the_board(board):
     frame = frames.load_board(board)
     row = frame[frame["name"] == "pid_robust"].iloc[0]
     assert row["normalised"] == pytest.approx(100.0)
     assert row["normalised_R20C50"] == pytest.approx(100.0)
     assert row["draws"] == ROUND
-    record = frames.load_tracks(board)[1].ranked[0].record
-    by_lung, by_pip = frames.cell_means(record, "all"), frames.cell_means(record, "R5C10")
-    assert list(by_lung) == [*record.lungs, "mean"]
-    assert by_pip["mean"] == pytest.approx(by_lung["R5C10"])
-    with pytest.raises(InputError, match="--lung R1C1"):
-        frames.cell_means(record, "R1C1")
 
 
 def test_accepting_is_what_ranks(board, tmp_path):

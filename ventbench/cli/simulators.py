@@ -170,9 +170,7 @@ def open_loop(
 
     The error of a breath is the mean |simulated - recorded| pressure over its inspiratory samples,
     cmH2O; the simulation starts at the first recorded pressure. For held-out errors, a member of
-    the ensemble that was not trained on a breath simulates it. Breaths that another lung or valve
-    gain explains far better than their label are listed as misfits; only the last column leaves
-    them out.
+    the ensemble that was not trained on a breath simulates it.
 
     Example: `ventbench open-loop recording.csv --json errors.json`
     """
@@ -191,7 +189,7 @@ def open_loop(
         result = open_loop_report.open_loop(breaths, chosen, progress=simulating)
     console = told(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
-    for line in result.misfit_lines():
+    for line in result.remarks():
         console.print(line)
 
 
@@ -199,17 +197,16 @@ def _open_loop_table(result: dict[str, Any]) -> Any:
     def show(value: float | None) -> str:
         return "-" if value is None else f"{value:.2f}"
 
-    rows = []
-    for lung, figures in result["lungs"].items():
-        apart = figures["fitting_label"]
-        rows.append((
+    rows = [
+        (
             lung, str(figures["breaths"]), show(figures["mae"]), show(figures["median_mae"]),
             show(figures["held_out_mae"]), "..".join(map(show, figures["held_out_ci95"])),
             show(figures["held_out_median_mae"]),
-            f"{show(apart['held_out_mae'])} ({apart['held_out_breaths']})",
-        ))  # fmt: skip
+        )
+        for lung, figures in result["lungs"].items()
+    ]  # fmt: skip
     title = f"Open-loop MAE of the {result['plant']} simulators, cmH2O"
-    columns = ("lung", "n", "mean", "median", "held-out", "95 %", "median", "no misfits")
+    columns = ("lung", "n", "mean", "median", "held-out", "95 %", "median")
     return table_of(title, columns, rows, no_wrap=True)
 
 

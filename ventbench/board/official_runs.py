@@ -28,7 +28,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.base.resume import WorkFolder, kept_results
-from ventbench.board import attestation, canonical, create, rounds, schema, store
+from ventbench.board import canonical, create, gate, rounds, schema, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.record import Record, RecordStress
 from ventbench.board.replay import ReplayPlants, draws_of
@@ -408,7 +408,7 @@ def score(
         if not kept.exists():
             store.add(leaderboard, path, simulators)
         if secret:
-            attestation.sign(leaderboard, path.stem, secret)
+            gate.sign(leaderboard, path.stem, secret)
         records[key] = path.stem
         tell("records", at + 1, len(runs))
     content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))

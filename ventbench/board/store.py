@@ -19,7 +19,7 @@ import numpy as np
 from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.board import attestation, canonical, record, rounds, schema
+from ventbench.board import canonical, gate, record, rounds, schema
 from ventbench.board.canonical import RECORDS
 from ventbench.board.gate import Evidence
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
@@ -39,7 +39,7 @@ class Store:
     folder: Path  #: of the leaderboard.
     records: tuple[AnyRecord, ...]  #: all of them.
     #: hashes of the records that somebody who may do so vouches for; see
-    #: :mod:`ventbench.board.attestation`.
+    #: :mod:`ventbench.board.gate`.
     attested: frozenset[str]
     rounds: tuple[Round, ...] = ()  #: all of them, the newest first.
 
@@ -76,7 +76,7 @@ def load(folder: Path) -> Store:
         OSError: if one cannot be read.
     """
     records = in_order(read_record(path) for path in record_paths(folder))
-    attested, problems = attestation.attested(folder, measured(records))
+    attested, problems = gate.attested(folder, measured(records))
     if problems:
         raise InputError(problems[0])
     return Store(folder, records, attested, rounds.load_all(folder))

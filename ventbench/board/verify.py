@@ -15,7 +15,7 @@ import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.board import attestation, canonical, ranking, rounds, store
+from ventbench.board import canonical, gate, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.official_runs import STRESS_TOLERANCE, folders
 from ventbench.board.record import AnyRecord, Record
@@ -86,7 +86,7 @@ def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Rep
     report.records = len(entries)
     report.problems += _strange_files(folder, entries, whole=len(entries) == len(paths))
     report.problems += store.conflicts(entries)
-    vouched, problems = attestation.attested(folder, store.measured(entries))
+    vouched, problems = gate.attested(folder, store.measured(entries))
     report.problems += problems if len(entries) == len(paths) else []
     leaderboard = Store(folder, entries, vouched, tuple(_rounds(folder, load, report)))
     by_draw = _check_replay(leaderboard, load, report, progress)

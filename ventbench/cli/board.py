@@ -135,13 +135,13 @@ def sign(
     """
     import os
 
-    from ventbench.board import attestation, store
+    from ventbench.board import gate, store
 
-    secret = os.environ.get(attestation.SECRET, "")
+    secret = os.environ.get(gate.SECRET, "")
     if not secret:
-        raise InputError(f"environment variable {attestation.SECRET} holds no key")
+        raise InputError(f"environment variable {gate.SECRET} holds no key")
     sha256 = store.find_record(store.load(folder), record).sha256
-    typer.echo(f"signed {sha256}: {attestation.sign(folder, sha256, secret)}")
+    typer.echo(f"signed {sha256}: {gate.sign(folder, sha256, secret)}")
     typer.echo("next: ventbench board build")
 
 
@@ -151,10 +151,10 @@ def new_key() -> None:
 
     Example: `ventbench board new-key`
     """
-    from ventbench.board import attestation
+    from ventbench.board import gate
 
-    secret, lines = attestation.new_key()
-    typer.echo(f"# secret: {attestation.SECRET} of the workflow; keep it nowhere else\n{secret}\n")
+    secret, lines = gate.new_key()
+    typer.echo(f"# secret: {gate.SECRET} of the workflow; keep it nowhere else\n{secret}\n")
     typer.echo(f"# public: for leaderboard/attestations.toml\n{lines}", nl=False)
 
 

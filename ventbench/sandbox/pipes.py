@@ -38,8 +38,7 @@ from ventbench.sandbox.child.zygote import (
     START,
     TOKEN,
 )  # fmt: skip
-from ventbench.sandbox.configuration import SandboxError
-from ventbench.sandbox.reader import ENVIRONMENT, OPTIONS, ROOT, SITE
+from ventbench.sandbox.reader import ENVIRONMENT, OPTIONS, ROOT, SITE, SandboxError
 from ventbench.task.interfaces import Task
 
 #: Of bytes that nothing had asked for, whether they are found with the reply or before the next.

@@ -235,7 +235,6 @@ def _entry_pages(
 def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, Any]:
     track, status, row = line
     record, header = row.record, row.record.header
-    draws = pages.dumbbells(record, base)
     cells = {column.names[0]: column.cell(line) for column in SHOWN}
     return {
         "record": record,
@@ -256,9 +255,6 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
         "heat": pages.heat_map(
             np.concatenate([record.nominal[None], record.drawn]), record, pages.ERROR_LIMITS
         ),
-        "differences": pages.difference_map(record, base) if base else None,
-        "draws": draws,
-        "dots": pages.trusted(draws["drawing"]) if draws else None,
         "safety": _safety(record),
         "failures": header.failures[:MAX_FAILURES],
         "frames": [pages.trusted(pages.frame(pip)) for pip in record.pips],

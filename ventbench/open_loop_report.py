@@ -12,6 +12,7 @@ import numpy as np
 
 from ventbench.base import files
 from ventbench.base.arrays import Floats, Ints
+from ventbench.base.text import number
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators, names
 from ventbench.plants.stacking import PlantsFor, open_loop_breaths
@@ -94,7 +95,7 @@ class OpenLoopReport:
         """Return mean errors by lung, and the sentences of :meth:`remarks`."""
         title = f"Open-loop MAE of the {self.plant} simulators, cmH2O"
         rows = [
-            f"  {name}: {_shown(figures['mae'])}, held out {_shown(figures['held_out_mae'])} "
+            f"  {name}: {number(figures['mae'])}, held out {number(figures['held_out_mae'])} "
             f"({figures['breaths']} breaths)"
             for name, figures in self.lungs.items()
         ]
@@ -166,10 +167,6 @@ def open_loop(
         perhaps_copies=tuple(perhaps),
         notes=breaths.notes,
     )
-
-
-def _shown(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def errors(

@@ -12,7 +12,6 @@ import pytest
 from ventbench.base.errors import InputError
 from ventbench.base.text import number
 from ventbench.pages import panels, report, write_report
-from ventbench.pages import panels as shared
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
 
@@ -54,7 +53,7 @@ class Page(HTMLParser):
 
 
 def score_file(run: Trajectories, **more: Any) -> dict[str, Any]:
-    cells = shared.errors(run)
+    cells = run.errors().to_numpy()
     lungs = {
         lung: {
             "score": float(row.mean()),
@@ -71,7 +70,7 @@ def test_report(best: Trajectories, robust: Trajectories, tmp_path: Path) -> Non
     page = Page(text)
     assert path.stat().st_size < 300_000
     figures = [attrs["aria-label"] for tag, attrs in page.tags if attrs.get("role") == "img"]
-    errors = shared.errors(best)
+    errors = best.errors().to_numpy()
     assert len(figures) == 36
     for i, lung in enumerate(best.lungs):
         assert lung in page.text
@@ -163,7 +162,7 @@ def test_best_and_differences(best: Trajectories, robust: Trajectories) -> None:
     assert not base["best"]
     assert (ours["class"], base["difference"]) == ("better", "")
     assert ours["difference"] == number(
-        shared.errors(best).mean() - shared.errors(robust).mean(), sign=True
+        best.errors().to_numpy().mean() - robust.errors().to_numpy().mean(), sign=True
     )
     same = report.table(best.lungs, panels.collect([best, best]))[0]["cells"][0]
     assert (same["difference"], same["class"]) == ("±0.00", "same")
@@ -235,7 +234,7 @@ def test_runs_of_two_tracks_are_headed_by_both(best: Trajectories, robust: Traje
 
 
 def test_two_runs_are_compared_cell_by_cell(best: Trajectories, robust: Trajectories) -> None:
-    own, other = shared.errors(best), shared.errors(robust)
+    own, other = best.errors().to_numpy(), robust.errors().to_numpy()
     draws = {"sha256": "d" * 64, "version": 1}
     given = [
         score_file(best, draws={"score": 2.0, "ci95": [1.9, 2.1], "values": [1.9, 2.1], **draws}),

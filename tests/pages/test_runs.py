@@ -55,8 +55,8 @@ def test_errors_by_hand(best: Trajectories, failed: Trajectories) -> None:
         for step in range(34):
             t = 100 * breath + step
             total += abs(best.pressure[3, 4, t] - 30.0)
-    assert shared.errors(best)[3, 4] == pytest.approx(total / 68, rel=1e-12)
-    errors = shared.errors(failed)
+    assert best.errors().to_numpy()[3, 4] == pytest.approx(total / 68, rel=1e-12)
+    errors = failed.errors().to_numpy()
     assert np.isnan(errors[1, 2])
     # The infinite pressure lies in an expiration, which is not scored.
     assert np.isfinite(errors[1, 3])

@@ -7,7 +7,7 @@ with those of the scorer to 1e-9; matrix products of another batch size may roun
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -246,7 +246,7 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
     header, clipped = record.header, record.header.clipped
     size = int(np.prod(header.actions.shape))
     failed = np.isnan(record.nominal).any(axis=1) | np.isnan(record.drawn).any(axis=(0, 2))
-    checks: tuple[tuple[str, ArrayLike, ArrayLike, float], ...] = (
+    checks: tuple[Check, ...] = (
         ("errors.nominal", record.nominal, replayed.nominal, TOLERANCE),
         ("errors.drawn", record.drawn, replayed.drawn, TOLERANCE),
         ("spread", record.spread, replayed.spread, TOLERANCE),
@@ -264,7 +264,7 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("rigs.session", record.headroom.session, replayed.session, 0.0),
         ("rigs.member", record.headroom.member, replayed.member, 0.0),
     )
-    texts = [text for check in checks if (text := _difference(*check)) is not None]
+    texts = worst(checks)
     for key, recorded, given in (
         ("errors.nominal", record.nominal, replayed.nominal),
         ("errors.drawn", record.drawn, replayed.drawn),
@@ -274,8 +274,7 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
             of_draws, now = (
                 x.mean(axis=(-2, -1)) for x in (recorded, given)
             )  # NaN if a cell failed
-            text = _difference(f"{key}, mean over cells", of_draws, now, MEAN_TOLERANCE)
-            texts += [] if text is None else [text]
+            texts += worst([(f"{key}, mean over cells", of_draws, now, MEAN_TOLERANCE)])
     return texts + lung_leaks(record, replayed)
 
 
@@ -306,17 +305,28 @@ def lung_leaks(record: Record, replayed: Replayed) -> list[str]:
     ]
 
 
-def _difference(key: str, recorded: ArrayLike, replayed: ArrayLike, tolerance: float) -> str | None:
-    """Describe the worst value of a key, if it is off by more than the tolerance."""
-    recorded, replayed = np.asarray(recorded, float), np.asarray(replayed, float)
-    if recorded.shape != replayed.shape:
-        return f"key {key} has shape {recorded.shape}, its commands give {replayed.shape}"
-    off = _off(recorded, replayed)
-    if off.size == 0 or np.all(off <= tolerance):
-        return None
-    index: Any = np.unravel_index(int(np.argmax(off)), off.shape)
-    place = "".join(f"[{i}]" for i in index)
-    return f"key {key}{place} says {recorded[index]:.15g}, its commands give {replayed[index]:.15g}"
+#: A key of a record, its values there and now, and how far they may be off.
+Check = tuple[str, ArrayLike, ArrayLike, float]
+
+
+def worst(checks: Iterable[Check], source: str = "its commands") -> list[str]:
+    """Describe the worst value of each key that is off by more than its tolerance.
+
+    What has no value in the record is off by nothing; ``source`` says what gives the values now.
+    """
+    texts = []
+    for key, recorded, given, tolerance in checks:
+        recorded, given = np.asarray(recorded, float), np.asarray(given, float)
+        if recorded.shape != given.shape:
+            texts.append(f"key {key} has shape {recorded.shape}, {source} give {given.shape}")
+            continue
+        off = _off(recorded, given)
+        if not np.all(off <= tolerance):
+            at: Any = np.unravel_index(int(np.argmax(off)), off.shape)
+            place = "".join(f"[{i}]" for i in at)
+            said, now = f"{recorded[at]:.15g}", f"{given[at]:.15g}"
+            texts.append(f"key {key}{place} says {said}, {source} give {now}")
+    return texts
 
 
 def _off(recorded: ArrayLike, replayed: ArrayLike) -> np.ndarray:

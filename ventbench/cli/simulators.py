@@ -12,6 +12,7 @@ import typer
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.base.text import number
 from ventbench.cli.options import (
     Clip,
     JsonFile,
@@ -194,14 +195,11 @@ def open_loop(
 
 
 def _open_loop_table(result: dict[str, Any]) -> Any:
-    def show(value: float | None) -> str:
-        return "-" if value is None else f"{value:.2f}"
-
     rows = [
         (
-            lung, str(figures["breaths"]), show(figures["mae"]), show(figures["median_mae"]),
-            show(figures["held_out_mae"]), "..".join(map(show, figures["held_out_ci95"])),
-            show(figures["held_out_median_mae"]),
+            lung, str(figures["breaths"]), number(figures["mae"]), number(figures["median_mae"]),
+            number(figures["held_out_mae"]), "..".join(map(number, figures["held_out_ci95"])),
+            number(figures["held_out_median_mae"]),
         )
         for lung, figures in result["lungs"].items()
     ]  # fmt: skip

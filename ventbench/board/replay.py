@@ -1,8 +1,7 @@
 """Recorded commands through the frozen simulators again: no code of a submission is needed.
 
-Commands do not answer to pressures here, and every inspiration starts from the lung at PEEP, so
-that all breaths of all cells of several records advance together, 33 steps in all. Numbers agree
-with those of the scorer to 1e-9; matrix products of another batch size may round differently.
+All cells of several records advance together. Numbers agree with those of the scorer to 1e-9;
+matrix products of another batch size may round differently.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from ventbench.board.schema import ScoreHeader
 from ventbench.entries.cells import as_float64
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
-from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
 from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario
@@ -38,6 +36,7 @@ from ventbench.task.metrics.score import (
     run_error,
     safety_limit,
 )
+from ventbench.task.rollouts import Script
 
 #: The breath whose nominal inspirations are kept for the page.
 TRACE_BREATH = max(protocol.SCORED_BREATHS)
@@ -96,39 +95,16 @@ class Replayed:
 
 @jax.jit
 def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
-    """Airway pressures for commands of the same shape, ``(L, n, ..., S)``; cells ``(L, ...)``.
+    """Airway pressures for commands ``(N, L, ..., B, S)``, of that shape; cells ``(L, ...)``."""
 
-    The n inspirations are all breaths of some runs, breath by breath.
-    """
+    def run(commands: Array, plant: Plant, cells: Scenario) -> Array:
+        script = Script(commands.reshape(*commands.shape[:-2], -1))
+        return rollouts.closed_loop(plant, script, cells)[0].pressure
 
-    def lung(plant: Plant, cells: Scenario, commands: Array) -> Array:
-        def inspiration(commands: Array, breath: Array) -> Array:
-            varied = env.vary(plant, cells, breath)
-            _, _, pressure = rollouts.inspiration(
-                varied, cells, rollouts.commanded, inputs=jnp.moveaxis(commands, -1, 0),
-                record=lambda before, *_: before.signals.scored,
-            )  # fmt: skip
-            return jnp.moveaxis(pressure, 0, -1)
-
-        return jax.vmap(inspiration)(commands, jnp.arange(len(commands)) % protocol.BREATHS)
-
-    return jax.vmap(lung)(plants, cells, requested)
+    return jax.vmap(jax.vmap(run), (0, None, None))(requested, plants, cells)
 
 
 _members = jax.jit(jax.vmap(_pressures, in_axes=(0, None, None)))
-
-
-def _breaths_first(requested: Floats) -> Array:
-    """From ``(N, L, ..., B, S)`` to ``(L, N B, ..., S)``."""
-    moved = np.moveaxis(requested, (1, -2), (0, 2))
-    return jnp.asarray(moved.reshape(moved.shape[0], -1, *moved.shape[3:]))
-
-
-def _breaths_last(values: Array, count: int) -> Floats:
-    """Back again."""
-    array = np.asarray(values)
-    split = array.reshape(array.shape[0], count, protocol.BREATHS, *array.shape[2:])
-    return np.moveaxis(split, (0, 2), (1, -2))
 
 
 def pressures(
@@ -148,8 +124,7 @@ def pressures(
     with precision.float64():
         plants, cells = rigs_of(simulators).cells(draws, pips)
         plants = as_float64(plants, requested.shape[1])
-        pressure = _pressures(plants, cells, _breaths_first(requested))
-    return _breaths_last(pressure, len(requested))
+        return np.asarray(_pressures(plants, cells, jnp.asarray(requested)))
 
 
 def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
@@ -169,8 +144,7 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
     with precision.float64():
         cells, _, _ = draw_tables.with_nominal(None, [0] * lungs, pips)
         plants = as_float64(simulators.ensemble, members)
-        pressure = _members(plants, cells, _breaths_first(requested[:, :, None]))
-    by_member = np.stack([_breaths_last(pressure[m], len(requested)) for m in range(members)])
+        by_member = np.asarray(_members(plants, cells, jnp.asarray(requested[:, :, None])))
     deviation = np.std(by_member[:, :, :, 0], axis=0, ddof=1)
     assert deviation.shape[1] == lungs
     return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))

@@ -216,8 +216,6 @@ def _entry_pages(
     for status, row in track.rows:
         name = row.record.name
         path = pages.address(row.record)
-        if path in made:  # an older official record beside a newer unofficial one
-            continue
         same = base is not None and row.record.sha256 == base.sha256
         values = _values(Line(track, status, row), None if same else base, evidence)
         drawn = pages.panels(pages.paths(row.record), None if same else other)
@@ -301,21 +299,16 @@ def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
 
 def _history(row: Row, evidence: Evidence) -> list[dict[str, Any]]:
     """All records of the entry, newest first, and what became of each."""
-    counts = row.record.sha256
     lines = []
     for record in row.entry.history:
-        state = "counts" if record.sha256 == counts else "superseded"
-        official = evidence.official(record)
         withdrawn = evidence.withdrawn.get(record.sha256)
-        if not official and state != "counts":
-            state = "not official"
+        state = "counts" if record.sha256 == row.record.sha256 else "does not count"
         lines.append(
             {
                 "sha256": record.sha256,
                 "created": record.header.created,
-                "official": official,
-                "state": "withdrawn" if withdrawn is not None else state,
-                "reason": withdrawn or record.header.reason,
+                "state": state if withdrawn is None else "withdrawn",
+                "reason": withdrawn or "",
             }
         )
     return lines

@@ -51,7 +51,7 @@ def at_hand(folder: Path) -> Path:
     return path
 
 
-#: Characters of a hash that tables show, as `--supersedes` and `verify --rerun` take them.
+#: Characters of a hash that tables show, as `withdraw` and `verify --rerun` take them.
 SHOWN = 8
 
 
@@ -64,40 +64,20 @@ def add(
             help="JSON files of `ventbench score --record DIR`, each with its commands next to it.",
         ),
     ],
-    supersedes: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HASH", help="SHA-256 (or its beginning) of the record that this one corrects."
-        ),
-    ] = None,
-    reason: Annotated[str, typer.Option(help="Reason of the correction, shown on the page.")] = "",
-    source: Annotated[
-        list[str] | None,
-        typer.Option(metavar="KEY=TEXT", help="Origin of the submission; may be repeated."),
-    ] = None,
     folder: Folder = FOLDER,
 ) -> None:
     """Add records whose replay gives the recorded numbers.
 
-    Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
+    Example: `ventbench board add runs/record/3f2a....json`
     """
-    from ventbench.board import create, store
+    from ventbench.board import store
     from ventbench.plants import frozen
 
-    parts = [text.partition("=") for text in source or ()]
-    about = {key: text for key, _, text in parts}
-    if not all(about.values()):
-        raise InputError("--source needs KEY=TEXT, such as commit=9c1e5d0")
-    if supersedes is not None and len(paths) > 1:
-        raise InputError("--supersedes is about one record: add the others by themselves")
-    if supersedes is not None:
-        supersedes = store.find_record(store.load(folder), supersedes).sha256
     done = []
     try:
         with bar("replaying records") as replaying:
             for path in paths:
-                new = create.amend(path, supersedes=supersedes, reason=reason, source=about)
-                done.append(store.add(folder, new, frozen.load()))
+                done.append(store.add(folder, path, frozen.load()))
                 replaying(len(done), len(paths))
     finally:  # also those before one that is refused
         for added in done:

@@ -101,14 +101,14 @@ def _value(key: str, kind: Any, value: Any) -> Any:
     for entry in entries:
         if isinstance(entry, str):
             _check_text(entry)
+            if key == "name" and not NAME.fullmatch(entry):
+                raise ValueError(f"{_shown(entry)} {NAME_RULE}")
         elif abs(entry) >= _MAX_SEED:
             raise ValueError("must be an integer of at most 64 bits")
         choices = _CHOICES.get(key, (entry,))
         if entry not in choices:
             hint = _hint(entry, choices)
             raise ValueError(f"{_shown(entry)} is not one of {', '.join(choices)}{hint}")
-    if key == "name" and not NAME.fullmatch(kept):
-        raise ValueError(f"{_shown(kept)} {NAME_RULE}")
     if key == "api_version" and kept != API_VERSION:
         speaks = f"this ventbench speaks version {API_VERSION}"
         raise ValueError(f"{_shown(kept)} is not supported; {speaks}")

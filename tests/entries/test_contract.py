@@ -19,7 +19,7 @@ from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import check_files, open_submission
 from ventbench.entries.review import check_sources
 from ventbench.entries.runner import InProcessRunner
-from ventbench.sandbox.reader import Allowance
+from ventbench.sandbox.pipes import Allowance
 from ventbench.sandbox.runner import SandboxRunner
 
 from .conftest import MANIFEST

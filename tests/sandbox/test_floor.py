@@ -17,7 +17,7 @@ from ventbench.cli import app
 from ventbench.entries import contract
 from ventbench.sandbox import runner as runner_module
 from ventbench.sandbox.child import kernel, seccomp
-from ventbench.sandbox.reader import SandboxError
+from ventbench.sandbox.pipes import SandboxError
 from ventbench.sandbox.runner import SandboxRunner, layers
 
 ROOT = Path(runner_module.__file__).parents[2]

@@ -240,7 +240,7 @@ def check(
     """
     folder = resolve(name)
     if runner is None:  # first: a machine that cannot run it reads none of it
-        from ventbench.sandbox.reader import Allowance
+        from ventbench.sandbox.pipes import Allowance
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))

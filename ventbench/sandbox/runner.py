@@ -27,8 +27,17 @@ from ventbench.sandbox.child import kernel, lockdown, wire
 from ventbench.sandbox.child.cell import Failure, SubmissionError, printable
 from ventbench.sandbox.child.lockdown import FLOOR, OFFICIAL
 from ventbench.sandbox.child.wire import Reply
-from ventbench.sandbox.pipes import Asked, Clock, Outcome, Pipes, ZygoteClient, signal_name
-from ventbench.sandbox.reader import Allowance, SandboxError, configuration
+from ventbench.sandbox.pipes import (
+    Allowance,
+    Asked,
+    Clock,
+    Outcome,
+    Pipes,
+    SandboxError,
+    ZygoteClient,
+    configuration,
+    signal_name,
+)
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 

@@ -1,11 +1,11 @@
-"""Figures of the bundled entries on the stress track: the table and the picture of docs/stress.md.
+"""Figures of the bundled entries on the stress track: the table of docs/stress.md.
 
 Prints the table, and paired differences between the best entry and the others. The figures are
 those of the leaderboard's records; ``--run`` runs the bundled entries anew. Usage:
 
     python benchmarks/stress.py [--run [--draws N]] [--write]
 
-``--write`` puts table and picture into docs/.
+``--write`` puts the table into docs/.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from ventbench.base import compilation
 from ventbench.board.frames import load_tracks
 from ventbench.entries.runs import DRAWS, Runs
 from ventbench.entries.scoring import score
-from ventbench.pages.plots import write_stress_chart
 
 ENTRIES = ("pid_robust", "residual_mlp_all", "ppo", "dqn", "adaptive_pid")
 DOCS = Path(__file__).parents[1] / "docs"
@@ -50,7 +49,7 @@ def table(scores: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="put table and picture into docs/")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/")
     parser.add_argument("--run", action="store_true", help="run the entries anew, in this process")
     parser.add_argument("--draws", type=int, default=DRAWS, help="with --run: number of draws")
     given = parser.parse_args()
@@ -69,7 +68,6 @@ def main() -> None:
         block = f"<!-- figures -->\n{text}\n<!-- end -->"
         old = re.compile(r"<!-- figures -->\n.*?\n<!-- end -->", re.S)
         page.write_text(old.sub(lambda _: block, page.read_text("utf-8")), "utf-8")
-        write_stress_chart(DOCS / "img" / "stress.png", scores)
 
 
 def recorded() -> dict[str, Runs]:

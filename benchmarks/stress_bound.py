@@ -24,8 +24,7 @@ from ventbench.entries.cells import Cells, protocol_of
 from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE
 from ventbench.plants.rigs import load_rigs
 from ventbench.task import attainable, protocol
-from ventbench.task.metrics.figures import steady_error
-from ventbench.task.metrics.score import passes_safety_gate
+from ventbench.task.metrics.score import passes_safety_gate, steady_error
 from ventbench.task.stressors import WEIGHTS
 
 #: Steps that the starts of the search open the valve for: of six, two.

@@ -90,7 +90,7 @@ def figures(result: Score) -> str:
 def main() -> int:
     """Look at the pull request that the environment names; see ``score-pr.yml``."""
     from ventbench.plants.rigs import load_rigs
-    from ventbench.sandbox.configuration import Allowance
+    from ventbench.sandbox.pipes import Allowance
     from ventbench.sandbox.runner import SandboxRunner
 
     pull = workflow.required("SOURCE"), workflow.required("BASE"), workflow.required("COMMIT")

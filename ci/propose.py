@@ -15,7 +15,7 @@ from ci import workflow
 from ci.git import AUTHOR, Git
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.board import attestation, canonical, record, rounds, store
+from ventbench.board import canonical, gate, record, rounds, store
 from ventbench.board.record import Record
 from ventbench.board.replay import ReplayPlants
 
@@ -63,7 +63,7 @@ def add(
         if not isinstance(new, Record) or new.header.draws.sha256 != own.commitment:
             raise InputError(f"{path.name} is no record of round {name}")
         if secret:
-            attestation.sign(leaderboard, new.sha256, secret)
+            gate.sign(leaderboard, new.sha256, secret)
         added.append(new)
     return added
 
@@ -106,10 +106,10 @@ def main() -> int:
     lines = []
     if scored := os.environ.get("SCORED"):
         # Read here, where no code of a submission runs.
-        secret = os.environ.get(attestation.SECRET) or None
+        secret = os.environ.get(gate.SECRET) or None
         added = add(Path(scored), checkout / "leaderboard", name, frozen.load(), secret)
         lines += [f"{score.name} ({score.track}): record {score.sha256}" for score in added]
-        lines.append("signed" if secret else f"not signed, not ranked: {attestation.SECRET} unset")
+        lines.append("signed" if secret else f"not signed, not ranked: {gate.SECRET} unset")
     state = rounds.load(checkout / "leaderboard", name).state
     branch = commit(checkout, name, state)
     workflow.output(branch=branch)

@@ -33,5 +33,5 @@ print(f"this controller {score.score:.3f}, pid_robust {baseline.score:.3f} cmH2O
 
 OUT.mkdir(parents=True, exist_ok=True)
 runs = [score.trajectories, baseline.trajectories]
-print("wrote", pages.write_figure(OUT / "pi.png", runs))
+print("wrote", pages.write_report(OUT / "pi.html", runs))
 print("wrote", pages.write_rerun(OUT / "pi.rrd", runs))

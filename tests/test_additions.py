@@ -64,7 +64,7 @@ class Controller:
 
 #: File, what stands there, and the line that is added before it.
 LINES = (
-    ("task/metrics/figures.py", '    "swings":', '    "top_cmH2O": lambda s: s.pressure.max(-1),'),
+    ("task/metrics/score.py", '    "swings":', '    "top_cmH2O": lambda s: s.pressure.max(-1),'),
     (
         "plants/plant_files.py", '    "hybrid":',
         '    "balloon": PlantFamily(Balloon, lambda lung: Balloon(lung.C)),',
@@ -93,7 +93,7 @@ from ventbench.entries import manifest, scaffold
 from ventbench.physics import library, physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.task.lungs import lung
-from ventbench.task.metrics.figures import InspirationSignals, figures
+from ventbench.task.metrics.score import InspirationSignals, figures
 
 assert ventbench.__file__.startswith(sys.argv[1])
 ramp = np.linspace(5.0, 21.0, 34)

@@ -19,7 +19,7 @@ from ventbench.controllers.pid import PID
 from ventbench.entries import scoring
 from ventbench.entries.folder import open_submission
 from ventbench.plants.rigs import load_rigs
-from ventbench.sandbox.configuration import SandboxError
+from ventbench.sandbox.pipes import SandboxError
 
 TESTS = Path(__file__)
 ROOT = TESTS.parents[1]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,50 +12,16 @@ import numpy as np
 
 from ventbench.base import files
 from ventbench.base.arrays import Floats, Ints
+from ventbench.base.text import number
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators, names
 from ventbench.plants.stacking import PlantsFor, open_loop_breaths
 from ventbench.recordings import Breaths, load
-from ventbench.task.interfaces import Plant
-from ventbench.task.lungs import RECORDED_LUNGS
 from ventbench.task.metrics import bootstrap
 from ventbench.task.metrics.open_loop import mae
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-#: A breath is looked at more closely if its error exceeds this, cmH2O ...
-SUSPECT = 1.0
-
-#: ... and does not fit its label if another explanation leaves less than this share of its error.
-FAR_BETTER = 0.4
-
-#: Factors on the flow of the valve that are tried as explanations.
-GAINS = (0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6)
-
-#: Misfits that a printed report names; the JSON has all.
-_MISFITS_SHOWN = 20
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """A breath that something else than its label explains far better.
-
-    Attributes:
-        breath_id: id of the breath in the recording.
-        lung: label of the lung.
-        mae: error under its label, cmH2O.
-        explanation: what explains the breath better, such as ``"lung R20C20"`` or ``"valve gain x
-            0.8"``.
-        mae_explained: error under the explanation, cmH2O.
-    """
-
-    breath_id: int
-    lung: str
-    mae: float
-    explanation: str
-    mae_explained: float
 
 
 @dataclass(frozen=True)
@@ -64,14 +30,12 @@ class OpenLoopReport:
 
     Attributes:
         plant: name of the simulators.
-        simulators: version and hashes of the official ones, by which misfits are judged.
+        simulators: version and hashes of the official ones.
         about: what is known of simulators from a file, a function or the caller; else None.
         lungs: figures by lung id, those of :func:`summary`: without prefix of the simulators that
             make the scores, over all breaths; ``held_out_...`` of each breath by a member of the
             ensemble that has not seen it; ``official_held_out_...`` of the simulators that make the
-            scores, on what they have not seen. In ``fitting_label`` the figures without the
-            misfits.
-        misfits: breaths that something else than their label explains far better.
+            scores, on what they have not seen.
         not_judged: ids of breaths without a first or another inspiratory pressure.
         perhaps_copies: ids of breaths with the commands of one of the training, of which blank
             pressures do not tell whether they are copies: they count as such.
@@ -82,7 +46,6 @@ class OpenLoopReport:
     simulators: dict[str, Any]
     about: dict[str, Any] | None
     lungs: dict[str, dict[str, Any]]
-    misfits: tuple[Misfit, ...]
     not_judged: tuple[int, ...]
     perhaps_copies: tuple[int, ...]
     notes: tuple[str, ...]
@@ -100,39 +63,20 @@ class OpenLoopReport:
             **({} if self.about is None else {"about": self.about}),
             "unit": "cmH2O",
             "lungs": self.lungs,
-            "misfits": [asdict(misfit) for misfit in self.misfits],
             "not_judged": list(self.not_judged),
             "perhaps_copies": list(self.perhaps_copies),
             "notes": list(self.notes),
         }
 
     def to_frame(self) -> pd.DataFrame:
-        """One row a lung: the figures of :attr:`lungs`, those without misfits excepted."""
+        """One row a lung: the figures of :attr:`lungs`."""
         import pandas as pd
 
-        rows = {
-            name: {key: value for key, value in figures.items() if key != "fitting_label"}
-            for name, figures in self.lungs.items()
-        }
-        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("lung")
+        return pd.DataFrame.from_dict(self.lungs, orient="index").rename_axis("lung")
 
-    def misfit_lines(self) -> list[str]:
-        """Sentences about the breaths that do not fit their label or could not be judged."""
+    def remarks(self) -> list[str]:
+        """Sentences about breaths that were not judged or are perhaps copies."""
         lines = []
-        if self.misfits:
-            lines.append(
-                f"{len(self.misfits)} breaths are explained far better by something else than "
-                "their label:"
-            )
-            lines += [
-                f"  breath {misfit.breath_id} ({misfit.lung}): {misfit.mae:.2f} cmH2O, "
-                f"{misfit.mae_explained:.2f} as {misfit.explanation}"
-                for misfit in self.misfits[:_MISFITS_SHOWN]
-            ]
-            if len(self.misfits) > _MISFITS_SHOWN:
-                lines.append(
-                    f"  ... and {len(self.misfits) - _MISFITS_SHOWN} more; --json lists all"
-                )
         if self.not_judged:
             lines.append(
                 f"{len(self.not_judged)} breaths have no first pressure or no other inspiratory "
@@ -148,19 +92,19 @@ class OpenLoopReport:
         return lines
 
     def __str__(self) -> str:
-        """Return mean errors by lung, and the sentences of :meth:`misfit_lines`."""
+        """Return mean errors by lung, and the sentences of :meth:`remarks`."""
         title = f"Open-loop MAE of the {self.plant} simulators, cmH2O"
         rows = [
-            f"  {name}: {_shown(figures['mae'])}, held out {_shown(figures['held_out_mae'])} "
+            f"  {name}: {number(figures['mae'])}, held out {number(figures['held_out_mae'])} "
             f"({figures['breaths']} breaths)"
             for name, figures in self.lungs.items()
         ]
-        return "\n".join([title, *rows, *self.misfit_lines()])
+        return "\n".join([title, *rows, *self.remarks()])
 
     def _repr_html_(self) -> str:
         frame = self.to_frame()[["breaths", "mae", "median_mae", "held_out_mae"]]
         title = f"<p>Open-loop MAE of the {html.escape(self.plant)} simulators, cmH2O</p>"
-        below = "".join(f"<p>{html.escape(line)}</p>" for line in self.misfit_lines())
+        below = "".join(f"<p>{html.escape(line)}</p>" for line in self.remarks())
         return title + frame.to_html(float_format="%.2f") + below
 
 
@@ -177,11 +121,11 @@ def open_loop(
         breaths: n recorded breaths, or what :func:`ventbench.load_recording` takes.
         simulator: a name, a file, a plant, plants by lung, a function of commands or an array of
             simulated pressures ``(n, T)``; see :func:`ventbench.load_simulators`.
-        progress: called with how many breaths have been simulated and how many there are; the
-            second number grows if breaths do not seem to fit their label.
+        progress: called with how many simulations of a breath are done and how many there are,
+            two of each breath.
 
     Returns:
-        Errors by lung, and the breaths that do not fit their label.
+        Errors by lung.
 
     Raises:
         InputError: if there is no simulator for a lung of the recording.
@@ -193,40 +137,19 @@ def open_loop(
         True
     """
     breaths = load(breaths)
-    official = frozen.load()
     tested = load_simulators(simulator, breaths=breaths)
-    # Whether a label is wrong can be asked where there are official simulators to compare with.
-    recorded = {lung.id for lung in RECORDED_LUNGS}
-    known = [index for lung, index in breaths.by_lung_index.items() if lung in recorded]
-    done, total = 0, 2 * len(breaths) + sum(map(len, known))
+    done = 0
 
     def count(simulated: int) -> None:
         nonlocal done
         done += simulated
         if progress is not None:
-            progress(done, total)
-
-    def more(simulated: int) -> None:
-        nonlocal total
-        total += simulated
+            progress(done, 2 * len(breaths))
 
     error = mean_errors(tested.pressures(breaths, progress=count), breaths)
     crossed = mean_errors(tested.pressures(breaths, cross_fitted=True, progress=count), breaths)
     held_out, unseen = tested.held_out(breaths), tested.unseen(breaths)
     perhaps = breaths.breath_id[tested.perhaps_copies(breaths)].tolist()
-    doubtful: Sequence[Misfit] = ()
-    if known:
-        judged = breaths.select(np.sort(np.concatenate(known)))
-        doubtful = misfits(
-            official.cross_fitted,
-            lambda plants, gain: replace(plants, slopes=plants.slopes * gain),
-            judged,
-            errors(official.cross_fitted, judged, count),
-            tuple((lung.R, lung.C) for lung in RECORDED_LUNGS),
-            more,
-            count,
-        )
-    apart = np.isin(breaths.breath_id, [misfit.breath_id for misfit in doubtful])
 
     def figures(index: Ints) -> dict[str, Any]:
         return {
@@ -235,23 +158,15 @@ def open_loop(
             **summary("official_held_out_", error[index][unseen[index]]),
         }
 
-    lungs = {}
-    for lung, index in breaths.by_lung_index.items():
-        lungs[lung] = figures(index) | {"fitting_label": figures(index[~apart[index]])}
     return OpenLoopReport(
         plant=simulator if isinstance(simulator, str) and simulator in names() else tested.name,
-        simulators=official.about(),
+        simulators=frozen.load().about(),
         about=None if tested.kind in names() else dict(tested.about),
-        lungs=lungs,
-        misfits=tuple(doubtful),
+        lungs={lung: figures(index) for lung, index in breaths.by_lung_index.items()},
         not_judged=tuple(breaths.breath_id[np.isnan(error)].tolist()),
         perhaps_copies=tuple(perhaps),
         notes=breaths.notes,
     )
-
-
-def _shown(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def errors(
@@ -273,58 +188,6 @@ def mean_errors(simulated: Floats, breaths: Breaths) -> Floats:
     blank = np.isnan(breaths.pressure[:, 0])
     error = mae(breaths.pressure, np.nan_to_num(simulated), breaths.inspiratory)
     return np.where(blank, np.nan, error)
-
-
-def misfits(
-    plants_for: PlantsFor,
-    with_gain: Callable[[Any, float], Plant],
-    breaths: Breaths,
-    error: Floats,
-    settings: tuple[tuple[float, float], ...],
-    expected: Callable[[int], object] = lambda simulated: None,
-    progress: Callable[[int], object] = lambda simulated: None,
-) -> list[Misfit]:
-    """Find breaths that do not fit their label.
-
-    Each suspect breath is simulated once more as every other lung setting and with each of
-    :data:`GAINS`; nothing is fitted to it.
-
-    Args:
-        plants_for: see :data:`PlantsFor`.
-        with_gain: returns plants whose valve gives a multiple of its flow.
-        breaths: n breaths.
-        error: error of each breath under its label, cmH2O, shape ``(n,)``.
-        settings: the (R, C) that are tried.
-        expected: called once with the number of breaths that will be simulated, if any.
-        progress: called with numbers of breaths, as they are done.
-    """
-    index = np.flatnonzero(error > SUSPECT)
-    if index.size == 0:
-        return []
-    expected((len(settings) + len(GAINS)) * index.size)
-    suspects = breaths.select(index)
-    names, explained = [], []
-    for r, c in settings:
-        other = replace(suspects, R=np.full(index.size, r), C=np.full(index.size, c))
-        names.append(f"lung R{r:g}C{c:g}")
-        explained.append(errors(plants_for, other, progress))
-    for gain in GAINS:
-        names.append(f"valve gain x {gain:g}")
-        explained.append(
-            errors(lambda part, gain=gain: with_gain(plants_for(part), gain), suspects, progress)
-        )
-    best = np.argmin(explained, axis=0)
-    least = np.min(explained, axis=0)
-    return [
-        Misfit(
-            int(suspects.breath_id[i]),
-            str(suspects.lung_ids[i]),
-            float(error[index[i]]),
-            names[best[i]],
-            float(least[i]),
-        )
-        for i in np.flatnonzero(least < FAR_BETTER * error[index])
-    ]
 
 
 def summary(prefix: str, error: Floats) -> dict[str, Any]:

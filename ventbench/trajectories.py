@@ -70,12 +70,18 @@ class Trajectories:
         return pd.DataFrame(series, index=index).reset_index()
 
     def errors(self) -> pd.DataFrame:
-        """Mean |p - target| of the scored inspirations, cmH2O; a row a lung, a column a PIP."""
+        """Mean |p - target| of the scored inspirations, cmH2O; a row a lung, a column a PIP.
+
+        NaN where a scored pressure is not finite: such a cell failed.
+        """
         import pandas as pd
 
         breaths = (*self.pressure.shape[:2], protocol.BREATHS, protocol.BREATH_STEPS)
-        inspired = self.pressure.reshape(breaths)[..., : protocol.INSPIRATION_STEPS]
-        error = run_error(inspired, np.asarray(self.pips)[:, None, None])
+        pressure, target = (
+            x.reshape(breaths)[..., : protocol.INSPIRATION_STEPS]
+            for x in (self.pressure, self.target)
+        )
+        error = run_error(np.where(np.isfinite(pressure), pressure, np.nan), target)
         return pd.DataFrame(error, index=list(self.lungs), columns=list(self.pips))
 
     def _repr_html_(self) -> str:

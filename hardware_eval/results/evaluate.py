@@ -212,7 +212,7 @@ def controllers(
 def make_runner(sandbox: bool) -> Any:
     """The sandbox of scoring, or this process for code that is trusted."""
     if sandbox:
-        from ventbench.sandbox.configuration import Allowance
+        from ventbench.sandbox.pipes import Allowance
         from ventbench.sandbox.runner import SandboxRunner
 
         # A run lasts 9 s and the loop does not wait; a controller silent for 2 s has failed.

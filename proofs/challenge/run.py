@@ -254,7 +254,7 @@ def child() -> None:
 
 
 def _lock_down(told: dict[str, Any]) -> list[str]:
-    from ventbench.sandbox.child import privileges
+    from ventbench.sandbox.child import kernel
     from ventbench.sandbox.child.lockdown import FLOOR, CellLimits, Lockdown
     from ventbench.sandbox.reader import libraries
 
@@ -262,7 +262,7 @@ def _lock_down(told: dict[str, Any]) -> list[str]:
         import resource
 
         resource.setrlimit(resource.RLIMIT_CPU, (told["seconds"], told["seconds"] + 1))
-        if (used := privileges.address_space()) is not None:
+        if (used := kernel.address_space()) is not None:
             size = used + told["memory"]
             resource.setrlimit(resource.RLIMIT_AS, (size, size))
         return []

@@ -22,7 +22,7 @@ from ventbench.plants import frozen
 from ventbench.plants.rigs import Rigs
 from ventbench.task import environment, protocol, rollouts, waveform
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.task.metrics import figures
+from ventbench.task.metrics import score as metric
 from ventbench.train import pid_grid
 
 AnyFloats = NDArray[np.floating]
@@ -151,9 +151,9 @@ def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -
                 name,
                 _gains(chosen[name]) if name in chosen else "network on PID",
                 float(np.mean(np.abs(breath - EXAMPLE_PIP))),
-                float(figures.rise_time(breath, protocol.PEEP, EXAMPLE_PIP, protocol.DT)),
-                float(figures.overshoot(breath, EXAMPLE_PIP)),
-                float(figures.swings(breath, EXAMPLE_PIP)),
+                float(metric.rise_time(breath, protocol.PEEP, EXAMPLE_PIP, protocol.DT)),
+                float(metric.overshoot(breath, EXAMPLE_PIP)),
+                float(metric.swings(breath, EXAMPLE_PIP)),
             )
         )
     ours, others = rows[-1], rows[:-1]

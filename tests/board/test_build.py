@@ -128,13 +128,13 @@ def test_a_new_leaderboard_has_a_page(tmp_path: Path) -> None:
 
 def test_a_correction_takes_the_place_of_its_record(leaderboard, out, draft, simulators) -> None:
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
-    corrected = draft("softer", factor=0.95, supersedes=old.sha256, reason="a better number")
-    new = put(leaderboard, corrected, simulators)
+    store.withdraw(leaderboard, old.sha256, "a bug")
+    new = put(leaderboard, draft("softer", factor=0.95), simulators)
     done = build.build(leaderboard, out)
     page = (out / "entries/r1/performance/softer.html").read_text()
     assert "entries/r1/performance/softer.html" in done.changed
-    assert page.index(new.sha256[:12]) < page.index("superseded")
-    assert f"<b>counts</b>: {'a better number'}" in page
+    assert f"<code>{new.sha256[:12]}</code></a> <b>counts</b>" in page
+    assert f"<code>{old.sha256[:12]}</code></a> <b>withdrawn</b>: a bug" in page
     assert f"records/{old.sha256}.json" in page
     rows = csv.DictReader(io.StringIO((out / "leaderboard.csv").read_text()))
     assert [row["record"] for row in rows if row["name"] == "softer"] == [new.sha256]

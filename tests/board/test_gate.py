@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import attestation, canonical, frames, gate, record, store
+from ventbench.board import canonical, frames, gate, record, store
 from ventbench.board.gate import Evidence
 from ventbench.board.record import HardwareRecord
 from ventbench.task import protocol
@@ -144,13 +144,13 @@ def test_only_a_bench_log_ranks_hardware(leaderboard: Path, template) -> None:
         return frames.load_tracks(leaderboard, track="performance")[0].hardware[0]
 
     assert (row().rank, row().reasons) == (None, (gate.NO_BENCH_LOG,))
-    public = attestation._private(SECRET).public_key().public_bytes_raw()
+    public = gate._private(SECRET).public_key().public_bytes_raw()
     key = (
-        f'[[keys]]\nid = "{attestation.key_id(public)}"\npublic = "{public.hex()}"\n'
+        f'[[keys]]\nid = "{gate.key_id(public)}"\npublic = "{public.hex()}"\n'
         'added = 2026-11-23\nholder = "a test"\n'
     )
     listed.write_text(before + key)
-    attestation.sign(leaderboard, made.sha256, SECRET)
+    gate.sign(leaderboard, made.sha256, SECRET)
     assert row().rank is None
     second = f'[[second_runs]]\nrecord = "{made.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
     listed.write_text(before + key + second)

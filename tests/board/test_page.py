@@ -81,7 +81,7 @@ def test_an_entry_opens_and_leads_back(quiet: Page, site: Path) -> None:
     quiet.follow("tbody a", "performance/harder.html")
     assert quiet.run("document.querySelector('h1').innerText") == "harder"
     assert quiet.run("document.querySelectorAll('.grid figure').length") == 36
-    assert quiet.run("document.querySelectorAll('.heat tbody td:not(.mean)').length") == 108
+    assert quiet.run("document.querySelectorAll('.heat tbody td:not(.mean)').length") == 72
     boxes = "[...document.querySelectorAll('.grid path.p')].every(x => x.getBBox().width > 500)"
     assert quiet.run(boxes)
     quiet.follow(".kicker a", "index.html")

@@ -39,15 +39,6 @@ def test_a_link_is_no_record(drafts, tmp_path: Path) -> None:
 def test_add_refuses_what_does_not_fit(leaderboard: Path, draft, drafts, simulators) -> None:
     with pytest.raises(InputError, match="already"):
         put(leaderboard, drafts["softer"], simulators)
-    with pytest.raises(InputError, match="is not there"):
-        put(leaderboard, draft("new", supersedes="a" * 64), simulators)
-    robust = next(x for x in store.load(leaderboard).scores if x.name == "robust")
-    with pytest.raises(InputError, match="another entry or track"):
-        put(leaderboard, draft("softer", supersedes=robust.sha256), simulators)
-    softer = next(x for x in store.load(leaderboard).scores if x.name == "softer")
-    quiet = draft("softer", sandbox=None, supersedes=softer.sha256)
-    with pytest.raises(InputError, match="is not official and supersedes"):
-        put(leaderboard, quiet, simulators)
 
     class Other(TextbookRigs):
         def about(self) -> dict[str, Any]:
@@ -68,22 +59,20 @@ def test_a_record_that_does_not_replay_is_not_added(
         put(shutil.copytree(entered, tmp_path / "new"), forged, simulators)
 
 
-def test_the_newest_official_record_counts(leaderboard: Path, draft, simulators) -> None:
+def test_an_entry_is_replaced_once_it_is_withdrawn(leaderboard: Path, draft, simulators) -> None:
+    """Also by a record that was made before it was withdrawn."""
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
-    new = put(leaderboard, draft("softer", factor=0.96, supersedes=old.sha256), simulators)
-    track = performance(leaderboard)
-    entry = next(x for x in track.ranked if x.record.name == "softer")
+    made = draft("softer", factor=0.96)
+    with pytest.raises(InputError, match=f"the entry has record {old.sha256[:12]}; withdraw that"):
+        put(leaderboard, made, simulators)
+    store.withdraw(leaderboard, old.sha256, "a bug")
+    new = put(leaderboard, made, simulators)
+    entry = next(x for x in performance(leaderboard).ranked if x.record.name == "softer")
     assert entry.record.sha256 == new.sha256
-    assert [record.sha256 for record in entry.entry.history] == [new.sha256, old.sha256]
-
-
-def test_an_entry_is_replaced_only_by_name(leaderboard: Path, draft, simulators) -> None:
-    old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
-    with pytest.raises(InputError, match=f"the entry has record {old.sha256[:12]}"):
-        put(leaderboard, draft("softer", factor=0.96), simulators)
-    new = put(leaderboard, draft("softer", factor=0.96, supersedes=old.sha256), simulators)
-    with pytest.raises(InputError, match=f"the newest record of softer is {new.sha256[:12]}"):
-        put(leaderboard, draft("softer", factor=0.94, supersedes=old.sha256), simulators)
+    assert {record.sha256 for record in entry.entry.history} == {new.sha256, old.sha256}
+    assert verify(leaderboard, lambda: simulators).problems == []
+    with pytest.raises(InputError, match=f"the entry has record {new.sha256[:12]}; withdraw that"):
+        put(leaderboard, draft("softer", factor=0.94), simulators)
 
 
 def test_verify_reports_a_replacement_that_add_refuses(
@@ -97,7 +86,7 @@ def test_verify_reports_a_replacement_that_add_refuses(
     assert thief.sha256 in softer
     assert all(any(x in text for x in softer) for text in problems)
     (problem,) = problems
-    assert "a new one must name it, with --supersedes" in problem
+    assert "withdraw that first" in problem
 
 
 def test_a_withdrawn_record_is_listed_with_its_reason(leaderboard: Path) -> None:

@@ -52,7 +52,7 @@ EXAMPLES = (
     "ventbench lungs", "ventbench stressors", "ventbench doctor",
     "ventbench simulate", "ventbench open-loop", "ventbench fmu", "ventbench coverage",
     "ventbench data import",
-    "ventbench board show", "ventbench board records", "ventbench board new-key",
+    "ventbench board show", "ventbench board new-key",
 )  # fmt: skip
 
 

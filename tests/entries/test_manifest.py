@@ -50,8 +50,8 @@ datum = ""
     assert problems(text) == [
         "mine/submission.toml, key name: 'Mine!' must be lower-case letters, digits and "
         "underscores, begin with a letter and have at most 40 characters",
-        "mine/submission.toml, key authors: must be a list that is not empty",
-        "mine/submission.toml, key licence: must be text in quotes",
+        "mine/submission.toml, key authors: expected `array` of length >= 1",
+        "mine/submission.toml, key licence: expected `str`, got `int`",
         "mine/submission.toml, key api_version: 2 is not supported; this ventbench speaks "
         "version 1",
         "mine/submission.toml, key family: 'pdi' is not one of pid, residual, ppo, dqn, other; "
@@ -59,8 +59,8 @@ datum = ""
         "mine/submission.toml, key tracks: contains something twice",
         "mine/submission.toml, key 'licens' is not known; did you mean licence?",
         "mine/submission.toml, key description: is missing",
-        "mine/submission.toml, key training.seeds: must be an integer, not True",
-        "mine/submission.toml, key training.per_lung: must be true or false, not 'yes'",
+        "mine/submission.toml, key training.seeds: expected `int`, got `bool` - at `$[1]`",
+        "mine/submission.toml, key training.per_lung: expected `bool`, got `str`",
         "mine/submission.toml, key training.'datum' is not known; did you mean data?",
     ]
 
@@ -129,7 +129,7 @@ def test_manifest_problems_have_lines(demo):
         (3, "key license is not known; did you mean licence?"),
         (5, "key family 'pdi' is not one of pid, residual, ppo, dqn, other; did you mean pid?"),
         (None, "key licence is missing"),
-        (11, "key training.seeds must be a list"),
+        (11, "key training.seeds expected `array`, got `int`"),
         (12, "key training.se'ed is not known; did you mean seeds?"),
     ]
     assert findings[2].advice == 'write licence = "Apache-2.0"'

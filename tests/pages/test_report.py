@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -12,8 +11,7 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.base.text import number
-from ventbench.pages import panels, report, write_figure, write_report
-from ventbench.pages import panels as shared
+from ventbench.pages import panels, report, write_report
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
 
@@ -55,7 +53,7 @@ class Page(HTMLParser):
 
 
 def score_file(run: Trajectories, **more: Any) -> dict[str, Any]:
-    cells = shared.errors(run)
+    cells = run.errors().to_numpy()
     lungs = {
         lung: {
             "score": float(row.mean()),
@@ -72,7 +70,7 @@ def test_report(best: Trajectories, robust: Trajectories, tmp_path: Path) -> Non
     page = Page(text)
     assert path.stat().st_size < 300_000
     figures = [attrs["aria-label"] for tag, attrs in page.tags if attrs.get("role") == "img"]
-    errors = shared.errors(best)
+    errors = best.errors().to_numpy()
     assert len(figures) == 36
     for i, lung in enumerate(best.lungs):
         assert lung in page.text
@@ -115,9 +113,8 @@ def test_failed_cells(failed: Trajectories, best: Trajectories, tmp_path: Path) 
 
 
 def test_equal_input_gives_equal_bytes(best: Trajectories, robust: Trajectories, tmp_path: Path):
-    for write in (write_report, write_figure):
-        one, two = (write(tmp_path / name, [best, robust]).read_bytes() for name in "ab")
-        assert one == two
+    one, two = (write_report(tmp_path / name, [best, robust]).read_bytes() for name in "ab")
+    assert one == two
 
 
 def test_score_files(best: Trajectories, robust: Trajectories, tmp_path: Path) -> None:
@@ -165,7 +162,7 @@ def test_best_and_differences(best: Trajectories, robust: Trajectories) -> None:
     assert not base["best"]
     assert (ours["class"], base["difference"]) == ("better", "")
     assert ours["difference"] == number(
-        shared.errors(best).mean() - shared.errors(robust).mean(), sign=True
+        best.errors().to_numpy().mean() - robust.errors().to_numpy().mean(), sign=True
     )
     same = report.table(best.lungs, panels.collect([best, best]))[0]["cells"][0]
     assert (same["difference"], same["class"]) == ("±0.00", "same")
@@ -193,24 +190,6 @@ def test_path_breaks_at_gaps() -> None:
     line = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, np.nan], [3.0, 3.0], [4.0, 2.5]])
     assert panels.path(line) == "M0 0l1 1M3 3l1-.5"
     assert panels.area(line, line) == ""
-
-
-def test_figure(
-    best: Trajectories, robust: Trajectories, failed: Trajectories, tmp_path: Path
-) -> None:
-    matplotlib = pytest.importorskip("matplotlib", reason="needs the extra ventbench[view]")
-    image = pytest.importorskip("PIL.Image")
-    before = dict(matplotlib.rcParams)
-    path = write_figure(tmp_path / "figure.png", [best, robust, failed])
-    assert dict(matplotlib.rcParams) == before
-    assert path.stat().st_size < 300_000
-    picture = image.open(io.BytesIO(path.read_bytes()))
-    assert picture.width == 1800
-    pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
-    for color in ((0, 0x65, 0xB3), (0x80, 0x80, 0x80)):
-        near = np.abs(pixels.astype(int) - color).max(axis=1) < 12
-        assert near.sum() > 1000, "each run is drawn"
-    assert (pixels > 250).all(axis=1).mean() > 0.4
 
 
 def test_protocol_is_the_shown_one(best: Trajectories, tmp_path: Path) -> None:
@@ -255,7 +234,7 @@ def test_runs_of_two_tracks_are_headed_by_both(best: Trajectories, robust: Traje
 
 
 def test_two_runs_are_compared_cell_by_cell(best: Trajectories, robust: Trajectories) -> None:
-    own, other = shared.errors(best), shared.errors(robust)
+    own, other = best.errors().to_numpy(), robust.errors().to_numpy()
     draws = {"sha256": "d" * 64, "version": 1}
     given = [
         score_file(best, draws={"score": 2.0, "ci95": [1.9, 2.1], "values": [1.9, 2.1], **draws}),

@@ -3,7 +3,7 @@
 import pytest
 
 from ventbench.entries.folder import Submission, open_submission
-from ventbench.sandbox.configuration import Allowance
+from ventbench.sandbox.pipes import Allowance
 
 #: So long that only what hangs meets it, on a busy machine too.
 PATIENT = Allowance(start_patience_s=300.0, patience_s=300.0, total_s=3600.0)

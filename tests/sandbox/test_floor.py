@@ -16,8 +16,8 @@ from ventbench.board import official_runs
 from ventbench.cli import app
 from ventbench.entries import contract
 from ventbench.sandbox import runner as runner_module
-from ventbench.sandbox.child import libc, seccomp
-from ventbench.sandbox.configuration import SandboxError
+from ventbench.sandbox.child import kernel, seccomp
+from ventbench.sandbox.pipes import SandboxError
 from ventbench.sandbox.runner import SandboxRunner, layers
 
 ROOT = Path(runner_module.__file__).parents[2]
@@ -32,19 +32,19 @@ CALLS = {
 
 WITHOUT = f"""
 import errno, sys
-from ventbench.sandbox.child import libc, privileges, seccomp
+from ventbench.sandbox.child import kernel, seccomp
 calls = {{name: seccomp.CallNumber(*numbers) for name, numbers in {
     {name: tuple(call) for name, call in CALLS.items()}
 }.items()}}
-numbers = [getattr(calls[name], libc.MACHINE) for name in sys.argv[1].split()]
+numbers = [getattr(calls[name], kernel.MACHINE) for name in sys.argv[1].split()]
 rules = [seccomp.Rule(number, seccomp.errno_action(errno.ENOSYS)) for number in numbers]
-privileges.no_new_privs()
-seccomp.install(seccomp.assemble(libc.MACHINE, rules, seccomp.ALLOW))
+kernel.no_new_privs()
+seccomp.install(seccomp.assemble(kernel.MACHINE, rules, seccomp.ALLOW))
 """
 SHOW = "from ventbench.sandbox.runner import SandboxRunner; print(*SandboxRunner().missing)"
 COMMAND = "from ventbench.cli import main; sys.argv[:] = ['ventbench', *sys.argv[2:]]; main()"
 
-if not libc.LINUX or not seccomp.available() or not {"landlock", "empty-root"} <= set(layers()):
+if not kernel.LINUX or not seccomp.available() or not {"landlock", "empty-root"} <= set(layers()):
     pytest.skip("this machine lacks the layers that are taken away here", allow_module_level=True)
 
 
@@ -104,7 +104,7 @@ def test_every_door_is_closed(monkeypatch, door, shown):
 
 
 def test_other_systems_have_no_floor(monkeypatch):
-    monkeypatch.setattr(libc, "LINUX", False)
+    monkeypatch.setattr(kernel, "LINUX", False)
     monkeypatch.setattr(runner_module.platform, "system", lambda: "Darwin")
     with pytest.raises(SandboxError, match=r"^empty-root/landlock and seccomp missing .*Darwin"):
         SandboxRunner()

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from ventbench.sandbox.child import libc
+from ventbench.sandbox.child import kernel
 from ventbench.sandbox.runner import SandboxRunner
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 
 from .conftest import PATIENT
 
-pytestmark = pytest.mark.skipif(not libc.LINUX, reason="looks into /proc")
+pytestmark = pytest.mark.skipif(not kernel.LINUX, reason="looks into /proc")
 
 
 def started(submission, lungs=(None,), **options):
@@ -61,10 +61,10 @@ def _children(process):
 
 def test_the_scorer_is_hidden_while_cells_run(written):
     still = "class Controller:\n def reset(self, t): pass\n def act(self, o): return 0.0"
-    assert libc.prctl(libc.PR_GET_DUMPABLE) == 1
+    assert kernel.prctl(kernel.PR_GET_DUMPABLE) == 1
     session = started(written(still))
     other = started(written(still))
     session.close()
-    assert libc.prctl(libc.PR_GET_DUMPABLE) == 0
+    assert kernel.prctl(kernel.PR_GET_DUMPABLE) == 0
     other.close()
-    assert libc.prctl(libc.PR_GET_DUMPABLE) == 1
+    assert kernel.prctl(kernel.PR_GET_DUMPABLE) == 1

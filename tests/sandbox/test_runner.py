@@ -20,7 +20,7 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.sandbox import runner as runner_module
 from ventbench.sandbox.child.cell import ROW
-from ventbench.sandbox.configuration import Allowance, SandboxError
+from ventbench.sandbox.pipes import Allowance, SandboxError
 from ventbench.sandbox.runner import SandboxRunner, layers
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task

@@ -44,10 +44,6 @@ _IGNORABLE = re.compile(
 )
 
 
-# Scripts that are written together.
-_ASIAN = {"CJK", "HIRAGANA", "KATAKANA", "KATAKANA-HIRAGANA"}
-
-
 def deceptive(text: str) -> str:
     """Say why a name may look like another one; empty if it cannot.
 
@@ -59,6 +55,7 @@ def deceptive(text: str) -> str:
         scripts = {
             unicodedata.name(c, "?").split()[0] for c in word if unicodedata.category(c) != "Lm"
         }
+        # Those of Asia are written together.
         if len(scripts - {"CJK", "HIRAGANA", "KATAKANA", "FULLWIDTH", "HALFWIDTH"}) > 1:
             return f"{word!r} mixes the letters of {' and '.join(sorted(scripts)).lower()}"
     return ""

@@ -217,8 +217,6 @@ def _entry_pages(
     for status, row in track.rows:
         name = row.record.name
         path = pages.address(row.record)
-        if path in made:  # an older official record beside a newer unofficial one
-            continue
         same = base is not None and row.record.sha256 == base.sha256
         values = _values(Line(track, status, row), None if same else base, evidence)
         drawn = pages.panels(pages.paths(row.record), None if same else other)
@@ -236,7 +234,6 @@ def _entry_pages(
 def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, Any]:
     track, status, row = line
     record, header = row.record, row.record.header
-    draws = pages.dumbbells(record, base)
     cells = {column.names[0]: column.cell(line) for column in SHOWN}
     return {
         "record": record,
@@ -257,9 +254,6 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
         "heat": pages.heat_map(
             np.concatenate([record.nominal[None], record.drawn]), record, pages.ERROR_LIMITS
         ),
-        "differences": pages.difference_map(record, base) if base else None,
-        "draws": draws,
-        "dots": pages.trusted(draws["drawing"]) if draws else None,
         "safety": _safety(record),
         "failures": header.failures[:MAX_FAILURES],
         "frames": [pages.trusted(pages.frame(pip)) for pip in record.pips],
@@ -306,21 +300,16 @@ def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
 
 def _history(row: Row, evidence: Evidence) -> list[dict[str, Any]]:
     """All records of the entry, newest first, and what became of each."""
-    counts = row.record.sha256
     lines = []
     for record in row.entry.history:
-        state = "counts" if record.sha256 == counts else "superseded"
-        official = evidence.official(record)
         withdrawn = evidence.withdrawn.get(record.sha256)
-        if not official and state != "counts":
-            state = "not official"
+        state = "counts" if record.sha256 == row.record.sha256 else "does not count"
         lines.append(
             {
                 "sha256": record.sha256,
                 "created": record.header.created,
-                "official": official,
-                "state": "withdrawn" if withdrawn is not None else state,
-                "reason": withdrawn or record.header.reason,
+                "state": state if withdrawn is None else "withdrawn",
+                "reason": withdrawn or "",
             }
         )
     return lines

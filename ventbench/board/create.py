@@ -1,6 +1,6 @@
 """From a score to a record: replayed first, so that no record can exist that does not replay.
 
-A record also says where it was made, and, once amended, which record it corrects.
+A record also says where it was made.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, record, schema, store
-from ventbench.board.record import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
 from ventbench.entries.folder import combined_hash, file_hashes
 from ventbench.entries.result import Score, package_versions
@@ -62,10 +61,7 @@ def create(
     score: Score,
     simulators: ReplayPlants,
     *,
-    official: bool = True,
     source: Mapping[str, Any] | None = None,
-    supersedes: str | None = None,
-    reason: str = "",
     now: datetime | None = None,
 ) -> Draft:
     """Make the record of a score.
@@ -73,10 +69,7 @@ def create(
     Args:
         score: over all lungs, PIPs and published draws.
         simulators: that it was scored on.
-        official: whether to call it so if its sandbox allows that.
         source: where the submission came from, such as commit and pull request.
-        supersedes: SHA-256 of the record that this one corrects.
-        reason: why, for the page.
         now: time of the record; the clock's if not given.
 
     Raises:
@@ -102,9 +95,9 @@ def create(
         "kind": "score",
         "protocol": schema.PROTOCOL,
         "created": record.timestamp(now),
-        "official": official and score.official,
-        "supersedes": supersedes,
-        "reason": reason,
+        "official": score.official,
+        "supersedes": None,
+        "reason": "",
         "provenance": dict(source or {}),
         "track": score.track,
         "submission": {
@@ -201,50 +194,6 @@ def _stressed(score: Score) -> dict[str, Any]:
 def stress_digest(stressed: Runs) -> str:
     """SHA-256 of the commands of stressed runs."""
     return canonical.digest(np.ascontiguousarray(stressed.requested, "<f8").tobytes())
-
-
-def amend(
-    path: Path,
-    *,
-    supersedes: str | None = None,
-    reason: str = "",
-    source: Mapping[str, str] | None = None,
-) -> Path:
-    """Say which record a new one corrects and why, and where its submission came from.
-
-    The amended record is a file of its own, beside the given one, whose commands lie there too.
-
-    Args:
-        path: of the record.
-        supersedes: SHA-256 of the record that it corrects.
-        reason: why, for the page.
-        source: where the submission came from, such as its commit; joins what is there.
-
-    Returns:
-        The new record's path; ``path`` itself if there is nothing to change.
-
-    Raises:
-        InputError: if it is not the record of a score.
-        OSError: if a file cannot be read or written.
-    """
-    loaded = record.load(path)
-    if isinstance(loaded, HardwareRecord) and not (supersedes or reason or source):
-        return path
-    if not isinstance(loaded, record.Record):
-        raise InputError(f"{path} is not the record of a score")
-    values = canonical.parse(path.read_bytes(), str(path))
-    if supersedes is not None:
-        values["supersedes"] = supersedes
-    if reason:
-        values["reason"] = reason
-    values["provenance"] = {**values["provenance"], **(source or {})}
-    content = canonical.canonical(values)
-    record.from_bytes(content, f"{path}, amended")
-    new = path.parent / f"{canonical.digest(content)}{record.SUFFIX}"
-    if content != path.read_bytes():
-        files.write_atomically(new, lambda file: file.write(content))
-        return new
-    return path
 
 
 def versions() -> dict[str, str]:

@@ -15,7 +15,7 @@ from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.board import comparison, pages, ranking, store
 from ventbench.board.ranking import Interval, Row, Track
-from ventbench.board.record import Record, Withdrawal, created_of
+from ventbench.board.record import Record
 from ventbench.entries.manifest import TRACKS
 
 if TYPE_CHECKING:
@@ -271,8 +271,10 @@ def load_tracks(folder: Path | str | None = None, *, track: str | None = None) -
     """Read and rank a leaderboard; arguments and errors as of :func:`load_board`."""
     if track is not None and track not in TRACKS:
         raise InputError(f"track {track!r} is not one of {', '.join(TRACKS)}")
-    board = ranking.board(_loaded(folder))
-    return [tracks for tracks in board if track in (None, tracks.name)]
+    leaderboard = store.load(path := folder_of(folder))
+    if not leaderboard.records:
+        raise InputError(f"{path} holds no record; add one with `ventbench board add`")
+    return [tracks for tracks in ranking.board(leaderboard) if track in (None, tracks.name)]
 
 
 def folder_of(given: Path | str | None) -> Path:
@@ -281,72 +283,9 @@ def folder_of(given: Path | str | None) -> Path:
     return files.leaderboard_folder() if path == FOLDER and not path.is_dir() else path
 
 
-def _loaded(folder: Path | str | None) -> store.Store:
-    leaderboard = store.load(path := folder_of(folder))
-    if not leaderboard.records:
-        raise InputError(f"{path} holds no record; add one with `ventbench board add`")
-    return leaderboard
-
-
 def lines(tracks: Sequence[Track]) -> list[Line]:
     """All entries of some tracks, in the order in which they are shown."""
     return [Line(track, *row) for track in tracks for row in track.rows]
-
-
-def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
-    """List every record of a leaderboard: whose each file is; errors as of :func:`load_board`.
-
-    Returns:
-        For each record ``record`` and ``commands`` (SHA-256, or None: they name the files in
-        ``records/``), ``kind`` (``"score"``, ``"hardware"``, ``"withdrawal"``), ``track`` and
-        ``name`` (of what is withdrawn, for a withdrawal), ``created`` (UTC) and ``state``:
-        ``"ranked"``, ``"practice"``, ``"not ranked"``, ``"not official"``, ``"superseded"``,
-        ``"withdrawn"``, or empty for what has none.
-    """
-    leaderboard = _loaded(folder)
-    shown = lines(ranking.board(leaderboard))
-    states = {line.row.record.sha256: line.status for line in shown}
-    by_hash = {entry.sha256: entry for entry in leaderboard.records}
-    taken_back = {x.withdraws for x in leaderboard.records if isinstance(x, Withdrawal)}
-    rows = []
-    for entry in leaderboard.records:
-        about = by_hash.get(entry.withdraws) if isinstance(entry, Withdrawal) else entry
-        if about is None or isinstance(about, Withdrawal):  # refused when the folder is verified
-            continue
-        scored = isinstance(entry, Record)
-        state = states.get(entry.sha256, "superseded") if scored else ""
-        rows.append(
-            {
-                "record": entry.sha256,
-                "commands": entry.header.actions.sha256 if scored else None,
-                "kind": "score" if scored else type(entry).__name__.removesuffix("Record").lower(),
-                "track": about.track,
-                "name": about.name,
-                "created": created_of(entry),
-                "state": "withdrawn" if entry.sha256 in taken_back else state,
-            },
-        )
-    return rows
-
-
-def cell_means(record: Record, lung: str) -> dict[str, float | None]:
-    """Normalised scores over the ranked draws of one lung by PIP, or of ``"all"`` by lung.
-
-    The last is their mean; None where a cell failed.
-
-    Raises:
-        InputError: if the record has no such lung.
-    """
-    means = record.headroom.normalised[1:][record.headroom.ranked].mean(axis=0)
-    if lung == "all":
-        named = dict(zip(record.lungs, means.mean(axis=1).tolist(), strict=True))
-    elif lung in record.lungs:
-        names = (f"PIP {pip:g}" for pip in record.pips)
-        named = dict(zip(names, means[record.lungs.index(lung)].tolist(), strict=True))
-    else:
-        raise InputError(f"--lung {lung}: the board has {', '.join(record.lungs)}, or all")
-    named["mean"] = sum(named.values()) / len(named)
-    return {name: value if math.isfinite(value) else None for name, value in named.items()}
 
 
 def csv_text(tracks: Sequence[Track]) -> str:

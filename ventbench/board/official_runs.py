@@ -16,6 +16,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,10 +29,10 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.base.resume import WorkFolder, kept_results
-from ventbench.board import attestation, canonical, create, rounds, schema, store
+from ventbench.board import canonical, create, gate, rounds, schema, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.record import Record, RecordStress
-from ventbench.board.replay import ReplayPlants, draws_of
+from ventbench.board.replay import ReplayPlants, draws_of, worst
 from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
 from ventbench.entries import reference as references
 from ventbench.entries.folder import (
@@ -221,21 +222,18 @@ def stress_difference(recorded: RecordStress, again: Runs) -> str:
     if recorded.stressors != stressors.VERSION:
         return f"stress: its stressors are version {recorded.stressors}, not {stressors.VERSION}"
     tables = recorded.tables
-    pairs = {
-        "errors": (tables.error, again.error, STRESS_TOLERANCE),
-        "safe": (tables.safe, again.safe, 0.0),
-        "survived": (tables.survived, again.survived, 0.0),
-        "above_alarm_ms": (tables.alarm_s, again.alarm_s, 1e-3),
-        "peak_centi_cmH2O": (tables.peak, again.peak, 0.011),
-        "volume_mL": (tables.volume, again.volume, 1.0),
-    }
-    for key, (old, new, tolerance) in pairs.items():
-        # A failed run has no error; -1 stands for it on both sides.
-        ours, theirs = (np.nan_to_num(np.asarray(x, float), nan=-1.0) for x in (new, old))
-        off = np.abs(ours - theirs)
-        if off.max() > tolerance:
-            return f"stress.{key}: differs by up to {off.max():.3g} from the record"
-    return ""
+    pairs = (
+        ("errors", tables.error, again.error, STRESS_TOLERANCE),
+        ("safe", tables.safe, again.safe, 0.0),
+        ("survived", tables.survived, again.survived, 0.0),
+        ("above_alarm_ms", tables.alarm_s, again.alarm_s, 1e-3),
+        ("peak_centi_cmH2O", tables.peak, again.peak, 0.011),
+        ("volume_mL", tables.volume, again.volume, 1.0),
+    )
+    # A failed run has no error; -1 stands for it on both sides.
+    known = partial(np.nan_to_num, nan=-1.0)
+    checks = [(f"stress.{key}", known(old), known(new), off) for key, old, new, off in pairs]
+    return "; ".join(worst(checks, "the second run's commands"))
 
 
 def _closeness(recorded: Floats, again: Floats) -> str:
@@ -408,7 +406,7 @@ def score(
         if not kept.exists():
             store.add(leaderboard, path, simulators)
         if secret:
-            attestation.sign(leaderboard, path.stem, secret)
+            gate.sign(leaderboard, path.stem, secret)
         records[key] = path.stem
         tell("records", at + 1, len(runs))
     content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))

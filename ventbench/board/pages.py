@@ -272,14 +272,10 @@ def _float(value: float | None) -> float:
 #: Size of the small plot of an interval; the entry's dot never touches its edge.
 INTERVAL_WIDTH, MARGIN = 120, 6
 
-#: Plot of the draws: left and width of its axis, height of a row.
-PLOT_LEFT, PLOT_AXIS, PLOT_ROW = 40, 580, 14
-
 #: Limits between the shades of maps, cmH2O and points of the normalised score: the same for all
 #: entries, so that maps can be compared.
 ERROR_LIMITS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0)
 NORMALISED_LIMITS = (5.0, 15.0, 30.0, 50.0, 75.0, 100.0, 150.0, 250.0)
-DIFFERENCE_LIMITS = (0.02, 0.2, 0.7, 2.0)
 
 #: Size of a panel, left of its plots, units from one step to the next.
 WIDTH, HEIGHT = 690, 600
@@ -309,36 +305,6 @@ def interval_plot(row: Row, low: float, high: float) -> dict[str, str] | None:
     return {"x": f"{left:.1f}", "width": f"{max(right - left, 1.0):.1f}", "dot": f"{dot:.1f}"}
 
 
-def dumbbells(record: Record, pid: Record | None) -> dict[str, Any] | None:
-    """Each draw beside the PID's; None where a draw failed or there is no PID to compare with.
-
-    SVG elements and their height, ends of the axis, on how many of all draws the entry is better.
-    """
-    if pid is None or not np.isfinite(record.by_draw).all():
-        return None
-    both = np.stack([record.by_draw, pid.by_draw])
-    low, high = float(both.min()), float(both.max())
-    places = PLOT_LEFT + PLOT_AXIS * (both - low) / max(high - low, 1e-9)
-    rows = enumerate(places.T.round(1).tolist(), 1)
-    return {
-        "drawing": "".join(_row(draw, own, other) for draw, (own, other) in rows),
-        "height": PLOT_ROW * both.shape[1] + 30,
-        "low": number(low),
-        "high": number(high),
-        "better": int(np.sum(both[0] < both[1])),
-        "count": both.shape[1],
-    }
-
-
-def _row(draw: int, own: float, other: float) -> str:
-    y = PLOT_ROW * draw - 3
-    return (
-        f'<text x="{PLOT_LEFT - 14}" y="{y + 4}">{draw}</text><path d="M{other} {y}H{own}"/>'
-        f'<circle class="pid" cx="{other}" cy="{y}" r="3.5"/>'
-        f'<circle class="own" cx="{own}" cy="{y}" r="4.5"/>'
-    )
-
-
 def heat_map(
     values: Floats, record: Record, limits: tuple[float, ...], digits: int = 2
 ) -> list[dict[str, Any]]:
@@ -362,28 +328,6 @@ def heat_map(
         }
         for i, lung in enumerate(record.lungs)
     ]
-
-
-def difference_map(record: Record, other: Record) -> list[dict[str, Any]]:
-    """Rows of the map of differences to another record, mean over draws; below zero is better."""
-    cells = record.drawn.mean(axis=0) - other.drawn.mean(axis=0)
-    return [
-        {
-            "name": lung,
-            "cells": [
-                {"text": signed(value, 2), "shade": _difference_shade(value)} for value in cells[i]
-            ],
-            "mean": signed(float(cells[i].mean()), 2),
-        }
-        for i, lung in enumerate(record.lungs)
-    ]
-
-
-def _difference_shade(value: float) -> str:
-    if not np.isfinite(value):
-        return "hx"
-    level = int(np.searchsorted(DIFFERENCE_LIMITS, abs(value)))
-    return f"{'b' if value < 0 else 'w'}{level}" if level else "h0"
 
 
 def _y(pressure: Floats | float, pip: float) -> Floats:

@@ -216,15 +216,16 @@ def _track(
     own = evidence.rounds.get(draws)
     placed: dict[str, list[Entry]] = defaultdict(list)
     for _, history in sorted(histories.items()):
-        counts = [record for record in history if evidence.official(record)][:1]
-        newest = [] if evidence.official(history[0]) else history[:1]
-        for record in counts + newest:
-            why = gate.simulated(record, evidence)
-            if own is None:
-                why = tuple(reason for reason in why if reason != gate.PRACTICE)
-            kind = "unranked" if why else "ranked"
-            kind = kind if evidence.official(record) else "unofficial"
-            placed[kind].append(Entry(record, tuple(history), why))
+        # The one that is not withdrawn; nobody takes an official one's place.
+        record = min(
+            history, key=lambda x: (x.sha256 in evidence.withdrawn, not evidence.official(x))
+        )
+        why = gate.simulated(record, evidence)
+        if own is None:
+            why = tuple(reason for reason in why if reason != gate.PRACTICE)
+        kind = "unranked" if why else "ranked"
+        kind = kind if evidence.official(record) else "unofficial"
+        placed[kind].append(Entry(record, tuple(history), why))
     ranked = rank(derived(leaderboard, placed["ranked"]), name, ranks=own is not None)
     records = [row.record for row in ranked]
     base = _baseline(records, name)

@@ -1,13 +1,12 @@
 """Recorded commands through the frozen simulators again: no code of a submission is needed.
 
-Commands do not answer to pressures here, and every inspiration starts from the lung at PEEP, so
-that all breaths of all cells of several records advance together, 33 steps in all. Numbers agree
-with those of the scorer to 1e-9; matrix products of another batch size may round differently.
+All cells of several records advance together. Numbers agree with those of the scorer to 1e-9;
+matrix products of another batch size may round differently.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -26,7 +25,6 @@ from ventbench.board.schema import ScoreHeader
 from ventbench.entries.cells import as_float64
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
-from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
 from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario
@@ -38,6 +36,7 @@ from ventbench.task.metrics.score import (
     run_error,
     safety_limit,
 )
+from ventbench.task.rollouts import Script
 
 #: The breath whose nominal inspirations are kept for the page.
 TRACE_BREATH = max(protocol.SCORED_BREATHS)
@@ -96,39 +95,16 @@ class Replayed:
 
 @jax.jit
 def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
-    """Airway pressures for commands of the same shape, ``(L, n, ..., S)``; cells ``(L, ...)``.
+    """Airway pressures for commands ``(N, L, ..., B, S)``, of that shape; cells ``(L, ...)``."""
 
-    The n inspirations are all breaths of some runs, breath by breath.
-    """
+    def run(commands: Array, plant: Plant, cells: Scenario) -> Array:
+        script = Script(commands.reshape(*commands.shape[:-2], -1))
+        return rollouts.closed_loop(plant, script, cells)[0].pressure
 
-    def lung(plant: Plant, cells: Scenario, commands: Array) -> Array:
-        def inspiration(commands: Array, breath: Array) -> Array:
-            varied = env.vary(plant, cells, breath)
-            _, _, pressure = rollouts.inspiration(
-                varied, cells, rollouts.commanded, inputs=jnp.moveaxis(commands, -1, 0),
-                record=lambda before, *_: before.signals.scored,
-            )  # fmt: skip
-            return jnp.moveaxis(pressure, 0, -1)
-
-        return jax.vmap(inspiration)(commands, jnp.arange(len(commands)) % protocol.BREATHS)
-
-    return jax.vmap(lung)(plants, cells, requested)
+    return jax.vmap(jax.vmap(run), (0, None, None))(requested, plants, cells)
 
 
 _members = jax.jit(jax.vmap(_pressures, in_axes=(0, None, None)))
-
-
-def _breaths_first(requested: Floats) -> Array:
-    """From ``(N, L, ..., B, S)`` to ``(L, N B, ..., S)``."""
-    moved = np.moveaxis(requested, (1, -2), (0, 2))
-    return jnp.asarray(moved.reshape(moved.shape[0], -1, *moved.shape[3:]))
-
-
-def _breaths_last(values: Array, count: int) -> Floats:
-    """Back again."""
-    array = np.asarray(values)
-    split = array.reshape(array.shape[0], count, protocol.BREATHS, *array.shape[2:])
-    return np.moveaxis(split, (0, 2), (1, -2))
 
 
 def pressures(
@@ -148,8 +124,7 @@ def pressures(
     with precision.float64():
         plants, cells = rigs_of(simulators).cells(draws, pips)
         plants = as_float64(plants, requested.shape[1])
-        pressure = _pressures(plants, cells, _breaths_first(requested))
-    return _breaths_last(pressure, len(requested))
+        return np.asarray(_pressures(plants, cells, jnp.asarray(requested)))
 
 
 def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
@@ -169,8 +144,7 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
     with precision.float64():
         cells, _, _ = draw_tables.with_nominal(None, [0] * lungs, pips)
         plants = as_float64(simulators.ensemble, members)
-        pressure = _members(plants, cells, _breaths_first(requested[:, :, None]))
-    by_member = np.stack([_breaths_last(pressure[m], len(requested)) for m in range(members)])
+        by_member = np.asarray(_members(plants, cells, jnp.asarray(requested[:, :, None])))
     deviation = np.std(by_member[:, :, :, 0], axis=0, ddof=1)
     assert deviation.shape[1] == lungs
     return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
@@ -246,7 +220,7 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
     header, clipped = record.header, record.header.clipped
     size = int(np.prod(header.actions.shape))
     failed = np.isnan(record.nominal).any(axis=1) | np.isnan(record.drawn).any(axis=(0, 2))
-    checks: tuple[tuple[str, ArrayLike, ArrayLike, float], ...] = (
+    checks: tuple[Check, ...] = (
         ("errors.nominal", record.nominal, replayed.nominal, TOLERANCE),
         ("errors.drawn", record.drawn, replayed.drawn, TOLERANCE),
         ("spread", record.spread, replayed.spread, TOLERANCE),
@@ -264,7 +238,7 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("rigs.session", record.headroom.session, replayed.session, 0.0),
         ("rigs.member", record.headroom.member, replayed.member, 0.0),
     )
-    texts = [text for check in checks if (text := _difference(*check)) is not None]
+    texts = worst(checks)
     for key, recorded, given in (
         ("errors.nominal", record.nominal, replayed.nominal),
         ("errors.drawn", record.drawn, replayed.drawn),
@@ -274,8 +248,7 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
             of_draws, now = (
                 x.mean(axis=(-2, -1)) for x in (recorded, given)
             )  # NaN if a cell failed
-            text = _difference(f"{key}, mean over cells", of_draws, now, MEAN_TOLERANCE)
-            texts += [] if text is None else [text]
+            texts += worst([(f"{key}, mean over cells", of_draws, now, MEAN_TOLERANCE)])
     return texts + lung_leaks(record, replayed)
 
 
@@ -306,17 +279,28 @@ def lung_leaks(record: Record, replayed: Replayed) -> list[str]:
     ]
 
 
-def _difference(key: str, recorded: ArrayLike, replayed: ArrayLike, tolerance: float) -> str | None:
-    """Describe the worst value of a key, if it is off by more than the tolerance."""
-    recorded, replayed = np.asarray(recorded, float), np.asarray(replayed, float)
-    if recorded.shape != replayed.shape:
-        return f"key {key} has shape {recorded.shape}, its commands give {replayed.shape}"
-    off = _off(recorded, replayed)
-    if off.size == 0 or np.all(off <= tolerance):
-        return None
-    index: Any = np.unravel_index(int(np.argmax(off)), off.shape)
-    place = "".join(f"[{i}]" for i in index)
-    return f"key {key}{place} says {recorded[index]:.15g}, its commands give {replayed[index]:.15g}"
+#: A key of a record, its values there and now, and how far they may be off.
+Check = tuple[str, ArrayLike, ArrayLike, float]
+
+
+def worst(checks: Iterable[Check], source: str = "its commands") -> list[str]:
+    """Describe the worst value of each key that is off by more than its tolerance.
+
+    What has no value in the record is off by nothing; ``source`` says what gives the values now.
+    """
+    texts = []
+    for key, recorded, given, tolerance in checks:
+        recorded, given = np.asarray(recorded, float), np.asarray(given, float)
+        if recorded.shape != given.shape:
+            texts.append(f"key {key} has shape {recorded.shape}, {source} give {given.shape}")
+            continue
+        off = _off(recorded, given)
+        if not np.all(off <= tolerance):
+            at: Any = np.unravel_index(int(np.argmax(off)), off.shape)
+            place = "".join(f"[{i}]" for i in at)
+            said, now = f"{recorded[at]:.15g}", f"{given[at]:.15g}"
+            texts.append(f"key {key}{place} says {said}, {source} give {now}")
+    return texts
 
 
 def _off(recorded: ArrayLike, replayed: ArrayLike) -> np.ndarray:

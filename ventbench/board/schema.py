@@ -252,7 +252,7 @@ class ScoreHeader(SubmittedContent, frozen=True):
     """A score's record without its large tables; L lungs, P PIPs, K draws."""
 
     official: bool
-    supersedes: Sha256 | None
+    supersedes: None  # a correction is a withdrawal and a new record
     reason: Text
     track: Track
     simulators: FreeForm

@@ -19,7 +19,7 @@ import numpy as np
 from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.board import attestation, canonical, record, rounds, schema
+from ventbench.board import canonical, gate, record, rounds, schema
 from ventbench.board.canonical import RECORDS
 from ventbench.board.gate import Evidence
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
@@ -39,7 +39,7 @@ class Store:
     folder: Path  #: of the leaderboard.
     records: tuple[AnyRecord, ...]  #: all of them.
     #: hashes of the records that somebody who may do so vouches for; see
-    #: :mod:`ventbench.board.attestation`.
+    #: :mod:`ventbench.board.gate`.
     attested: frozenset[str]
     rounds: tuple[Round, ...] = ()  #: all of them, the newest first.
 
@@ -76,7 +76,7 @@ def load(folder: Path) -> Store:
         OSError: if one cannot be read.
     """
     records = in_order(read_record(path) for path in record_paths(folder))
-    attested, problems = attestation.attested(folder, measured(records))
+    attested, problems = gate.attested(folder, measured(records))
     if problems:
         raise InputError(problems[0])
     return Store(folder, records, attested, rounds.load_all(folder))
@@ -91,22 +91,14 @@ def measured(records: Iterable[AnyRecord]) -> dict[str, str | None]:
 
 
 def in_order(records: Iterable[AnyRecord]) -> tuple[AnyRecord, ...]:
-    """Sort records by their times, each after the one that it supersedes or withdraws."""
+    """Sort records by their times, withdrawals after what they withdraw."""
     known = {entry.sha256: entry for entry in records}
     ordered: dict[str, AnyRecord] = {}
     for entry in sorted(known.values(), key=lambda x: (record.created_of(x), x.sha256)):
-        waiting = [entry]
-        while (named := known.get(_follows(waiting[-1]))) and named.sha256 not in ordered:
-            waiting.append(named)  # ends: no record can hold the hash of a later one
-        ordered |= {x.sha256: x for x in reversed(waiting)}
+        if isinstance(entry, Withdrawal) and (withdrawn := known.get(entry.withdraws)):
+            ordered.setdefault(withdrawn.sha256, withdrawn)
+        ordered.setdefault(entry.sha256, entry)
     return tuple(ordered.values())
-
-
-def _follows(entry: AnyRecord) -> str:
-    """Hash of the record that one names as its predecessor; empty if it names none."""
-    if isinstance(entry, Withdrawal):
-        return entry.withdraws
-    return (entry.header.supersedes or "") if isinstance(entry, Record) else ""
 
 
 def read_record(path: Path, *, strict: bool = False) -> AnyRecord:
@@ -244,7 +236,9 @@ def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
     sentences: list[str] = []
     known: dict[str, Record | HardwareRecord] = {}  # by hash
     first: dict[str, Record] = {}  # on each draws, by their name
-    newest: dict[tuple[str, str, str], Record] = {}  # of each entry, by draws, track and name
+    counting: dict[tuple[str, str, str], Record] = {}  # of each entry, by draws, track and name
+    # Whenever it was withdrawn: a record that was made before may be added after.
+    taken_back = {entry.withdraws for entry in records if isinstance(entry, Withdrawal)}
     withdrawn: set[str] = set()
     for index, entry in enumerate(records):
         name, found = f"record {entry.sha256}", list[str]()
@@ -259,19 +253,19 @@ def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
                 found = [f"{name} is on the leaderboard already"]
             elif isinstance(entry, Record):
                 common = first.get(entry.header.draws.season)
-                found = _conflicts(entry, common, newest.get(entry.key), known)
+                own = None if entry.sha256 in taken_back else counting.get(entry.key)
+                found = _conflicts(entry, common, own)
             known[entry.sha256] = entry
             if isinstance(entry, Record):
                 first.setdefault(entry.header.draws.season, entry)
-                newest[entry.key] = entry
+                if entry.sha256 not in taken_back:
+                    counting.setdefault(entry.key, entry)
         sentences += found if index >= start else []
     return sentences
 
 
-def _conflicts(
-    entry: Record, first: Record | None, newest: Record | None, known: Mapping[str, Any]
-) -> list[str]:
-    """Conflicts of a score with the first on its draws, the newest of its entry, and all others."""
+def _conflicts(entry: Record, first: Record | None, counting: Record | None) -> list[str]:
+    """Conflicts of a score with the first on its draws, and with the one of its entry."""
     name, sentences = f"record {entry.sha256}", list[str]()
     if first is not None:
         # Records can only be compared over the same simulators, draws and reference errors.
@@ -282,25 +276,11 @@ def _conflicts(
             for key, own, common in zip(keys, entry.basis, first.basis, strict=True)
             if own != common
         ]
-    superseded = entry.header.supersedes
-    if superseded is None:
-        if newest is not None:
-            sentences.append(
-                f"{name} ({entry.name}), key supersedes: the entry has record "
-                f"{newest.sha256[:12]}; a new one must name it, with --supersedes and a --reason"
-            )
-        return sentences
-    old = known.get(superseded)
-    if not isinstance(old, Record):
-        sentences.append(f"{name}, key supersedes: {superseded[:12]} is not there")
-    elif old.key != entry.key:
-        sentences.append(f"{name}, key supersedes: is of another entry or track")
-    elif newest is not None and old.sha256 != newest.sha256:
+    if counting is not None:
         sentences.append(
-            f"{name}, key supersedes: the newest record of {entry.name} is {newest.sha256[:12]}"
+            f"{name} ({entry.name}): the entry has record {counting.sha256[:12]}; withdraw that "
+            'first, ventbench board withdraw HASH --reason "why"'
         )
-    elif old.official and not entry.official:
-        sentences.append(f"{name} is not official and supersedes an official record")
     return sentences
 
 

@@ -16,9 +16,7 @@ from ventbench.cli.options import (
     bar,
     console_of,
     emit,
-    known_lungs,
     notes,
-    table_of,
     told,
 )
 
@@ -53,7 +51,7 @@ def at_hand(folder: Path) -> Path:
     return path
 
 
-#: Characters of a hash that tables show, as `--supersedes` and `verify --rerun` take them.
+#: Characters of a hash that tables show, as `withdraw` and `verify --rerun` take them.
 SHOWN = 8
 
 
@@ -66,40 +64,20 @@ def add(
             help="JSON files of `ventbench score --record DIR`, each with its commands next to it.",
         ),
     ],
-    supersedes: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HASH", help="SHA-256 (or its beginning) of the record that this one corrects."
-        ),
-    ] = None,
-    reason: Annotated[str, typer.Option(help="Reason of the correction, shown on the page.")] = "",
-    source: Annotated[
-        list[str] | None,
-        typer.Option(metavar="KEY=TEXT", help="Origin of the submission; may be repeated."),
-    ] = None,
     folder: Folder = FOLDER,
 ) -> None:
     """Add records whose replay gives the recorded numbers.
 
-    Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
+    Example: `ventbench board add runs/record/3f2a....json`
     """
-    from ventbench.board import create, store
+    from ventbench.board import store
     from ventbench.plants import frozen
 
-    parts = [text.partition("=") for text in source or ()]
-    about = {key: text for key, _, text in parts}
-    if not all(about.values()):
-        raise InputError("--source needs KEY=TEXT, such as commit=9c1e5d0")
-    if supersedes is not None and len(paths) > 1:
-        raise InputError("--supersedes is about one record: add the others by themselves")
-    if supersedes is not None:
-        supersedes = store.find_record(store.load(folder), supersedes).sha256
     done = []
     try:
         with bar("replaying records") as replaying:
             for path in paths:
-                new = create.amend(path, supersedes=supersedes, reason=reason, source=about)
-                done.append(store.add(folder, new, frozen.load()))
+                done.append(store.add(folder, path, frozen.load()))
                 replaying(len(done), len(paths))
     finally:  # also those before one that is refused
         for added in done:
@@ -137,13 +115,13 @@ def sign(
     """
     import os
 
-    from ventbench.board import attestation, store
+    from ventbench.board import gate, store
 
-    secret = os.environ.get(attestation.SECRET, "")
+    secret = os.environ.get(gate.SECRET, "")
     if not secret:
-        raise InputError(f"environment variable {attestation.SECRET} holds no key")
+        raise InputError(f"environment variable {gate.SECRET} holds no key")
     sha256 = store.find_record(store.load(folder), record).sha256
-    typer.echo(f"signed {sha256}: {attestation.sign(folder, sha256, secret)}")
+    typer.echo(f"signed {sha256}: {gate.sign(folder, sha256, secret)}")
     typer.echo("next: ventbench board build")
 
 
@@ -153,10 +131,10 @@ def new_key() -> None:
 
     Example: `ventbench board new-key`
     """
-    from ventbench.board import attestation
+    from ventbench.board import gate
 
-    secret, lines = attestation.new_key()
-    typer.echo(f"# secret: {attestation.SECRET} of the workflow; keep it nowhere else\n{secret}\n")
+    secret, lines = gate.new_key()
+    typer.echo(f"# secret: {gate.SECRET} of the workflow; keep it nowhere else\n{secret}\n")
     typer.echo(f"# public: for leaderboard/attestations.toml\n{lines}", nl=False)
 
 
@@ -269,38 +247,19 @@ def _summary(console: Console, report: Report) -> None:
 @app.command()
 def show(
     folder: Folder = FOLDER,
-    lung: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LUNG",
-            help="Show the cells of one lung by PIP, or `all` lungs.",
-            autocompletion=known_lungs,
-        ),
-    ] = None,
     json: JsonFile = None,
 ) -> None:
     """Show the newest round's ranking of both tracks and under missing physics, and practice.
 
-    With --lung the table has a column for each PIP of that lung, or for each lung with `all`: the
-    normalised score over the draws.
-
-    Example: `ventbench board show --lung R20C50`
+    Example: `ventbench board show`
     """
     from ventbench.board import frames, ranking
 
     folder = at_hand(folder)
     tracks = ranking.newest(frames.load_tracks(folder))
-    rows = [
-        frames.csv_row(line)
-        | ({} if lung is None else {"cells": frames.cell_means(line.row.record, lung)})
-        for line in frames.lines(tracks)
-    ]
-    console = told({"rows": rows}, json)
+    console = told({"rows": [frames.csv_row(line) for line in frames.lines(tracks)]}, json)
     for track in tracks:
-        if lung is not None:
-            console.print(_lung_table(track, lung))
-        else:
-            _print_track(console, track)
+        _print_track(console, track)
 
 
 def tables_of(folder: Path, name: str, *, err: bool = False) -> None:
@@ -327,29 +286,6 @@ def _print_track(console: Console, track: Track) -> None:
         console.print(_stress_table(track))
 
 
-@app.command(name="records")
-def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
-    """List the files of `records/`: whose each is, and whether it counts.
-
-    Example: `ventbench board records`
-    """
-    from ventbench.board import frames
-
-    folder = at_hand(folder)
-    rows = frames.record_index(folder)
-    table = _plain_table("")
-    for name in ("record", "entry", "track", "kind", "made", "state"):
-        table.add_column(name, overflow="fold")
-    for row in rows:
-        record, made = row["record"][:SHOWN], row["created"][:10]
-        table.add_row(record, plain(row["name"]), row["track"], row["kind"], made, row["state"])
-    console = told({"records": rows}, json)
-    console.print(table)
-    console.print(
-        f"{len(rows)} records in {folder / 'records'}; the beginning of a hash is enough."
-    )
-
-
 def _plain_table(title: str) -> Table:
     """Return a table without frames, which fits 80 columns."""
     from rich import box
@@ -359,20 +295,6 @@ def _plain_table(title: str) -> Table:
         title=title or None, box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False,
         title_justify="left", caption_justify="left",
     )  # fmt: skip
-
-
-def _lung_table(track: Track, lung: str) -> Table:
-    """Entries by PIP of one lung, or by lung."""
-    from ventbench.board import frames
-
-    cells = [frames.cell_means(row.record, lung) for _, row in track.rows]
-    columns = ("rank", "entry", *(cells[0] if cells else ()))
-    table = table_of(f"{track.name}, {lung}: normalised score over draws", columns, left=["entry"])
-    table.columns[1].no_wrap = True
-    for (_, row), own in zip(track.rows, cells, strict=True):
-        texts = ("failed" if x is None else f"{x:.1f}" for x in own.values())
-        table.add_row("" if row.rank is None else str(row.rank), row.record.name, *texts)
-    return table
 
 
 def _table(track: Track) -> Table:

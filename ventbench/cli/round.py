@@ -151,7 +151,7 @@ def score(
     import os
 
     from ventbench.base.executor import executor
-    from ventbench.board import attestation, official_runs, rounds
+    from ventbench.board import gate, official_runs, rounds
 
     own = rounds.load(folder, name)
     if plan:
@@ -167,7 +167,7 @@ def score(
     with bars() as tell, executor(workers, scheduler) as pool:
         made = official_runs.score(
             folder, name, pool, out / name, places=[folder.parent / "submissions", *(source or [])],
-            secret=os.environ.get(attestation.SECRET) or None, progress=tell,
+            secret=os.environ.get(gate.SECRET) or None, progress=tell,
         )  # fmt: skip
     _told(made, json)
 

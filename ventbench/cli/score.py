@@ -67,8 +67,7 @@ def score(
         bool,
         typer.Option(
             "--report",
-            help="Also write report.html, scores.rrd and, with --stress, stress.png to the folder "
-            "of --out.",
+            help="Also write report.html and scores.rrd to the folder of --out.",
         ),
     ] = False,
     record: Annotated[
@@ -348,14 +347,10 @@ def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
         result.save(written[-1])
     if report:
         from ventbench import pages
-        from ventbench.pages.plots import write_stress_chart
 
         values = [result.to_json() for result in scores]
         written.append(pages.write_report(out / "report.html", runs, values))
         written.append(pages.write_rerun(out / "scores.rrd", runs))
-        stressed = [value["stress"] for value in values if value["stress"]]
-        if stressed:
-            written.append(write_stress_chart(out / "stress.png", stressed))
     return written
 
 

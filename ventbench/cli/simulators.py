@@ -12,6 +12,7 @@ import typer
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.base.text import number
 from ventbench.cli.options import (
     Clip,
     JsonFile,
@@ -170,9 +171,7 @@ def open_loop(
 
     The error of a breath is the mean |simulated - recorded| pressure over its inspiratory samples,
     cmH2O; the simulation starts at the first recorded pressure. For held-out errors, a member of
-    the ensemble that was not trained on a breath simulates it. Breaths that another lung or valve
-    gain explains far better than their label are listed as misfits; only the last column leaves
-    them out.
+    the ensemble that was not trained on a breath simulates it.
 
     Example: `ventbench open-loop recording.csv --json errors.json`
     """
@@ -191,25 +190,21 @@ def open_loop(
         result = open_loop_report.open_loop(breaths, chosen, progress=simulating)
     console = told(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
-    for line in result.misfit_lines():
+    for line in result.remarks():
         console.print(line)
 
 
 def _open_loop_table(result: dict[str, Any]) -> Any:
-    def show(value: float | None) -> str:
-        return "-" if value is None else f"{value:.2f}"
-
-    rows = []
-    for lung, figures in result["lungs"].items():
-        apart = figures["fitting_label"]
-        rows.append((
-            lung, str(figures["breaths"]), show(figures["mae"]), show(figures["median_mae"]),
-            show(figures["held_out_mae"]), "..".join(map(show, figures["held_out_ci95"])),
-            show(figures["held_out_median_mae"]),
-            f"{show(apart['held_out_mae'])} ({apart['held_out_breaths']})",
-        ))  # fmt: skip
+    rows = [
+        (
+            lung, str(figures["breaths"]), number(figures["mae"]), number(figures["median_mae"]),
+            number(figures["held_out_mae"]), "..".join(map(number, figures["held_out_ci95"])),
+            number(figures["held_out_median_mae"]),
+        )
+        for lung, figures in result["lungs"].items()
+    ]  # fmt: skip
     title = f"Open-loop MAE of the {result['plant']} simulators, cmH2O"
-    columns = ("lung", "n", "mean", "median", "held-out", "95 %", "median", "no misfits")
+    columns = ("lung", "n", "mean", "median", "held-out", "95 %", "median")
     return table_of(title, columns, rows, no_wrap=True)
 
 
@@ -289,9 +284,6 @@ def report(
         Path | None,
         typer.Option(metavar="FILE", help="File to write; default: report.html in the first RUN."),
     ] = None,
-    figure: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also write the panels as a PNG.")
-    ] = None,
 ) -> None:
     """Write a self-contained HTML report of scored runs.
 
@@ -301,8 +293,6 @@ def report(
 
     loaded, scores = _read(runs)
     typer.echo(f"wrote {pages.write_report(out or runs[0] / 'report.html', loaded, scores)}")
-    if figure is not None:
-        typer.echo(f"wrote {pages.write_figure(figure, loaded)}")
 
 
 COMMANDS = (lungs, coverage, simulate, open_loop, fmu, view, report)

@@ -7,21 +7,16 @@ In a test of your own::
     def test_my_controller():
         assert_ready("submissions/mine")
 
-Runs that it shows a controller are plain, repetitions in the same and in another process, and
-unusual inputs. They run from the submission itself; only where a controller is reset and made anew
-in the middle of a run is a copy needed in which it can be.
+Runs that it shows a controller are plain, one of them once more in another process, and unusual
+inputs. Each is in a process of its own, as the runs of a score are.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import re
-import shutil
-import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -71,11 +66,6 @@ def plain(tracks: Sequence[str]) -> list[ContractRun]:
     return runs
 
 
-def repeated(told: Task) -> list[ContractRun]:
-    """Return the plain run in another process; thrice in one, reset, then renewed between."""
-    return [ContractRun(told, breaths()), ContractRun(told, _thrice())]
-
-
 def unusual(told: Task) -> list[ContractRun]:
     """Short runs with inputs at and beyond the edge of what a bench gives."""
     random = np.random.default_rng(0)
@@ -112,13 +102,6 @@ def breaths() -> Script:
             pressure += (rest - pressure) * protocol.DT / _TIME_CONSTANT
 
 
-def _thrice() -> Script:
-    yield from breaths()
-    for moment in (RESET, RENEW):
-        yield _row(moment, protocol.DT, protocol.PEEP, _PIP, 5.0)
-        yield from breaths()
-
-
 def _played(
     dt: float | np.ndarray = protocol.DT,
     pressure: float | np.ndarray = 20.0,
@@ -146,58 +129,6 @@ def _row(elapsed: float, dt: float, pressure: float, target: float, command: flo
     return row
 
 
-#: Observations with these times, which no run has, ask for a reset, or a new controller and reset.
-RESET, RENEW = -1.0, -2.0
-
-# Runs at the end of controller.py, under a name of its own: the author's lines keep their numbers,
-# and the driver's are never taken for the author's. The class itself stays, as its code may name
-# it; only its `act` is replaced.
-_DRIVER = f"""
-def _drive(theirs):
-    from inspect import getattr_static
-
-    act, news, tasks = getattr_static(theirs, "act"), {{}}, {{}}
-    reset = getattr_static(theirs, "reset")
-
-    def bound(function, self):
-        return function.__get__(self, type(self)) if hasattr(function, "__get__") else function
-
-    def driven_reset(self, task):
-        tasks[id(self)] = task
-        return bound(reset, self)(task)
-
-    def driven_act(self, observation):
-        if observation.time >= 0.0:
-            return bound(act, news.get(id(self), self))(observation)
-        if observation.time == {RENEW}:
-            news[id(self)] = theirs()
-        bound(reset, news.get(id(self), self))(tasks[id(self)])
-        return 0.0
-
-    theirs.reset, theirs.act = driven_reset, driven_act
-
-
-_found = globals().get("Controller")
-if isinstance(_found, type) and hasattr(_found, "reset") and hasattr(_found, "act"):
-    _drive(_found)
-"""
-
-
-@contextlib.contextmanager
-def driven(submission: Submission) -> Iterator[Submission]:
-    """Give a copy of a submission whose controller obeys :data:`RESET` and :data:`RENEW`."""
-    with tempfile.TemporaryDirectory() as parent:
-        # Links resolved: Landlock and messages compare real paths.
-        folder = Path(parent).resolve() / submission.folder.name
-        shutil.copytree(submission.folder, folder, ignore=shutil.ignore_patterns("__pycache__"))
-        path = folder / CONTROLLER
-        path.chmod(0o644)
-        with open(path, "ab") as file:
-            code = f'\nexec(compile({_DRIVER!r}, "<contract>", "exec"))\n'
-            file.write(code.encode())
-        yield dataclasses.replace(submission, folder=folder)
-
-
 #: Rounds whose time does not count: first calls load and compile.
 _WARM_UP = 3
 
@@ -209,13 +140,6 @@ class Answers:
     commands: tuple[Floats, ...]  #: answers of each run, %, up to its end or failure.
     failures: dict[int, Failure]  #: what failed, by number of the run.
     act_seconds: Floats  #: processor time of one ``act`` in each round, s, without the first ones.
-
-
-def joined(first: Answers, second: Answers) -> Answers:
-    """Return the answers of two sets of runs as those of one, with the times of the first."""
-    shift = len(first.commands)
-    failures = {**first.failures, **{k + shift: v for k, v in second.failures.items()}}
-    return Answers((*first.commands, *second.commands), failures, first.act_seconds)
 
 
 def processor_time(session: ControllerSession) -> float:
@@ -289,8 +213,8 @@ _OTHER_ADVICE = "see the limits of the sandbox in docs/submitting.md"
 _TO_RUN: tuple[Group, ...] = ("run", "repeat", "time")
 
 
-#: Rounds of a check: plain runs, the timed one, and three in one process with two resets between.
-_ROUNDS = STEPS + STEPS + 3 * STEPS + 2
+#: Rounds of a check: all runs side by side, and the timed one.
+_ROUNDS = STEPS + STEPS
 
 
 def check(
@@ -316,7 +240,7 @@ def check(
     """
     folder = resolve(name)
     if runner is None:  # first: a machine that cannot run it reads none of it
-        from ventbench.sandbox.configuration import Allowance
+        from ventbench.sandbox.pipes import Allowance
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))
@@ -357,19 +281,14 @@ def _ran(
 ) -> CheckReport:
     name, tracks = submission.label, submission.manifest.tracks
     plain_runs = plain(tracks)
-    again, thrice = repeated(plain_runs[0].task)
-    runs = [*plain_runs, again, *unusual(plain_runs[0].task)]
+    told = plain_runs[0].task
+    runs = [*plain_runs, ContractRun(told, breaths()), *unusual(told)]
     sandbox = None if runner.sandbox is None else dict(runner.sandbox)
     try:
-        # The folder as it is, through the runner that scores it: what can be told from a score by
-        # its frames or files is the last run alone, whose answers show nothing but its resets.
         answers = run_all(submission, runs, runner, clock, count)
         # By itself, so that the time does not depend on how many run beside it.
         timed_run = plain_runs[0]._replace(script=breaths())
         timed_answers = run_all(submission, [timed_run], runner, clock, count)
-        with driven(submission) as driver:
-            answers = joined(answers, run_all(driver, [thrice], runner, clock, count))
-            runs = [*runs, thrice]
     except SubmissionError as error:
         # Each begins with the label.
         texts = [problem.removeprefix(f"{name}: ") for problem in error.problems]
@@ -377,7 +296,7 @@ def _ran(
         return _report(name, [*findings, *problems], left_out=_TO_RUN[1:], sandbox=sandbox)
     findings += _failure_findings(runs, answers) or _failure_findings([timed_run], timed_answers)
     findings += _clipping_notes(answers.commands[: len(plain_runs)])
-    repeats = (0, len(plain_runs), len(runs) - 1)
+    repeats = (0, len(plain_runs))
     if timed_answers.failures or set(repeats) & set(answers.failures):
         return _report(name, findings, left_out=_TO_RUN[1:], sandbox=sandbox)
     findings += repetition_findings(*(answers.commands[k] for k in repeats))
@@ -415,7 +334,7 @@ def _failure(run: ContractRun, answers: Answers, same: list[int]) -> Finding:
 def _when(run: ContractRun, failure: Failure, answered: int) -> str:
     words = f" {run.unusual}" if run.unusual else ""
     if failure.step is not None:
-        breath, step = divmod(answered % (STEPS + 1), protocol.INSPIRATION_STEPS)
+        breath, step = divmod(answered, protocol.INSPIRATION_STEPS)
         words += f" at step {step + 1} of breath {breath + 1}"
     return f"{words} (lung {run.task.lung or 'hidden'})"
 
@@ -440,33 +359,12 @@ def _clipping_notes(commands: Sequence[Floats]) -> Iterator[Finding]:
         yield Finding("run", CONTROLLER, what, advice, problem=False)
 
 
-def repetition_findings(first: Floats, again: Floats, thrice: Floats) -> Iterator[Finding]:
-    """Findings on answers that should be the same.
-
-    Args:
-        first: commands of a run, %.
-        again: commands of the same run in another process, %.
-        thrice: commands of the run three times in one process: fresh, reset, made anew; with one
-            command between each, which does not count.
-    """
-    fresh, reset, renewed = (thrice[k * (STEPS + 1) :][:STEPS] for k in range(3))
-    other = next((values for values in (again, fresh) if _differ(first, values)), None)
-    if other is not None:
+def repetition_findings(first: Floats, again: Floats) -> Iterator[Finding]:
+    """A finding if commands of a run, %, are others in another process."""
+    if different := _differ(first, again):
+        what = f"the same run in another process gave {different}"
         advice = "give every random generator a fixed seed; do not look at the clock"
-        yield _repeat(f"the same run in another process gave {_differ(first, other)}", advice)
-    elif _differ(first, renewed):
-        advice = "keep state in self, not in modules or the class: each run gets a fresh process"
-        what = f"a second Controller() remembers the first: it gave {_differ(first, renewed)}"
-        yield _repeat(what, advice)
-    elif _differ(first, reset):
-        advice = "set everything in reset that a run changes"
-        yield _repeat(
-            f"reset does not clear what it keeps: it gave {_differ(first, reset)}", advice
-        )
-
-
-def _repeat(what: str, advice: str) -> Finding:
-    return Finding("repeat", CONTROLLER, what, advice)
+        yield Finding("repeat", CONTROLLER, what, advice)
 
 
 def _differ(first: Floats, other: Floats) -> str:

@@ -6,10 +6,12 @@ import dataclasses
 import difflib
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_type_hints
+
+import msgspec
 
 from ventbench.entries.errors import Finding, SubmissionError
 from ventbench.task.interfaces import API_VERSION
@@ -46,6 +48,9 @@ NAME_RULE = (
 )
 
 
+_SOME = msgspec.Meta(min_length=1)
+
+
 @dataclass(frozen=True)
 class Training:
     """Table ``[training]``: where the parameters come from; every key may be left out."""
@@ -62,34 +67,14 @@ class Manifest:
     """The content of ``submission.toml``."""
 
     name: str  #: lower-case letters, digits and underscores, at most 40.
-    authors: tuple[str, ...]  #: at least one.
+    authors: Annotated[tuple[str, ...], _SOME]  #: at least one.
     licence: str  #: SPDX identifier, such as ``"Apache-2.0"``.
     api_version: int  #: version of the submission interface, now 1.
     family: str  #: one of :data:`FAMILIES`.
     #: one or both of :data:`TRACKS`; the first is scored if none is asked for.
-    tracks: tuple[str, ...]
+    tracks: Annotated[tuple[str, ...], _SOME]
     description: str  #: a sentence or two.
     training: Training = field(default_factory=Training)  #: see :class:`Training`.
-
-
-# A check takes a TOML value and returns the value to keep, or raises ValueError with what is wrong.
-ValueCheck = Callable[[Any], Any]
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError("must be text in quotes")
-    if len(value) > _MAX_TEXT:
-        raise ValueError(f"is longer than {_MAX_TEXT} characters")
-    if not all(c.isprintable() or c in "\n\t" for c in value):
-        raise ValueError("contains characters that cannot be printed")
-    return value.strip()
-
-
-def _name(value: Any) -> str:
-    if not NAME.fullmatch(_text(value)):
-        raise ValueError(f"{_shown(value)} {NAME_RULE}")
-    return value
 
 
 def _shown(value: Any) -> str:
@@ -101,69 +86,45 @@ def _shown(value: Any) -> str:
     return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
 
-def _one_of(choices: tuple[str, ...]) -> ValueCheck:
-    def check(value: Any) -> str:
-        if value not in choices:
-            raise ValueError(
-                f"{_shown(value)} is not one of {', '.join(choices)}{_hint(value, choices)}"
-            )
-        return value
-
-    return check
+#: Values that keys may have.
+_CHOICES = {"family": tuple(FAMILIES), "tracks": TRACKS}
 
 
-def _version(value: Any) -> int:
-    if type(value) is not int or value != API_VERSION:
-        raise ValueError(
-            f"{_shown(value)} is not supported; this ventbench speaks version {API_VERSION}"
-        )
-    return value
+def _value(key: str, kind: Any, value: Any) -> Any:
+    """A TOML value of a key as it is kept.
+
+    Raises:
+        ValueError: with what is wrong, or msgspec.ValidationError.
+    """
+    kept = msgspec.convert(value, kind)
+    entries = kept if isinstance(kept, tuple) else (kept,)
+    for entry in entries:
+        if isinstance(entry, str):
+            _check_text(entry)
+            if key == "name" and not NAME.fullmatch(entry):
+                raise ValueError(f"{_shown(entry)} {NAME_RULE}")
+        elif abs(entry) >= _MAX_SEED:
+            raise ValueError("must be an integer of at most 64 bits")
+        choices = _CHOICES.get(key, (entry,))
+        if entry not in choices:
+            hint = _hint(entry, choices)
+            raise ValueError(f"{_shown(entry)} is not one of {', '.join(choices)}{hint}")
+    if key == "api_version" and kept != API_VERSION:
+        speaks = f"this ventbench speaks version {API_VERSION}"
+        raise ValueError(f"{_shown(kept)} is not supported; {speaks}")
+    clean = tuple(entry.strip() if isinstance(entry, str) else entry for entry in entries)
+    if len(set(clean)) < len(clean):
+        raise ValueError("contains something twice")
+    return clean if isinstance(kept, tuple) else clean[0]
 
 
-def _many(check: ValueCheck, *, least: int) -> ValueCheck:
-    def checked(value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list) or len(value) < least:
-            raise ValueError("must be a list" + (" that is not empty" if least else ""))
-        entries = tuple(check(entry) for entry in value)
-        if len(set(entries)) < len(entries):
-            raise ValueError("contains something twice")
-        return entries
-
-    return checked
-
-
-def _typed(kind: type, text: str) -> ValueCheck:
-    def check(value: Any) -> Any:
-        if type(value) is not kind:
-            raise ValueError(f"must be {text}, not {_shown(value)}")
-        return value
-
-    return check
-
-
-def _seed(value: Any) -> int:
-    seed = _typed(int, "an integer")(value)
-    if abs(seed) >= _MAX_SEED:
-        raise ValueError("must be an integer of at most 64 bits")
-    return seed
-
-
-_TRAINING: dict[str, ValueCheck] = {
-    "data": _text,
-    "simulators": _text,
-    "seeds": _many(_seed, least=0),
-    "compute": _text,
-    "per_lung": _typed(bool, "true or false"),
-}
-_REQUIRED: dict[str, ValueCheck] = {
-    "name": _name,
-    "authors": _many(_text, least=1),
-    "licence": _text,
-    "api_version": _version,
-    "family": _one_of(tuple(FAMILIES)),
-    "tracks": _many(_one_of(TRACKS), least=1),
-    "description": _text,
-}
+def _check_text(text: str) -> None:
+    if not text.strip():
+        raise ValueError("is blank")
+    if len(text) > _MAX_TEXT:
+        raise ValueError(f"is longer than {_MAX_TEXT} characters")
+    if not all(c.isprintable() or c in "\n\t" for c in text):
+        raise ValueError("contains characters that cannot be printed")
 
 
 def _hint(value: Any, choices: tuple[str, ...]) -> str:
@@ -177,17 +138,18 @@ _UNKNOWN = "is not known"
 
 
 def _checked(
-    table: dict[str, Any], checks: dict[str, ValueCheck], where: str, problems: list[_Problem]
+    table: dict[str, Any], kinds: dict[str, Any], where: str, problems: list[_Problem]
 ) -> dict[str, Any]:
     kept = {}
     for key, value in table.items():
-        if key not in checks:
-            problems.append((f"{where}{_shown(key)}", f"{_UNKNOWN}{_hint(key, tuple(checks))}"))
+        if key not in kinds:
+            problems.append((f"{where}{_shown(key)}", f"{_UNKNOWN}{_hint(key, tuple(kinds))}"))
             continue
         try:
-            kept[key] = checks[key](value)
-        except ValueError as error:
-            problems.append((f"{where}{key}", str(error)))
+            kept[key] = _value(key, kinds[key], value)
+        except (ValueError, msgspec.ValidationError) as error:
+            what = str(error)
+            problems.append((f"{where}{key}", what[0].lower() + what[1:]))
     return kept
 
 
@@ -223,13 +185,14 @@ def _read(path: Path) -> Manifest | list[_Problem]:
         return [("", f"not TOML: {error}")]
     except OSError as error:
         return [("", f"cannot be read: {error.strerror}")]
-    training = content.pop("training", {})
+    training, kinds = content.pop("training", {}), get_type_hints(Manifest, include_extras=True)
+    del kinds["training"]
     if not isinstance(training, dict):
         problems.append(("training", "must be a table, [training]"))
         training = {}
-    kept = _checked(content, _REQUIRED, "", problems)
-    problems += [(key, "is missing") for key in _REQUIRED if key not in content]
-    trained = _checked(training, _TRAINING, "training.", problems)
+    kept = _checked(content, kinds, "", problems)
+    problems += [(key, "is missing") for key in kinds if key not in content]
+    trained = _checked(training, get_type_hints(Training), "training.", problems)
     return problems or Manifest(**kept, training=Training(**trained))
 
 

@@ -32,7 +32,7 @@ from ventbench.entries.folder import CONTROLLER, MAX_BYTES, check_files
 from ventbench.entries.manifest import check_manifest
 from ventbench.sandbox.child.cell import CLASS, source_text
 from ventbench.sandbox.child.sources import Import, imports, module_files, sources
-from ventbench.sandbox.configuration import OPTIONAL
+from ventbench.sandbox.pipes import OPTIONAL
 from ventbench.sandbox.reader import UnreadableError, read_apart
 
 

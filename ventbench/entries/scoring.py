@@ -30,13 +30,15 @@ from ventbench.task import draws, protocol
 from ventbench.task.draws import Draws
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.interfaces import Task
-from ventbench.task.metrics.figures import (
+from ventbench.task.metrics.score import (
     InspirationSignals,
+    controllable_error,
     figures,
+    passes_safety_gate,
+    run_error,
     steady_error,
     time_above_alarm,
 )
-from ventbench.task.metrics.score import controllable_error, passes_safety_gate, run_error
 from ventbench.task.stressors import Condition
 from ventbench.trajectories import end_to_end
 

@@ -1,5 +1,5 @@
 """Pictures of scored runs: rerun files, an HTML report, a figure (extra ``ventbench[view]``)."""
 
-from ventbench.pages.report import open_viewer, write_figure, write_report, write_rerun
+from ventbench.pages.report import open_viewer, write_report, write_rerun
 
-__all__ = ["open_viewer", "write_figure", "write_report", "write_rerun"]
+__all__ = ["open_viewer", "write_report", "write_rerun"]

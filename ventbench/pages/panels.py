@@ -18,7 +18,6 @@ from ventbench.base.errors import InputError
 from ventbench.base.text import flatten, number
 from ventbench.task import protocol
 from ventbench.task.metrics import bootstrap
-from ventbench.task.metrics.score import run_error
 from ventbench.trajectories import Trajectories
 
 #: Steps of a run.
@@ -100,18 +99,6 @@ def scored() -> Bools:
     return np.isin(breath, protocol.SCORED_BREATHS) & (phase < protocol.INSPIRATION_STEPS)
 
 
-def errors(run: Trajectories) -> Floats:
-    """Mean absolute error over the scored steps, cmH2O, shape ``(L, P)``.
-
-    NaN where a scored pressure is not finite: such a cell failed.
-    """
-    shape = (*run.pressure.shape[:-1], protocol.BREATHS, protocol.BREATH_STEPS)
-    pressure, target = (
-        x.reshape(shape)[..., : protocol.INSPIRATION_STEPS] for x in (run.pressure, run.target)
-    )
-    return run_error(np.where(np.isfinite(pressure), pressure, np.nan), target)
-
-
 #: Keys of a score that are shown elsewhere or say nothing about where the score comes from.
 NOT_PROVENANCE = frozenset(
     ("score", "ci95", "lungs", "secondary", "secondary_missing", "failures", "timing", "values")
@@ -136,7 +123,7 @@ def collect(
         InputError: if the files are not as many as the runs, or lack one of their lungs.
     """
     if given is None:
-        cells = np.stack([errors(run) for run in runs])
+        cells = np.stack([run.errors().to_numpy() for run in runs])
         lungs = cells.mean(axis=2)
         return Scores(lungs.mean(axis=1), lungs, cells)
     if len(given) != len(runs):
@@ -196,7 +183,7 @@ def _about(value: Any) -> Any:
 
 def _read(run: Trajectories, score: Mapping[str, Any]) -> tuple[float, list[float], Floats]:
     """Overall, lungs and cells of one score file; cells it does not have come from the run."""
-    cells = errors(run)
+    cells = run.errors().to_numpy(copy=True)
     lungs = []
     for i, lung in enumerate(run.lungs):
         entry = score.get("lungs", {}).get(lung)

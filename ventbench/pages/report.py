@@ -64,15 +64,6 @@ def write_report(
     return _write(path, html(runs, scores).encode())
 
 
-def write_figure(path: Path | str, runs: Sequence[Trajectories]) -> Path:
-    """Write the small multiples as a PNG, 1800 pixels wide; see :func:`write_report`."""
-    check(runs)
-    errors.require("matplotlib")
-    from ventbench.pages import plots
-
-    return _write(path, plots.runs_png(runs))
-
-
 def has_display() -> bool:
     """Whether a window can be opened here."""
     if sys.platform.startswith("linux"):

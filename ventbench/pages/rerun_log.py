@@ -21,8 +21,8 @@ import ventbench
 from ventbench import palette
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.base.text import escape_markdown, number
-from ventbench.pages.panels import STEPS, distinct, errors, labels, scored, shared_tracks
+from ventbench.base.text import escape_markdown
+from ventbench.pages.panels import STEPS, distinct, labels, scored, shared_tracks
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.trajectories import Trajectories
@@ -34,9 +34,6 @@ TIMELINE = "run_time"
 
 #: Entity of the text panel.
 ABOUT = "/about"
-
-#: Longest name over a column of the score table, characters.
-COLUMN = 16
 
 
 @dataclass(frozen=True)
@@ -272,55 +269,20 @@ def _last_scored_breath() -> rrb.TimeAxis:
 
 
 def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:
-    """Say what is seen and how the runs, the first one above all, scored; names are escaped."""
-    given, names = names, [escape_markdown(name) for name in names]
-    first, last = min(protocol.SCORED_BREATHS) + 1, max(protocol.SCORED_BREATHS) + 1
-    breath = protocol.BREATH_STEPS * protocol.DT
+    """Say what is seen; names are escaped."""
+    names = [escape_markdown(name) for name in names]
+    last = max(protocol.SCORED_BREATHS) + 1
     compared = f"- **thin lines** in a lung's tab: {', '.join(names[1:])}\n" if names[1:] else ""
-    lines = [
-        f"# {names[0]}",
-        "",
-        escape_markdown(shared_tracks(runs)),
-        "",
-        "## Score, cmH2O",
-        "",
-        *_score_table(runs, given),
-        "",
-        f"Mean absolute error, abs(pressure - target), over the inspirations of breaths {first} "
-        f"and {last}, without noise. Lower is better.",
-        "",
-        "## What you see",
-        "",
-        f"- **one colour a PIP**, {min(runs[0].pips):g} to {max(runs[0].pips):g} cmH2O",
-        "- **thin grey**: target, while the controller acts",
-        f"{compared}- **green bar** at the bottom: scored part",
-        "",
-        f"**All lungs**: one plot a lung, breath {last}. "
-        "R is resistance, cmH2O/(L/s); C compliance, mL/cmH2O.",
-        "",
-        f"**A lung's tab**: the whole run, {protocol.BREATHS} breaths of {breath:g} s, with "
-        "pressure, u_in and error above each other. The expiratory valve is the same for all runs: "
-        "closed in the inspiration; its data are in `u_out`.",
-        "",
-        "The time axis is seconds since the run began. Hover to read values, drag to move, "
-        "Ctrl + scroll to zoom, double-click to reset, click a legend entry to hide it.",
-        "",
-        f"ventbench {ventbench.__version__}",
-    ]
-    return "\n".join(lines) + "\n"
+    return f"""# {names[0]}
 
+{escape_markdown(shared_tracks(runs))}
 
-def _score_table(runs: Sequence[Trajectories], names: Sequence[str]) -> list[str]:
-    """Lungs by runs, the best of each lung in bold."""
-    scores = np.stack([errors(run).mean(axis=1) for run in runs], axis=1)
-    rows = [*zip(runs[0].lungs, scores, strict=True), ("mean", scores.mean(axis=0))]
-    heads = [
-        escape_markdown(name if len(name) <= COLUMN else name[: COLUMN - 2] + "..")
-        for name in names
-    ]
-    lines = ["| lung | " + " | ".join(heads) + " |", "|---|" + "---:|" * len(names)]
-    for lung, row in rows:
-        best = np.nanmin(row) if np.isfinite(row).any() else np.nan
-        cells = [f"**{number(x)}**" if x == best and len(row) > 1 else number(x) for x in row]
-        lines.append(f"| {lung} | " + " | ".join(cells) + " |")
-    return lines
+- **one colour a PIP**, {min(runs[0].pips):g} to {max(runs[0].pips):g} cmH2O
+- **thin grey**: target, while the controller acts
+{compared}- **green bar** at the bottom: scored part
+
+**All lungs**: breath {last}. **A lung's tab**: the whole run; the expiratory valve, `u_out`, is the
+same for all. Time is in seconds since the run began. `ventbench report` has the scores.
+
+ventbench {ventbench.__version__}
+"""

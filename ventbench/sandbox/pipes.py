@@ -1,6 +1,7 @@
 """The scorer's ends: of the zygote, which starts cells, and of the pipes to all of them.
 
-The zygote is asked for cells and says how they ended; each cell gets a frame and gives a reply.
+The zygote is told what cells may use, is asked for them, and says how they ended; each cell gets a
+frame and gives a reply.
 """
 
 from __future__ import annotations
@@ -19,17 +20,22 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ventbench.base.arrays import Floats, Ints
+from ventbench.base.errors import InputError
 from ventbench.sandbox.child import wire
+from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.sandbox.child.wire import Reply, WireError
 from ventbench.sandbox.child.zygote import (
     CLOCK,
     INTERRUPT,
     KILL,
+    NUMPY,
     PREPARED,
     REPORT,
     REQUEST,
@@ -38,9 +44,78 @@ from ventbench.sandbox.child.zygote import (
     START,
     TOKEN,
 )  # fmt: skip
-from ventbench.sandbox.configuration import SandboxError
-from ventbench.sandbox.reader import ENVIRONMENT, OPTIONS, ROOT, SITE
+from ventbench.sandbox.reader import ENVIRONMENT, OPTIONS, ROOT, SITE, UnreadableError, read_apart
 from ventbench.task.interfaces import Task
+
+
+class SandboxError(InputError):
+    """This machine cannot run submissions apart as was asked for; the message says what to do."""
+
+
+MIB, GIB = 1 << 20, 1 << 30
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """Limits of a session; the processor is shared by all its cells, hence patience, not a pace."""
+
+    memory: int = 512 * MIB  #: bytes of one cell beyond the interpreter with its libraries.
+    cpu_s: int = 60  #: seconds of processor time of one cell: import, reset and three breaths.
+    start_patience_s: float = 20.0  #: processor time in which a controller is imported and reset.
+    #: processor time of one answer. Cells that wait for something, or for a processor, time out
+    #: when none of them has answered for a multiple of it on the clock.
+    patience_s: float = 5.0
+    #: all cells time out when a session has taken this long on the clock, so that no entry keeps
+    #: others waiting for longer.
+    total_s: float = 900.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise ValueError(f"allowance {name} is {value}, it must be positive")
+
+
+#: Packages that may be imported besides numpy and the standard library, with what to load of each.
+OPTIONAL = {
+    "jax": ("jax", "jax.numpy", "jax.scipy", "jax.scipy.linalg"),
+    "flax": ("flax", "flax.linen", "flax.nnx"),
+    "safetensors": ("safetensors", "safetensors.numpy"),
+}
+
+#: Those that start threads and reserve much address space.
+_THREADED = ("jax", "flax")
+
+
+def modules_needed(folder: Path) -> tuple[tuple[str, ...], bool]:
+    """Modules to load before cells start, so that they share them, and whether they need threads.
+
+    Raises:
+        SubmissionError: if the sources cannot be read within the limits.
+    """
+    try:
+        packages = read_apart("ventbench.sandbox.child.sources:imported_packages", folder)
+    except UnreadableError as error:
+        raise SubmissionError(f"{folder.name}: a source {error}") from None
+    imported = [name for name in OPTIONAL if name in packages]
+    modules = [module for name in imported for module in OPTIONAL[name]]
+    return (*NUMPY, *modules), any(name in _THREADED for name in imported)
+
+
+#: JAX reserves address space that it does not use.
+_THREADED_MEMORY = 4 * GIB
+
+
+def configuration(folder: str, label: str, allowance: Allowance) -> dict[str, object]:
+    """What a zygote is told of a submission: folder, name in messages, and what cells may use."""
+    modules, threads = modules_needed(Path(folder))
+    memory = max(allowance.memory, _THREADED_MEMORY) if threads else allowance.memory
+    return {
+        "folder": folder,
+        "label": label,
+        "packages": modules,
+        "limits": {"memory": memory, "cpu_s": allowance.cpu_s, "threads": threads},
+    }
+
 
 #: Of bytes that nothing had asked for, whether they are found with the reply or before the next.
 _UNASKED = "bytes came after the reply"

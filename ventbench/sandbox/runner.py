@@ -23,12 +23,21 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ventbench.base.arrays import Floats, Ints
-from ventbench.sandbox.child import libc, lockdown, privileges, wire
+from ventbench.sandbox.child import kernel, lockdown, wire
 from ventbench.sandbox.child.cell import Failure, SubmissionError, printable
 from ventbench.sandbox.child.lockdown import FLOOR, OFFICIAL
 from ventbench.sandbox.child.wire import Reply
-from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
-from ventbench.sandbox.pipes import Asked, Clock, Outcome, Pipes, ZygoteClient, signal_name
+from ventbench.sandbox.pipes import (
+    Allowance,
+    Asked,
+    Clock,
+    Outcome,
+    Pipes,
+    SandboxError,
+    ZygoteClient,
+    configuration,
+    signal_name,
+)
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 
@@ -113,7 +122,7 @@ class SandboxRunner:
         allowance: Allowance | None = None,
         clock: Clock | None = None,
     ):
-        self._layers = layers() if libc.LINUX else ()
+        self._layers = layers() if kernel.LINUX else ()
         check_floor(self._layers)
         self._allowance = allowance or Allowance()
         self._clock = clock
@@ -133,7 +142,7 @@ class SandboxRunner:
         """Layers in force in every cell, for the record."""
         return {
             "layers": list(self._layers),
-            "landlock_abi": privileges.landlock_abi(),
+            "landlock_abi": kernel.landlock_abi(),
             "kernel": f"{platform.system()} {platform.release()}",
             "official": not self.missing,
         }
@@ -396,9 +405,9 @@ def hide_process() -> None:
     """No tracing, no ``/proc/PID/mem`` for others; counts how often it was asked for."""
     global _hiders, _dumpable_before
     with _dumpable_lock:
-        if libc.LINUX and _hiders == 0:
-            _dumpable_before = libc.prctl(libc.PR_GET_DUMPABLE)
-            libc.prctl(libc.PR_SET_DUMPABLE, 0)
+        if kernel.LINUX and _hiders == 0:
+            _dumpable_before = kernel.prctl(kernel.PR_GET_DUMPABLE)
+            kernel.prctl(kernel.PR_SET_DUMPABLE, 0)
         _hiders += 1
 
 
@@ -408,8 +417,8 @@ def show_process() -> None:
     with _dumpable_lock:
         _hiders -= 1
         # 2, "for root alone", cannot be set again by hand; 0 is what it means for others.
-        if libc.LINUX and _hiders == 0 and _dumpable_before == 1:
-            libc.prctl(libc.PR_SET_DUMPABLE, 1)
+        if kernel.LINUX and _hiders == 0 and _dumpable_before == 1:
+            kernel.prctl(kernel.PR_SET_DUMPABLE, 1)
 
 
 #: Kinds that a cell may give itself, before the first observation and after it.

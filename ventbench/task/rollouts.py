@@ -170,11 +170,10 @@ def commanded(state: Any, observation: Any, command: Array) -> tuple[Any, Array]
     return state, command
 
 
-@partial(jax.jit, static_argnames=("whole", "changing"))
+@partial(jax.jit, static_argnames=("whole",))
 def closed_loop(
-    plant: Plant, controller: Controller, scenario: Scenario, *, whole: bool = False,
-    changing: bool = False,
-) -> tuple[Inspirations, Expirations | None]:  # fmt: skip
+    plant: Plant, controller: Controller, scenario: Scenario, *, whole: bool = False
+) -> tuple[Inspirations, Expirations | None]:
     """Run a pure controller through the protocol, all cells at once.
 
     Args:
@@ -182,23 +181,19 @@ def closed_loop(
         controller: parameters broadcast against the cells.
         scenario: the cells, batch shape ``(...)``.
         whole: simulate the expirations too (for pictures; no score depends on them).
-        changing: the plant is another one in each breath: its leaves have a leading axis of
-            ``BREATHS``.
 
     Returns:
         The inspirations, and the expirations if asked for.
     """
     policy = controlled_by(controller)
 
-    def run(state: Any, at: tuple[Array, Any]) -> tuple[Any, Any]:
-        breath, own = at
-        varied = env.vary(own if changing else plant, scenario, breath)
+    def run(state: Any, breath: Array) -> tuple[Any, Any]:
+        varied = env.vary(plant, scenario, breath)
         loop, state, inspired = inspiration(varied, scenario, policy, state, breath=breath)
 
         expired = expiration(varied, scenario, loop)[1] if whole else None
         return state, (inspired, expired)
 
-    breaths = (jnp.arange(BREATHS), plant if changing else None)
-    _, out = jax.lax.scan(run, controller.init(scenario.pip.shape), breaths)
+    _, out = jax.lax.scan(run, controller.init(scenario.pip.shape), jnp.arange(BREATHS))
     # Scans stack time in front: (breath, step, ...) -> (..., breath, step).
     return jax.tree.map(lambda x: jnp.moveaxis(x, (0, 1), (-2, -1)), out)

@@ -14,7 +14,7 @@ from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.task.lungs import LUNGS
-from ventbench.task.metrics.figures import FIGURES, Figure, InspirationSignals, figures
+from ventbench.task.metrics.score import FIGURES, Figure, InspirationSignals, figures
 
 #: Lungs, PIPs, breaths and steps of the signals.
 SHAPE = (2, 3, 4, 34)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ventbench.task.metrics.figures import (
+from ventbench.task.metrics.score import (
     clipped_share,
     mean_change,
     mean_command,

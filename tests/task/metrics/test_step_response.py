@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ventbench.task.metrics import figures as sr
+from ventbench.task.metrics import score as sr
 
 PEEP, PIP, DT = 5.0, 25.0, 1e-3
 STEP = PIP - PEEP

@@ -20,10 +20,10 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from . import libc
+from . import kernel
 from .sources import walk
 
-_NETWORK, _IPC, _HOST_NAME, _USER = 0x40000000, 0x08000000, 0x04000000, libc.NEW_USER
+_NETWORK, _IPC, _HOST_NAME, _USER = 0x40000000, 0x08000000, 0x04000000, kernel.NEW_USER
 _MOUNT, _PROCESSES = 0x20000, 0x20000000
 _APART = _NETWORK | _IPC | _HOST_NAME | _MOUNT | _PROCESSES
 
@@ -65,7 +65,7 @@ def enter_namespaces() -> bool:
     ways = (_APART, _APART | _USER) if user == 0 else (_APART | _USER,)
     for flags in ways:
         try:
-            libc.unshare(flags)
+            kernel.unshare(flags)
         except OSError:
             continue
         socket.sethostname(_HOST)
@@ -104,21 +104,21 @@ class Forks:
     def fork(self) -> int:
         """Fork: the child's number in this process, 0 in the child; OSError if it is refused."""
         if self._own is not None:
-            libc.unshare(_PROCESSES)
+            kernel.unshare(_PROCESSES)
         child = os.fork()
         self.is_child = child == 0
         if self._own is not None:
             if self.is_child:
                 os.close(self._own)
             else:
-                libc.setns(self._own, _PROCESSES)
+                kernel.setns(self._own, _PROCESSES)
         return child
 
 
 def _continue_as_first_process() -> None:
     child = os.fork()
     if child == 0:
-        libc.prctl(libc.PR_SET_PDEATHSIG, signal.SIGKILL)
+        kernel.prctl(kernel.PR_SET_PDEATHSIG, signal.SIGKILL)
         return
     os.closerange(0, 1 << 16)  # else the scorer would not notice that the zygote has ended
     _, status = os.waitpid(child, 0)
@@ -151,7 +151,7 @@ def change_root(readable: Iterable[str], folder: str) -> bool:
     try:
         _set_attributes("/", propagation=_PRIVATE)
         options = b"mode=0755,size=%d" % _ROOT
-        libc.mount(b"none", base.encode(), b"tmpfs", _MS_NO_SUID | _MS_NO_DEV, options)
+        kernel.mount(b"none", base.encode(), b"tmpfs", _MS_NO_SUID | _MS_NO_DEV, options)
     except OSError:
         _close(sources)
         return False
@@ -174,9 +174,9 @@ def change_root(readable: Iterable[str], folder: str) -> bool:
         target.chmod(0o644)
     os.mkdir(f"{base}/.old")
     os.chdir(base)
-    libc.syscall(_PIVOT_ROOT[libc.MACHINE], b".", b".old")
+    kernel.syscall(_PIVOT_ROOT[kernel.MACHINE], b".", b".old")
     os.chdir("/")
-    libc.umount(b"/.old", _DETACH)
+    kernel.umount(b"/.old", _DETACH)
     os.rmdir("/.old")
     _set_attributes("/", attributes=_READ_ONLY | _NO_SUID)
     return True
@@ -196,7 +196,7 @@ def _set_attributes(path: str, *, attributes: int = 0, propagation: int = 0) -> 
     wanted = _MountAttributes(attributes, 0, propagation, 0)
     size = ctypes.sizeof(wanted)
     name = path.encode()
-    libc.syscall(_MOUNT_SETATTR, _HERE, name, _RECURSIVE, ctypes.byref(wanted), size)
+    kernel.syscall(_MOUNT_SETATTR, _HERE, name, _RECURSIVE, ctypes.byref(wanted), size)
 
 
 def _opened(path: str) -> int | None:
@@ -216,7 +216,7 @@ def _bind(source: int, target: str) -> None:
     """Put a device into the new root."""
     os.makedirs(os.path.dirname(target), 0o755, exist_ok=True)
     os.close(os.open(target, os.O_CREAT | os.O_WRONLY, 0o644))
-    libc.mount(f"/proc/self/fd/{source}".encode(), os.fsencode(target), b"", _MS_BIND, b"")
+    kernel.mount(f"/proc/self/fd/{source}".encode(), os.fsencode(target), b"", _MS_BIND, b"")
 
 
 def _loaded() -> set[tuple[int, int]]:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
-from . import isolation, libc, privileges, seccomp
+from . import isolation, kernel, seccomp
 
 #: Every layer, in the order of the bits of a ``LOCKED`` reply.
 LAYERS = (
@@ -79,19 +79,19 @@ class Lockdown:
         self._ruleset: int | None = None
         # Another user must be able to read the interpreter.
         self._root = os.geteuid() == 0 and bool(os.stat(os.__file__).st_mode & stat.S_IROTH)
-        self._used = privileges.address_space()
-        if not libc.LINUX:
+        self._used = kernel.address_space()
+        if not kernel.LINUX:
             return
-        privileges.no_new_privs()
+        kernel.no_new_privs()
         if folder is not None and change_root:
             if isolation.change_root(readable, folder):
                 self._layers += ["empty-root", "read-only-mounts"]
             elif isolation.read_only():
                 self._layers.append("read-only-mounts")
-        privileges.undumpable()
-        if privileges.landlock_abi():
+        kernel.undumpable()
+        if kernel.landlock_abi():
             readable = [*readable, *([folder] if folder else [])]
-            handle = privileges.ruleset(readable, listable)
+            handle = kernel.ruleset(readable, listable)
             # Out of the way of the numbers that a cell's pipes will have.
             self._ruleset = fcntl.fcntl(handle, fcntl.F_DUPFD_CLOEXEC, 16)
             os.close(handle)
@@ -109,29 +109,29 @@ class Lockdown:
         """
         layers = [*self._layers, "rlimits"]
         if self._root and "empty-root" in self._layers:
-            privileges.become_stranger()
+            kernel.become_stranger()
         processes = None if limits.threads else 0
-        if limits.threads and privileges.count_processes_apart():
-            processes = privileges.THREADS
-        if processes is not None and libc.LINUX:
+        if limits.threads and kernel.count_processes_apart():
+            processes = kernel.THREADS
+        if processes is not None and kernel.LINUX:
             layers.append("counted-threads")
         memory = None if self._used is None else self._used + limits.memory
-        privileges.limit_resources(memory, limits.cpu_s, processes)
-        if libc.LINUX:
-            privileges.drop_capabilities()
-            privileges.undumpable()  # a fork inherits it, but another user is another matter
+        kernel.limit_resources(memory, limits.cpu_s, processes)
+        if kernel.LINUX:
+            kernel.drop_capabilities()
+            kernel.undumpable()  # a fork inherits it, but another user is another matter
             if parent is not None:
-                privileges.die_with(parent)
+                kernel.die_with(parent)
             layers += ["no-new-privileges", "no-capabilities", "undumpable"]
         if self._ruleset is not None:
-            privileges.enforce(self._ruleset)
+            kernel.enforce(self._ruleset)
             layers.append("landlock")
         os.closerange(keep, 1 << 16)
         if self._ruleset is not None:
             _prove_no_files()
         if "empty-root" in self._layers:
             _prove_no_names()
-        if libc.LINUX and seccomp.available():
+        if kernel.LINUX and seccomp.available():
             seccomp.restrict(limits.threads)
             _prove_no_sockets()
             layers.append("seccomp")

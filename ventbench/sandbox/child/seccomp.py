@@ -19,7 +19,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from . import libc
+from . import kernel
 
 
 class CallNumber(NamedTuple):
@@ -176,12 +176,12 @@ _Rules = list[Rule]
 
 def available() -> bool:
     """Whether this kernel filters and this machine has a table here."""
-    if libc.MACHINE not in AUDIT:
+    if kernel.MACHINE not in AUDIT:
         return False
     action = ctypes.c_uint32(ALLOW)
     try:
-        number = getattr(SECCOMP, libc.MACHINE)
-        libc.syscall(number, _GET_ACTION_AVAILABLE, 0, ctypes.byref(action))
+        number = getattr(SECCOMP, kernel.MACHINE)
+        kernel.syscall(number, _GET_ACTION_AVAILABLE, 0, ctypes.byref(action))
     except OSError:
         return False
     return True
@@ -253,12 +253,12 @@ def install(program: bytes) -> None:
     """
     buffer = ctypes.create_string_buffer(program, len(program))
     header = _Program(len(program) // 8, ctypes.addressof(buffer))
-    number = getattr(SECCOMP, libc.MACHINE)
+    number = getattr(SECCOMP, kernel.MACHINE)
     # With TSYNC a positive result names a thread that could not be filtered.
-    if libc.syscall(number, _SET_MODE_FILTER, _TSYNC, ctypes.byref(header)):
+    if kernel.syscall(number, _SET_MODE_FILTER, _TSYNC, ctypes.byref(header)):
         raise OSError("a thread could not be filtered")
 
 
 def restrict(threads: bool) -> None:
     """Confine this process to the calls of a cell; OSError if the kernel refuses."""
-    install(cell_filter(libc.MACHINE, os.getpid(), threads))
+    install(cell_filter(kernel.MACHINE, os.getpid(), threads))

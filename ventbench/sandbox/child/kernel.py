@@ -1,6 +1,10 @@
-"""What the zygote and its cells give up: capabilities, their user, being looked into, resources.
+"""Kernel calls that Python has no function for, and what the zygote and its cells give up by them.
 
-All functions raise OSError if the kernel refuses.
+They give up capabilities, their user, being looked into, resources. All functions raise OSError if
+the kernel refuses.
+
+Why not packages: ``pyseccomp`` needs ``libseccomp.so`` on the machine, Landlock bindings on PyPI
+are young and incomplete for new ABIs. What is needed of both is four system calls.
 """
 
 from __future__ import annotations
@@ -8,11 +12,76 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
+import platform
 import resource
 import signal
+import sys
 from collections.abc import Iterable
 
-from . import libc
+LINUX = sys.platform == "linux"
+
+#: Machine of the running process: ``"x86_64"``, ``"aarch64"`` or another that has no table here.
+MACHINE = {"AMD64": "x86_64", "arm64": "aarch64"}.get(platform.machine(), platform.machine())
+
+_libc = ctypes.CDLL(None, use_errno=True) if LINUX else None
+if _libc is not None:
+    _libc.syscall.restype = ctypes.c_long
+
+PR_SET_PDEATHSIG, PR_GET_DUMPABLE, PR_SET_DUMPABLE = 1, 3, 4
+PR_CAPBSET_DROP, PR_SET_SECUREBITS, PR_SET_NO_NEW_PRIVS, PR_CAP_AMBIENT = 24, 28, 38, 47
+
+
+def _call(name: str, *arguments: object, what: str = "") -> int:
+    """Call a function of the C library.
+
+    Raises:
+        OSError: with the kernel's reason if it answers -1, or if this is not Linux.
+    """
+    if _libc is None:
+        raise OSError(f"{name} needs Linux, this is {sys.platform}")
+    result = getattr(_libc, name)(*arguments)
+    if result == -1:
+        error = ctypes.get_errno()
+        raise OSError(error, f"{what or name}: {os.strerror(error)}")
+    return result
+
+
+def prctl(option: int, *arguments: int) -> int:
+    """``prctl(2)``; errors of this and of what follows as of :func:`_call`."""
+    padded = (ctypes.c_ulong(a) for a in (*arguments, 0, 0, 0, 0)[:4])
+    return _call("prctl", ctypes.c_int(option), *padded, what=f"prctl {option}")
+
+
+def syscall(number: int, *arguments: object) -> int:
+    """Raw system call; every integer argument is passed as a long."""
+    longs = (ctypes.c_long(a) if isinstance(a, int) else a for a in arguments)
+    return _call("syscall", ctypes.c_long(number), *longs, what=f"system call {number}")
+
+
+#: A user namespace of one's own.
+NEW_USER = 0x10000000
+
+
+def unshare(flags: int) -> None:
+    """``unshare(2)``, which Python has only since 3.12."""
+    _call("unshare", ctypes.c_int(flags))
+
+
+def setns(namespace: int, kind: int) -> None:
+    """``setns(2)``, which Python has only since 3.12."""
+    _call("setns", ctypes.c_int(namespace), ctypes.c_int(kind))
+
+
+def mount(source: bytes, target: bytes, kind: bytes, flags: int, options: bytes) -> None:
+    """``mount(2)``."""
+    what = f"mount {target.decode(errors='replace')}"
+    _call("mount", source, target, kind, ctypes.c_ulong(flags), options, what=what)
+
+
+def umount(target: bytes, flags: int) -> None:
+    """``umount2(2)``."""
+    _call("umount2", target, ctypes.c_int(flags), what=f"umount {target.decode()}")
+
 
 _CAPSET = {"x86_64": 126, "aarch64": 91}
 _CAPABILITY_VERSION_3 = 0x20080522
@@ -22,17 +91,17 @@ _NO_ROOT_LOCKED = 0b101111  # noroot, no-setuid-fixup, no-ambient-raise, each lo
 
 def no_new_privs() -> None:
     """No program started from here gains rights (set-uid files); Landlock and seccomp need it."""
-    libc.prctl(libc.PR_SET_NO_NEW_PRIVS, 1)
+    prctl(PR_SET_NO_NEW_PRIVS, 1)
 
 
 def undumpable() -> None:
     """Nobody else of the same user may trace this process or read its memory."""
-    libc.prctl(libc.PR_SET_DUMPABLE, 0)
+    prctl(PR_SET_DUMPABLE, 0)
 
 
 def die_with(parent: int) -> None:
     """End this process when its parent, the process ``parent``, ends."""
-    libc.prctl(libc.PR_SET_PDEATHSIG, signal.SIGKILL)
+    prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it ended before the line above
         os._exit(1)
 
@@ -43,22 +112,22 @@ def drop_capabilities() -> None:
     Raises:
         OSError: if some remain.
     """
-    number = _CAPSET.get(libc.MACHINE)
+    number = _CAPSET.get(MACHINE)
     if number is None:
-        raise OSError(f"no table of system calls for {libc.MACHINE}")
+        raise OSError(f"no table of system calls for {MACHINE}")
     for capability in range(64):
         try:
-            libc.prctl(libc.PR_CAPBSET_DROP, capability)
+            prctl(PR_CAPBSET_DROP, capability)
         except OSError:  # an ordinary user may not, or the kernel has no more
             break
     try:
-        libc.prctl(libc.PR_CAP_AMBIENT, _CLEAR_AMBIENT)
-        libc.prctl(libc.PR_SET_SECUREBITS, _NO_ROOT_LOCKED)
+        prctl(PR_CAP_AMBIENT, _CLEAR_AMBIENT)
+        prctl(PR_SET_SECUREBITS, _NO_ROOT_LOCKED)
     except OSError:
         pass  # the latter only root can; without capabilities an ordinary user need not
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     nothing = (ctypes.c_uint32 * 6)()
-    libc.syscall(number, ctypes.byref(header), ctypes.byref(nothing))
+    syscall(number, ctypes.byref(header), ctypes.byref(nothing))
 
 
 #: The user that cells of a scorer run by root become: one that owns nothing. Any number would do
@@ -84,10 +153,10 @@ def count_processes_apart() -> bool:
         Whether that was allowed, and the kernel (from 5.14) counts so.
     """
     release = os.uname().release.split(".")
-    if not libc.LINUX or (int(release[0]), int(release[1].partition("-")[0])) < (5, 14):
+    if not LINUX or (int(release[0]), int(release[1].partition("-")[0])) < (5, 14):
         return False
     try:
-        libc.unshare(libc.NEW_USER)
+        unshare(NEW_USER)
     except OSError:
         return False
     return True
@@ -130,7 +199,7 @@ def limit_resources(memory: int | None, cpu_s: int, processes: int | None) -> No
         limits["NPROC"] = processes  # does not bind root
     for name, value in limits.items():
         kind = getattr(resource, f"RLIMIT_{name}", None)
-        if kind is None and name == "SIGPENDING" and libc.LINUX:
+        if kind is None and name == "SIGPENDING" and LINUX:
             kind = _SIGPENDING
         if kind is not None:  # not every system knows every limit
             # At the soft limit of processor time comes a signal with a name, at the hard one a
@@ -144,7 +213,7 @@ def limit_resources(memory: int | None, cpu_s: int, processes: int | None) -> No
 
 def address_space() -> int | None:
     """Return the bytes of this process's address space; None on systems that do not say."""
-    if not libc.LINUX:
+    if not LINUX:
         return None
     try:
         with open("/proc/self/statm") as file:
@@ -198,7 +267,7 @@ class _PathBeneath(ctypes.Structure):
 def landlock_abi() -> int:
     """Landlock ABI of the running kernel; 0 where it is absent or switched off."""
     try:
-        return libc.syscall(_CREATE_RULESET, None, 0, _VERSION_FLAG)
+        return syscall(_CREATE_RULESET, None, 0, _VERSION_FLAG)
     except OSError:
         return 0
 
@@ -222,7 +291,7 @@ def ruleset(readable: Iterable[str], listable: Iterable[str] = ()) -> int:
     """
     attributes = _Ruleset(*taken_away(landlock_abi()))
     # Kernels of before a field was added take the larger structure as long as the rest is zero.
-    handle = libc.syscall(_CREATE_RULESET, ctypes.byref(attributes), ctypes.sizeof(attributes), 0)
+    handle = syscall(_CREATE_RULESET, ctypes.byref(attributes), ctypes.sizeof(attributes), 0)
     try:
         for path in readable:
             # For a file the kernel takes no right that only a folder has.
@@ -242,7 +311,7 @@ def enforce(handle: int) -> None:
         OSError: if the kernel refuses. ``no_new_privs`` must be set.
     """
     try:
-        libc.syscall(_RESTRICT_SELF, handle, 0)
+        syscall(_RESTRICT_SELF, handle, 0)
     finally:
         os.close(handle)
 
@@ -254,6 +323,6 @@ def _grant(handle: int, path: str, rights: int) -> None:
         return
     try:
         rule = _PathBeneath(rights, target)
-        libc.syscall(_ADD_RULE, handle, _RULE_PATH_BENEATH, ctypes.byref(rule), 0)
+        syscall(_ADD_RULE, handle, _RULE_PATH_BENEATH, ctypes.byref(rule), 0)
     finally:
         os.close(target)

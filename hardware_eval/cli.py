@@ -257,10 +257,7 @@ def selftest(
 
 @app.command()
 def conformance(
-    port: Annotated[str | None, typer.Option(help="Serial port of the device; see `run`.")] = None,
-    vectors: Annotated[
-        bool, typer.Option("--vectors", help="Print frames for whoever writes firmware.")
-    ] = False,
+    port: Port,
     json: JsonFile = None,
 ) -> None:
     """Does a device follow PROTOCOL.md? Exit code 1 if a line of it does not hold.
@@ -269,14 +266,8 @@ def conformance(
 
     Example: `ventbench-hardware conformance --port /dev/ttyACM0`
     """
-    from hardware_eval.wire import conformance as judge
-
-    if vectors:
-        print(judge.vectors())
-        return
-    if port is None:
-        raise InputError("--port: give the device's serial port, such as /dev/ttyACM0")
     from hardware_eval.results import evaluate as ev
+    from hardware_eval.wire import conformance as judge
 
     shown = told(json)
     transport, clock = ev.carrier(port)

@@ -9,35 +9,14 @@ a check in which sensor or pressure made the device vent.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
 
 from hardware_eval.realtime import Clock
 from hardware_eval.wire.clauses import CLAUSES
 from hardware_eval.wire.client import Transport
-from hardware_eval.wire.messages import (
-    Arm,
-    Capability,
-    Command,
-    Counters,
-    DeviceMessage,
-    Flag,
-    Heartbeat,
-    Hello,
-    HostMessage,
-    Mode,
-    Packet,
-    Reading,
-    Reason,
-    Refusal,
-    Statistics,
-    Vent,
-    Welcome,
-    encode,
-)
+from hardware_eval.wire.messages import Counters, Vent
 from hardware_eval.wire.parser import NoAnswerError
 from hardware_eval.wire.probe import DiffersError, LateError, Probe, UntriedError
 
@@ -134,57 +113,3 @@ def _by_itself(host: Probe, before: Counters) -> bool:
         return False
     names = ("sensor", "overpressure", "device_late")
     return any(getattr(after, name) != getattr(before, name) for name in names)
-
-
-def exchange() -> list[tuple[str, HostMessage | DeviceMessage, str]]:
-    """Frames for whoever writes firmware: a device at 1.234567 s, its sensor at 5 cmH2O.
-
-    Returns:
-        Who sends, the message, and its frame in hexadecimal digits, in the order of the exchange.
-    """
-    reading: dict[str, Any] = {"time": 1.234567, "pressure": 5.0, "flow": math.nan}
-    ready = {"u_in": 0.0, "u_out": 1, "mode": Mode.READY, "flags": Flag.NONE}
-    running = {**ready, "mode": Mode.RUNNING}
-    welcome = Welcome(
-        1, (1, 0, 0), Capability.NONE, 0.08, 40.0, b"12345678", bytes(range(32)), "bench"
-    )
-    counts = Counters(frames=6, commands=1, stale=1)
-    steps: list[tuple[HostMessage, Callable[[int], DeviceMessage]]] = [
-        (Hello(pressure_limit=40.0), lambda number: welcome),
-        (Heartbeat(), lambda number: Reading(number, **reading, **ready)),
-        (Arm(), lambda number: Reading(number, **reading, **running)),
-        (
-            Command(12.34, 0, 1234),
-            lambda number: Reading(number, **reading, **{**running, "u_in": 12.34, "u_out": 0}),
-        ),
-        (
-            Command(50.0, 0, 1133),
-            lambda number: Refusal(number, Reason.STALE, Mode.RUNNING, Flag.NONE),
-        ),
-        (Statistics(), lambda number: counts),
-        (
-            Command(100.01, 0, 1234),
-            lambda number: Refusal(number, Reason.OUT_OF_RANGE, Mode.VENTED, Flag.OUT_OF_RANGE),
-        ),
-        (
-            Vent(),
-            lambda number: Reading(
-                number, **reading, u_in=0.0, u_out=1, mode=Mode.VENTED,
-                flags=Flag.OUT_OF_RANGE | Flag.HOST_VENTED,
-            ),
-        ),
-    ]  # fmt: skip
-    rows: list[tuple[str, HostMessage | DeviceMessage, str]] = []
-    for number, (asked, answer) in enumerate(steps, 1):
-        for who, message in (("host", asked), ("device", answer(number))):
-            frame = encode(Packet(0x01020304, number, message)).hex()
-            rows.append((who, message, frame))
-    return rows
-
-
-def vectors() -> str:
-    """The exchange as the table of PROTOCOL.md."""
-    lines = ["| from | message | frame |", "|---|---|---|"]
-    for who, message, frame in exchange():
-        lines.append(f"| {who} | {message.kind.name.lower()} | `{frame}` |")
-    return "\n".join(lines)

@@ -311,19 +311,34 @@ def compare(
     ] = True,
     json: JsonFile = None,
 ) -> None:
-    """Show where simulators and the lung part, by lung and waveform, and diagnose it.
+    """Show how far simulators and the lung part by lung, and diagnose it.
 
     Example: `ventbench-hardware compare runs/hardware --out runs/mismatch`
     """
-    from hardware_eval.results import compare as comparison
+    from hardware_eval.results.replay import recorded_breaths, scored_plants
+    from ventbench.open_loop_report import mean_errors, summary
 
-    breaths = comparison.recorded_breaths(recorded, log)
-    done = comparison.compare(breaths, simulator=plant, diagnose=diagnose)
-    if out is not None:
-        for lung, diagnosis in done.diagnoses.items():
-            diagnosis.save(out / lung)
-    emit(done.as_dict(), json)
-    print(done, file=told(json))
+    breaths = recorded_breaths(recorded, log)
+    tested = scored_plants(plant, list(breaths.by_lung_index))
+    error = mean_errors(tested.pressures(breaths), breaths)
+    lungs = {lung: summary("", error[index]) for lung, index in breaths.by_lung_index.items()}
+    diagnoses = {}
+    if diagnose:
+        from ventbench.diagnosis.diagnose import diagnose as run_diagnosis
+
+        for lung in lungs:
+            diagnoses[lung] = run_diagnosis(breaths, simulator=tested, lung=lung)
+            if out is not None:
+                diagnoses[lung].save(out / lung)
+    found = {lung: diagnosis.as_dict() for lung, diagnosis in diagnoses.items()}
+    emit({"simulator": tested.name, "unit": "cmH2O", "lungs": lungs, "diagnoses": found}, json)
+    to = told(json)
+    print(f"open-loop MAE of the {tested.name} simulators, cmH2O", file=to)
+    for lung, figures in lungs.items():
+        shown = "-" if figures["mae"] is None else f"{figures['mae']:.2f}"
+        print(f"  {lung}: {shown} ({figures['breaths']} breaths)", file=to)
+    for lung, diagnosis in diagnoses.items():
+        print(f"{lung}: {diagnosis}", file=to)
 
 
 @app.command()
@@ -413,7 +428,7 @@ def demo(
         sandbox=not in_process, tell=lambda text: print(text, file=to, flush=True),
     )  # fmt: skip
     emit(done.as_dict(), json)
-    print(f"\n{done}", file=to)
+    print(f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}", file=to)
     if not done.better:
         raise typer.Exit(1)
 
@@ -436,7 +451,7 @@ def replay(
 
     Example: `ventbench-hardware replay runs/hardware`
     """
-    from hardware_eval.results.compare import replay as run_replay
+    from hardware_eval.results.replay import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
     emit(report.as_dict(), json)

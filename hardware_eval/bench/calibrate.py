@@ -19,10 +19,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from hardware_eval.bench.drive import Commands, Driven, drive
-from hardware_eval.bench.identity import KnownLung, measured_lung, white_noise
+from hardware_eval.bench.identity import (
+    Interval,
+    KnownLung,
+    interval,
+    measured_lung,
+    white_noise,
+)
 from hardware_eval.bench.loop import Bench
 from hardware_eval.bench.selftest import hold, programs
 from hardware_eval.wire.client import Client
@@ -59,30 +64,13 @@ _LEAD, _ABOVE, _OWN, _COUNT, _LARGER, _HOLD_S = 3, 2, 3, 2, 1.5, 3.0
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A value and its 95 % interval; NaN where the series does not tell."""
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.value:.4g} ({self.low:.4g} to {self.high:.4g})"
-
-
-@dataclass(frozen=True)
 class Fit:
     """The line through a series."""
 
-    intercept: Estimate  #: reading where the reference is 0.
-    slope: Estimate  #: reading per reference; NaN if the reference is the same throughout.
-    hysteresis: Estimate  #: mean reading from above less that from below; NaN if only one is there.
+    intercept: Interval  #: reading where the reference is 0.
+    slope: Interval  #: reading per reference; NaN if the reference is the same throughout.
+    hysteresis: Interval  #: mean reading from above less that from below; NaN if only one is there.
     residual: float  #: standard deviation of the readings about the line.
-
-
-def _student(value: float, error: float, freedom: float) -> Estimate:
-    half = float(stats.t.ppf(0.975, freedom)) * error if freedom > 0 else math.nan
-    return Estimate(value, value - half, value + half)
 
 
 def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit:
@@ -105,10 +93,10 @@ def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit
     scatter = float(np.sum((residual / error) ** 2)) / max(freedom, 1)
     covariance = np.linalg.inv(design.T @ design) * max(scatter, 1.0)
     found = [
-        _student(float(x), math.sqrt(v), freedom)
+        interval(x, math.sqrt(v), freedom)
         for x, v in zip(solution, np.diag(covariance), strict=True)
     ]
-    unknown = Estimate(math.nan, math.nan, math.nan)
+    unknown = Interval(math.nan)
     both = [x for x in np.unique(reference) if len(set(above[reference == x])) == 2]
     apart = np.array(
         [
@@ -120,7 +108,7 @@ def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit
     hysteresis = unknown
     if len(apart) > 1:
         each = float(apart.std(ddof=1)) / math.sqrt(len(apart))
-        hysteresis = _student(float(apart.mean()), each, len(apart) - 1)
+        hysteresis = interval(float(apart.mean()), each, len(apart) - 1)
     spread = math.sqrt(float(residual @ residual) / max(freedom, 1))
     return Fit(found[0], unknown if level else found[1], hysteresis, spread)
 
@@ -155,7 +143,7 @@ class Part:
     def __str__(self) -> str:
         if self.kind == "lung":
             R, elastance = (
-                Estimate(math.exp(x), math.exp(x - 1.96 * e), math.exp(x + 1.96 * e))
+                Interval(math.exp(x), math.exp(x - 1.96 * e), math.exp(x + 1.96 * e))
                 for x, e in zip(self.reading, self.error, strict=True)
             )
             return f"lung: {self.lung} has R {R} cmH2O/(L/s), 1/C {elastance} cmH2O/L"
@@ -465,7 +453,7 @@ def load(
     return Calibration(own, parts, digest)
 
 
-def lost_flow(leak: Part, lung: str) -> Estimate:
+def lost_flow(leak: Part, lung: str) -> Interval:
     """Leak of a closed lung by its fall of pressure and the label's C, mL/s."""
     slope, C = leak.fit.slope, parse_lung(lung).C
-    return Estimate(-C * slope.value, -C * slope.high, -C * slope.low)
+    return Interval(-C * slope.value, -C * slope.high, -C * slope.low)

@@ -18,9 +18,8 @@ from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
 from hardware_eval.bench.raw_log import RawLog, breaths, lines
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.session import run_plan
-from hardware_eval.emulation.faults import LineFault, LineFaultKind
+from hardware_eval.emulation.faults import Fault, FaultKind, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
-from hardware_eval.emulation.simulated import FaultKind, LungFault
 from hardware_eval.wire.parser import LinkError
 from ventbench import rollout
 from ventbench.controllers.pid import PID
@@ -99,7 +98,7 @@ def test_an_entry_that_is_late_more_often_than_one_in_a_hundred_fails(bench: Ben
 def silent(device: LoopbackDevice, after: float, steps: float) -> None:
     """Let the line be silent ``after`` a run of 2 s of rest begins, s, for some steps."""
     begins = device.clock.now() - device.start + 2.0 + protocol.DT + after - 0.002
-    fault = LineFault(LineFaultKind.SILENT, begins, begins + steps * protocol.DT)
+    fault = Fault(LineFaultKind.SILENT, begins, begins + steps * protocol.DT)
     device.line.faults = (fault,)
 
 
@@ -149,11 +148,11 @@ def test_a_wide_open_valve_is_stopped_and_blames_the_controller(bench: Bench) ->
 
 
 FAULTS = {
-    "tube off": (LungFault(FaultKind.DISCONNECTED, 0.0), {"low_pressure", "disconnected"}),
-    "sensor stuck": (LungFault(FaultKind.SENSOR_STUCK, 0.0), {"stuck_sensor"}),
-    "sensor lost": (LungFault(FaultKind.SENSOR_LOST, 0.0), {"no_reading"}),
+    "tube off": (Fault(FaultKind.DISCONNECTED, 0.0), {"low_pressure", "disconnected"}),
+    "sensor stuck": (Fault(FaultKind.SENSOR_STUCK, 0.0), {"stuck_sensor"}),
+    "sensor lost": (Fault(FaultKind.SENSOR_LOST, 0.0), {"no_reading"}),
     "expiratory valve stuck": (
-        LungFault(FaultKind.EXPIRATORY_STUCK, 0.0), {"expiratory_valve", "stuck_sensor"}
+        Fault(FaultKind.EXPIRATORY_STUCK, 0.0), {"expiratory_valve", "stuck_sensor"}
     ),
 }  # fmt: skip
 

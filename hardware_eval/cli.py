@@ -129,7 +129,7 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval.bench.console import Blind, RerunView, TerminalView, Views
+    from hardware_eval.bench.console import Blind, RerunView, show_bars
     from hardware_eval.bench.fallback import DEFAULT as FALLBACK
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.plan import make_plan
@@ -150,8 +150,7 @@ def run(
         control_every=control_every, perturbations=perturb or (), seed=seed,
     )  # fmt: skip
     settings = SafetySettings(largest_u_in=largest_u_in, largest_rise=largest_rise)
-    views = Views(TerminalView(), *([RerunView(rerun)] if rerun else []))
-
+    shows = [show_bars, *([RerunView(rerun).breath] if rerun else [])]
     left_out = chosen_parts(skip or ())
 
     def before_lung(bench: Bench, mounted: str) -> Sheet | None:
@@ -164,12 +163,13 @@ def run(
 
     with bench_on(port, yes=yes, control=control) as (line, _, person):
         calibrated = calibration_of(line, calibration)
-        masked = Blind(person, views, plan)
+        masked = Blind(person, plan)
         done = ev.evaluate(
             entries, line, out, masked if blind else person, plan=plan,
-            view=masked if blind else views, sandbox=not in_process, dry=dry_run,
-            before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
-            rest=rest, calibration=calibrated, fallback=FALLBACK if fallback else None,
+            shows=[masked.hiding(show) for show in shows] if blind else shows,
+            sandbox=not in_process, dry=dry_run, before_lung=before_lung, settings=settings,
+            operator_name=operator, notes=notes, rest=rest, calibration=calibrated,
+            fallback=FALLBACK if fallback else None,
         )  # fmt: skip
     reason = masked.hidden(done.reason) if blind else done.reason
     emit(

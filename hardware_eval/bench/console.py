@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, View
+from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.emulation.faults import parse
 from ventbench.base.errors import InputError, require
@@ -176,13 +176,13 @@ class ConsoleOperator:
 
 
 class Blind:
-    """Operator and view that call entries by numbers, whatever is asked, told or shown.
+    """An operator to whom entries are called by numbers, whatever is asked, told or shown.
 
     Attributes:
         called: what each entry is called, by its name.
     """
 
-    def __init__(self, operator: Operator, view: View, plan: Plan) -> None:
+    def __init__(self, operator: Operator, plan: Plan) -> None:
         """Draw the numbers from the plan's seed, so that a session that continues keeps them."""
         order = np.random.default_rng([plan.seed, 1]).permutation(len(plan.entries))
         self.called = {
@@ -190,7 +190,7 @@ class Blind:
         }
         names = "|".join(re.escape(x) for x in sorted(self.called, key=len, reverse=True))
         self._names = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
-        self._operator, self._view = operator, view
+        self._operator = operator
 
     def hidden(self, text: str) -> str:
         """A text without names of entries."""
@@ -212,35 +212,36 @@ class Blind:
         """Open a leak or pinch the tube now, or undo it."""
         self._operator.disturb(perturbation, on)
 
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Show a breath."""
-        self._view.breath(replace(run, entry=self.hidden(run.entry)), breath, done, total)
+    def hiding(self, show: Show) -> Show:
+        """What shows breaths, without the names of entries."""
+
+        def shown(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+            show(replace(run, entry=self.hidden(run.entry)), breath, done, total)
+
+        return shown
 
 
-class TerminalView:
-    """One line a breath: where the plan is, the error, and the inspiration as bars."""
-
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Print a breath."""
-        inspired = np.array(breath.pressure[: protocol.INSPIRATION_STEPS])
-        inspired = inspired[np.isfinite(inspired)]
-        if not inspired.size:
-            return
-        error = float(np.mean(np.abs(inspired - run.pip)))
-        share = (inspired - protocol.PEEP) / (run.pip - protocol.PEEP)
-        heights = np.clip(share * 6.5, 0, len(_BARS) - 1).astype(int)  # the target is at 6.5 of 8
-        worst = 1e3 * max(breath.late)
-        print(
-            f"{done + 1:4d}/{total} {run.kind:9s} {run.entry:16.16s} {run.lung:6s} "
-            f"PIP {run.pip:2.0f} #{run.repeat:<2d} error {error:6.2f} "
-            f"peak {inspired.max():5.1f} late {worst:4.1f} ms "
-            f"|{''.join(_BARS[h] for h in heights)}|",
-            flush=True,
-        )
+def show_bars(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+    """Print a line: where the plan is, the error, and the inspiration as bars."""
+    inspired = np.array(breath.pressure[: protocol.INSPIRATION_STEPS])
+    inspired = inspired[np.isfinite(inspired)]
+    if not inspired.size:
+        return
+    error = float(np.mean(np.abs(inspired - run.pip)))
+    share = (inspired - protocol.PEEP) / (run.pip - protocol.PEEP)
+    heights = np.clip(share * 6.5, 0, len(_BARS) - 1).astype(int)  # the target is at 6.5 of 8
+    worst = 1e3 * max(breath.late)
+    print(
+        f"{done + 1:4d}/{total} {run.kind:9s} {run.entry:16.16s} {run.lung:6s} "
+        f"PIP {run.pip:2.0f} #{run.repeat:<2d} error {error:6.2f} "
+        f"peak {inspired.max():5.1f} late {worst:4.1f} ms "
+        f"|{''.join(_BARS[h] for h in heights)}|",
+        flush=True,
+    )
 
 
 class RerunView:
-    """Sends each breath to a rerun viewer or file.
+    """Sends breaths to a rerun viewer or file.
 
     Args:
         target: ``"live"`` for a viewer that is started, else the path of an ``.rrd`` file.
@@ -284,7 +285,7 @@ class RerunView:
 
 
 class McapView:
-    """Writes each breath to an MCAP file, for Foxglove and its kin: JSON, one message a step.
+    """Writes breaths to an MCAP file, for Foxglove and its kin: JSON, one message a step.
 
     The topic ``/breath`` has the samples in the log's units, null where there is none, and what
     runs; times are those of the bench, from 0.
@@ -330,20 +331,3 @@ class McapView:
 
 def _told(run: PlannedRun) -> str:
     return f"{run.kind} {run.entry} {run.lung} PIP {run.pip:g} #{run.repeat}"
-
-
-class Views:
-    """Several views as one."""
-
-    def __init__(self, *views: Any) -> None:
-        self._views = views
-
-    def close(self) -> None:
-        """Close those that are files."""
-        for view in self._views:
-            getattr(view, "close", lambda: None)()
-
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Show a breath in each."""
-        for view in self._views:
-            view.breath(run, breath, done, total)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -97,14 +97,6 @@ class SilentOperator:
         """No hand to do it."""
 
 
-class View(Protocol):
-    """Shows a session as it runs; called while the lung breathes out."""
-
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Show a breath."""
-        ...
-
-
 @dataclass(frozen=True)
 class BreathLog:
     """One breath as it happened; lists of one value a step.
@@ -140,6 +132,11 @@ class BreathLog:
         about = {"run": run.number, "attempt": attempt, "breath": breath, "entry": run.entry}
         label = {"kind": run.kind, "lung": run.lung, "pip": run.pip, "repeat": run.repeat}
         return {"type": "breath", **about, **label, **rounded, "u_out": list(self.u_out)}
+
+
+#: Shows a breath of a run while the lung breathes out; told how many runs of the plan are done, and
+#: how many there are.
+Show = Callable[[PlannedRun, BreathLog, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -206,7 +203,7 @@ class Bench:
     clock: Clock  #: of the device's time or a virtual one.
     settings: SafetySettings  #: safety.
     operator: Operator  #: the person.
-    view: View | None = None  #: shows breaths; None for none.
+    shows: Sequence[Show] = ()  #: what shows breaths.
     rest: float = REST_S  #: time at rest before each run, s.
     #: bounds of the controller that takes over; None for none.
     fallback: FallbackSettings | None = None

@@ -195,8 +195,8 @@ def _one(
 
     def write(index: int, breath: BreathLog) -> None:
         log.append(breath.line(run, attempt, index))
-        if bench.view is not None:
-            bench.view.breath(run, breath, done, total)
+        for show in bench.shows:
+            show(run, breath, done, total)
 
     # A disk can take longer than a step; the thread has the loop's priority, or Python's lock would
     # wait for it.

@@ -21,7 +21,7 @@ from hardware_eval.bench.controllers import (
     SubmissionController,
 )
 from hardware_eval.bench.fallback import FallbackSettings
-from hardware_eval.bench.loop import REST_S, Bench, Operator, View
+from hardware_eval.bench.loop import REST_S, Bench, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
@@ -224,7 +224,7 @@ def make_runner(sandbox: bool) -> Any:
 
 def evaluate(
     submissions: Sequence[Submission], line: Line, out: Path, operator: Operator, *, plan: Plan,
-    view: View | None = None, sandbox: bool = True, dry: bool = True,
+    shows: Sequence[Show] = (), sandbox: bool = True, dry: bool = True,
     before_lung: Callable[[Bench, str], Sheet | None] = lambda bench, lung: None,
     settings: SafetySettings = DEFAULT, operator_name: str = "", notes: str = "",
     rest: float = REST_S, prepare_run: Callable[[PlannedRun], None] = lambda run: None,
@@ -238,7 +238,7 @@ def evaluate(
         out: folder of the log, the recording and the records.
         operator: the person at the bench.
         plan: from :func:`hardware_eval.bench.plan.make_plan`.
-        view: shows breaths.
+        shows: show breaths.
         sandbox: run entries as in scoring; without it, in this process.
         dry: run the plan on the frozen simulators first, unless the log has begun.
         before_lung: tests a lung once it is set; None where nobody does.
@@ -278,7 +278,7 @@ def evaluate(
         "sandbox": None if runner.sandbox is None else dict(runner.sandbox),
         "simulated": simulated,
     }
-    bench = Bench(line.client, line.clock, settings, operator, view, rest, fallback)
+    bench = Bench(line.client, line.clock, settings, operator, shows, rest, fallback)
     make = controllers(submissions, plan.track, runner, real_time=line.real)
     with RawLog(log_path) as log, _ends_by_exception(), _quick_switches():
         end = session.run_plan(

@@ -36,10 +36,6 @@ class Replay:
     runs: int  #: runs of the plan.
     done: int  #: those that need not run again.
     breaths: int  #: breaths in the log, of all attempts.
-    #: mean error of the complete scored runs by entry and lung, cmH2O.
-    errors: dict[str, dict[str, float]]
-    #: standard deviation of the runs of one cell, pooled, cmH2O; NaN for one repetition.
-    spreads: dict[str, dict[str, float]]
     timing: Jitter  #: statistics of the loop.
     problems: tuple[str, ...]  #: where the record and the log differ; empty without a record.
 
@@ -50,9 +46,6 @@ class Replay:
     def __str__(self) -> str:
         timing = self.timing
         rows = [f"{self.done} of {self.runs} runs are done, {self.breaths} breaths logged"]
-        for entry, by_lung in self.errors.items():
-            cells = ", ".join(f"{lung} {error:.3f}" for lung, error in by_lung.items())
-            rows.append(f"{entry}: {cells} cmH2O")
         rows.append(
             f"{timing.steps} steps, {100 * timing.on_time:.2f} % within 2 ms, latest "
             f"{1e3 * timing.worst:.1f} ms, {timing.lost} lost, {timing.late_answers} late answers "
@@ -94,38 +87,29 @@ def replay(
         )
         error = float(np.mean(np.abs(inspired - first.pip)))
         cells.setdefault((first.entry, first.lung, first.pip), []).append(error)
-    errors: dict[str, dict[str, float]] = {}
-    spreads: dict[str, dict[str, float]] = {}
-    for entry in plan.entries:
-        for lung in plan.lungs:
-            own = [values for key, values in cells.items() if key[:2] == (entry, lung)]
-            if own:
-                errors.setdefault(entry, {})[lung] = float(np.mean([np.mean(x) for x in own]))
-                variances = [np.var(x, ddof=1) for x in own if len(x) > 1]
-                spread = float(np.sqrt(np.mean(variances))) if variances else float("nan")
-                spreads.setdefault(entry, {})[lung] = spread
     _show(everything, rerun, mcap, len(plan.runs))
     problems = () if record is None else tuple(_differences(record, log, cells))
     done = len(progress(plan, logged).done)
     timing = jitter(log)
-    return Replay(len(plan.runs), done, len(everything), errors, spreads, timing, problems)
+    return Replay(len(plan.runs), done, len(everything), timing, problems)
 
 
 def _show(everything: list[Any], rerun: str | None, mcap: Path | None, total: int) -> None:
-    from hardware_eval.bench.console import McapView, RerunView, Views
+    from hardware_eval.bench.console import McapView, RerunView
 
-    shown = [*([RerunView(rerun)] if rerun else []), *([McapView(mcap)] if mcap else [])]
-    if not shown:
-        return
-    view = Views(*shown)
-    for breath in everything:
+    written = McapView(mcap) if mcap else None
+    shows = [RerunView(rerun).breath] if rerun else []
+    shows += [written.breath] if written else []
+    for breath in everything if shows else ():
         names = ("run", "kind", "entry", "lung", "pip", "repeat")
         run = PlannedRun(*(getattr(breath, name) for name in names))
         aims = waveform.target(np.arange(len(breath.time)), breath.pip)
         names = ("time", "pressure", "flow", "requested", "u_in", "u_out", "late")
         columns = {name: getattr(breath, name).tolist() for name in names}
-        view.breath(run, BreathLog(**columns, target=aims.tolist()), breath.run, total)
-    view.close()
+        for show in shows:
+            show(run, BreathLog(**columns, target=aims.tolist()), breath.run, total)
+    if written:
+        written.close()
 
 
 def _differences(

@@ -348,12 +348,11 @@ def test_six_lungs_survive_three_crashes_and_two_cables(tmp_path: Path) -> None:
     def mount(run: PlannedRun) -> None:
         device.service.hal = lungs[run.lung]
 
-    class Counts:
-        def breath(self, run: PlannedRun, breath: Any, done: int, total: int) -> None:
-            nonlocal ended
-            ended += len(breath.time) == protocol.BREATH_STEPS
+    def count(run: PlannedRun, breath: Any, done: int, total: int) -> None:
+        nonlocal ended
+        ended += len(breath.time) == protocol.BREATH_STEPS
 
-    bench = Bench(client, device.clock, DEFAULT, SilentOperator(), Counts(), 1.0)
+    bench = Bench(client, device.clock, DEFAULT, SilentOperator(), [count], 1.0)
     path, result, restarts = tmp_path / "raw.jsonl", None, 0
     while result is None:
         try:

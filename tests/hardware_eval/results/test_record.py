@@ -18,6 +18,7 @@ from hardware_eval.results import evaluate as ev
 from hardware_eval.results import record as records
 from hardware_eval.results.evaluate import Line
 from hardware_eval.results.replay import recorded_breaths, replay
+from hardware_eval.results.trial import analyse
 from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, gate, record, store
 from ventbench.board.record import HardwareRecord
@@ -76,9 +77,10 @@ def test_the_record_holds_score_device_and_recording(done: ev.Evaluation, path: 
 
 
 def test_the_log_gives_the_errors_of_the_record(done: ev.Evaluation, path: Path) -> None:
-    report = replay(done.log, record=path)
-    assert report.problems == ()
-    assert report.errors["pid_best"][LUNG] == pytest.approx(loaded(path).score, abs=1e-3)
+    assert replay(done.log, record=path).problems == ()
+    assert analyse([done.log]).entries["pid_best"].score.value == pytest.approx(
+        loaded(path).score, abs=1e-3
+    )
 
 
 def changed(path: Path, change: Any) -> bytes:

@@ -117,8 +117,7 @@ def pairs(
         list[str] | None,
         typer.Option(
             metavar="KIND",
-            help="Only this kind (may be repeated): label, lung, drive, leak, lag; and, minutes a "
-            "pair, lung_pressure, gain_pressure, lag_pressure.",
+            help="Only this kind (may be repeated): label, lung, drive, leak, lag.",
         ),
     ] = None,
     sealed: Annotated[

@@ -29,9 +29,8 @@ from hardware_eval.emulation import faults
 from hardware_eval.emulation.faults import FaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import simulated_lung
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, LinkError, NoAnswerError
 from hardware_eval.wire.messages import Reading
-from hardware_eval.wire.parser import LinkError, NoAnswerError
 from ventbench.task import protocol
 
 #: Time at rest before each run, s.

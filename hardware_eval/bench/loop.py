@@ -27,9 +27,8 @@ from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.plan import PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.realtime import Clock
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, LinkError, NoAnswerError, RefusedError
 from hardware_eval.wire.messages import CAUSES, Flag, Reading
-from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
 from ventbench.base.arrays import Floats
 from ventbench.task import protocol, waveform
 from ventbench.task.lungs import lung as parse_lung

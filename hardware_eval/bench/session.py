@@ -25,8 +25,7 @@ from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.safety import SafetySettings
 from hardware_eval.bench.selftest import PARTS, Sheet
 from hardware_eval.realtime import take_priority
-from hardware_eval.wire.client import Client
-from hardware_eval.wire.parser import LinkError
+from hardware_eval.wire.client import Client, LinkError
 
 if TYPE_CHECKING:
     from hardware_eval.emulation.simulated import SimulatedHal

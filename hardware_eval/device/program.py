@@ -27,12 +27,14 @@ from hardware_eval.wire.messages import (
     Command,
     Counters,
     DeviceMessage,
+    Fault,
     Flag,
     Heartbeat,
     Hello,
     HostMessage,
     Mode,
     Packet,
+    ParserState,
     Reading,
     Reason,
     Refusal,
@@ -40,9 +42,9 @@ from hardware_eval.wire.messages import (
     Vent,
     Welcome,
     encode,
+    feed_bytes,
     microseconds,
 )
-from hardware_eval.wire.parser import Fault, ParserState, feed_bytes
 from ventbench.task import protocol
 
 #: Version of this program: what a device tells as its firmware.

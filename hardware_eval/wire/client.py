@@ -15,28 +15,24 @@ from hardware_eval.wire.messages import (
     Arm,
     Command,
     Counters,
+    Event,
+    Fault,
     Heartbeat,
     Hello,
     HostMessage,
     Message,
     Packet,
+    ParserState,
     Reading,
     Refusal,
     Statistics,
     Vent,
     Welcome,
     encode,
+    feed_bytes,
     milliseconds,
 )
-from hardware_eval.wire.parser import (
-    DisconnectedError,
-    Event,
-    Fault,
-    NoAnswerError,
-    ParserState,
-    RefusedError,
-    feed_bytes,
-)
+from ventbench.base.errors import InputError
 
 #: Time that an answer may take, s: most of a control step of 30 ms.
 ANSWER_TIMEOUT = 0.020
@@ -49,6 +45,43 @@ ATTEMPTS, PATIENCE = 5, 0.2
 _REMEMBERED = 10_000
 
 AnswerT = TypeVar("AnswerT", Welcome, Reading, Counters)
+
+
+class LinkError(InputError):
+    """The base of all errors of the link."""
+
+
+class PortMissingError(LinkError):
+    """There is no such port."""
+
+
+class PortBusyError(LinkError):
+    """Another program has the port."""
+
+
+class PortForbiddenError(LinkError):
+    """The user may not open the port."""
+
+
+class DisconnectedError(LinkError):
+    """The port went away while it was open; the device vents by itself."""
+
+
+class NoAnswerError(LinkError):
+    """The device did not answer in time."""
+
+
+class RefusedError(LinkError):
+    """The device refused a message.
+
+    Attributes:
+        refusal: its answer.
+    """
+
+    def __init__(self, message: str, refusal: Refusal) -> None:
+        """Keep the device's answer."""
+        super().__init__(message)
+        self.refusal = refusal
 
 
 class Transport(Protocol):

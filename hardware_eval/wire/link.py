@@ -19,7 +19,7 @@ from typing import cast
 import serial
 
 from hardware_eval.realtime import take_priority
-from hardware_eval.wire.parser import (
+from hardware_eval.wire.client import (
     DisconnectedError,
     LinkError,
     PortBusyError,

@@ -20,7 +20,7 @@ from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.session import run_plan
 from hardware_eval.emulation.faults import Fault, FaultKind, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
-from hardware_eval.wire.parser import LinkError
+from hardware_eval.wire.client import LinkError
 from ventbench import rollout
 from ventbench.controllers.pid import PID
 from ventbench.task import protocol

@@ -19,10 +19,8 @@ from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.emulation import emulator as emulator_module
 from hardware_eval.emulation.electronics import emulated_lung
 from hardware_eval.emulation.emulator import Emulator, tell
-from hardware_eval.wire.client import Client
-from hardware_eval.wire.link import Link
-from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
-from hardware_eval.wire.parser import (
+from hardware_eval.wire.client import (
+    Client,
     DisconnectedError,
     LinkError,
     NoAnswerError,
@@ -31,6 +29,8 @@ from hardware_eval.wire.parser import (
     PortMissingError,
     RefusedError,
 )
+from hardware_eval.wire.link import Link
+from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 

@@ -11,9 +11,8 @@ import pytest
 from hardware_eval.emulation.faults import Fault, FaultKind, Line, LineFaultKind, parse
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, DisconnectedError, NoAnswerError
 from hardware_eval.wire.messages import Capability, Flag, Mode
-from hardware_eval.wire.parser import DisconnectedError, NoAnswerError
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 from ventbench.base.precision import float64

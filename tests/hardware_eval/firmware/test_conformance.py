@@ -13,9 +13,9 @@ from hardware_eval import cli
 from hardware_eval.device.program import DeviceService, DeviceSettings, Identity
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.results import evaluate
+from hardware_eval.wire.client import NoAnswerError
 from hardware_eval.wire.conformance import CLAUSES, NOT_TRIED, Clause, conformance
-from hardware_eval.wire.messages import Capability, Packet
-from hardware_eval.wire.parser import NoAnswerError, ParserState, feed_bytes
+from hardware_eval.wire.messages import Capability, Packet, ParserState, feed_bytes
 from tests.hardware_eval.firmware.core import CoreService, loopback
 from tests.hardware_eval.stand_in import Bench
 

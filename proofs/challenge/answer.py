@@ -22,7 +22,7 @@ from ventbench.recordings.read import load
 
 def answer(
     folder: ChallengeFolder, diagnoser: Diagnoser, *, limits: Limits | None = None, jobs: int = 1,
-    only: tuple[str, ...] = (), scheduler: str | None = None,
+    only: tuple[str, ...] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, str]:  # fmt: skip
     """Answer all cases that have no answer yet; each answer is written as soon as it is there.
@@ -35,7 +35,6 @@ def answer(
         limits: what it may use on a case; the usual ones if None.
         jobs: number of cases at once.
         only: names of cases; all if empty.
-        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: called with the number of answered cases and the number of all cases.
 
     Returns:
@@ -54,7 +53,7 @@ def answer(
     done, lost = len(names) - len(waiting), {}
     progress(done, len(names))
     work = {name: (folder, name, diagnoser, limits or Limits()) for name in waiting}
-    with executor(jobs if jobs > 1 and scheduler is None else 0, scheduler) as pool:
+    with executor(jobs if jobs > 1 else 0) as pool:
         for name, problem in results(pool, answer_case, work):
             done += 1
             progress(done, len(names))

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from proofs.cli import ResultsPage
-from ventbench.cli.options import JsonFile, Scheduler, bar, bars, claim_out, emit
+from ventbench.cli.options import JsonFile, bar, bars, claim_out, emit
 
 app = typer.Typer(
     name="challenge",
@@ -46,7 +46,6 @@ def make(
         ),
     ] = "all",
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
-    scheduler: Scheduler = None,
     generator: Annotated[
         Literal["first", "stranger", "faults"],
         typer.Option(
@@ -67,9 +66,8 @@ def make(
     from proofs.challenge.make import make as work
 
     with bar("recording") as recording:
-        place = out if scheduler is None else out.resolve()
         hashed = work(
-            seed, place, kind, cases, jobs=jobs, scheduler=scheduler, source=generator,
+            seed, out, kind, cases, jobs=jobs, source=generator,
             progress=lambda done: recording(done, cases),
         )  # fmt: skip
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
@@ -92,7 +90,6 @@ def answer(
     memory: Annotated[float, typer.Option(min=0.5, help="Address space a case, GiB.")] = 16.0,
     jobs: Annotated[int, typer.Option(min=1, help="Number of cases at once.")] = 1,
     case: Annotated[list[str], typer.Option(help="Only this case; may be repeated.")] = [],  # noqa: B006
-    scheduler: Scheduler = None,
     round_: Round = 1,
 ) -> None:
     """Let a diagnoser answer every case, each in a process of its own.
@@ -107,10 +104,9 @@ def answer(
 
     who = find(diagnoser)
     with bar("answering") as progress:
-        place = folder if scheduler is None else folder.resolve()
         lost = work(
-            ChallengeFolder(place, round_), who, limits=Limits(seconds, memory), jobs=jobs,
-            only=tuple(case), scheduler=scheduler, progress=progress,
+            ChallengeFolder(folder, round_), who, limits=Limits(seconds, memory), jobs=jobs,
+            only=tuple(case), progress=progress,
         )  # fmt: skip
     for name, problem in sorted(lost.items()):
         typer.echo(f"{name}: lost: {problem}", err=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ventbench.base import files
-from ventbench.cli.options import JsonFile, RecordingsDir, Scheduler, Workers, bar, told
+from ventbench.cli.options import JsonFile, RecordingsDir, Workers, bar, told
 
 
 def paper(
@@ -28,7 +28,6 @@ def paper(
         int, typer.Option(min=1, max=32, help="Trainings of each method and part with --full.")
     ] = 5,
     workers: Workers = 0,
-    scheduler: Scheduler = None,
     page: Annotated[
         Path | None, typer.Option("--html", metavar="FILE", help="Write the page, with charts.")
     ] = None,
@@ -58,7 +57,7 @@ def paper(
     with bar("paper") as progress:
         result, stored = reproduce_paper(
             recordings=recordings, full=full, out=out, seeds=seeds,
-            workers=workers, scheduler=scheduler,
+            workers=workers,
             progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
     console = told(result.to_json(), json)

@@ -13,7 +13,6 @@ from ventbench.base.files import json_values
 from ventbench.cli.options import (
     JsonFile,
     RecordingsDir,
-    Scheduler,
     Workers,
     bar,
     bars,
@@ -104,7 +103,6 @@ def controllers(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/controllers"),
     workers: Workers = 0,
-    scheduler: Scheduler = None,
     json: JsonFile = None,
 ) -> None:
     """Remove or change one part of the residual controller at a time.
@@ -125,7 +123,7 @@ def controllers(
     with bar("controllers") as progress:
         runs = work.compare(
             frozen.load(), out, range(seeds), config=config, only=only,
-            workers=workers, scheduler=scheduler,
+            workers=workers,
             progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
     table = work.summary(runs)
@@ -152,7 +150,6 @@ def networks(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/networks"),
     workers: Workers = 0,
-    scheduler: Scheduler = None,
     json: JsonFile = None,
 ) -> None:
     """Change windows, width, depth and boundary networks of the paper's simulators, one at a time.
@@ -169,7 +166,7 @@ def networks(
     _check(only, work.variants(work.ARCHITECTURE))
     with bar("networks") as progress:
         breaths = work.compare(
-            folder, out, only=only, workers=workers, scheduler=scheduler,
+            folder, out, only=only, workers=workers,
             progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
     table = work.summary(breaths)

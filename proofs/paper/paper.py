@@ -70,7 +70,6 @@ def reproduce_paper(
     seeds: int = 5,
     sizes: StudySizes | None = None,
     workers: int = 0,
-    scheduler: str | None = None,
     gains: Floats | None = None,
     stored: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
@@ -86,7 +85,6 @@ def reproduce_paper(
         sizes: of the studies of ``full``.
         workers: processes for grid, entries and the studies of controllers and networks; 0 for
             this one alone.
-        scheduler: address of a Dask scheduler instead.
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given. They must
             contain those of the paper's table.
         stored: results of minutes; those of ``proofs/paper/stored.json`` if not given.
@@ -111,9 +109,8 @@ def reproduce_paper(
         kept["horizon"] = simulators.measure_horizon(Path(recordings) / MEASURED)
     if full:
         source = None if recordings is None else Path(recordings)
-        parallel = {"workers": workers, "scheduler": scheduler}
-        kept |= _studies(Path(out), source, seeds, sizes or StudySizes(), parallel, tell)
-    with executor(workers, scheduler) as pool:
+        kept |= _studies(Path(out), source, seeds, sizes or StudySizes(), workers, tell)
+    with executor(workers) as pool:
         tell("PID grid", 0.1)
         grid = pid_grid.search(
             {name: take(official.plants, index) for index, name in enumerate(LUNG_IDS)},
@@ -171,10 +168,10 @@ def _scored(name: str, track: str) -> tuple[Floats, Floats]:
 
 
 def _studies(
-    out: Path, recordings: Path | None, seeds: int, sizes: StudySizes, parallel: Mapping[str, Any],
+    out: Path, recordings: Path | None, seeds: int, sizes: StudySizes, workers: int,
     tell: Progress,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
-    """Run the studies of minutes again, as JSON values; ``parallel``: workers and scheduler."""
+    """Run the studies of minutes again, as JSON values."""
     from proofs.studies import controllers, networks, samples
     from proofs.studies.networks import ARCHITECTURE
     from ventbench.train.residual import ResidualConfig
@@ -188,7 +185,7 @@ def _studies(
     config = ResidualConfig(updates=sizes.updates)
     runs = controllers.compare(
         frozen.load(), out / "controllers", range(seeds), config=config, only=sizes.parts,
-        draws=sizes.draws, **parallel,
+        draws=sizes.draws, workers=workers,
         progress=lambda what, share: tell(f"controllers: {what}", share),
     )  # fmt: skip
     known = controllers.variants(config)
@@ -206,7 +203,7 @@ def _studies(
     }
     if recordings is not None:
         breaths = networks.compare(
-            recordings, out / "networks", **parallel, **sizes.networks,
+            recordings, out / "networks", workers=workers, **sizes.networks,
             progress=lambda what, share: tell(f"networks: {what}", share),
         )  # fmt: skip
         names = {"depth": "depth", "N_B": "boundaries", "H_p": "pressures", "H_c": "controls"}

@@ -84,7 +84,6 @@ def compare(
     draws: int = DRAWS,
     gains: Gains | None = None,
     workers: int = 0,
-    scheduler: str | None = None,
     progress: Progress = lambda *_: None,
 ) -> pd.DataFrame:
     """Train one network for all six lungs by each variant with each seed.
@@ -100,7 +99,6 @@ def compare(
         draws: published draws to score on.
         gains: P, I, D of the PID; the best single set of the paper's grid if not given.
         workers: processes, each with a training at a time; 0 for this one alone.
-        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: see :data:`Progress`.
 
     Returns:
@@ -126,7 +124,7 @@ def compare(
         checkpoint = work.checkpoint(part)
         jobs[part] = (simulators, own, chosen[name].config, seed, draws, checkpoint)
     finish(
-        work, _trained, jobs, workers=workers, scheduler=scheduler,
+        work, _trained, jobs, workers=workers,
         progress=lambda part, share: progress(trainings[part][0], share),
     )  # fmt: skip
     runs = pd.DataFrame(

@@ -160,6 +160,20 @@ def summary(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def stored(runs: pd.DataFrame, config: ResidualConfig) -> dict[str, Any]:
+    """JSON values of trainings by some settings, for the paper's page."""
+    known, seeds = variants(config), runs["seed"].nunique()
+    command = f"python -m proofs study controllers --seeds {seeds} --updates {config.updates}"
+    return {
+        "about": {"command": command, "simulators": 1},
+        "variants": [
+            {"variant": row["variant"], "meaning": known[str(row["variant"])].meaning}
+            | {figure: round(float(row[figure]), 4) for figure in FIGURES}
+            for row in summary(runs).to_dict("records")
+        ],
+    }
+
+
 def _trained(
     simulators: frozen.Frozen, gains: Gains, config: ResidualConfig, seed: int, draws: int,
     checkpoint: Path, tell: Tell | None,

@@ -140,6 +140,17 @@ def summary(breaths: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def stored(breaths: pd.DataFrame) -> dict[str, Any]:
+    """JSON values of a comparison of :data:`ARCHITECTURE`, for the paper's page."""
+    names = {"depth": "depth", "N_B": "boundaries", "H_p": "pressures", "H_c": "controls"}
+    base = {key: getattr(ARCHITECTURE, field) for key, field in names.items()}
+    return {
+        "about": {"command": "python -m proofs study networks", "simulators": 1},
+        "base": base | {"width": ARCHITECTURE.width},
+        "variants": summary(breaths).round(4).to_dict("records"),
+    }
+
+
 def _judged(
     data: TrainingData, judged: Breaths, fold: np.ndarray,
     architecture: Architecture, config: LearnedConfig, members: int, checkpoint: Path,

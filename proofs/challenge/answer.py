@@ -44,10 +44,8 @@ def answer(
         InputError: if there is no challenge, or a recording is missing or cannot be read.
     """
     names = [name for name in folder.cases() if not only or name in only]
-    missing = [name for name in names if not folder.recording(name, diagnoser.name).is_file()]
-    if folder.round == 2:  # has recordings only of the cases that requested breaths
-        names = [name for name in names if name not in missing]
-    elif missing:
+    missing = [name for name in names if not folder.recording(name).is_file()]
+    if missing:
         raise InputError(f"{folder.recording(missing[0])} is missing")
     waiting = [name for name in names if not folder.answer(name, diagnoser.name).is_file()]
     done, lost = len(names) - len(waiting), {}
@@ -64,7 +62,7 @@ def answer(
 
 def answer_case(folder: ChallengeFolder, name: str, diagnoser: Diagnoser, limits: Limits) -> str:
     """Answer one case and write the file; returns why the case is lost, or an empty text."""
-    path = folder.recording(name, diagnoser.name)
+    path = folder.recording(name)
     breaths = load(path)
     withheld = tuple(folder.cases()[name]["withheld"])
     apart = np.isin(breaths.breath_id, withheld)

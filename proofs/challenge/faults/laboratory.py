@@ -138,26 +138,6 @@ def record(
     return _run(case, rng, time, u_out, command, np.arange(n), noise)
 
 
-def record_commands(
-    case: Case, time: Floats, u_in: Floats, u_out: NDArray[np.int8],
-    rng: np.random.Generator, *, steps: int | None = None,
-) -> Breaths:  # fmt: skip
-    """Record given commands, open loop, after the case's own breaths.
-
-    Args:
-        case: a case of this generator.
-        time: times of the samples, s, ``(k, T)``.
-        u_in: %, ``(k, T)``.
-        u_out: 0/1, ``(k, T)``.
-        rng: source of noise.
-        steps: not used.
-    """
-    assert isinstance(case, FaultsCase)
-    number = case.breaths + np.arange(len(time))
-    noise = coloured_noise(case, 0.7, rng, time.shape)
-    return _run(case, rng, time, u_out, lambda k, pressure: u_in[:, k], number, noise)
-
-
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:
     """Readings without noise under recorded commands, cmH2O, ``(n, T)``.
 

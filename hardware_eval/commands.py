@@ -111,9 +111,6 @@ def calibrate(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="The device's calibration; parts are added to it.")
     ] = Path("calibration.json"),
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also draw all parts, as a PNG.")
-    ] = None,
     yes: Yes = False,
     json: JsonFile = None,
 ) -> None:
@@ -137,8 +134,6 @@ def calibrate(
         )
     saved = calibration.Calibration(device, {**kept, part: made}).save(out)
     emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
-    if plot is not None:
-        files.write_atomically(plot, lambda file: file.write(saved.plot_png()))
     to = told(json)
     print(made, file=to)
     if part == "leak":

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-import io
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -34,7 +33,7 @@ from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Reading
 from ventbench.base import files
 from ventbench.base.arrays import Floats
-from ventbench.base.errors import InputError, require
+from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 
@@ -357,40 +356,6 @@ class Calibration:
             return None
         (R, elastance), (R_error, elastance_error) = part.reading, part.error
         return KnownLung(part.lung, (R, elastance), (R_error, elastance_error))
-
-    def plot_png(self) -> bytes:
-        """Draw each series about its line: circles from below, triangles from above.
-
-        Raises:
-            InputError: if matplotlib is missing.
-        """
-        require("matplotlib")
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        shown = [part for part in self.parts.values() if part.kind != "lung"]
-        figure = Figure(figsize=(4.0 * max(len(shown), 1), 3.4), layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.suptitle(f"device {self.device['device_id']}, SHA-256 {self.sha256[:12]}")
-        for place, part in enumerate(shown, 1):
-            axes, (x_unit, y_unit), line = figure.add_subplot(1, len(shown), place), *(
-                PARTS[part.kind], part.fit,
-            )  # fmt: skip
-            x, y, error, above = map(np.array, (part.reference, part.reading, part.error,
-                                                part.above))  # fmt: skip
-            slope = 0.0 if math.isnan(line.slope.value) else line.slope.value
-            departure = y - line.intercept.value - slope * x
-            if np.ptp(x) == 0.0:
-                x = np.arange(1.0, len(x) + 1)
-            for marker, these in (("o", above == 0), ("v", above == 1)):
-                axes.errorbar(x[these], departure[these], 1.96 * error[these], None, marker)
-            axes.axhline(0.0, color="0.6")
-            axes.set_title(f"{part.kind}, {part.date[:10]}")
-            axes.set_xlabel("mean" if slope == 0.0 else f"reference, {x_unit}")
-            axes.set_ylabel(f"reading - line, {y_unit}")
-        with io.BytesIO() as file:
-            figure.savefig(file, format="png", dpi=110)
-            return file.getvalue()
 
     def about(self) -> dict[str, Any]:
         """What a record says of it."""

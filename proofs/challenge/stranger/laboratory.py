@@ -104,7 +104,7 @@ def record(
     )  # fmt: skip
 
 
-def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:
+def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
     """Pressures without noise under recorded commands, cmH2O, ``(n, T)``.
 
     Args:
@@ -112,7 +112,6 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
         breaths: commands and times.
         start: airway pressure at rest, ``(n,)``.
         seed: seed of efforts and phases.
-        steps: not used.
     """
     assert isinstance(case, StrangerCase)
     quiet = replace(case, gain_scatter=0.0)

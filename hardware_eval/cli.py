@@ -436,7 +436,7 @@ def replay(
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Show a session again, and compute its errors and timing from the raw log.
+    """Show a session again, compute its timing from the raw log, and check a record by it.
 
     Example: `ventbench-hardware replay runs/hardware`
     """

@@ -1,4 +1,4 @@
-"""A session read again from its raw log: breaths in order, errors and timing computed anew.
+"""A session read again from its raw log: its breaths in order, its timing, its record checked.
 
 The breaths behind a record serve to compare simulators with the lung, too: these get the recorded
 commands, and what they then do otherwise is the mismatch, whatever the controller did.
@@ -15,7 +15,7 @@ import numpy as np
 
 from hardware_eval.bench.loop import BreathLog
 from hardware_eval.bench.plan import PlannedRun, progress
-from hardware_eval.bench.raw_log import breaths, lines, recording
+from hardware_eval.bench.raw_log import LoggedBreath, breaths, lines, recording
 from hardware_eval.results.evaluate import LOG, PLANNED
 from hardware_eval.results.record import Jitter, jitter, plan_of
 from ventbench.base import files
@@ -45,13 +45,13 @@ class Replay:
 
     def __str__(self) -> str:
         timing = self.timing
-        rows = [f"{self.done} of {self.runs} runs are done, {self.breaths} breaths logged"]
-        rows.append(
+        rows = (
+            f"{self.done} of {self.runs} runs are done, {self.breaths} breaths logged",
             f"{timing.steps} steps, {100 * timing.on_time:.2f} % within 2 ms, latest "
             f"{1e3 * timing.worst:.1f} ms, {timing.lost} lost, {timing.late_answers} late answers "
             f"({100 * timing.late_share:.2f} %), longest {1e3 * timing.longest_answer:.1f} ms, "
             f"{timing.outside} outside the envelope; fallback {100 * timing.fallback_share:.2f} % "
-            f"of steps, at most {timing.longest_fallback} in a row"
+            f"of steps, at most {timing.longest_fallback} in a row",
         )
         return "\n".join([*rows, *self.problems])
 
@@ -73,28 +73,15 @@ def replay(
     log = log / LOG if log.is_dir() else log
     logged = list(lines(log))
     plan = plan_of(logged, str(log))
-    cells: dict[tuple[str, str, float], list[float]] = {}
     everything = breaths(log)
-    by_run: dict[tuple[int, int], list[Any]] = {}
-    for breath in everything:
-        by_run.setdefault((breath.run, breath.attempt), []).append(breath)
-    for run in by_run.values():
-        first = run[0]
-        if not first.complete or first.kind != "scored":
-            continue
-        inspired = np.stack(
-            [run[k].pressure[: protocol.INSPIRATION_STEPS] for k in protocol.SCORED_BREATHS]
-        )
-        error = float(np.mean(np.abs(inspired - first.pip)))
-        cells.setdefault((first.entry, first.lung, first.pip), []).append(error)
     _show(everything, rerun, mcap, len(plan.runs))
-    problems = () if record is None else tuple(_differences(record, log, cells))
+    problems = () if record is None else tuple(_differences(record, log, everything))
     done = len(progress(plan, logged).done)
     timing = jitter(log)
     return Replay(len(plan.runs), done, len(everything), timing, problems)
 
 
-def _show(everything: list[Any], rerun: str | None, mcap: Path | None, total: int) -> None:
+def _show(everything: list[LoggedBreath], rerun: str | None, mcap: Path | None, total: int) -> None:
     from hardware_eval.bench.console import McapView, RerunView
 
     written = McapView(mcap) if mcap else None
@@ -112,14 +99,12 @@ def _show(everything: list[Any], rerun: str | None, mcap: Path | None, total: in
         written.close()
 
 
-def _differences(
-    path: Path, log: Path, cells: dict[tuple[str, str, float], list[float]]
-) -> list[str]:
-    """Where a record says something else than the log."""
+def _differences(path: Path, log: Path, everything: list[LoggedBreath]) -> list[str]:
+    """Where a record says something else than the log and its breaths."""
     loaded = records.load(path)
     if not isinstance(loaded, HardwareRecord):
         raise InputError(f"{path} is not a hardware record")
-    problems = []
+    cells, problems = _errors(everything), []
     if files.sha256(log) != loaded.header.recording.sha256:
         problems.append(f"{log} is not the recording that the record names by its hash")
     for i, lung in enumerate(loaded.header.lungs):
@@ -130,6 +115,24 @@ def _differences(
             if own.shape != said.shape or np.any(np.abs(own - said) > 0.001):
                 problems.append(f"{lung}, PIP {pip:g}: the log gives other errors than the record")
     return problems
+
+
+def _errors(everything: list[LoggedBreath]) -> dict[tuple[str, str, float], list[float]]:
+    """Errors of the complete scored runs by entry, lung and PIP, cmH2O."""
+    cells: dict[tuple[str, str, float], list[float]] = {}
+    by_run: dict[tuple[int, int], list[LoggedBreath]] = {}
+    for breath in everything:
+        by_run.setdefault((breath.run, breath.attempt), []).append(breath)
+    for run in by_run.values():
+        first = run[0]
+        if not first.complete or first.kind != "scored":
+            continue
+        inspired = np.stack(
+            [run[k].pressure[: protocol.INSPIRATION_STEPS] for k in protocol.SCORED_BREATHS]
+        )
+        error = float(np.mean(np.abs(inspired - first.pip)))
+        cells.setdefault((first.entry, first.lung, first.pip), []).append(error)
+    return cells
 
 
 def scored_plants(simulator: Any, lungs: list[str]) -> Simulators:

@@ -36,10 +36,9 @@ import numpy as np
 
 from hardware_eval import realtime
 from hardware_eval.emulation.emulator import tell
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, LinkError
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Mode
-from hardware_eval.wire.parser import LinkError
 from ventbench.base import files
 
 #: The lung must be vented within this time of a death, s: watchdog, deadman, monostable, age of the

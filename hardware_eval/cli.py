@@ -44,12 +44,6 @@ Lungs = Annotated[
         autocompletion=options.known_lungs,
     ),
 ]
-Control = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="SOCKET", help="Control socket of an emulator, which then disturbs the tube itself."
-    ),
-]
 Skip = Annotated[
     list[str] | None,
     typer.Option(
@@ -79,10 +73,6 @@ def run(
     track: Annotated[
         str | None,
         typer.Option(help="performance (the lung is told) or robustness; default: the entry's."),
-    ] = None,
-    perturb: Annotated[
-        list[str] | None,
-        typer.Option(help="Also run with a disturbed tube: leak or pinch; repeatable."),
     ] = None,
     control_every: Annotated[
         int, typer.Option(min=0, help="Scored runs between two control runs of the PID; 0: none.")
@@ -119,7 +109,6 @@ def run(
         typer.Option(metavar="FILE|live", help="Also show breaths in rerun: a file, or live."),
     ] = None,
     calibration: Calibrated = None,
-    control: Control = None,
     yes: Yes = False,
     json: JsonFile = None,
 ) -> None:
@@ -129,7 +118,7 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval.bench.console import Blind, RerunView, TerminalView, Views
+    from hardware_eval.bench.console import Blind, RerunView, show_bars
     from hardware_eval.bench.fallback import DEFAULT as FALLBACK
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.plan import make_plan
@@ -147,11 +136,10 @@ def run(
         seed = secrets.randbits(32) if begun is None else int(begun["seed"])
     plan = make_plan(
         [x.manifest.name for x in entries], lung, track=track, pips=chosen, repeats=repeats,
-        control_every=control_every, perturbations=perturb or (), seed=seed,
+        control_every=control_every, seed=seed,
     )  # fmt: skip
     settings = SafetySettings(largest_u_in=largest_u_in, largest_rise=largest_rise)
-    views = Views(TerminalView(), *([RerunView(rerun)] if rerun else []))
-
+    shows = [show_bars, *([RerunView(rerun).breath] if rerun else [])]
     left_out = chosen_parts(skip or ())
 
     def before_lung(bench: Bench, mounted: str) -> Sheet | None:
@@ -162,14 +150,15 @@ def run(
         print(sheet, flush=True)
         return sheet
 
-    with bench_on(port, yes=yes, control=control) as (line, _, person):
+    with bench_on(port, yes=yes) as (line, _, person):
         calibrated = calibration_of(line, calibration)
-        masked = Blind(person, views, plan)
+        masked = Blind(person, plan)
         done = ev.evaluate(
             entries, line, out, masked if blind else person, plan=plan,
-            view=masked if blind else views, sandbox=not in_process, dry=dry_run,
-            before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
-            rest=rest, calibration=calibrated, fallback=FALLBACK if fallback else None,
+            shows=[masked.hiding(show) for show in shows] if blind else shows,
+            sandbox=not in_process, dry=dry_run, before_lung=before_lung, settings=settings,
+            operator_name=operator, notes=notes, rest=rest, calibration=calibrated,
+            fallback=FALLBACK if fallback else None,
         )  # fmt: skip
     reason = masked.hidden(done.reason) if blind else done.reason
     emit(
@@ -257,10 +246,7 @@ def selftest(
 
 @app.command()
 def conformance(
-    port: Annotated[str | None, typer.Option(help="Serial port of the device; see `run`.")] = None,
-    vectors: Annotated[
-        bool, typer.Option("--vectors", help="Print frames for whoever writes firmware.")
-    ] = False,
+    port: Port,
     json: JsonFile = None,
 ) -> None:
     """Does a device follow PROTOCOL.md? Exit code 1 if a line of it does not hold.
@@ -269,14 +255,8 @@ def conformance(
 
     Example: `ventbench-hardware conformance --port /dev/ttyACM0`
     """
-    from hardware_eval.wire import conformance as judge
-
-    if vectors:
-        print(judge.vectors())
-        return
-    if port is None:
-        raise InputError("--port: give the device's serial port, such as /dev/ttyACM0")
     from hardware_eval.results import evaluate as ev
+    from hardware_eval.wire import conformance as judge
 
     shown = told(json)
     transport, clock = ev.carrier(port)
@@ -320,19 +300,34 @@ def compare(
     ] = True,
     json: JsonFile = None,
 ) -> None:
-    """Show where simulators and the lung part, by lung and waveform, and diagnose it.
+    """Show how far simulators and the lung part by lung, and diagnose it.
 
     Example: `ventbench-hardware compare runs/hardware --out runs/mismatch`
     """
-    from hardware_eval.results import compare as comparison
+    from hardware_eval.results.replay import recorded_breaths, scored_plants
+    from ventbench.open_loop_report import mean_errors, summary
 
-    breaths = comparison.recorded_breaths(recorded, log)
-    done = comparison.compare(breaths, simulator=plant, diagnose=diagnose)
-    if out is not None:
-        for lung, diagnosis in done.diagnoses.items():
-            diagnosis.save(out / lung)
-    emit(done.as_dict(), json)
-    print(done, file=told(json))
+    breaths = recorded_breaths(recorded, log)
+    tested = scored_plants(plant, list(breaths.by_lung_index))
+    error = mean_errors(tested.pressures(breaths), breaths)
+    lungs = {lung: summary("", error[index]) for lung, index in breaths.by_lung_index.items()}
+    diagnoses = {}
+    if diagnose:
+        from ventbench.diagnosis.diagnose import diagnose as run_diagnosis
+
+        for lung in lungs:
+            diagnoses[lung] = run_diagnosis(breaths, simulator=tested, lung=lung)
+            if out is not None:
+                diagnoses[lung].save(out / lung)
+    found = {lung: diagnosis.as_dict() for lung, diagnosis in diagnoses.items()}
+    emit({"simulator": tested.name, "unit": "cmH2O", "lungs": lungs, "diagnoses": found}, json)
+    to = told(json)
+    print(f"open-loop MAE of the {tested.name} simulators, cmH2O", file=to)
+    for lung, figures in lungs.items():
+        shown = "-" if figures["mae"] is None else f"{figures['mae']:.2f}"
+        print(f"  {lung}: {shown} ({figures['breaths']} breaths)", file=to)
+    for lung, diagnosis in diagnoses.items():
+        print(f"{lung}: {diagnosis}", file=to)
 
 
 @app.command()
@@ -422,7 +417,7 @@ def demo(
         sandbox=not in_process, tell=lambda text: print(text, file=to, flush=True),
     )  # fmt: skip
     emit(done.as_dict(), json)
-    print(f"\n{done}", file=to)
+    print(f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}", file=to)
     if not done.better:
         raise typer.Exit(1)
 
@@ -441,11 +436,11 @@ def replay(
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Show a session again, and compute its errors and timing from the raw log.
+    """Show a session again, compute its timing from the raw log, and check a record by it.
 
     Example: `ventbench-hardware replay runs/hardware`
     """
-    from hardware_eval.results.compare import replay as run_replay
+    from hardware_eval.results.replay import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
     emit(report.as_dict(), json)

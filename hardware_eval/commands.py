@@ -39,9 +39,7 @@ def told(json: Path | None) -> TextIO:
 
 
 @contextlib.contextmanager
-def bench_on(
-    port: str, *, yes: bool, control: Path | None = None
-) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
+def bench_on(port: str, *, yes: bool) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
     """A bench with a person at it, whose keys are stops; the line is released at the end."""
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench
@@ -50,7 +48,7 @@ def bench_on(
 
     line = ev.connect(port)
     try:
-        person = ConsoleOperator(yes=yes, control=control, device=line.device)
+        person = ConsoleOperator(yes=yes)
         with keys(person):
             yield line, Bench(line.client, line.clock, DEFAULT, person), person
     finally:
@@ -113,9 +111,6 @@ def calibrate(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="The device's calibration; parts are added to it.")
     ] = Path("calibration.json"),
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also draw all parts, as a PNG.")
-    ] = None,
     yes: Yes = False,
     json: JsonFile = None,
 ) -> None:
@@ -139,8 +134,6 @@ def calibrate(
         )
     saved = calibration.Calibration(device, {**kept, part: made}).save(out)
     emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
-    if plot is not None:
-        files.write_atomically(plot, lambda file: file.write(saved.plot_png()))
     to = told(json)
     print(made, file=to)
     if part == "leak":

@@ -8,7 +8,6 @@ simulator and runs on the same lung. Only then the seal is opened. Nothing in be
 
 from __future__ import annotations
 
-import html
 import subprocess
 import sys
 import time
@@ -21,19 +20,21 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.collect import collect
-from hardware_eval.bench.loop import Bench, Operator, SilentOperator, run_once
+from hardware_eval.bench.loop import Bench, Operator, SilentOperator
 from hardware_eval.bench.plan import Plan, make_plan
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.bench.safety import DEFAULT
+from hardware_eval.bench.session import dry_run
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, conceal, reveal
-from hardware_eval.planned import plan_controller
+from hardware_eval.planned import PlannedController, plan_controller
 from hardware_eval.results import evaluate as ev
-from hardware_eval.results.compare import Comparison, compare, scored_plants
 from hardware_eval.results.evaluate import Evaluation, Line
+from hardware_eval.results.replay import scored_plants
 from hardware_eval.wire.client import Client
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.diagnosis.diagnose import diagnose
 from ventbench.entries.folder import open_submission
 from ventbench.task.interfaces import Plant
 
@@ -64,12 +65,11 @@ class Demo:
     words: str  #: what the lung was drawn from.
     lung: str  #: its label.
     commitment: str  #: hash of the sealed answer, published first.
-    #: P, I, D of the feedback before and after the correction, %/cmH2O.
+    #: P and I of the feedback before and after the correction, %/cmH2O.
     gains: tuple[tuple[float, ...], tuple[float, ...]]
     #: error of the entry on the emulator of the plain simulator, by PIP.
     simulated: dict[float, float]
     measured: dict[float, float]  #: its error on the lung that conceals something, by PIP.
-    comparison: Comparison  #: simulators against the collected recording.
     verdict: str  #: of the diagnosis.
     named: dict[str, dict[str, float]]  #: mechanisms that it names, with their parameters.
     #: held-out open-loop error before, refitted and after the correction.
@@ -77,7 +77,7 @@ class Demo:
     predicted: float  #: error of the replanned entry on the corrected simulator, mean over PIPs.
     retuned: dict[float, float]  #: error of the replanned entry on the lung, by PIP.
     truth: dict[str, Any]  #: what the seal held.
-    folder: Path  #: where everything lies.
+    steps: tuple[str, ...]  #: what was done, with its figures, a sentence each.
     seconds: float  #: duration.
 
     @property
@@ -112,59 +112,20 @@ class Demo:
                 "truth": self.truth,
                 "right": self.right,
                 "better": self.better,
+                "steps": self.steps,
                 "seconds": self.seconds,
             }
         )
 
-    def steps(self) -> list[tuple[str, str]]:
-        """Title and figures of every step."""
-        named = "; ".join(_mechanism(name, values) for name, values in self.named.items())
-        truth = _mechanism(self.truth["name"], self.truth["parameters"])
-        before, refit, after = self.open_loop
-        first, second = (" ".join(f"{gain:g}" for gain in gains) for gains in self.gains)
-        return [
-            ("A lung is sealed", f"{self.lung}; commitment {self.commitment[:16]}..."),
-            (
-                "A controller is planned on the simulator",
-                f"{_mean(self.simulated):.2f} cmH2O there; feedback P I D = {first}",
-            ),
-            (
-                "The same controller on the lung",
-                f"{_said(self.measured)}{_against(self.simulated, self.measured, 'simulation')}",
-            ),
-            (
-                "The comparison",
-                f"{len(self.comparison.breaths)} breaths explored; open-loop error "
-                f"{self.comparison.lungs[self.lung].mae:.2f} cmH2O a step",
-            ),
-            ("The diagnosis", f"{self.verdict}: {named or 'no mechanism is named'}"),
-            (
-                "The corrected simulator",
-                f"held-out open-loop error {before:.2f}, refitted {refit:.2f}, corrected "
-                f"{after:.2f}",
-            ),
-            (
-                "The controller is planned again on it",
-                f"{self.predicted:.2f} cmH2O predicted; feedback P I D = {second}",
-            ),
-            (
-                "The replanned controller on the lung",
-                f"{_said(self.retuned)}{_against(self.measured, self.retuned, 'the first')}",
-            ),
-            (
-                "The seal is opened",
-                f"{truth}, {self.truth['strength']}: {'named' if self.right else 'not named'}",
-            ),
-        ]
-
-    def __str__(self) -> str:
-        rows = [f"{k}. {title}: {text}" for k, (title, text) in enumerate(self.steps(), start=1)]
-        return "\n".join([*rows, f"{self.seconds:.0f} s; report: {self.folder / 'report.html'}"])
-
 
 def _mechanism(name: str, parameters: Mapping[str, float]) -> str:
+    """A mechanism and its parameters in words."""
     values = ", ".join(f"{key} {value:.3g}" for key, value in parameters.items())
     return f"{name.replace('_', ' ')} ({values})"
+
+
+def _gains(planned: PlannedController) -> str:
+    return " ".join(f"{gain:g}" for gain in planned.gains)
 
 
 def _mean(errors: Mapping[float, float]) -> float:
@@ -207,7 +168,7 @@ def demo(
         simulator: name of the simulators, which the concealed physics is added to.
         real_time: over a pseudo-terminal in real time; else in this process on a virtual clock.
         sandbox: run entries as in scoring.
-        tell: told every step as it begins.
+        tell: told every step and its figures as it ends.
 
     Raises:
         InputError: if the folder is not empty, or a plan does not finish.
@@ -217,55 +178,71 @@ def demo(
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out} is not empty; choose another --out")
     out.mkdir(parents=True, exist_ok=True)
+    steps: list[str] = []
+
+    def step(title: str, figures: str) -> None:
+        steps.append(f"{title}: {figures}")
+        tell(f"{len(steps)}. {steps[-1]}")
+
     # The public half of the concealed lung: its label and the seal. The plant stays in there.
     hidden = conceal(words, simulator)
     lung, seal = hidden.lung.id, out / "seal.json"
     hidden.write(seal)
     commitment = str(hidden.seal["commitment"])
-    tell(f"1. a lung {lung} is sealed: {commitment[:16]}...")
-    plain = scored_plants(simulator, [lung]).plant(lung)
+    step("A lung is sealed", f"{lung}; commitment {commitment[:16]}...")
+    tested = scored_plants(simulator, [lung])
+    plain = tested.plant(lung)
     planned = plan_controller(plain, pips)
     entry = planned.write(out / "entries", "first")
     plan = _plan("first", lung, pips)
-    tell(f"2. a controller is planned on the simulator: {planned.error:.2f} cmH2O predicted")
     simulated = error_on(SimulatedHal(plain, noise=NOISE, quantum=QUANTUM), entry, lung, pips)
+    step(
+        "A controller is planned on the simulator",
+        f"{_mean(simulated):.2f} cmH2O there; feedback P I = {_gains(planned)}",
+    )
     with _line(hidden.plant, words, simulator, lung, out, real_time) as line:
-        tell("3. it runs on the lung")
         measured = _errors(_evaluate(plan, entry, line, out / "first", sandbox))
-        tell(f"   {_said(measured)}; {_mean(simulated):.2f} cmH2O in simulation")
-        tell(f"4. {breaths} breaths are explored")
+        against = _against(simulated, measured, "simulation")
+        step("The same controller on the lung", f"{_said(measured)}{against}")
         bench = Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=_REST)
-        explored = collect(bench, lung, breaths, out / "explored")
-    tell("5. simulator and lung are compared")
-    compared = compare(explored.breaths, simulator=simulator)
-    diagnosis = compared.diagnoses[lung]
+        explored = collect(bench, lung, breaths, out / "explored").breaths
+        step("The lung is explored", f"{len(explored)} breaths")
+    diagnosis = diagnose(explored, simulator=tested, lung=lung)
     diagnosis.save(out / "diagnosis")
-    corrected: Plant = diagnosis.plants.get(lung, plain)
-    tell(f"6. {str(diagnosis).splitlines()[0]}")
-    replanned = plan_controller(corrected, pips)
+    named = {
+        x.name: {key: estimate.value for key, estimate in x.parameters.items()}
+        for x in diagnosis.mechanisms
+    }
+    said = "; ".join(_mechanism(name, values) for name, values in named.items())
+    step("The diagnosis", f"{diagnosis.verdict}: {said or 'no mechanism is named'}")
+    errors = diagnosis.open_loop
+    open_loop = errors.before.mae, errors.refit.mae, errors.after.mae
+    step(
+        "The corrected simulator",
+        "held-out open-loop error {:.2f}, refitted {:.2f}, corrected {:.2f}".format(*open_loop),
+    )
+    replanned = plan_controller(diagnosis.plants.get(lung, plain), pips)
     second = replanned.write(out / "entries", "replanned")
-    tell(f"7. it is planned again on the corrected one: {replanned.error:.2f} cmH2O predicted")
+    step(
+        "The controller is planned again on it",
+        f"{replanned.error:.2f} cmH2O predicted; feedback P I = {_gains(replanned)}",
+    )
     with _line(hidden.plant, words, simulator, lung, out, real_time) as line:
         again = _plan("replanned", lung, pips)
-        tell("8. it runs on the lung")
         retuned = _errors(_evaluate(again, second, line, out / "second", sandbox))
+    against = _against(measured, retuned, "the first")
+    step("The replanned controller on the lung", f"{_said(retuned)}{against}")
     _, effect = reveal(seal, words)
-    errors = diagnosis.open_loop
-    gains = ((*planned.gains, 0.0), (*replanned.gains, 0.0))
+    truth = _mechanism(effect.name, effect.parameters)
+    found = "named" if effect.name in named else "not named"
+    step("The seal is opened", f"{truth}, {effect.strength}: {found}")
     done = Demo(
-        words, lung, commitment, gains, simulated, measured, compared,
-        diagnosis.verdict,
-        {
-            x.name: {key: estimate.value for key, estimate in x.parameters.items()}
-            for x in diagnosis.mechanisms
-        },
-        (errors.before.mae, errors.refit.mae, errors.after.mae), replanned.error, retuned,
+        words, lung, commitment, (planned.gains, replanned.gains), simulated, measured,
+        diagnosis.verdict, named, open_loop, replanned.error, retuned,
         {"name": effect.name, "strength": effect.strength, "parameters": dict(effect.parameters)},
-        out, time.perf_counter() - began,
+        tuple(steps), time.perf_counter() - began,
     )  # fmt: skip
-    tell(f"9. the seal is opened: {effect.name}")
     files.write_json(out / "demo.json", done.as_dict())
-    files.write_text(out / "report.html", _report(done))
     return done
 
 
@@ -276,7 +253,7 @@ def _plan(name: str, lung: str, pips: tuple[float, ...]) -> Plan:
 def error_on(
     hal: SimulatedHal, entry: Path, lung: str, pips: tuple[float, ...]
 ) -> dict[float, float]:
-    """Errors of an entry on an emulator in this process, cmH2O, by PIP.
+    """Errors of an entry on an emulator in this process, cmH2O, by PIP; infinite if it stopped.
 
     Args:
         hal: the emulated lung.
@@ -284,20 +261,12 @@ def error_on(
         lung: its label, which the entry is told.
         pips: cmH2O.
     """
-    device = LoopbackDevice(hal)
-    client = Client(device, device.clock)
-    client.hello()
-    bench = Bench(client, device.clock, DEFAULT, SilentOperator(), rest=_REST)
     plan = _plan(entry.name, lung, pips)
     make = ev.controllers([open_submission(str(entry))], plan.track, ev.make_runner(False),
                           real_time=False)  # fmt: skip
-    errors = {}
-    for run in plan.runs:
-        if run.kind == "scored":
-            controller = make(run)
-            errors[run.pip] = run_once(bench, run, controller).error
-            controller.close()
-    return dict(sorted(errors.items()))
+    _, errors = dry_run(plan, make, DEFAULT, _REST, lung=lambda label: hal)
+    by_pip = {pip: error for *_, pip, error in errors}
+    return {pip: by_pip.get(pip, float("inf")) for pip in pips}
 
 
 def _evaluate(plan: Plan, entry: Path, line: Line, out: Path, sandbox: bool) -> Evaluation:
@@ -353,53 +322,3 @@ def _line(
         emulator.wait(_STARTS_S)
         if emulator.stdout is not None:
             emulator.stdout.close()
-
-
-_STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:60rem;padding:0 1rem;
-color:#1b1f24;background:#fff}h1{font-size:1.6rem}ol{padding-left:1.4rem}li{margin:.4rem 0}
-table{border-collapse:collapse;margin:1rem 0}
-th,td{padding:.3rem .8rem;text-align:right;border-bottom:1px solid #d7dce2}
-th:first-child,td:first-child{text-align:left}.note{color:#57606a}
-@media(prefers-color-scheme:dark){body{background:#14181d;color:#e6e9ed}td,th{border-color:#39414b}}
-"""
-
-
-def _report(done: Demo) -> str:
-    """One page: the steps, the errors by PIP, the distance, and what was named."""
-    steps = "".join(
-        f"<li><b>{html.escape(title)}.</b> {html.escape(text)}</li>" for title, text in done.steps()
-    )
-    rows = "".join(
-        f"<tr><td>{pip:g}</td>"
-        + "".join(
-            f"<td>{errors[pip]:.2f}</td>" if np.isfinite(errors[pip]) else "<td>stopped</td>"
-            for errors in (done.simulated, done.measured, done.retuned)
-        )
-        + "</tr>"
-        for pip in done.simulated
-    )
-    heads = "".join(f"<th>{name}</th>" for name in ("in simulation", "on the lung", "replanned"))
-    waves = "".join(
-        f"<tr><td>{html.escape(name)}</td><td>{x.breaths}</td><td>{x.mae:.2f}</td>"
-        f"<td>{x.bias:+.2f}</td></tr>"
-        for name, x in done.comparison.waveforms[done.lung].items()
-    )
-    sentences = "".join(
-        f"<p>{html.escape(line)}</p>"
-        for line in str(done.comparison.diagnoses[done.lung]).splitlines()
-    )
-    return (
-        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport "
-        f'content="width=device-width"><title>The loop closed: {html.escape(done.lung)}</title>'
-        f"<style>{_STYLE}</style><h1>The loop closed on an emulated {html.escape(done.lung)}</h1>"
-        "<p class=note>Mean |pressure - target| over the scored inspirations, cmH2O: lower is "
-        "better. The lung is emulated in software behind the real wire protocol.</p>"
-        f"<ol>{steps}</ol><table><tr><th>PIP, cmH2O</th>{heads}</tr>{rows}</table>"
-        "<h2>Open-loop distance by waveform</h2><table><tr><th>plateau, "
-        f"cmH2O</th><th>breaths</th><th>error a step</th><th>bias</th></tr>{waves}</table>"
-        f"<h2>The diagnosis in its own words</h2>{sentences}"
-        '<p><a href="diagnosis/report.html">its report</a>, <a href="demo.json">all figures</a>, '
-        f'<a href="seal.json">the seal</a>; the words were "{html.escape(done.words)}".</p>'
-        "</html>\n"
-    )

@@ -27,7 +27,7 @@ import msgspec
 from proofs.challenge.answer import answer
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.generators import generator
-from proofs.challenge.make import Record, make
+from proofs.challenge.make import make
 from proofs.challenge.questions import Kind
 from proofs.challenge.reveal import Board, board
 from proofs.challenge.run import Diagnoser, Limits, find
@@ -174,7 +174,7 @@ def _drawn(own: Round, content: bytes, label: str) -> Round:
 
 
 def play(
-    own: Round, *, jobs: int = 1, record: Record = None,
+    own: Round, *, jobs: int = 1,
     tell: Callable[..., None] = lambda what, done, count: None,
 ) -> Board:  # fmt: skip
     """Make the cases, let all answer, judge, and write the board; what is finished is kept.
@@ -182,7 +182,6 @@ def play(
     Args:
         own: round that is drawn.
         jobs: number of cases at once.
-        record: see :data:`~proofs.challenge.make.Record`.
         tell: called with what is done, how much of it, and ``count``, of how much.
 
     Raises:
@@ -201,7 +200,7 @@ def play(
     for folder, (world, count) in zip(folders, own.frozen.worlds.items(), strict=True):
         if not folder.sealed.exists():
             make(own.seed, folder.path, own.frozen.kind, count, jobs=jobs, source=world,
-                 record=record, progress=partial(tell, f"make {world}", count=count))  # fmt: skip
+                 progress=partial(tell, f"make {world}", count=count))  # fmt: skip
         for name in own.frozen.diagnosers:
             tell_this = partial(tell, f"{name}, {world}")
             answer(folder, own.diagnoser(name), limits=limits, jobs=jobs, progress=tell_this)

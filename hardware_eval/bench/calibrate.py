@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-import io
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -19,17 +18,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from hardware_eval.bench.drive import Commands, Driven, drive
-from hardware_eval.bench.identity import KnownLung, measured_lung, white_noise
+from hardware_eval.bench.identity import (
+    Interval,
+    KnownLung,
+    interval,
+    measured_lung,
+    white_noise,
+)
 from hardware_eval.bench.loop import Bench
 from hardware_eval.bench.selftest import hold, programs
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Reading
 from ventbench.base import files
 from ventbench.base.arrays import Floats
-from ventbench.base.errors import InputError, require
+from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 
@@ -59,30 +63,13 @@ _LEAD, _ABOVE, _OWN, _COUNT, _LARGER, _HOLD_S = 3, 2, 3, 2, 1.5, 3.0
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A value and its 95 % interval; NaN where the series does not tell."""
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.value:.4g} ({self.low:.4g} to {self.high:.4g})"
-
-
-@dataclass(frozen=True)
 class Fit:
     """The line through a series."""
 
-    intercept: Estimate  #: reading where the reference is 0.
-    slope: Estimate  #: reading per reference; NaN if the reference is the same throughout.
-    hysteresis: Estimate  #: mean reading from above less that from below; NaN if only one is there.
+    intercept: Interval  #: reading where the reference is 0.
+    slope: Interval  #: reading per reference; NaN if the reference is the same throughout.
+    hysteresis: Interval  #: mean reading from above less that from below; NaN if only one is there.
     residual: float  #: standard deviation of the readings about the line.
-
-
-def _student(value: float, error: float, freedom: float) -> Estimate:
-    half = float(stats.t.ppf(0.975, freedom)) * error if freedom > 0 else math.nan
-    return Estimate(value, value - half, value + half)
 
 
 def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit:
@@ -105,10 +92,10 @@ def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit
     scatter = float(np.sum((residual / error) ** 2)) / max(freedom, 1)
     covariance = np.linalg.inv(design.T @ design) * max(scatter, 1.0)
     found = [
-        _student(float(x), math.sqrt(v), freedom)
+        interval(x, math.sqrt(v), freedom)
         for x, v in zip(solution, np.diag(covariance), strict=True)
     ]
-    unknown = Estimate(math.nan, math.nan, math.nan)
+    unknown = Interval(math.nan)
     both = [x for x in np.unique(reference) if len(set(above[reference == x])) == 2]
     apart = np.array(
         [
@@ -120,7 +107,7 @@ def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit
     hysteresis = unknown
     if len(apart) > 1:
         each = float(apart.std(ddof=1)) / math.sqrt(len(apart))
-        hysteresis = _student(float(apart.mean()), each, len(apart) - 1)
+        hysteresis = interval(float(apart.mean()), each, len(apart) - 1)
     spread = math.sqrt(float(residual @ residual) / max(freedom, 1))
     return Fit(found[0], unknown if level else found[1], hysteresis, spread)
 
@@ -155,7 +142,7 @@ class Part:
     def __str__(self) -> str:
         if self.kind == "lung":
             R, elastance = (
-                Estimate(math.exp(x), math.exp(x - 1.96 * e), math.exp(x + 1.96 * e))
+                Interval(math.exp(x), math.exp(x - 1.96 * e), math.exp(x + 1.96 * e))
                 for x, e in zip(self.reading, self.error, strict=True)
             )
             return f"lung: {self.lung} has R {R} cmH2O/(L/s), 1/C {elastance} cmH2O/L"
@@ -370,40 +357,6 @@ class Calibration:
         (R, elastance), (R_error, elastance_error) = part.reading, part.error
         return KnownLung(part.lung, (R, elastance), (R_error, elastance_error))
 
-    def plot_png(self) -> bytes:
-        """Draw each series about its line: circles from below, triangles from above.
-
-        Raises:
-            InputError: if matplotlib is missing.
-        """
-        require("matplotlib")
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        shown = [part for part in self.parts.values() if part.kind != "lung"]
-        figure = Figure(figsize=(4.0 * max(len(shown), 1), 3.4), layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.suptitle(f"device {self.device['device_id']}, SHA-256 {self.sha256[:12]}")
-        for place, part in enumerate(shown, 1):
-            axes, (x_unit, y_unit), line = figure.add_subplot(1, len(shown), place), *(
-                PARTS[part.kind], part.fit,
-            )  # fmt: skip
-            x, y, error, above = map(np.array, (part.reference, part.reading, part.error,
-                                                part.above))  # fmt: skip
-            slope = 0.0 if math.isnan(line.slope.value) else line.slope.value
-            departure = y - line.intercept.value - slope * x
-            if np.ptp(x) == 0.0:
-                x = np.arange(1.0, len(x) + 1)
-            for marker, these in (("o", above == 0), ("v", above == 1)):
-                axes.errorbar(x[these], departure[these], 1.96 * error[these], None, marker)
-            axes.axhline(0.0, color="0.6")
-            axes.set_title(f"{part.kind}, {part.date[:10]}")
-            axes.set_xlabel("mean" if slope == 0.0 else f"reference, {x_unit}")
-            axes.set_ylabel(f"reading - line, {y_unit}")
-        with io.BytesIO() as file:
-            figure.savefig(file, format="png", dpi=110)
-            return file.getvalue()
-
     def about(self) -> dict[str, Any]:
         """What a record says of it."""
         return {"sha256": self.sha256, "dates": {k: x.date for k, x in self.parts.items()}}
@@ -465,7 +418,7 @@ def load(
     return Calibration(own, parts, digest)
 
 
-def lost_flow(leak: Part, lung: str) -> Estimate:
+def lost_flow(leak: Part, lung: str) -> Interval:
     """Leak of a closed lung by its fall of pressure and the label's C, mL/s."""
     slope, C = leak.fit.slope, parse_lung(lung).C
-    return Estimate(-C * slope.value, -C * slope.high, -C * slope.low)
+    return Interval(-C * slope.value, -C * slope.high, -C * slope.low)

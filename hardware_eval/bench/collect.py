@@ -21,7 +21,7 @@ from hardware_eval.bench import safety
 from hardware_eval.bench.loop import Bench, BreathLog, EmergencyStop, answer_by, sample_of
 from hardware_eval.bench.plan import PlannedRun
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
-from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
+from hardware_eval.wire.client import LinkError, NoAnswerError, RefusedError
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths

@@ -8,34 +8,18 @@ import math
 import os
 import re
 import select
-import socket
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, View
+from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
-from hardware_eval.emulation.faults import parse
 from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
-
-if TYPE_CHECKING:
-    from hardware_eval.emulation.loopback import LoopbackDevice
-
-#: What the emulator is told for a perturbation; see :mod:`hardware_eval.emulation.emulator`. A
-#: leak as if the expiratory valve stood open by a twentieth; a tube pinched to three times the
-#: resistance.
-EMULATED = {"leak": "leak@0-60:0.05", "pinch": "pinched@0-60:3"}
-
-#: What the operator does by hand.
-_BY_HAND = {
-    "leak": ("open the leak port NOW", "close the leak port"),
-    "pinch": ("pinch the tube NOW", "let the tube go"),
-}
 
 #: Time that a person takes at least to answer what has just been shown, s.
 REACTION = 0.2
@@ -54,21 +38,11 @@ class ConsoleOperator:
 
     Args:
         yes: confirm everything; for an emulator and for tests.
-        control: control socket of an emulator, which then does perturbations by itself.
-        device: a device that is emulated in this process, to which the same applies.
         reaction: time after a question was shown in which a key cannot be an answer yet, s.
     """
 
-    def __init__(
-        self,
-        *,
-        yes: bool = False,
-        control: Path | None = None,
-        device: LoopbackDevice | None = None,
-        reaction: float = REACTION,
-    ) -> None:
-        self._yes, self._control, self._device = yes, control, device
-        self._reaction = reaction
+    def __init__(self, *, yes: bool = False, reaction: float = REACTION) -> None:
+        self._yes, self._reaction = yes, reaction
         self._terminal: int | None = None
 
     @contextlib.contextmanager
@@ -157,32 +131,15 @@ class ConsoleOperator:
         """Print a line."""
         print(text, flush=True)
 
-    def disturb(self, perturbation: str, on: bool) -> None:
-        """Have a leak opened or the tube pinched, by hand or by the emulator."""
-        if self._device is not None:
-            hal: Any = self._device.service.hal
-            hal.faults = (parse(EMULATED[perturbation], self._device.clock.now()),) if on else ()
-            return
-        if self._control is not None:
-            text = EMULATED[perturbation] if on else "clear"
-            # A session must not fail because nobody disturbs it.
-            with (
-                contextlib.suppress(OSError),
-                socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender,
-            ):
-                sender.sendto(text.encode(), str(self._control))
-            return
-        print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
-
 
 class Blind:
-    """Operator and view that call entries by numbers, whatever is asked, told or shown.
+    """An operator to whom entries are called by numbers, whatever is asked, told or shown.
 
     Attributes:
         called: what each entry is called, by its name.
     """
 
-    def __init__(self, operator: Operator, view: View, plan: Plan) -> None:
+    def __init__(self, operator: Operator, plan: Plan) -> None:
         """Draw the numbers from the plan's seed, so that a session that continues keeps them."""
         order = np.random.default_rng([plan.seed, 1]).permutation(len(plan.entries))
         self.called = {
@@ -190,7 +147,7 @@ class Blind:
         }
         names = "|".join(re.escape(x) for x in sorted(self.called, key=len, reverse=True))
         self._names = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
-        self._operator, self._view = operator, view
+        self._operator = operator
 
     def hidden(self, text: str) -> str:
         """A text without names of entries."""
@@ -208,39 +165,36 @@ class Blind:
         """Whether the emergency stop has been pressed."""
         return self._operator.stop()
 
-    def disturb(self, perturbation: str, on: bool) -> None:
-        """Open a leak or pinch the tube now, or undo it."""
-        self._operator.disturb(perturbation, on)
+    def hiding(self, show: Show) -> Show:
+        """What shows breaths, without the names of entries."""
 
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Show a breath."""
-        self._view.breath(replace(run, entry=self.hidden(run.entry)), breath, done, total)
+        def shown(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+            show(replace(run, entry=self.hidden(run.entry)), breath, done, total)
+
+        return shown
 
 
-class TerminalView:
-    """One line a breath: where the plan is, the error, and the inspiration as bars."""
-
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Print a breath."""
-        inspired = np.array(breath.pressure[: protocol.INSPIRATION_STEPS])
-        inspired = inspired[np.isfinite(inspired)]
-        if not inspired.size:
-            return
-        error = float(np.mean(np.abs(inspired - run.pip)))
-        share = (inspired - protocol.PEEP) / (run.pip - protocol.PEEP)
-        heights = np.clip(share * 6.5, 0, len(_BARS) - 1).astype(int)  # the target is at 6.5 of 8
-        worst = 1e3 * max(breath.late)
-        print(
-            f"{done + 1:4d}/{total} {run.kind:9s} {run.entry:16.16s} {run.lung:6s} "
-            f"PIP {run.pip:2.0f} #{run.repeat:<2d} error {error:6.2f} "
-            f"peak {inspired.max():5.1f} late {worst:4.1f} ms "
-            f"|{''.join(_BARS[h] for h in heights)}|",
-            flush=True,
-        )
+def show_bars(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+    """Print a line: where the plan is, the error, and the inspiration as bars."""
+    inspired = np.array(breath.pressure[: protocol.INSPIRATION_STEPS])
+    inspired = inspired[np.isfinite(inspired)]
+    if not inspired.size:
+        return
+    error = float(np.mean(np.abs(inspired - run.pip)))
+    share = (inspired - protocol.PEEP) / (run.pip - protocol.PEEP)
+    heights = np.clip(share * 6.5, 0, len(_BARS) - 1).astype(int)  # the target is at 6.5 of 8
+    worst = 1e3 * max(breath.late)
+    print(
+        f"{done + 1:4d}/{total} {run.kind:9s} {run.entry:16.16s} {run.lung:6s} "
+        f"PIP {run.pip:2.0f} #{run.repeat:<2d} error {error:6.2f} "
+        f"peak {inspired.max():5.1f} late {worst:4.1f} ms "
+        f"|{''.join(_BARS[h] for h in heights)}|",
+        flush=True,
+    )
 
 
 class RerunView:
-    """Sends each breath to a rerun viewer or file.
+    """Sends breaths to a rerun viewer or file.
 
     Args:
         target: ``"live"`` for a viewer that is started, else the path of an ``.rrd`` file.
@@ -284,7 +238,7 @@ class RerunView:
 
 
 class McapView:
-    """Writes each breath to an MCAP file, for Foxglove and its kin: JSON, one message a step.
+    """Writes breaths to an MCAP file, for Foxglove and its kin: JSON, one message a step.
 
     The topic ``/breath`` has the samples in the log's units, null where there is none, and what
     runs; times are those of the bench, from 0.
@@ -330,20 +284,3 @@ class McapView:
 
 def _told(run: PlannedRun) -> str:
     return f"{run.kind} {run.entry} {run.lung} PIP {run.pip:g} #{run.repeat}"
-
-
-class Views:
-    """Several views as one."""
-
-    def __init__(self, *views: Any) -> None:
-        self._views = views
-
-    def close(self) -> None:
-        """Close those that are files."""
-        for view in self._views:
-            getattr(view, "close", lambda: None)()
-
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Show a breath in each."""
-        for view in self._views:
-            view.breath(run, breath, done, total)

@@ -19,7 +19,7 @@ from hardware_eval.bench.loop import (
     no_collection,
     sample_of,
 )
-from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
+from hardware_eval.wire.client import LinkError, NoAnswerError, RefusedError
 from ventbench.base.arrays import Floats
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy import stats
 from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
@@ -29,6 +31,26 @@ from ventbench.task.lungs import lung as parse_lung
 #: Steps from a command to the sample that its flow is in: at once, and two later as in the
 #: recordings.
 LAGS = (1, 2, 3)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value with its 95 % interval; NaN where there is none."""
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+    def __str__(self) -> str:
+        if math.isnan(self.low):
+            return f"{self.value:.4g}"
+        return f"{self.value:.4g} ({self.low:.4g} to {self.high:.4g})"
+
+
+def interval(mean: Any, error: Any, freedom: Any) -> Interval:
+    """The 95 % interval of a mean by Student's t; none without a degree of freedom."""
+    half = float(stats.t.ppf(0.975, freedom)) * float(error) if freedom > 0 else math.nan
+    return Interval(float(mean), float(mean) - half, float(mean) + half)
 
 
 def identified(

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -24,12 +24,11 @@ from hardware_eval import realtime
 from hardware_eval.bench import fallback, safety
 from hardware_eval.bench.controllers import ControllerFailedError, LiveController
 from hardware_eval.bench.fallback import FallbackSettings
-from hardware_eval.bench.plan import PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
+from hardware_eval.bench.plan import PlannedRun
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.realtime import Clock
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, LinkError, NoAnswerError, RefusedError
 from hardware_eval.wire.messages import CAUSES, Flag, Reading
-from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
 from ventbench.base.arrays import Floats
 from ventbench.task import protocol, waveform
 from ventbench.task.lungs import lung as parse_lung
@@ -74,10 +73,6 @@ class Operator(Protocol):
         """Whether the emergency stop has been pressed; called at every step."""
         ...
 
-    def disturb(self, perturbation: str, on: bool) -> None:
-        """Open a leak or pinch the tube now, or undo it."""
-        ...
-
 
 class SilentOperator:
     """Confirms everything; for dry runs, tests and ``--yes``."""
@@ -92,17 +87,6 @@ class SilentOperator:
     def stop(self) -> bool:
         """No key to press."""
         return False
-
-    def disturb(self, perturbation: str, on: bool) -> None:
-        """No hand to do it."""
-
-
-class View(Protocol):
-    """Shows a session as it runs; called while the lung breathes out."""
-
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Show a breath."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -140,6 +124,11 @@ class BreathLog:
         about = {"run": run.number, "attempt": attempt, "breath": breath, "entry": run.entry}
         label = {"kind": run.kind, "lung": run.lung, "pip": run.pip, "repeat": run.repeat}
         return {"type": "breath", **about, **label, **rounded, "u_out": list(self.u_out)}
+
+
+#: Shows a breath of a run while the lung breathes out; told how many runs of the plan are done, and
+#: how many there are.
+Show = Callable[[PlannedRun, BreathLog, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -206,7 +195,7 @@ class Bench:
     clock: Clock  #: of the device's time or a virtual one.
     settings: SafetySettings  #: safety.
     operator: Operator  #: the person.
-    view: View | None = None  #: shows breaths; None for none.
+    shows: Sequence[Show] = ()  #: what shows breaths.
     rest: float = REST_S  #: time at rest before each run, s.
     #: bounds of the controller that takes over; None for none.
     fallback: FallbackSettings | None = None
@@ -257,7 +246,6 @@ class _Loop:
         self._breaths: list[BreathLog] = []
         self._asked = self._late_answers = self._limited = self._unanswered = 0
         self._command = (0.0, 1)
-        self._disturbed = False
 
     def run(self) -> RunResult:
         """All breaths."""
@@ -319,7 +307,6 @@ class _Loop:
         if bench.operator.stop():
             bench.client.vent()
             raise EmergencyStop
-        self._disturb(breath, step)
         try:
             reading: Reading | None = bench.client.heartbeat()
         except NoAnswerError:
@@ -425,18 +412,9 @@ class _Loop:
             return self._vented_by_device(flags)
         return self._ended("aborted", str(error))
 
-    def _disturb(self, breath: int, step: int) -> None:
-        """Announce and undo the perturbation of a perturbed run."""
-        tube = self._run.perturbation
-        if tube and not self._disturbed and (breath, step) == (PERTURBED_BREATH, PERTURBED_STEP):
-            self._bench.operator.disturb(tube, True)
-            self._disturbed = True
-
     def _ended(
         self, status: str, reason: str, vented_after: float = math.nan, held_up: bool = False
     ) -> RunResult:
-        if self._disturbed:
-            self._bench.operator.disturb(self._run.perturbation, False)
         return RunResult(
             status, reason, self._safety.trips, tuple(self._breaths), self._late_answers,
             self._limited, vented_after, held_up, self._asked, self._controller.longest_answer,

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hardware_eval.bench.controllers import ControllerFailedError, MakeController, control_pid
 from hardware_eval.bench.loop import (
@@ -25,8 +25,10 @@ from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.safety import SafetySettings
 from hardware_eval.bench.selftest import PARTS, Sheet
 from hardware_eval.realtime import take_priority
-from hardware_eval.wire.client import Client
-from hardware_eval.wire.parser import LinkError
+from hardware_eval.wire.client import Client, LinkError
+
+if TYPE_CHECKING:
+    from hardware_eval.emulation.simulated import SimulatedHal
 
 #: Runs that the bench spoils in a row before the session gives up.
 MAX_ATTEMPTS = 3
@@ -192,8 +194,8 @@ def _one(
 
     def write(index: int, breath: BreathLog) -> None:
         log.append(breath.line(run, attempt, index))
-        if bench.view is not None:
-            bench.view.breath(run, breath, done, total)
+        for show in bench.shows:
+            show(run, breath, done, total)
 
     # A disk can take longer than a step; the thread has the loop's priority, or Python's lock would
     # wait for it.
@@ -232,9 +234,10 @@ def _run_line(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[s
 
 
 def dry_run(
-    plan: Plan, make_controller: MakeController, settings: SafetySettings, rest: float = REST_S
-) -> tuple[list[str], list[tuple[str, str, float, float]]]:
-    """Run every distinct run of a plan once on the frozen simulators, by the same code.
+    plan: Plan, make_controller: MakeController, settings: SafetySettings, rest: float = REST_S,
+    lung: Callable[[str], SimulatedHal] | None = None,
+) -> tuple[list[str], list[tuple[str, str, float, float]]]:  # fmt: skip
+    """Run every distinct run of a plan once on emulated lungs, by the same code as on a bench.
 
     Repetitions are left out: on a simulator they are the same. Lungs start as on the bench, vented
     for the same time.
@@ -244,6 +247,7 @@ def dry_run(
         make_controller: makes the controller of a run.
         settings: of the safety.
         rest: time at rest before each run, s.
+        lung: the emulated lung of a label; if not given, that of the frozen simulators.
 
     Returns:
         What went wrong, one sentence each, empty if the plan is safe there; and entry, lung, PIP
@@ -258,11 +262,11 @@ def dry_run(
     mounted, bench = "", None
     for run in plan.runs:
         key = (run.kind == "control", run.entry, run.lung, run.pip)
-        if key in seen or run.kind == "perturbed":
+        if key in seen:
             continue
         seen.add(key)
         if bench is None or run.lung != mounted:
-            device, mounted = LoopbackDevice(simulated_lung(run.lung)), run.lung
+            device, mounted = LoopbackDevice((lung or simulated_lung)(run.lung)), run.lung
             client = Client(device, device.clock)
             client.hello()
             bench = Bench(client, device.clock, settings, SilentOperator(), rest=rest)

@@ -27,12 +27,14 @@ from hardware_eval.wire.messages import (
     Command,
     Counters,
     DeviceMessage,
+    Fault,
     Flag,
     Heartbeat,
     Hello,
     HostMessage,
     Mode,
     Packet,
+    ParserState,
     Reading,
     Reason,
     Refusal,
@@ -40,9 +42,9 @@ from hardware_eval.wire.messages import (
     Vent,
     Welcome,
     encode,
+    feed_bytes,
     microseconds,
 )
-from hardware_eval.wire.parser import Fault, ParserState, feed_bytes
 from ventbench.task import protocol
 
 #: Version of this program: what a device tells as its firmware.
@@ -124,28 +126,18 @@ class Hal(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
-    """Limits of a device, fixed when its program starts."""
+    """What is fixed when a device's program starts."""
 
-    #: pressure above which the device vents, cmH2O.
-    pressure_limit: float = protocol.SAFETY_PRESSURE
-    u_in_limit: float = protocol.U_MAX  #: largest command, %.
-    #: time without an acceptable command after which it vents, s, at most :data:`WATCHDOG`.
-    watchdog: float = WATCHDOG
+    pressure_limit: float = protocol.SAFETY_PRESSURE  #: above which the device vents, cmH2O.
 
     def __post_init__(self) -> None:
-        """Check the limits.
+        """Check the limit.
 
         Raises:
-            ValueError: if a limit is outside what is safe.
+            ValueError: if it is outside what is safe.
         """
-        if not 0.0 < self.watchdog <= WATCHDOG:
-            raise ValueError(
-                f"watchdog {self.watchdog} s: it must be above 0 and at most {WATCHDOG}"
-            )
         if not 0.0 < self.pressure_limit <= 100.0:
             raise ValueError(f"pressure limit {self.pressure_limit} cmH2O is outside 0..100")
-        if not 0.0 < self.u_in_limit <= protocol.U_MAX:
-            raise ValueError(f"limit {self.u_in_limit} % of u_in is outside 0..{protocol.U_MAX:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +192,7 @@ def step(
         The next state, whose ``u_in`` and ``u_out`` the valves must take at once, and the bytes to
         send.
     """
-    instant, watchdog = microseconds(now), microseconds(settings.watchdog)
+    instant, watchdog = microseconds(now), microseconds(WATCHDOG)
     held_up = instant - state.stepped
     state = replace(_sampled(state, sample), stepped=instant)
     if state.mode is Mode.RUNNING:
@@ -265,7 +257,7 @@ def _received(
             pressure_limit=limit,
         )  # fmt: skip
         return state, Welcome(
-            PROTOCOL_VERSION, FIRMWARE, identity.capabilities, settings.watchdog, limit,
+            PROTOCOL_VERSION, FIRMWARE, identity.capabilities, WATCHDOG, limit,
             identity.device_id, identity.calibration, identity.name,
         )  # fmt: skip
     if packet.session != state.session:
@@ -288,7 +280,7 @@ def _received(
             )
             return reading(armed)
         case Command(u_in, u_out, seen):
-            if u_in > settings.u_in_limit or u_out not in (0, 1):
+            if u_in > protocol.U_MAX or u_out not in (0, 1):
                 state = _counted(_vented(state, Flag.OUT_OF_RANGE), "out_of_range")
                 return refused(state, Reason.OUT_OF_RANGE)
             if state.mode is not Mode.RUNNING:

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 from hardware_eval import realtime
 from hardware_eval.device import deadman
 from hardware_eval.device.program import Hal, Identity, Sample
-from hardware_eval.emulation.faults import FaultKind, LungFault, active
+from hardware_eval.emulation.faults import Fault, FaultKind, active
 from ventbench.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ class EmulatedHal(deadman.SupervisedHal):
             here.close()
             self._end()
             raise
-        self._faults: tuple[LungFault, ...] = tuple(given["faults"])
+        self._faults: tuple[Fault, ...] = tuple(given["faults"])
         self._bus = _Bus(here, identity)
         super().__init__(self._bus, orders, clock)
 
@@ -152,12 +152,12 @@ class EmulatedHal(deadman.SupervisedHal):
         return {**mine, "electronics": self._process.pid}
 
     @property
-    def faults(self) -> tuple[LungFault, ...]:
+    def faults(self) -> tuple[Fault, ...]:
         """What goes wrong; a fault that the lung cannot have is told on stderr."""
         return self._faults
 
     @faults.setter
-    def faults(self, faults: Sequence[LungFault]) -> None:
+    def faults(self, faults: Sequence[Fault]) -> None:
         self._faults = tuple(faults)
         self._bus.send(self._faults)
 

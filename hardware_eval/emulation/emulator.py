@@ -27,7 +27,7 @@ from typing import Any
 from hardware_eval import realtime
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
-from hardware_eval.emulation.faults import AnyFault, Line, LineFault, LungFault, parse
+from hardware_eval.emulation.faults import Fault, FaultKind, Line, LineFaultKind, parse
 from hardware_eval.emulation.firmware import Firmware
 from hardware_eval.emulation.loopback import Actuation
 from hardware_eval.wire.messages import Flag
@@ -56,7 +56,7 @@ class Emulator(Guard):
 
     def __init__(
         self, service: DeviceService | Firmware, *, link: Path | None = None,
-        control: Path | None = None, line_faults: Sequence[LineFault] = (), log: Path | None = None,
+        control: Path | None = None, line_faults: Sequence[Fault] = (), log: Path | None = None,
         begun: float | None = None,
     ) -> None:  # fmt: skip
         """Open the terminal.
@@ -148,9 +148,9 @@ class Emulator(Guard):
             except ValueError as error:
                 print(f"control: {error}", file=sys.stderr, flush=True)
 
-    def add_fault(self, fault: AnyFault) -> None:
+    def add_fault(self, fault: Fault) -> None:
         """Add a fault of the lung or of the line; times on the device's clock."""
-        if isinstance(fault, LungFault):
+        if isinstance(fault.kind, FaultKind):
             hal: Any = self._device.hal
             hal.faults = (*hal.faults, fault)
         else:
@@ -250,7 +250,7 @@ def _emulate(given: argparse.Namespace) -> int:
     from hardware_eval.emulation.electronics import EmulatedHal
 
     faults = [parse(text) for text in given.fault]
-    line_faults = [fault for fault in faults if isinstance(fault, LineFault)]
+    line_faults = [fault for fault in faults if isinstance(fault.kind, LineFaultKind)]
     limit = given.pressure_limit
     try:
         settings = DeviceSettings() if limit is None else DeviceSettings(limit)
@@ -260,7 +260,7 @@ def _emulate(given: argparse.Namespace) -> int:
     sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
     begun = time.monotonic()
     asked = {
-        **about, **sensor, "faults": [x for x in faults if isinstance(x, LungFault)],
+        **about, **sensor, "faults": [x for x in faults if isinstance(x.kind, FaultKind)],
         "log": given.electronics, "normally_open": not given.normally_closed,
         "monostable": float("inf") if given.no_monostable else MONOSTABLE,
     }  # fmt: skip

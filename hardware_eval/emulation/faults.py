@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TypeVar
 
 import numpy as np
 
@@ -61,34 +60,21 @@ class LineFaultKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class LungFault:
-    """A fault of the simulated hardware."""
+class Fault:
+    """A fault of the simulated hardware or of the line."""
 
-    kind: FaultKind  #: what goes wrong.
+    kind: FaultKind | LineFaultKind  #: what goes wrong.
     start: float  #: from when, s on the device's clock.
     end: float = math.inf  #: until when, s.
-    strength: float = 1.0  #: how much; see :class:`FaultKind`.
+    strength: float = 1.0  #: how much; see the kinds.
 
-
-@dataclass(frozen=True, slots=True)
-class LineFault:
-    """A fault of the line; attributes as of :class:`LungFault`."""
-
-    kind: LineFaultKind
-    start: float
-    end: float = math.inf
-    strength: float = 1.0
-
-
-AnyFault = LungFault | LineFault
-FaultT = TypeVar("FaultT", LungFault, LineFault)
 
 _TEXT = re.compile(
     r"(?P<kind>\w+)@(?P<start>[\d.]+)(?:-(?P<end>[\d.]+))?(?::(?P<strength>[-\d.]+))?"
 )
 
 
-def parse(text: str, now: float = 0.0) -> AnyFault:
+def parse(text: str, now: float = 0.0) -> Fault:
     """Read a fault as people write it: ``KIND@START[-END][:STRENGTH]``, seconds from ``now`` on.
 
     Raises:
@@ -109,12 +95,10 @@ def parse(text: str, now: float = 0.0) -> AnyFault:
             f"fault {text!r}: write KIND@START[-END][:STRENGTH], times in s, such as "
             f"leak@10-13:0.1; kinds: {', '.join(kinds)}"
         ) from None
-    if isinstance(kind, FaultKind):
-        return LungFault(kind, now + start, now + end, strength)
-    return LineFault(kind, now + start, now + end, strength)
+    return Fault(kind, now + start, now + end, strength)
 
 
-def active(faults: Iterable[FaultT], now: float) -> dict[object, FaultT]:
+def active(faults: Iterable[Fault], now: float) -> dict[object, Fault]:
     """Faults that act at ``now``, s, by kind; of two of one kind the later of the sequence."""
     return {fault.kind: fault for fault in faults if fault.start <= now < fault.end}
 
@@ -126,7 +110,7 @@ class Line:
         faults: what goes wrong; may be replaced while it runs.
     """
 
-    def __init__(self, faults: Sequence[LineFault] = (), seed: int = 0) -> None:
+    def __init__(self, faults: Sequence[Fault] = (), seed: int = 0) -> None:
         """Start with faults; ``seed`` is that of losses, flips and delays."""
         self.faults = tuple(faults)
         self._random = np.random.default_rng(seed)
@@ -153,7 +137,7 @@ class Line:
         self._latest = max(self._latest, due)  # a line keeps the order
         return self._latest, self._damaged(kinds, data)
 
-    def _damaged(self, kinds: dict[object, LineFault], data: bytes) -> bytes:
+    def _damaged(self, kinds: dict[object, Fault], data: bytes) -> bytes:
         if LineFaultKind.LOSS in kinds and self._random.uniform() < (
             kinds[LineFaultKind.LOSS].strength
         ):

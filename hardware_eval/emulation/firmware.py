@@ -24,7 +24,7 @@ from cobs import cobs
 
 from hardware_eval.device.program import Sample
 from hardware_eval.emulation import electronics
-from hardware_eval.emulation.faults import LungFault
+from hardware_eval.emulation.faults import Fault
 from hardware_eval.wire.messages import (
     FLOW_STEPS,
     PRESSURE_STEPS,
@@ -77,7 +77,7 @@ class Firmware:
         """
         self._command = _command(image)
         self.state, self.lost = Order(), False
-        self._faults: tuple[LungFault, ...] = tuple(given["faults"])
+        self._faults: tuple[Fault, ...] = tuple(given["faults"])
         self._answers: deque[bytes] = deque()
         self._image: subprocess.Popen[bytes] | None = None
         self._ended, self._asking = threading.Event(), threading.Lock()
@@ -139,12 +139,12 @@ class Firmware:
         return self
 
     @property
-    def faults(self) -> tuple[LungFault, ...]:
+    def faults(self) -> tuple[Fault, ...]:
         """What goes wrong with the lung."""
         return self._faults
 
     @faults.setter
-    def faults(self, faults: Sequence[LungFault]) -> None:
+    def faults(self, faults: Sequence[Fault]) -> None:
         self._faults = tuple(faults)
         with self._asking:
             self._sensors.send(self._faults)

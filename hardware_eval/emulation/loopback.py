@@ -9,7 +9,7 @@ from itertools import count
 from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
 from hardware_eval.emulation.faults import Line
 from hardware_eval.realtime import VirtualClock
-from hardware_eval.wire.parser import DisconnectedError
+from hardware_eval.wire.client import DisconnectedError
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,7 @@ from hardware_eval.emulation.cases import (
     random_generator,
     unseal,
 )
-from hardware_eval.emulation.faults import FaultKind, LungFault, active
+from hardware_eval.emulation.faults import Fault, FaultKind, active
 from hardware_eval.wire.messages import Capability
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -74,7 +74,7 @@ class SimulatedHal:
     """A plant as a ventilator; compiles the plant once, before any time passes."""
 
     def __init__(
-        self, plant: Plant, *, name: str = "simulated lung", faults: Sequence[LungFault] = (),
+        self, plant: Plant, *, name: str = "simulated lung", faults: Sequence[Fault] = (),
         noise: float = 0.0, quantum: float = 0.0, highest: float = math.inf, seed: int = 0,
     ) -> None:  # fmt: skip
         """Put a lung at rest at PEEP on the ventilator.
@@ -126,13 +126,13 @@ class SimulatedHal:
         self._rest = vector
         self._reset(faults, seed)
 
-    def at_rest(self, faults: Sequence[LungFault] = (), seed: int = 0) -> SimulatedHal:
+    def at_rest(self, faults: Sequence[Fault] = (), seed: int = 0) -> SimulatedHal:
         """Return the same lung at rest, with other faults; nothing is compiled again."""
         fresh = copy.copy(self)
         fresh._reset(faults, seed)
         return fresh
 
-    def _reset(self, faults: Sequence[LungFault], seed: int) -> None:
+    def _reset(self, faults: Sequence[Fault], seed: int) -> None:
         self.faults = tuple(faults)
         self._random = np.random.default_rng(seed)
         self._state = self._rest
@@ -198,7 +198,7 @@ class SimulatedHal:
             self._restart = 1.0
         self._command = (u_in, u_out)
 
-    def _by(self, now: float, kinds: dict[object, LungFault]) -> tuple[jax.Array, jax.Array]:
+    def _by(self, now: float, kinds: dict[object, Fault]) -> tuple[jax.Array, jax.Array]:
         """State and readings at ``now`` if the present command is held until then."""
         u_in, u_out = self._command
         share, r_scale = float(u_out), 1.0

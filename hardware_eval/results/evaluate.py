@@ -21,7 +21,7 @@ from hardware_eval.bench.controllers import (
     SubmissionController,
 )
 from hardware_eval.bench.fallback import FallbackSettings
-from hardware_eval.bench.loop import REST_S, Bench, Operator, View
+from hardware_eval.bench.loop import REST_S, Bench, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from hardware_eval.emulation.loopback import LoopbackDevice
     from hardware_eval.wire.link import Link
 
-#: Kinds of runs whose lung is as its label says.
-UNDISTURBED = ("ramp", "scored", "control")
+#: Kinds of runs of a plan.
+PLANNED = ("ramp", "scored", "control")
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,6 @@ class Line:
 
     client: Client  #: of the device.
     clock: Clock  #: real, or the loopback device's.
-    #: the device if it is emulated in this process, else None.
-    device: LoopbackDevice | None = None
     port: str = "virtual"  #: what carries the bytes, see :func:`port_kind`.
 
     @property
@@ -134,8 +132,6 @@ def connect(port: str) -> Line:
         LinkError: if it cannot be opened, or no device answers.
         InputError: if there is no such emulated lung.
     """
-    from hardware_eval.wire.link import Link
-
     transport, clock = carrier(port)
     client = Client(transport, clock)
     try:
@@ -143,8 +139,7 @@ def connect(port: str) -> Line:
     except InputError:
         client.close()
         raise
-    device = None if isinstance(transport, Link) else transport
-    return Line(client, clock, device, port_kind(port))
+    return Line(client, clock, port_kind(port))
 
 
 def device_about(line: Line) -> dict[str, Any]:
@@ -224,7 +219,7 @@ def make_runner(sandbox: bool) -> Any:
 
 def evaluate(
     submissions: Sequence[Submission], line: Line, out: Path, operator: Operator, *, plan: Plan,
-    view: View | None = None, sandbox: bool = True, dry: bool = True,
+    shows: Sequence[Show] = (), sandbox: bool = True, dry: bool = True,
     before_lung: Callable[[Bench, str], Sheet | None] = lambda bench, lung: None,
     settings: SafetySettings = DEFAULT, operator_name: str = "", notes: str = "",
     rest: float = REST_S, prepare_run: Callable[[PlannedRun], None] = lambda run: None,
@@ -238,7 +233,7 @@ def evaluate(
         out: folder of the log, the recording and the records.
         operator: the person at the bench.
         plan: from :func:`hardware_eval.bench.plan.make_plan`.
-        view: shows breaths.
+        shows: show breaths.
         sandbox: run entries as in scoring; without it, in this process.
         dry: run the plan on the frozen simulators first, unless the log has begun.
         before_lung: tests a lung once it is set; None where nobody does.
@@ -278,7 +273,7 @@ def evaluate(
         "sandbox": None if runner.sandbox is None else dict(runner.sandbox),
         "simulated": simulated,
     }
-    bench = Bench(line.client, line.clock, settings, operator, view, rest, fallback)
+    bench = Bench(line.client, line.clock, settings, operator, shows, rest, fallback)
     make = controllers(submissions, plan.track, runner, real_time=line.real)
     with RawLog(log_path) as log, _ends_by_exception(), _quick_switches():
         end = session.run_plan(
@@ -287,7 +282,7 @@ def evaluate(
         )  # fmt: skip
     written: Path | None = None
     with contextlib.suppress(InputError):  # no whole breath yet
-        breaths = recording(log_path, kinds=UNDISTURBED)
+        breaths = recording(log_path, kinds=PLANNED)
         written = out / RECORDING
         write(breaths, written)
     made: dict[str, Path] = {}

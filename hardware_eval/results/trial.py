@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from hardware_eval.bench.identity import Interval, interval
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.results.evaluate import LOG
 from hardware_eval.results.record import plan_of
@@ -35,20 +36,6 @@ from ventbench.base.errors import InputError
 
 #: Draws of the interval of rank agreement, and their seed.
 DRAWS, SEED = 4000, 0
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A value with its 95 % interval; NaN where there is none."""
-
-    value: float
-    low: float = math.nan
-    high: float = math.nan
-
-    def __str__(self) -> str:
-        if math.isnan(self.low):
-            return f"{self.value:.3f}"
-        return f"{self.value:.3f} ({self.low:.3f} to {self.high:.3f})"
 
 
 def as_mounted(errors: Floats) -> tuple[Floats, Floats, Floats]:
@@ -68,12 +55,6 @@ def mounted_anew(by_mounting: Floats) -> tuple[Floats, Floats, Floats]:
     count = by_mounting.shape[-1]
     error = by_mounting.std(axis=-1, ddof=1) / math.sqrt(count)
     return by_mounting.mean(axis=-1), error, np.full(error.shape, count - 1.0)
-
-
-def interval(mean: Any, error: Any, freedom: Any) -> Interval:
-    """The 95 % interval of a mean by Student's t."""
-    half = float(stats.t.ppf(0.975, freedom)) * float(error)
-    return Interval(float(mean), float(mean) - half, float(mean) + half)
 
 
 def kendall(simulated: Floats, measured: Floats) -> Floats:

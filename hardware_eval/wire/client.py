@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import secrets
 from collections import Counter, deque
-from dataclasses import dataclass, fields
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -16,28 +15,24 @@ from hardware_eval.wire.messages import (
     Arm,
     Command,
     Counters,
+    Event,
+    Fault,
     Heartbeat,
     Hello,
     HostMessage,
     Message,
     Packet,
+    ParserState,
     Reading,
     Refusal,
     Statistics,
     Vent,
     Welcome,
     encode,
+    feed_bytes,
     milliseconds,
 )
-from hardware_eval.wire.parser import (
-    DisconnectedError,
-    Event,
-    Fault,
-    NoAnswerError,
-    ParserState,
-    RefusedError,
-    feed_bytes,
-)
+from ventbench.base.errors import InputError
 
 #: Time that an answer may take, s: most of a control step of 30 ms.
 ANSWER_TIMEOUT = 0.020
@@ -46,10 +41,47 @@ ANSWER_TIMEOUT = 0.020
 #: may be busy starting.
 ATTEMPTS, PATIENCE = 5, 0.2
 
-#: Round trips that :class:`LinkStatistics` summarises.
+#: Round trips that :meth:`Client.round_trips` summarises.
 _REMEMBERED = 10_000
 
 AnswerT = TypeVar("AnswerT", Welcome, Reading, Counters)
+
+
+class LinkError(InputError):
+    """The base of all errors of the link."""
+
+
+class PortMissingError(LinkError):
+    """There is no such port."""
+
+
+class PortBusyError(LinkError):
+    """Another program has the port."""
+
+
+class PortForbiddenError(LinkError):
+    """The user may not open the port."""
+
+
+class DisconnectedError(LinkError):
+    """The port went away while it was open; the device vents by itself."""
+
+
+class NoAnswerError(LinkError):
+    """The device did not answer in time."""
+
+
+class RefusedError(LinkError):
+    """The device refused a message.
+
+    Attributes:
+        refusal: its answer.
+    """
+
+    def __init__(self, message: str, refusal: Refusal) -> None:
+        """Keep the device's answer."""
+        super().__init__(message)
+        self.refusal = refusal
 
 
 class Transport(Protocol):
@@ -72,24 +104,6 @@ class Transport(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class LinkStatistics:
-    """What the host counted since the client was made."""
-
-    sent: int  #: messages sent.
-    answered: int  #: messages answered in time.
-    unanswered: int  #: messages without an answer in time.
-    unexpected: int  #: answers to no message that waited, such as late ones.
-    refused: int  #: messages that the device refused.
-    framing: int  #: runs of bytes that are no frame.
-    checksum: int  #: packets with a wrong CRC.
-    malformed: int  #: intact packets of unknown kind or wrong length.
-    sessions: int  #: sessions opened.
-    disconnections: int  #: losses of the port.
-    round_trip_median: float  #: median time from message to answer of the last ten thousand, s.
-    round_trip_worst: float  #: longest of them, s.
-
-
 class Client:
     """A session with one device.
 
@@ -100,6 +114,9 @@ class Client:
     Attributes:
         welcome: what the device told at the last :meth:`hello`; None before.
         reading: the newest reading; None before the first.
+        counts: messages ``sent``, ``answered`` in time, ``unanswered`` and ``refused``; answers to
+            none that waited (``unexpected``), such as late ones; ``sessions``, ``disconnections``;
+            and bytes that were no message, by the name of their :class:`Fault`.
     """
 
     def __init__(
@@ -114,7 +131,7 @@ class Client:
         self._transport, self._clock, self._timeout = transport, clock or RealClock(), timeout
         self._parser = ParserState()
         self._session, self._sequence = 0, 0
-        self._counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
         self._round_trips: deque[float] = deque(maxlen=_REMEMBERED)
         self._pressure_limit: float | None = None
 
@@ -127,7 +144,7 @@ class Client:
         """
         self._session, self._sequence = secrets.randbits(32), 0
         self._pressure_limit = pressure_limit
-        self._counts["sessions"] += 1
+        self.counts["sessions"] += 1
         hello = Hello(PROTOCOL_VERSION, pressure_limit)
         self.welcome = self._persist(hello, Welcome)
         self.heartbeat()
@@ -175,7 +192,7 @@ class Client:
         return self._ask(Statistics(), Counters, self._timeout)
 
     def reconnect(self) -> Welcome:
-        """Connect again after a loss, by the policy of the link, and open a new session.
+        """Connect again after a loss, as patiently as the link is, and open a new session.
 
         Raises:
             LinkError: if the port does not come back.
@@ -192,15 +209,10 @@ class Client:
         finally:
             self._transport.close()
 
-    def statistics(self) -> LinkStatistics:
-        """Return what the host counted."""
+    def round_trips(self) -> tuple[float, float]:
+        """Median and longest time from message to answer of the last ten thousand, s, or NaN."""
         trips = np.asarray(self._round_trips if self._round_trips else [np.nan])
-        counts = {x.name: self._counts[x.name] for x in fields(LinkStatistics) if x.type == "int"}
-        return LinkStatistics(
-            **counts,
-            round_trip_median=float(np.median(trips)),
-            round_trip_worst=float(np.max(trips)),
-        )
+        return float(np.median(trips)), float(np.max(trips))
 
     def _persist(self, message: HostMessage, answer: type[AnswerT]) -> AnswerT:
         for attempt in range(ATTEMPTS):
@@ -217,24 +229,24 @@ class Client:
         begun = self._clock.now()
         try:
             self._transport.write(frame)
-            self._counts["sent"] += 1
+            self.counts["sent"] += 1
             answered = self._wait(begun + timeout)
         except DisconnectedError:
-            self._counts["disconnections"] += 1
+            self.counts["disconnections"] += 1
             raise
         name = message.kind.name.lower()
         if answered is None:
-            self._counts["unanswered"] += 1
+            self.counts["unanswered"] += 1
             raise NoAnswerError(
                 f"the device did not answer {name} within {1000 * timeout:.0f} ms: is it on, and "
                 "does its program run?"
             )
-        self._counts["answered"] += 1
+        self.counts["answered"] += 1
         self._round_trips.append(self._clock.now() - begun)
         if isinstance(answered, Reading):
             self.reading = answered
         if isinstance(answered, Refusal):
-            self._counts["refused"] += 1
+            self.counts["refused"] += 1
             causes = f" (vented by {answered.flags.name})" if answered.flags else ""
             raise RefusedError(
                 f"the device refused {name}: {answered.reason.name}, mode {answered.mode.name}"
@@ -260,9 +272,9 @@ class Client:
 
     def _expected(self, event: Event) -> Message | None:
         if isinstance(event, Fault):
-            self._counts[event.value] += 1
+            self.counts[event.value] += 1
             return None
         if (event.session, event.sequence) != (self._session, self._sequence):
-            self._counts["unexpected"] += 1
+            self.counts["unexpected"] += 1
             return None
         return event.message

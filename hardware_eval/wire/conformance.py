@@ -13,21 +13,20 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
 
 from hardware_eval.realtime import Clock
-from hardware_eval.wire.clauses import CLAUSES
-from hardware_eval.wire.client import Transport
+from hardware_eval.wire.client import NoAnswerError, Transport
 from hardware_eval.wire.messages import (
+    LONGEST_FRAME,
+    LONGEST_PACKET,
     Arm,
     Capability,
     Command,
     Counters,
-    DeviceMessage,
     Flag,
     Heartbeat,
     Hello,
-    HostMessage,
+    Kind,
     Mode,
     Packet,
     Reading,
@@ -36,10 +35,21 @@ from hardware_eval.wire.messages import (
     Statistics,
     Vent,
     Welcome,
-    encode,
+    to_frame,
+    to_packet,
+    with_crc,
 )
-from hardware_eval.wire.parser import NoAnswerError
-from hardware_eval.wire.probe import DiffersError, LateError, Probe, UntriedError
+from hardware_eval.wire.probe import (
+    ANSWER,
+    BOUND,
+    WATCHDOG,
+    DiffersError,
+    LateError,
+    Probe,
+    UntriedError,
+    equal,
+    told,
+)
 
 #: Attempts at a check that a slow host spoils.
 _ATTEMPTS = 20
@@ -52,6 +62,386 @@ NOT_TRIED = (
     "the end of the sensor's range vents, and a limit beyond it bars arming (duty 2)",
     "a device that was held up vents before it listens (duty 3)",
 )
+
+#: Largest step of the sequence number.
+WINDOW = 65_536
+
+
+def _vented(reading: Reading | Refusal, what: str, flags: Flag | None = None) -> None:
+    equal(f"mode {what}", reading.mode.name, "VENTED")
+    if isinstance(reading, Reading):
+        equal(f"valves {what}", (reading.u_in, reading.u_out), (0.0, 1))
+    if flags is not None:
+        equal(f"flags {what}", reading.flags & ~Flag.SATURATED, flags)
+
+
+def _counted(host: Probe, data: bytes, **more: int) -> None:
+    """Send what must not be answered, and be counted."""
+    before = host.counters()
+    host.transport.write(data)
+    after = host.counters()  # the next answer is this one
+    for name in ("frames", "framing", "checksum", "malformed"):
+        wanted = (getattr(before, name) + more.get(name, 0) + (name == "frames")) & 0xFFFFFFFF
+        equal(f"counter {name} after {data[:12].hex(' ')}..", getattr(after, name), wanted)
+
+
+# Frames.
+
+
+def _garbage(host: Probe) -> None:
+    host.transport.write(b"\xff" * 700)
+    host.reading()
+    host.transport.write(bytes(range(1, 256)))
+    host.reading()
+
+
+def _pieces(host: Probe) -> None:
+    for byte in host.frame(Heartbeat()):
+        host.transport.write(bytes([byte]))
+    host.next()
+    host.sequence += 1
+    first, second = host.frame(Heartbeat(), 1), host.frame(Heartbeat(), 2)
+    numbers = [host.raw(first[:-1] + second).sequence, host.next().sequence]
+    equal("two frames answered", numbers, [host.sequence + 1, host.sequence + 2])
+    host.sequence += 2
+
+
+def _faulty(host: Probe) -> None:
+    content = to_packet(Packet(host.session, 1, Heartbeat()))[:-4]
+    wrong = to_frame(content + b"\x01\x02\x03\x04")
+    _counted(host, b"\0\x09\x01\x02\0", framing=1)
+    _counted(host, b"\0" + b"\x01" * (LONGEST_FRAME + 1) + b"\0", framing=1)
+    _counted(host, wrong, checksum=1)
+    _counted(host, b"\0\x02\x01\0", checksum=1)
+
+
+def _malformed(host: Probe) -> None:
+    bodies = {
+        Kind.HELLO: 3, Kind.ARM: 0, Kind.COMMAND: 7, Kind.HEARTBEAT: 0, Kind.VENT: 0,
+        Kind.STATISTICS: 0,
+    }  # fmt: skip
+    header = host.session.to_bytes(4, "little") + (host.sequence + 9).to_bytes(4, "little")
+    for kind, length in bodies.items():
+        for wrong in {length + 1, max(length - 1, 1)} - {length}:
+            _counted(host, to_frame(with_crc(bytes([kind]) + header + bytes(wrong))), malformed=1)
+    longest = bytes(LONGEST_PACKET - 4 - 9)
+    for kind in (0x00, 0x07, 0x7F, 0x80, 0xFF):
+        _counted(host, to_frame(with_crc(bytes([kind]) + header + longest)), malformed=1)
+    echo = Reading(0, 1.0, 5.0, math.nan, 0.0, 1, Mode.READY, Flag.NONE)
+    _counted(host, host.frame(echo), malformed=1)
+
+
+def _silent(host: Probe) -> None:
+    if heard := host.hear(0.15):
+        raise DiffersError(f"the device sent {told(heard[0].message)} without a question")
+    host.arm()
+    if heard := host.hear(0.15):
+        raise DiffersError(f"the device sent {told(heard[0].message)} when it vented")
+
+
+# Sessions and numbers.
+
+
+def _welcome(host: Probe) -> None:
+    own = host.hello()
+    equal("protocol version", own.version, 1)
+    if not 0.0 < own.watchdog <= WATCHDOG:
+        raise DiffersError(f"watchdog {1000 * own.watchdog:.0f} ms, not above 0 and at most 80")
+    lower = round(own.pressure_limit / 2.0, 2)
+    equal("a lower limit", host.hello(lower).pressure_limit, lower)
+    equal("a limit of 655.34", host.hello(655.34).pressure_limit, own.pressure_limit)
+    equal("the device's own limit", host.hello().pressure_limit, own.pressure_limit)
+    equal("mode after hello", host.reading().mode.name, "READY")
+    reading = host.reading()
+    equal("valves after hello", (reading.u_in, reading.u_out), (0.0, 1))
+    equal("flow is known", not math.isnan(reading.flow), Capability.FLOW in own.capabilities)
+
+
+def _version(host: Probe) -> None:
+    before = host.counters()
+    other = host.random.getrandbits(32)
+    for session in (host.session, other):
+        host.refused(Hello(2), Reason.VERSION, session=session, consumes=False)
+    host.refused(Hello(2), Reason.VERSION, step=0, consumes=False)
+    after = host.counters()  # with the next number: the refused one was not consumed
+    equal("messages of another number", after.sequence, before.sequence)
+
+
+def _sessions(host: Probe) -> None:
+    other, before = host.random.getrandbits(32), host.counters()
+    for message in (Arm(), Command(1.0, 0, 0), Heartbeat(), Statistics()):
+        host.refused(message, Reason.SESSION, session=other, consumes=False)
+    host.refused(Command(200.0, 0, 0), Reason.SESSION, session=other, consumes=False)
+    equal("counter session", host.counters().session - before.session, 5)
+    equal("mode after strangers", host.reading().mode.name, "READY")
+    old, since = host.session, host.arm()
+    command = host.command(30.0, 0)
+    host.in_time(since)
+    host.ask(command, Reading)
+    host.hello()
+    reading = host.reading()
+    equal("mode after a second host", reading.mode.name, "READY")
+    equal("valves after a second host", (reading.u_in, reading.u_out), (0.0, 1))
+    host.in_time(since)
+    host.refused(Heartbeat(), Reason.SESSION, session=old, consumes=False)
+
+
+def _again(host: Probe) -> None:
+    host.reading()
+    for step in (0, -1):
+        host.refused(Hello(), Reason.SEQUENCE, step=step, consumes=False)
+    host.ask(Hello(pressure_limit=20.0), Welcome)
+    equal("mode after a hello of the same session", host.reading().mode.name, "READY")
+
+
+def _numbers(host: Probe) -> None:
+    before = host.counters().sequence
+    for step in (0, -1, WINDOW + 1):
+        for message in (Heartbeat(), Arm(), Statistics(), Command(200.0, 0, 0)):
+            host.refused(message, Reason.SEQUENCE, step=step, consumes=False)
+    equal("counter sequence", host.counters().sequence - before, 12)
+    host.ask(Heartbeat(), Reading, step=WINDOW)
+    host.ask(Heartbeat(), Reading, step=2)
+
+
+def _consumed(host: Probe) -> None:
+    host.refused(Command(1.0, 0, 0), Reason.NOT_ARMED)
+    host.refused(Heartbeat(), Reason.SEQUENCE, step=0, consumes=False)
+    host.refused(Command(200.0, 0, 0), Reason.OUT_OF_RANGE)
+    host.refused(Heartbeat(), Reason.SEQUENCE, step=0, consumes=False)
+    host.ask(Vent(), Reading)
+    host.refused(Heartbeat(), Reason.SEQUENCE, step=0, consumes=False)
+    host.ask(Vent(), Reading, step=-1, consumes=False)
+    host.ask(Vent(), Reading, step=WINDOW + 1, consumes=False)
+    host.ask(Vent(), Reading, step=5, session=host.session ^ 1, consumes=False)
+    host.reading()
+
+
+# Commands.
+
+
+def _not_armed(host: Probe) -> None:
+    before = host.counters()
+    host.refused(host.command(10.0, 0), Reason.NOT_ARMED)
+    host.refused(host.command(10.0, 0, age=5000), Reason.NOT_ARMED)
+    equal("counter not armed", host.counters().not_armed - before.not_armed, 2)
+    equal("mode after a command before arming", host.reading().mode.name, "READY")
+
+
+def _commands(host: Probe) -> None:
+    before = host.counters().commands
+    since = host.arm()
+    for u_in, u_out in ((12.34, 0), (0.01, 1), (100.0, 1), (0.0, 0)):
+        sent, command = host.clock.now(), host.command(u_in, u_out)
+        host.in_time(since)
+        reading = host.ask(command, Reading)
+        host.in_time(since)
+        equal("valves", (reading.u_in, reading.u_out), (u_in, u_out))
+        equal("mode", reading.mode.name, "RUNNING")
+        kept = host.reading()
+        equal("valves after a heartbeat", (kept.u_in, kept.u_out), (u_in, u_out))
+        since = sent
+    equal("counter commands", host.counters().commands - before, 4)
+
+
+def _out_of_range(host: Probe) -> None:
+    before = host.counters().out_of_range
+    for armed in (True, False):
+        for u_in, u_out in ((100.01, 0), (655.35, 1), (5.0, 2), (5.0, 255)):
+            host.hello()
+            since = host.arm() if armed else host.clock.now()
+            command = host.command(u_in, u_out, age=0 if armed else 9999)
+            host.in_time(since)
+            refusal = host.refused(command, Reason.OUT_OF_RANGE)
+            host.in_time(since)
+            _vented(refusal, "after a command out of range", Flag.OUT_OF_RANGE)
+            _vented(host.reading(), "after a command out of range", Flag.OUT_OF_RANGE)
+            host.refused(host.command(5.0, 0), Reason.NOT_ARMED)
+    equal("counter out of range", host.counters().out_of_range - before, 8)
+
+
+def _stale(host: Probe) -> None:
+    before, since = host.counters(), host.arm()
+    for age in (101, 5000, 1 << 31, -10_000):
+        stale = host.command(50.0, 0, age)
+        host.in_time(since)
+        host.refused(stale, Reason.STALE)
+        host.in_time(since)
+    reading = host.reading()
+    host.in_time(since)
+    equal("valves after stale commands", (reading.u_in, reading.u_out), (0.0, 1))
+    equal("mode after stale commands", reading.mode.name, "RUNNING")
+    asked = host.clock.now()
+    fresh = host.command(50.0, 0, age=50)
+    host.in_time(since)
+    got = host.raw(host.frame(fresh)).message
+    host.sequence += 1
+    if host.clock.now() - asked > 0.030:
+        raise LateError
+    equal("a command on a reading of 50 ms", told(got), "reading")
+    equal("counter stale", host.counters().stale - before.stale, 4)
+
+
+# Guards.
+
+
+def _vent(host: Probe) -> None:
+    for session, step in ((None, 1), (host.session ^ 0x5A5A5A5A, 1), (None, 0)):
+        since = host.arm()
+        command = host.command(30.0, 0)
+        host.in_time(since)
+        host.ask(command, Reading)
+        own = session is None and step == 1
+        reading = host.ask(Vent(), Reading, step=step, session=session, consumes=own)
+        host.in_time(since)
+        _vented(reading, "after a vent", Flag.HOST_VENTED)
+        host.refused(host.command(30.0, 0), Reason.NOT_ARMED)
+    host.arm()
+    equal("flags after arming", host.ask(Arm(), Reading).flags & ~Flag.SATURATED, Flag.NONE)
+
+
+def _rearm(host: Probe) -> None:
+    since = host.arm()
+    command = host.command(30.0, 0)
+    host.in_time(since)
+    host.ask(command, Reading)
+    host.in_time(since)
+    reading = host.ask(Arm(), Reading)
+    equal("valves after arming again", (reading.u_in, reading.u_out), (0.0, 1))
+
+
+def _pressure(host: Probe) -> None:
+    host.hello(0.0)
+    pressure = host.reading().pressure
+    if not pressure > 0.5:
+        raise UntriedError(f"the sensor shows {pressure:g} cmH2O; it needs more than 0.5")
+    refusal = host.refused(Arm(), Reason.UNSAFE)
+    _vented(refusal, "with the pressure above the limit")
+    equal("over pressure is flagged", Flag.OVERPRESSURE in refusal.flags, True)
+    host.refused(host.command(1.0, 1), Reason.NOT_ARMED)
+    host.hello(round(pressure + 5.0, 2))
+    host.arm()
+
+
+def _watchdog(
+    host: Probe, feed: Callable[[Probe], object] | None = None, armed_only: bool = False
+) -> None:
+    """The device vents between the watchdog's time and its bound after the last command."""
+    before = host.counters().watchdog
+    first = host.clock.now()
+    host.arm()
+    if not armed_only:
+        command = host.command(30.0, 0)
+        sent = host.clock.now()
+        host.in_time(first)
+        host.ask(command, Reading)
+        first = sent
+    last = host.clock.now()  # the device took it before
+    lived = False
+    while True:
+        asked = host.clock.now()
+        if feed is not None:
+            feed(host)
+        reading = host.reading()
+        if reading.mode is Mode.RUNNING:
+            if asked > last + BOUND:
+                raise DiffersError(f"it still ran {1000 * (asked - last):.0f} ms after the last")
+            lived = True
+        elif host.clock.now() - first < host.watchdog - ANSWER:
+            raise DiffersError(
+                f"it vented {1000 * (host.clock.now() - first):.0f} ms after the last"
+            )
+        else:
+            break
+        host.clock.sleep_until(asked + 0.004)
+    if not lived:
+        raise LateError
+    if Flag.DEVICE_LATE in reading.flags:
+        raise LateError
+    _vented(reading, "after silence", Flag.COMMANDS_STOPPED)
+    equal("counter watchdog", host.counters().watchdog - before, 1)
+    host.refused(host.command(30.0, 0), Reason.NOT_ARMED)
+
+
+def _feeds(host: Probe) -> None:
+    since = host.arm()
+    for k in range(8):
+        host.clock.sleep_until(since + 0.045)
+        command = host.command(20.0 + k, k % 2)
+        host.in_time(since)
+        sent = host.clock.now()
+        reading = host.ask(command, Reading)
+        host.in_time(since)
+        equal("mode under commands 45 ms apart", reading.mode.name, "RUNNING")
+        since = sent
+
+
+def _noise(host: Probe) -> object:
+    """Messages that must not feed the watchdog."""
+    host.refused(host.command(30.0, 0, age=500), Reason.STALE)
+    host.refused(Command(30.0, 0, 0), Reason.SEQUENCE, step=0, consumes=False)
+    host.refused(Arm(), Reason.SESSION, session=host.session ^ 1, consumes=False)
+    return host.counters()
+
+
+def _restless(host: Probe) -> object:
+    """As :func:`_noise`, where the device may have vented in between."""
+    try:
+        return _noise(host)
+    except DiffersError:
+        if host.reading().mode is Mode.RUNNING:
+            raise
+        return None
+
+
+def _answers(host: Probe) -> None:
+    trips = []
+    for _ in range(50):
+        begun = host.clock.now()
+        host.reading()
+        trips.append(host.clock.now() - begun)
+    median = sorted(trips)[len(trips) // 2]
+    wire = (len(host.frame(Heartbeat())) + 39) * 10 / 115_200  # of the slowest line
+    if median > ANSWER + wire:
+        raise DiffersError(f"half of the answers took longer than {1000 * median:.1f} ms")
+
+
+def _time(host: Probe) -> None:
+    before, first = host.reading().time, host.clock.now()
+    host.clock.sleep_until(first + 0.2)
+    passed = host.reading().time - before
+    slack = host.clock.now() - first
+    if not 0.1 * slack <= passed <= slack + 0.05:  # how right it must be is not specified
+        raise DiffersError(f"its clock went {1000 * passed:.0f} ms in {1000 * slack:.0f} ms")
+
+
+#: What the specification asks, and how it is tried.
+CLAUSES: tuple[tuple[str, Callable[[Probe], None]], ...] = (
+    ("garbage before a frame costs no frame (frames)", _garbage),
+    ("frames in pieces, and with one zero between, are read (frames)", _pieces),
+    ("bad COBS, too long, wrong CRC: counted, not answered (frames)", _faulty),
+    ("unknown kind, wrong length, a device's kind: malformed (order 1)", _malformed),
+    ("the device sends nothing by itself (messages)", _silent),
+    ("welcome: version, watchdog, limits, and no limit is raised (duty 5)", _welcome),
+    ("another protocol version is refused first, and consumes nothing (order 3)", _version),
+    ("other sessions are refused before all else; a new hello vents (order 4)", _sessions),
+    ("a hello of the open session needs a new number (duty 4)", _again),
+    ("numbers rise by 1 to 65,536; others are refused before all else (duty 4)", _numbers),
+    ("refused for what it asks, a message has consumed its number (order 5)", _consumed),
+    ("commands before arming are refused, fresh or stale (order 7)", _not_armed),
+    ("commands move the valves, heartbeats do not (messages)", _commands),
+    ("a command out of range vents, armed or not, fresh or not (order 6)", _out_of_range),
+    ("a command on a reading older than 100 ms, or to come, is refused (order 8)", _stale),
+    ("a vent is obeyed in every session, with every number (order 2)", _vent),
+    ("arming again closes the inspiratory valve (messages)", _rearm),
+    ("pressure above the session's limit bars arming (duty 2)", _pressure),
+    ("vented in time after the last command (duty 2)", _watchdog),
+    ("vented in time after arming (duty 2)", lambda h: _watchdog(h, armed_only=True)),
+    ("refused messages do not feed the watchdog (duty 2)", lambda h: _watchdog(h, _restless)),
+    ("commands feed the watchdog (duty 2)", _feeds),
+    ("readings carry the device's time (messages)", _time),
+    ("answers come within 5 ms (duty 6)", _answers),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,57 +524,3 @@ def _by_itself(host: Probe, before: Counters) -> bool:
         return False
     names = ("sensor", "overpressure", "device_late")
     return any(getattr(after, name) != getattr(before, name) for name in names)
-
-
-def exchange() -> list[tuple[str, HostMessage | DeviceMessage, str]]:
-    """Frames for whoever writes firmware: a device at 1.234567 s, its sensor at 5 cmH2O.
-
-    Returns:
-        Who sends, the message, and its frame in hexadecimal digits, in the order of the exchange.
-    """
-    reading: dict[str, Any] = {"time": 1.234567, "pressure": 5.0, "flow": math.nan}
-    ready = {"u_in": 0.0, "u_out": 1, "mode": Mode.READY, "flags": Flag.NONE}
-    running = {**ready, "mode": Mode.RUNNING}
-    welcome = Welcome(
-        1, (1, 0, 0), Capability.NONE, 0.08, 40.0, b"12345678", bytes(range(32)), "bench"
-    )
-    counts = Counters(frames=6, commands=1, stale=1)
-    steps: list[tuple[HostMessage, Callable[[int], DeviceMessage]]] = [
-        (Hello(pressure_limit=40.0), lambda number: welcome),
-        (Heartbeat(), lambda number: Reading(number, **reading, **ready)),
-        (Arm(), lambda number: Reading(number, **reading, **running)),
-        (
-            Command(12.34, 0, 1234),
-            lambda number: Reading(number, **reading, **{**running, "u_in": 12.34, "u_out": 0}),
-        ),
-        (
-            Command(50.0, 0, 1133),
-            lambda number: Refusal(number, Reason.STALE, Mode.RUNNING, Flag.NONE),
-        ),
-        (Statistics(), lambda number: counts),
-        (
-            Command(100.01, 0, 1234),
-            lambda number: Refusal(number, Reason.OUT_OF_RANGE, Mode.VENTED, Flag.OUT_OF_RANGE),
-        ),
-        (
-            Vent(),
-            lambda number: Reading(
-                number, **reading, u_in=0.0, u_out=1, mode=Mode.VENTED,
-                flags=Flag.OUT_OF_RANGE | Flag.HOST_VENTED,
-            ),
-        ),
-    ]  # fmt: skip
-    rows: list[tuple[str, HostMessage | DeviceMessage, str]] = []
-    for number, (asked, answer) in enumerate(steps, 1):
-        for who, message in (("host", asked), ("device", answer(number))):
-            frame = encode(Packet(0x01020304, number, message)).hex()
-            rows.append((who, message, frame))
-    return rows
-
-
-def vectors() -> str:
-    """The exchange as the table of PROTOCOL.md."""
-    lines = ["| from | message | frame |", "|---|---|---|"]
-    for who, message, frame in exchange():
-        lines.append(f"| {who} | {message.kind.name.lower()} | `{frame}` |")
-    return "\n".join(lines)

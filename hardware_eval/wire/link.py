@@ -13,14 +13,13 @@ import errno
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import cast
 
 import serial
 
 from hardware_eval.realtime import take_priority
-from hardware_eval.wire.parser import (
+from hardware_eval.wire.client import (
     DisconnectedError,
     LinkError,
     PortBusyError,
@@ -38,14 +37,9 @@ WRITE_TIMEOUT = 1.0
 READ_SLICE = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class ReconnectPolicy:
-    """How to try again when a port has gone."""
-
-    first: float = 0.1  #: pause before the second attempt, s.
-    factor: float = 1.5  #: by which each pause exceeds the one before.
-    longest: float = 2.0  #: longest pause, s.
-    patience: float = 60.0  #: time after which to give up, s.
+#: When a port has gone: the first pause between two attempts to open it, s, the factor by which
+#: each pause exceeds the one before, and the longest, s.
+_PAUSE, _FACTOR, _LONGEST_PAUSE = 0.1, 1.5, 2.0
 
 
 class _Traffic:
@@ -115,23 +109,20 @@ class Link:
         url: a device such as ``/dev/ttyACM0``, ``socket://host:port`` or ``loop://``.
     """
 
-    def __init__(
-        self, url: str, baud_rate: int = BAUD_RATE, policy: ReconnectPolicy | None = None
-    ) -> None:
+    def __init__(self, url: str, baud_rate: int = BAUD_RATE, patience: float = 60.0) -> None:
         """Open a port.
 
         Args:
             url: whatever :func:`serial.serial_for_url` takes.
             baud_rate: bits per second.
-            policy: of :meth:`reopen`.
+            patience: time after which :meth:`reopen` gives up, s.
 
         Raises:
             LinkError: if it cannot be opened: PortMissingError, PortBusyError and
                 PortForbiddenError say why.
         """
         self.url = url
-        self._baud_rate = baud_rate
-        self._policy = policy or ReconnectPolicy()
+        self._baud_rate, self._patience = baud_rate, patience
         self._port = self._open()
         self._traffic = _Traffic(self._port)
 
@@ -154,13 +145,13 @@ class Link:
         self._port.close()
 
     def reopen(self) -> None:
-        """Open the port again, and try until the policy's patience ends.
+        """Open the port again, and try until the patience ends.
 
         Raises:
             LinkError: the last one, if the port does not come back.
         """
         self.close()
-        pause, end = self._policy.first, time.monotonic() + self._policy.patience
+        pause, end = min(_PAUSE, self._patience), time.monotonic() + self._patience
         while True:
             try:
                 self._port = self._open()
@@ -168,9 +159,9 @@ class Link:
                 return
             except LinkError as error:
                 if time.monotonic() + pause > end:
-                    raise type(error)(f"{error} (tried for {self._policy.patience:g} s)") from error
+                    raise type(error)(f"{error} (tried for {self._patience:g} s)") from error
             time.sleep(pause)
-            pause = min(pause * self._policy.factor, self._policy.longest)
+            pause = min(pause * _FACTOR, _LONGEST_PAUSE)
 
     def _open(self) -> serial.Serial:
         try:

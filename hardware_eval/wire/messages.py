@@ -1,7 +1,11 @@
-"""Messages of the wire protocol: types, units, scaling, and their coding to packets and frames.
+"""Messages of the wire protocol: types, units, scaling, and their coding to frames and back.
 
-Pure. A *packet* is kind, session, sequence number, body and CRC-32; a *frame* is a packet in COBS
-between zero bytes. ``PROTOCOL.md`` has the layouts.
+Pure, and the same on host and device. A *packet* is kind, session, sequence number, body and
+CRC-32; a *frame* is a packet in COBS between zero bytes. ``PROTOCOL.md`` has the layouts.
+
+The parser finds the frames, and decodes what lies between two zero bytes. Whatever comes, it holds
+at most one frame's bytes, and any zero byte brings it back in step, so that the next intact frame
+is always read.
 """
 
 from __future__ import annotations
@@ -10,8 +14,8 @@ import math
 import struct
 from binascii import crc32
 from dataclasses import dataclass, fields
-from enum import IntEnum, IntFlag
-from typing import ClassVar
+from enum import Enum, IntEnum, IntFlag
+from typing import ClassVar, NamedTuple
 
 from cobs import cobs
 
@@ -415,3 +419,75 @@ def fixed_point(value: float, steps: int) -> int:
 
 def _or_nan(number: int, steps: int) -> float:
     return math.nan if number == _NO_VALUE else number / steps
+
+
+#: Longest frame without its zero bytes: COBS adds one byte to a packet of at most 254.
+LONGEST_FRAME = LONGEST_PACKET + 1
+
+
+class ParserMode(Enum):
+    """Place in the stream."""
+
+    #: Before the first zero byte, or in a frame that became too long: waits for a zero byte.
+    HUNTING = "hunting"
+    #: After a zero byte.
+    BETWEEN = "between"
+    #: Inside a frame.
+    INSIDE = "inside"
+
+
+class Fault(Enum):
+    """What was wrong with the bytes between two zero bytes."""
+
+    #: No frame: too long, too short, or no COBS.
+    FRAMING = "framing"
+    #: The CRC-32 differs.
+    CHECKSUM = "checksum"
+    #: Intact, but of unknown kind or wrong length.
+    MALFORMED = "malformed"
+
+
+class ParserState(NamedTuple):
+    """Place in the stream and the bytes of the frame so far."""
+
+    mode: ParserMode = ParserMode.HUNTING
+    kept: bytes = b""
+
+
+Event = Packet | Fault
+
+
+def feed(state: ParserState, byte: int) -> tuple[ParserState, Event | None]:
+    """Take one byte, 0..255; returns the next state, and the event that it completes, if any."""
+    if byte == 0:
+        ended = _finished(state.kept) if state.mode is ParserMode.INSIDE else None
+        return ParserState(ParserMode.BETWEEN), ended
+    if state.mode is ParserMode.HUNTING:
+        return state, None
+    if len(state.kept) >= LONGEST_FRAME:
+        return ParserState(ParserMode.HUNTING), Fault.FRAMING
+    return ParserState(ParserMode.INSIDE, state.kept + bytes((byte,))), None
+
+
+def feed_bytes(state: ParserState, data: bytes) -> tuple[ParserState, list[Event]]:
+    """Take bytes one by one; returns the next state and all events in order."""
+    events: list[Event] = []
+    for byte in data:
+        state, event = feed(state, byte)
+        if event is not None:
+            events.append(event)
+    return state, events
+
+
+def _finished(frame: bytes) -> Event:
+    try:
+        packet = cobs.decode(frame)
+    except cobs.DecodeError:
+        return Fault.FRAMING
+    content = checked(packet)
+    if content is None:
+        return Fault.CHECKSUM
+    try:
+        return decode(content)
+    except MalformedPacketError:
+        return Fault.MALFORMED

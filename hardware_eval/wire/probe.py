@@ -17,15 +17,16 @@ from hardware_eval.wire.messages import (
     HostMessage,
     Message,
     Packet,
+    ParserState,
     Reading,
     Reason,
     Refusal,
     Statistics,
     Welcome,
     encode,
+    feed_bytes,
     milliseconds,
 )
-from hardware_eval.wire.parser import ParserState, feed_bytes
 
 #: From the last command to moved valves, s; the watchdog; and the time for an answer.
 BOUND, WATCHDOG, ANSWER = 0.100, 0.080, 0.005

@@ -22,7 +22,7 @@ from ventbench.recordings.read import load
 
 def answer(
     folder: ChallengeFolder, diagnoser: Diagnoser, *, limits: Limits | None = None, jobs: int = 1,
-    only: tuple[str, ...] = (), scheduler: str | None = None,
+    only: tuple[str, ...] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, str]:  # fmt: skip
     """Answer all cases that have no answer yet; each answer is written as soon as it is there.
@@ -35,7 +35,6 @@ def answer(
         limits: what it may use on a case; the usual ones if None.
         jobs: number of cases at once.
         only: names of cases; all if empty.
-        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: called with the number of answered cases and the number of all cases.
 
     Returns:
@@ -45,16 +44,14 @@ def answer(
         InputError: if there is no challenge, or a recording is missing or cannot be read.
     """
     names = [name for name in folder.cases() if not only or name in only]
-    missing = [name for name in names if not folder.recording(name, diagnoser.name).is_file()]
-    if folder.round == 2:  # has recordings only of the cases that requested breaths
-        names = [name for name in names if name not in missing]
-    elif missing:
+    missing = [name for name in names if not folder.recording(name).is_file()]
+    if missing:
         raise InputError(f"{folder.recording(missing[0])} is missing")
     waiting = [name for name in names if not folder.answer(name, diagnoser.name).is_file()]
     done, lost = len(names) - len(waiting), {}
     progress(done, len(names))
     work = {name: (folder, name, diagnoser, limits or Limits()) for name in waiting}
-    with executor(jobs if jobs > 1 and scheduler is None else 0, scheduler) as pool:
+    with executor(jobs if jobs > 1 else 0) as pool:
         for name, problem in results(pool, answer_case, work):
             done += 1
             progress(done, len(names))
@@ -65,7 +62,7 @@ def answer(
 
 def answer_case(folder: ChallengeFolder, name: str, diagnoser: Diagnoser, limits: Limits) -> str:
     """Answer one case and write the file; returns why the case is lost, or an empty text."""
-    path = folder.recording(name, diagnoser.name)
+    path = folder.recording(name)
     breaths = load(path)
     withheld = tuple(folder.cases()[name]["withheld"])
     apart = np.isin(breaths.breath_id, withheld)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from proofs.challenge.vocabulary import PARAMETERS, PUBLISHED, TERMS
 from ventbench.base import files
@@ -37,8 +36,8 @@ RIG: dict[str, Any] = {
 #: Probabilities may miss their sum by this much.
 _ROUNDING = 1e-3
 
-#: Most hypotheses, most terms of one, largest pressure, cmH2O, and most breaths to record next.
-_HYPOTHESES, _TERMS, _PRESSURE, _NEXT = 500, 8, 1000.0, 10
+#: Most hypotheses, most terms of one, and largest pressure, cmH2O.
+_HYPOTHESES, _TERMS, _PRESSURE = 500, 8, 1000.0
 
 
 class AnswerError(InputError):
@@ -60,14 +59,6 @@ class Interval(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     high: float
 
 
-class Commands(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One breath to record next: time, s, from 0; ``u_in``, %; ``u_out``, 0/1; ``(T,)`` each."""
-
-    time: tuple[float, ...]
-    u_in: tuple[float, ...]
-    u_out: tuple[int, ...]
-
-
 class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The answer of a diagnoser."""
 
@@ -79,8 +70,8 @@ class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     #: where an effect acts that acts in part of the recording only: intervals of time, s, by id of
     #: the breath.
     active: dict[int, tuple[tuple[float, float], ...]] = {}
-    record_next: tuple[Commands, ...] = ()  #: breaths that would tell what is open.
     notes: Any = None  #: anything; nobody reads it.
+    record_next: Any = None  #: as notes.
 
 
 class Question(msgspec.Struct, frozen=True):
@@ -134,12 +125,6 @@ def decode(data: bytes, samples: dict[int, int]) -> Answer:
                 raise AnswerError(
                     f"active[{breath}]: {low:g} to {high:g} is no interval of time; give start, end"
                 )
-    if len(answer.record_next) > _NEXT:
-        raise AnswerError(
-            f"record_next has {len(answer.record_next)} breaths; give {_NEXT} at most"
-        )
-    for number, commands in enumerate(answer.record_next):
-        _check_commands(f"record_next[{number}]", commands)
     return answer
 
 
@@ -190,18 +175,6 @@ def _check_parameter(path: str, given: Interval) -> None:
         raise AnswerError(f"parameters.{path} is not finite")
     if not given.low <= given.value <= given.high:
         raise AnswerError(f"parameters.{path}: {given.value:g} is not within its interval")
-
-
-def _check_commands(where: str, commands: Commands) -> None:
-    time, u_in, u_out = (
-        np.asarray(c, float) for c in (commands.time, commands.u_in, commands.u_out)
-    )
-    if not len(time) == len(u_in) == len(u_out) >= 2:
-        raise AnswerError(f"{where}: time, u_in and u_out need the same length, 2 or more")
-    if time[0] != 0.0 or not np.all(np.diff(time) > 0.0):
-        raise AnswerError(f"{where}.time must start at 0 and rise")
-    if not (np.all((u_in >= 0.0) & (u_in <= 100.0)) and np.all(np.isin(u_out, (0.0, 1.0)))):
-        raise AnswerError(f"{where}: u_in must be 0..100 % and u_out 0 or 1")
 
 
 def _finite(*values: float) -> bool:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from proofs.challenge.judge import CONFIDENT, JudgedCase
-from proofs.challenge.questions import CLASSES
 
 #: Resamples of the cases for an interval, and bins of equally many cases of a calibration error.
 _RESAMPLES, _BINS = 2000, 10
@@ -200,26 +199,6 @@ def _parameters(cases: Sequence[JudgedCase]) -> list[Figure]:
         share("R and C, nothing missing: intervals that hold the truth",
               (e.covered for e in lungs)),
     ]  # fmt: skip
-
-
-def _is_confusable(case: JudgedCase) -> bool:
-    right = frozenset().union(*(effect.terms for effect in case.truth))
-    within = any(case.false & group and right & group for group in CLASSES)
-    return within or case.confidence < 0.9
-
-
-def second_round(before: dict[str, JudgedCase], after: dict[str, JudgedCase]) -> Figure:
-    """Share of the confusable cases that the requested breaths resolve.
-
-    A case is confusable if its first answer is believed at less than 90 %, or has another name of
-    the same class for the true one. It is resolved if the second is right and believed.
-    """
-    cases = [
-        after[name].right and after[name].confidence >= 0.9
-        for name, first in before.items()
-        if name in after and _is_confusable(first)
-    ]
-    return share("confusable cases resolved by more breaths", cases, least=0.80)
 
 
 def false_alarm(case: JudgedCase) -> bool | None:

@@ -76,7 +76,6 @@ class ChallengeFolder:
     """Paths of a challenge's files."""
 
     path: Path  #: path of the folder.
-    round: int = 1  #: 1, or 2 with the breaths that the first answers requested.
 
     @property
     def public(self) -> Path:
@@ -93,11 +92,9 @@ class ChallengeFolder:
         """Hash of the plain answers."""
         return self.path / "commitment.txt"
 
-    def recording(self, name: str, diagnoser: str = "") -> Path:
-        """Recording of a case; in the second round, with the breaths that a diagnoser requested."""
-        if self.round == 1:
-            return self.path / "recordings" / f"{name}.csv"
-        return self.path / "recordings_2" / diagnoser / f"{name}.csv"
+    def recording(self, name: str) -> Path:
+        """Recording of a case."""
+        return self.path / "recordings" / f"{name}.csv"
 
     def withheld(self, name: str) -> Path:
         """What is withheld of a recording, encrypted."""
@@ -105,8 +102,7 @@ class ChallengeFolder:
 
     def answer(self, name: str, diagnoser: str) -> Path:
         """A diagnoser's answer to a case."""
-        rounds = "answers" if self.round == 1 else "answers_2"
-        return self.path / rounds / diagnoser / f"{name}.json"
+        return self.path / "answers" / diagnoser / f"{name}.json"
 
     def cases(self) -> dict[str, dict[str, Any]]:
         """Return the public entries by name.
@@ -122,13 +118,13 @@ class ChallengeFolder:
         return {Path(entry["file"]).stem: entry for entry in entries}
 
     def check_recordings(self) -> None:
-        """Compare the recordings of the first round with their hashes.
+        """Compare the recordings with their hashes.
 
         Raises:
             InputError: if a recording is missing or has another hash.
         """
         for name, entry in self.cases().items():
-            path = ChallengeFolder(self.path).recording(name)
+            path = self.recording(name)
             if not path.is_file():
                 raise InputError(f"{path} is missing; make the challenge again in another folder")
             if files.sha256(path) != entry["sha256"]:

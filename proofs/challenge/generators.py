@@ -28,8 +28,6 @@ class Generator:
     draw: Callable[..., list[DrawnCase]]
     #: records a case; see :func:`~proofs.challenge.first.rig.record`.
     record: Callable[..., Breaths]
-    #: records requested breaths; see :func:`~proofs.challenge.first.rig.record_commands`.
-    record_commands: Callable[..., Breaths]
     #: responds without noise; see :func:`~proofs.challenge.first.rig.replay`.
     replay: Callable[..., rig.Floats]
     #: where in a recording the effects of a case act, ``(n, T)``, or None if everywhere.
@@ -37,14 +35,11 @@ class Generator:
     compared: int = 8  #: most breaths by which it is measured how far an effect can be detected.
 
 
-FIRST = Generator("first", plan.draw, rig.record, rig.record_commands, rig.replay)
-STRANGER = Generator(
-    "stranger", stranger.draw, laboratory.record, laboratory.record_commands, laboratory.replay
-)
+FIRST = Generator("first", plan.draw, rig.record, rig.replay)
+STRANGER = Generator("stranger", stranger.draw, laboratory.record, laboratory.replay)
 FAULTS = Generator(
-    "faults", faults.draw, bedside.record, bedside.record_commands, bedside.replay, bedside.active,
-    compared=1000,
-)  # fmt: skip
+    "faults", faults.draw, bedside.record, bedside.replay, bedside.active, compared=1000
+)
 GENERATORS: dict[str, Generator] = {entry.name: entry for entry in (FIRST, STRANGER, FAULTS)}
 
 

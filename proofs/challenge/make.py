@@ -42,7 +42,7 @@ Record = Callable[..., Breaths] | None
 
 def make(
     secret: str, out: Path, kind: Kind | Literal["all"], count: int, *, jobs: int = 1,
-    scheduler: str | None = None, source: str = "first", record: Record = None,
+    source: str = "first", record: Record = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> str:  # fmt: skip
     """Write a challenge.
@@ -55,8 +55,6 @@ def make(
         kind: kind of the cases.
         count: number of cases.
         jobs: number of processes.
-        scheduler: address of a Dask scheduler instead, whose workers see the same files; they are
-            told the secret.
         source: name of the generator, one of :data:`~proofs.challenge.generators.GENERATORS`.
         record: see :data:`Record`; a function of a module if there are processes.
         progress: called with the number of finished recordings.
@@ -78,7 +76,7 @@ def make(
     ]
     names = [question.case.name for question in drawn]
     nats: dict[str, list[float]] = {}
-    with executor(jobs if jobs > 1 and scheduler is None else 0, scheduler) as pool:
+    with executor(jobs if jobs > 1 else 0) as pool:
         work = {question.case.name: (secret, folder, question, record) for question in drawn}
         for name, of_effects in results(pool, _make_case, work):
             nats[name] = of_effects

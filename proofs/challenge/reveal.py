@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from proofs.challenge import contract
-from proofs.challenge.figures import Figure, by_kind, paired, scores, second_round
+from proofs.challenge.figures import Figure, by_kind, paired, scores
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.generators import generator_of
 from proofs.challenge.judge import JudgedCase, judge
@@ -37,16 +37,14 @@ class Judged:
     draws: tuple[Draw, ...]  #: where the cases are from.
     #: judged answers, by number of the draw and name of the case.
     cases: dict[tuple[int, str], JudgedCase]
-    #: cases without an answer; in the second round only those with a request.
-    unanswered: tuple[str, ...] = ()
+    unanswered: tuple[str, ...] = ()  #: cases without an answer.
     versions: tuple[str, ...] = ()  #: code that ran the diagnoser, as the answers say.
-    more: tuple[Figure, ...] = ()  #: further figures.
 
     @cached_property
     def figures(self) -> tuple[Figure, ...]:
         """Everything that is measured."""
         cases = list(self.cases.values())
-        return (*scores(cases), *by_kind(cases), *self.more)
+        return (*scores(cases), *by_kind(cases))
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
@@ -69,7 +67,7 @@ def reveal(folders: Sequence[ChallengeFolder], seeds: Sequence[str], diagnoser: 
     """Check all hashes and judge the answers of a diagnoser to draws from one generator.
 
     Args:
-        folders: draws; of the second round one alone, whose first is read too.
+        folders: draws.
         seeds: secret that each was made with.
         diagnoser: name of the diagnoser.
 
@@ -78,20 +76,14 @@ def reveal(folders: Sequence[ChallengeFolder], seeds: Sequence[str], diagnoser: 
             generators differ, or there is no answer.
     """
     draws, cases, unanswered, versions, generators = [], {}, [], set(), set()
-    more: tuple[Figure, ...] = ()
     for number, (folder, secret) in enumerate(zip(folders, seeds, strict=True)):
         found = _judge_all(folder, secret, diagnoser)
-        expected = list(folder.cases())
-        if folder.round == 2:
-            expected = [n for n in expected if folder.recording(n, diagnoser).is_file()]
-            first = _judge_all(ChallengeFolder(folder.path), secret, diagnoser)
-            more = (second_round(first, found),)
         published = folder.commitment.read_text().split()[0]
         if published in {draw.commitment for draw in draws}:
             raise InputError(f"the draw with commitment {published} is given twice")
         draws.append(Draw(secret, published, len(folder.cases()), len(found)))
         cases |= {(number, name): case for name, case in found.items()}
-        unanswered += [name for name in expected if name not in found]
+        unanswered += [name for name in folder.cases() if name not in found]
         versions |= {given["code"] for given in folder.answers(diagnoser).values()}
         generators.add(generator_name(folder, secret))
     if len(generators) > 1:
@@ -103,9 +95,8 @@ def reveal(folders: Sequence[ChallengeFolder], seeds: Sequence[str], diagnoser: 
         place = folders[0].answer("case", diagnoser).parent
         raise InputError(f"{place} has no answers; run `answer --diagnoser {diagnoser}` first")
     return Judged(
-        diagnoser, generators.pop(), tuple(draws), cases, tuple(unanswered),
-        tuple(sorted(versions)), more,
-    )  # fmt: skip
+        diagnoser, generators.pop(), tuple(draws), cases, tuple(unanswered), tuple(sorted(versions))
+    )
 
 
 def generator_name(folder: ChallengeFolder, secret: str) -> str:
@@ -123,11 +114,11 @@ def _judge_all(folder: ChallengeFolder, secret: str, diagnoser: str) -> dict[str
         if name not in answers:
             continue
         given = answers[name]
-        if folder.round == 1 and given["recording_sha256"] != public[name]["sha256"]:
+        if given["recording_sha256"] != public[name]["sha256"]:
             raise InputError(
                 f"{folder.answer(name, diagnoser)} answers another recording; remove it"
             )
-        breaths = load(ChallengeFolder(folder.path).recording(name))
+        breaths = load(folder.recording(name))
         withheld = folder.open(name, secret)
         if not given["problem"]:
             samples = {breath: len(readings) for breath, readings in withheld.pressures.items()}

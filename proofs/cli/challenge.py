@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from proofs.cli import ResultsPage
-from ventbench.cli.options import JsonFile, Scheduler, bar, bars, claim_out, emit
+from ventbench.cli.options import JsonFile, bar, bars, claim_out, emit
 
 app = typer.Typer(
     name="challenge",
@@ -18,15 +18,6 @@ app = typer.Typer(
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the challenge.")]
 Seed = Annotated[str, typer.Option(help="Secret seed of the challenge; any text.")]
-Round = Annotated[
-    int,
-    typer.Option(
-        "--round",
-        min=1,
-        max=2,
-        help="1: the recordings as made; 2: also the breaths that the answers asked for.",
-    ),
-]
 Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked", "all"]
 
 
@@ -46,7 +37,6 @@ def make(
         ),
     ] = "all",
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
-    scheduler: Scheduler = None,
     generator: Annotated[
         Literal["first", "stranger", "faults"],
         typer.Option(
@@ -67,9 +57,8 @@ def make(
     from proofs.challenge.make import make as work
 
     with bar("recording") as recording:
-        place = out if scheduler is None else out.resolve()
         hashed = work(
-            seed, place, kind, cases, jobs=jobs, scheduler=scheduler, source=generator,
+            seed, out, kind, cases, jobs=jobs, source=generator,
             progress=lambda done: recording(done, cases),
         )  # fmt: skip
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
@@ -79,7 +68,7 @@ Diagnoser = Annotated[
     str,
     typer.Option(
         help="Who answers: module:function, a folder with diagnoser.toml, or one of the project's, "
-        "such as ventbench or refit. `reveal` and `record` take the name alone."
+        "such as ventbench or refit. `reveal` takes the name alone."
     ),
 ]
 
@@ -92,8 +81,6 @@ def answer(
     memory: Annotated[float, typer.Option(min=0.5, help="Address space a case, GiB.")] = 16.0,
     jobs: Annotated[int, typer.Option(min=1, help="Number of cases at once.")] = 1,
     case: Annotated[list[str], typer.Option(help="Only this case; may be repeated.")] = [],  # noqa: B006
-    scheduler: Scheduler = None,
-    round_: Round = 1,
 ) -> None:
     """Let a diagnoser answer every case, each in a process of its own.
 
@@ -107,10 +94,9 @@ def answer(
 
     who = find(diagnoser)
     with bar("answering") as progress:
-        place = folder if scheduler is None else folder.resolve()
         lost = work(
-            ChallengeFolder(place, round_), who, limits=Limits(seconds, memory), jobs=jobs,
-            only=tuple(case), scheduler=scheduler, progress=progress,
+            ChallengeFolder(folder), who, limits=Limits(seconds, memory), jobs=jobs,
+            only=tuple(case), progress=progress,
         )  # fmt: skip
     for name, problem in sorted(lost.items()):
         typer.echo(f"{name}: lost: {problem}", err=True)
@@ -120,21 +106,6 @@ def answer(
     )
     if lost:
         raise typer.Exit(1)
-
-
-@app.command()
-def record(folder: Folder, seed: Seed, diagnoser: Diagnoser = "ventbench") -> None:
-    """Record the breaths that a diagnoser's answers ask for, each on its own concealed rig.
-
-    Afterwards, `answer` and `reveal` with `--round 2` use all breaths.
-
-    Example: `python -m proofs challenge record runs/challenge --seed "$SECRET"`
-    """
-    from proofs.challenge import requests
-    from proofs.challenge.folder import ChallengeFolder
-
-    names = requests.record(ChallengeFolder(folder), seed, diagnoser)
-    typer.echo(f"recorded the requested breaths of {len(names)} cases")
 
 
 Folders = Annotated[
@@ -150,7 +121,6 @@ def reveal(
     folders: Folders,
     seed: Seeds,
     diagnoser: Diagnoser = "ventbench",
-    round_: Round = 1,
     json: JsonFile = None,
     page: ResultsPage = None,
 ) -> None:
@@ -161,14 +131,12 @@ def reveal(
     Example: `python -m proofs challenge reveal runs/challenge --seed "$SECRET" --json scores.json`
     """
     _one_seed_each(folders, seed)
-    if len(folders) > 1 and round_ == 2:
-        raise typer.BadParameter("--round 2 takes one folder", param_hint="DIR")
 
     from proofs.challenge.folder import ChallengeFolder
     from proofs.challenge.reveal import reveal as work
     from proofs.results_page import challenge_section
 
-    result = work([ChallengeFolder(folder, round_) for folder in folders], seed, diagnoser)
+    result = work([ChallengeFolder(folder) for folder in folders], seed, diagnoser)
     _told(result, json, page, f"challenge {result.generator}", challenge_section(result))
     if any(figure.met is False for figure in result.figures):
         raise typer.Exit(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -18,12 +18,7 @@ from ventbench.cli.options import (
     claim_out,
     emit,
     recordings_folder,
-    table_of,
-    told,
 )
-
-if TYPE_CHECKING:
-    from proofs.real.rig import Proof
 
 
 def rig(
@@ -74,40 +69,16 @@ def rig(
     compilation.keep()
     with bars() as tell:
         result = prove(
-            folder, out, lambda to, diagnosis: diagnosis.save(to), only or (),
+            folder, out, only or (),
             lambda part, what, share: tell(part, share, text=f"{part}: {what}"),
         )  # fmt: skip
-    console = told(result.as_dict(), json)
+    text = proof_section(result)
     if page is not None:
-        write_section(page, "proof", proof_section(result))
-    _show(console, result)
+        write_section(page, "proof", text)
+    emit(result.as_dict(), json)
+    typer.echo(text, err=str(json) == "-")
     if not result.met:
         raise typer.Exit(1)
-
-
-def _show(console: Any, result: Proof) -> None:
-    console.print(_table(result))
-    for name, reason in result.impossible.items():
-        console.print(f"{name}: {reason}")
-    for claim in result.claims:
-        verdict = "met" if claim.met else "missed"
-        console.print(f"{claim.part}: {claim.what}: {verdict} ({claim.value})")
-
-
-def _table(result: Proof) -> Any:
-    rows = []
-    for name, part in result.parts.items():
-        errors = (f"{part['mae'][k] or float('nan'):.2f}" for k in ("before", "refit", "after"))
-        share = part["cut_percent"]
-        rows.append((
-            name, str(part["held_out"]), *errors, "-" if share is None else f"{share:.0f} %",
-            ", ".join(mechanism["name"] for mechanism in part["mechanisms"]) or "-",
-            part["slot"]["name"] if part["slot"] else "-",
-            ", ".join(misfit["label"] for misfit in part["misfitting_labels"]) or "-",
-        ))  # fmt: skip
-    heads = ("part", "n", "before", "refit", "after", "cut", "named", "without a name",
-             "label misfits")  # fmt: skip
-    return table_of("Open-loop MAE on held-out real breaths, cmH2O", heads, rows, left=heads[6:])
 
 
 def pairs(
@@ -117,8 +88,7 @@ def pairs(
         list[str] | None,
         typer.Option(
             metavar="KIND",
-            help="Only this kind (may be repeated): label, lung, drive, leak, lag; and, minutes a "
-            "pair, lung_pressure, gain_pressure, lag_pressure.",
+            help="Only this kind (may be repeated): label, lung, drive, leak, lag.",
         ),
     ] = None,
     sealed: Annotated[

@@ -13,7 +13,6 @@ from ventbench.base.files import json_values
 from ventbench.cli.options import (
     JsonFile,
     RecordingsDir,
-    Scheduler,
     Workers,
     bar,
     bars,
@@ -34,6 +33,15 @@ Only = Annotated[
 ]
 
 
+Store = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Also put the results into this file, in the form of proofs/paper/stored.json.",
+    ),
+]
+
+
 @app.command()
 def samples(
     lung: Annotated[str, typer.Option(metavar="ID", help="Lung, such as R20C50.")] = "R20C50",
@@ -47,6 +55,7 @@ def samples(
         float,
         typer.Option(min=0.001, max=1.0, help="Share of the full length of each training to run."),
     ] = 1.0,
+    store: Store = None,
     json: JsonFile = None,
 ) -> None:
     """Compare how many breaths policy gradient, PPO and DQN need for a score.
@@ -67,6 +76,7 @@ def samples(
         )  # fmt: skip
     picture = work.learning_curves_png(result)
     files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
+    _keep(store, samples=result.stored())
     table = result.summary()
     _tell({"lung": result.lung, "methods": _plain(table)}, _summary(result, table), out, json)
 
@@ -104,7 +114,7 @@ def controllers(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/controllers"),
     workers: Workers = 0,
-    scheduler: Scheduler = None,
+    store: Store = None,
     json: JsonFile = None,
 ) -> None:
     """Remove or change one part of the residual controller at a time.
@@ -125,9 +135,10 @@ def controllers(
     with bar("controllers") as progress:
         runs = work.compare(
             frozen.load(), out, range(seeds), config=config, only=only,
-            workers=workers, scheduler=scheduler,
+            workers=workers,
             progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
+    _keep(store, controllers=work.stored(runs, config))
     table = work.summary(runs)
     meanings = {name: variant.meaning for name, variant in known.items()}
     rows = [
@@ -152,7 +163,7 @@ def networks(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/networks"),
     workers: Workers = 0,
-    scheduler: Scheduler = None,
+    store: Store = None,
     json: JsonFile = None,
 ) -> None:
     """Change windows, width, depth and boundary networks of the paper's simulators, one at a time.
@@ -169,9 +180,10 @@ def networks(
     _check(only, work.variants(work.ARCHITECTURE))
     with bar("networks") as progress:
         breaths = work.compare(
-            folder, out, only=only, workers=workers, scheduler=scheduler,
+            folder, out, only=only, workers=workers,
             progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
+    _keep(store, networks=work.stored(breaths))
     table = work.summary(breaths)
     rows = [
         (
@@ -191,6 +203,15 @@ def _check(only: list[str] | None, known: dict[str, Any]) -> None:
             raise InputError(
                 f"--only {name}: there is no such variant; choose from {', '.join(known)}"
             )
+
+
+def _keep(store: Path | None, **section: Any) -> None:
+    """Put the results of a study into a file of such, beside those of others."""
+    from proofs.paper.paper import load_stored
+
+    if store is not None:
+        kept = load_stored(store) if store.is_file() else {}
+        files.write_json(store, kept | section)
 
 
 def _tell(values: Any, shown: Any, out: Path, json: Path | None) -> None:

@@ -56,21 +56,12 @@ def diagnose(folder: Path) -> dict[str, Any]:
     observed = seen.breaths.select(~seen.apart)
     found = ventbench.diagnose(observed, simulator="physics", lung=seen.label, patient=True)
     notes = found.as_dict()
-    answer: dict[str, Any] = {
+    return {
         "hypotheses": hypotheses(notes, seen.question["vocabulary"]),
         "pressures": seen.pressures(_predictions(found, seen, observed)),
         "parameters": _parameters(found, seen.question["vocabulary"]["names"]),
         "notes": notes,
     }
-    if found.request is not None:
-        answer["record_next"] = [
-            {"time": np.concatenate([[0.0], np.cumsum(dt[:-1])]), "u_in": u_in,
-             "u_out": u_out.astype(int)}
-            for u_in, u_out, dt in zip(
-                found.request.u_in, found.request.u_out, found.request.dt, strict=True
-            )
-        ]  # fmt: skip
-    return answer
 
 
 def _predictions(found: Any, seen: Any, observed: Any) -> Any:

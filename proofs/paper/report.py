@@ -1,4 +1,4 @@
-"""A comparison with a paper as plain data: sections with tables and charts, as text or Markdown."""
+"""A comparison with a paper as plain data: sections with tables and charts, as Markdown or JSON."""
 
 from __future__ import annotations
 
@@ -112,13 +112,6 @@ class Reproduction:
                 parts += [f"{table.caption}:", _markdown(table)]
         missing = Table("", ("paper", "what", "why not here"), self.not_reproduced)
         return "\n\n".join([*parts, "## Not reproduced", _markdown(missing)]) + "\n"
-
-    def __str__(self) -> str:
-        """Return a line a section."""
-        return "\n".join(
-            f"{section.place}: {section.claim} [{section.verdict}] {section.finding}"
-            for section in self.sections
-        )
 
 
 def _markdown(table: Table) -> str:

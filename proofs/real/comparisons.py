@@ -24,21 +24,12 @@ from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import Term, identify
 from ventbench.mechanics.labels import TOLERANCE_C, TOLERANCE_R, Estimate
-from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
-from ventbench.task.lungs import Lung
 
 #: Names that are right for what is added, and rivals that act alike where flow is measured before
 #: the circuit: the tubing delays flow as the sensor delays pressure.
 _NAMES = {"leak": "leak", "lag": "sensor_lag"}
 _RIVALS = {"leak": (), "lag": ("circuit_compliance",)}
-
-#: What the PVP rigs have beyond R-C lungs (``python -m proofs rig``, part ``rc``): the simulator of
-#: a first recording is fitted with these.
-_KNOWN = ("exhalation_valve_delay", "circuit_compliance", "valve_curve", "sensor_lag")
-
-#: Kinds that need minutes a pair.
-SLOW = ("lung_pressure", "gain_pressure", "lag_pressure")
 
 
 @dataclass(frozen=True)
@@ -145,58 +136,8 @@ def with_leak(breaths: Breaths, slope: float) -> Breaths:
     )
 
 
-def _diagnosed(pair: Pair, material: Material) -> Answered:
-    """Diagnose a simulator fitted to the first recording against the second one."""
-    from ventbench.diagnosis.diagnose import diagnose
-
-    first, second = material.lungs[pair.first], material.lungs[pair.second]
-    label = _lung_of(first)
-    simulator = {label.id: fitted_plant(first)}
-    given = replace(
-        second, R=np.full(len(second), label.R), C=np.full(len(second), label.C), sha256=None
-    )
-    if pair.kind == "gain_pressure":
-        given = replace(given, u_in=given.u_in / pair.strength)
-    if pair.kind == "lag_pressure":
-        given = slower_sensor(given, pair.strength)
-    diagnosis = diagnose(given, simulator=simulator, patient=False)
-    names = tuple(mechanism.name for mechanism in diagnosis.mechanisms)
-    match = diagnosis.lungs[0]
-    own = simulator[label.id]
-    ratio_R = match.fitted_R / float(own.get("R"))
-    ratio_C = match.fitted_C / float(own.get("C"))
-    words = f"{', '.join(names) or 'no effect'}; R x {ratio_R:.2f}, C x {ratio_C:.2f}"
-    if pair.kind == "lag_pressure":
-        lag = next((m for m in diagnosis.mechanisms if m.name == "sensor_lag"), None)
-        estimate = lag.parameters.get("tau") if lag is not None else None
-        return Answered(
-            pair, words, names == ("sensor_lag",), tuple(n for n in names if n != "sensor_lag"),
-            estimate.value if estimate else None, estimate.ci95 if estimate else None,
-        )  # fmt: skip
-    if pair.kind == "gain_pressure":
-        return Answered(pair, words, not names, names)
-    truth = _lung_of(second)
-    right = not names and truth.id in match.settings
-    return Answered(pair, words, right, names)
-
-
-def fitted_plant(breaths: Breaths) -> Physics:
-    """The plant of one lung, fitted with what the PVP rigs are known to have."""
-    from ventbench.physics.catalogue import paths
-    from ventbench.system_id import fit, make_data
-
-    fitted = fit(make_data(breaths), list(_KNOWN))
-    names = [path for path in paths(_KNOWN) if path != "position"]
-    return fitted.problem.predictor.plant({name: float(fitted.column(name)[0]) for name in names})
-
-
-def _lung_of(breaths: Breaths) -> Lung:
-    return Lung(float(breaths.R[0]), float(breaths.C[0]))
-
-
 _TOOLS: dict[str, Callable[[Pair, Material], Answered]] = {
     "label": _label, "lung": _lung, "drive": _lung, "leak": _added, "lag": _added,
-    "lung_pressure": _diagnosed, "gain_pressure": _diagnosed, "lag_pressure": _diagnosed,
 }  # fmt: skip
 
 
@@ -210,14 +151,14 @@ def run(
         folder: folder of the public recordings.
         out: folder of the answers; the same call continues.
         sealed: True to open the sealed pairs, once.
-        kinds: kinds of pairs; those with flow if empty.
+        kinds: kinds of pairs; all if empty.
         progress: called with the numbers of answered and of all pairs.
 
     Raises:
         InputError: if a kind or a file is unknown, or the sealed pairs were opened by another
             version.
     """
-    chosen = tuple(kinds) or tuple(kind for kind in KINDS if kind not in SLOW)
+    chosen = tuple(kinds) or tuple(KINDS)
     if unknown := sorted(set(chosen) - set(KINDS)):
         raise InputError(f"no kind {unknown[0]!r} of pairs; choose of {', '.join(KINDS)}")
     material = load(folder)

@@ -2,12 +2,11 @@
 
 Each pair has a first recording, which stands for the simulator, and a second one whose difference
 is known and concealed: another lung, another source of gas, a leak or a lag that was added to the
-signals, a valve whose gain was changed. The tool gets both and says what differs.
+signals. The tool gets both and says what differs.
 
-With flow (RespiraWorks) the tool is :mod:`ventbench.mechanics`. There an added leak and an added
-lag are exact: a leak behind the flow sensor adds its flow to the measured one at the measured
-pressure, and a lag of the pressure sensor is applied to the measured pressure. From pressure alone
-(PVP) the tool is the diagnosis of a simulator that was fitted to the first recording.
+The recordings are those with flow (RespiraWorks), the tool is :mod:`ventbench.mechanics`. An added
+leak and an added lag are exact: a leak behind the flow sensor adds its flow to the measured one at
+the measured pressure, and a lag of the pressure sensor is applied to the measured pressure.
 
 Half of the pairs, chosen by the hash of their names, are for development; the others are sealed
 and opened once.
@@ -21,7 +20,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ventbench import recordings
 from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import Mechanics, identify
 from ventbench.mechanics.respiraworks import RespiraWorksRun, breaths_of, load_respiraworks
@@ -29,19 +27,12 @@ from ventbench.recordings.breaths import Breaths
 
 Split = Literal["development", "sealed"]
 
-#: Files of the public recordings.
-FLOW_FILE, PRESSURE_FILE = "respiraworks_quicklung.parquet", "pvp_quicklung.csv"
+#: File of the public recordings.
+FLOW_FILE = "respiraworks_quicklung.parquet"
 
 #: Strengths of added leaks, mL/s per cmH2O, and of added lags, s; 0 shows what is named without.
 LEAKS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 LAGS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)
-
-#: Factor by which the gain of a valve is changed.
-_GAIN = 1.12
-
-#: Lags and lungs of pairs from pressure alone.
-_PRESSURE_LAGS = (0.04, 0.08)
-_PRESSURE_LUNGS = ("R5C10", "R5C20", "R5C50", "R20C10", "R20C20", "R20C50")
 
 #: Kinds of pairs, with what they ask.
 KINDS: dict[str, str] = {
@@ -50,9 +41,6 @@ KINDS: dict[str, str] = {
     "drive": "blower against proportional valve, same lung: nothing of the lung differs (flow)",
     "leak": "a leak was added to the recording (flow)",
     "lag": "a lag of the pressure sensor was added to the recording (flow)",
-    "lung_pressure": "a simulator fitted to one lung, a recording of another (pressure)",
-    "gain_pressure": "the gain of the valve was changed by 12 % (pressure)",
-    "lag_pressure": "a lag of the pressure sensor was added to the recording (pressure)",
 }
 
 
@@ -80,7 +68,6 @@ class Material:
 
     runs: Mapping[str, Breaths]  #: runs with flow or volume as breaths; padded, u_in 0.
     drives: Mapping[str, str]  #: source of gas of each run.
-    lungs: Mapping[str, Breaths]  #: recordings from pressure alone, by lung.
     _mechanics: dict[str, Mechanics] = field(default_factory=dict, repr=False)
 
     def mechanics(self, run: str) -> Mechanics:
@@ -94,19 +81,17 @@ def load(folder: Path) -> Material:
     """Read the recordings.
 
     Raises:
-        InputError: if a file is missing.
+        InputError: if their file is missing.
     """
-    for name in (FLOW_FILE, PRESSURE_FILE):
-        if not (folder / name).is_file():
-            raise InputError(f"{folder / name} is missing; the real pairs need it")
+    if not (folder / FLOW_FILE).is_file():
+        raise InputError(f"{folder / FLOW_FILE} is missing; the real pairs need it")
     runs, drives = {}, {}
     for run in load_respiraworks(folder / FLOW_FILE):
         breaths = breaths_of(run)
         if breaths.flow is not None or breaths.volume is not None:
             runs[_run_name(run)] = breaths
             drives[_run_name(run)] = "blower" if "blower" in run.drive else "proportional valve"
-    whole = recordings.load(folder / PRESSURE_FILE)
-    return Material(runs, drives, whole.by_lung())
+    return Material(runs, drives)
 
 
 def _run_name(run: RespiraWorksRun) -> str:
@@ -115,10 +100,10 @@ def _run_name(run: RespiraWorksRun) -> str:
 
 def pairs(material: Material) -> list[Pair]:
     """All pairs, in a fixed order."""
-    return [*_flow_pairs(material), *_pressure_pairs(material)]
+    return list(_pairs(material))
 
 
-def _flow_pairs(material: Material) -> Iterator[Pair]:
+def _pairs(material: Material) -> Iterator[Pair]:
     names = list(material.runs)
     label = {name: material.runs[name].lung_ids[0] for name in names}
     for name in names:
@@ -141,19 +126,6 @@ def _flow_pairs(material: Material) -> Iterator[Pair]:
             for strength in strengths:
                 truth = kind if strength else "nothing added"
                 yield Pair(f"{kind} {strength:g} {name}", kind, truth, name, name, strength)
-
-
-def _pressure_pairs(material: Material) -> Iterator[Pair]:
-    lungs = [name for name in _PRESSURE_LUNGS if name in material.lungs]
-    for k, first in enumerate(lungs):
-        for step in (1, 2):
-            second = lungs[(k + step) % len(lungs)]
-            truth = changed(first, second)
-            yield Pair(f"lung_pressure {first} {second}", "lung_pressure", truth, first, second)
-    for name in lungs:
-        yield Pair(f"gain_pressure {name}", "gain_pressure", "gain of the valve", name, name, _GAIN)
-        for tau in _PRESSURE_LAGS:
-            yield Pair(f"lag_pressure {tau:g} {name}", "lag_pressure", "lag", name, name, tau)
 
 
 def changed(first: str, second: str) -> str:

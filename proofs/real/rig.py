@@ -20,7 +20,7 @@ from proofs.real.parts import PARTS, Part, Setting, by_names_alone, has_unnamed
 from ventbench import recordings
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.diagnosis.diagnose import diagnose as diagnose_recording
+from ventbench.diagnosis.diagnose import diagnose
 from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.plants.catalog import load_simulators
@@ -37,14 +37,8 @@ DONE = "part.json"
 #: Least cut of the error by named physics alone, %.
 CUT = 60.0
 
-#: Writes the files of a diagnosis to a folder, and returns their paths.
-Save = Callable[[Path, Diagnosis], list[Path]]
-
 #: Called with the part, its current step, and the finished share of the part.
 Progress = Callable[[str, str, float], None]
-
-#: Makes a diagnosis; has the arguments of :func:`ventbench.diagnosis.diagnose.diagnose`.
-Diagnose = Callable[..., Diagnosis]
 
 
 @dataclass(frozen=True)
@@ -86,9 +80,8 @@ class Proof:
 
 
 def prove(
-    folder: Path, out: Path, save: Save, only: Collection[str] = (),
-    progress: Progress | None = None, diagnose: Diagnose | None = None,
-) -> Proof:  # fmt: skip
+    folder: Path, out: Path, only: Collection[str] = (), progress: Progress | None = None
+) -> Proof:
     """Run the parts that are not finished, and write ``proof.json`` of all that are.
 
     A part runs again if the recording, its setting or the part that it starts from has changed, but
@@ -97,10 +90,8 @@ def prove(
     Args:
         folder: folder of the public recordings.
         out: folder to write to, a folder for each part.
-        save: see :data:`Save`.
         only: names of parts; all parts if empty.
         progress: see :data:`Progress`.
-        diagnose: see :data:`Diagnose`; ventbench's own if None.
 
     Raises:
         InputError: if there is no such recording or part, or the part that another one starts from
@@ -128,9 +119,7 @@ def prove(
             continue
         key = {"recording_sha256": sha256, "lungs": list(part.lungs), "about": setting.about}
         if selected and _finished(out / part.name, key) is None:
-            _run(
-                part, setting, key, out / part.name, save, progress, diagnose or diagnose_recording
-            )
+            _run(part, setting, key, out / part.name, progress)
         if summary := _finished(out / part.name, key):
             diagnosis = json.loads((out / part.name / "diagnosis.json").read_text("utf-8"))
             parts[part.name] = figures(diagnosis, summary)
@@ -140,22 +129,20 @@ def prove(
 
 
 def _run(
-    part: Part, setting: Setting, key: dict[str, Any], out: Path, save: Save,
-    progress: Progress | None, diagnose: Diagnose,
-) -> None:  # fmt: skip
+    part: Part, setting: Setting, key: dict[str, Any], out: Path, progress: Progress | None
+) -> None:
     def tell(step: str, share: float) -> None:
         if progress is not None:
             progress(part.name, step, share)
 
-    # The ventilator was connected to a test lung.
-    own = {} if setting.rigs is None else {"rigs": setting.rigs}
     diagnosis = diagnose(
-        setting.breaths, simulator=setting.plant, patient=False, progress=tell, **own
-    )
+        setting.breaths, simulator=setting.plant, rigs=setting.rigs, progress=tell,
+        patient=False,  # the ventilator was connected to a test lung
+    )  # fmt: skip
     diagnosis = dataclasses.replace(diagnosis, simulator=setting.plant_name)
     out.mkdir(parents=True, exist_ok=True)
     (out / DONE).unlink(missing_ok=True)
-    written = save(out, diagnosis)
+    written = diagnosis.save(out)
     files.write_json(
         out / DONE,
         {

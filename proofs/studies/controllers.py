@@ -84,7 +84,6 @@ def compare(
     draws: int = DRAWS,
     gains: Gains | None = None,
     workers: int = 0,
-    scheduler: str | None = None,
     progress: Progress = lambda *_: None,
 ) -> pd.DataFrame:
     """Train one network for all six lungs by each variant with each seed.
@@ -100,7 +99,6 @@ def compare(
         draws: published draws to score on.
         gains: P, I, D of the PID; the best single set of the paper's grid if not given.
         workers: processes, each with a training at a time; 0 for this one alone.
-        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: see :data:`Progress`.
 
     Returns:
@@ -126,7 +124,7 @@ def compare(
         checkpoint = work.checkpoint(part)
         jobs[part] = (simulators, own, chosen[name].config, seed, draws, checkpoint)
     finish(
-        work, _trained, jobs, workers=workers, scheduler=scheduler,
+        work, _trained, jobs, workers=workers,
         progress=lambda part, share: progress(trainings[part][0], share),
     )  # fmt: skip
     runs = pd.DataFrame(
@@ -160,6 +158,20 @@ def summary(runs: pd.DataFrame) -> pd.DataFrame:
             row[f"{figure}_change_high"] = apart[figure].max()
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def stored(runs: pd.DataFrame, config: ResidualConfig) -> dict[str, Any]:
+    """JSON values of trainings by some settings, for the paper's page."""
+    known, seeds = variants(config), runs["seed"].nunique()
+    command = f"python -m proofs study controllers --seeds {seeds} --updates {config.updates}"
+    return {
+        "about": {"command": command, "simulators": 1},
+        "variants": [
+            {"variant": row["variant"], "meaning": known[str(row["variant"])].meaning}
+            | {figure: round(float(row[figure]), 4) for figure in FIGURES}
+            for row in summary(runs).to_dict("records")
+        ],
+    }
 
 
 def _trained(

@@ -68,7 +68,6 @@ def compare(
     members: int = MEMBERS,
     only: Sequence[str] | None = None,
     workers: int = 0,
-    scheduler: str | None = None,
     progress: Progress = lambda *_: None,
 ) -> pd.DataFrame:
     """Train each variant on each scored lung, once for each fold of the measured breaths.
@@ -84,7 +83,6 @@ def compare(
         members: folds of the measured breaths, and networks of each lung.
         only: names of variants; all if not given. The base is always included.
         workers: processes, each with a variant at a time; 0 for this one alone.
-        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: see :data:`Progress`.
 
     Returns:
@@ -112,7 +110,7 @@ def compare(
         for part, name in parts.items()
     }
     finish(
-        work, _judged, jobs, workers=workers, scheduler=scheduler,
+        work, _judged, jobs, workers=workers,
         progress=lambda part, share: progress(parts[part], share),
     )  # fmt: skip
     columns = {"breath_id": judged.breath_id, "lung": judged.lung_ids}
@@ -140,6 +138,17 @@ def summary(breaths: pd.DataFrame) -> pd.DataFrame:
             | {lung: mean[lung] for lung in LUNG_IDS if lung in mean}
         )
     return pd.DataFrame(rows)
+
+
+def stored(breaths: pd.DataFrame) -> dict[str, Any]:
+    """JSON values of a comparison of :data:`ARCHITECTURE`, for the paper's page."""
+    names = {"depth": "depth", "N_B": "boundaries", "H_p": "pressures", "H_c": "controls"}
+    base = {key: getattr(ARCHITECTURE, field) for key, field in names.items()}
+    return {
+        "about": {"command": "python -m proofs study networks", "simulators": 1},
+        "base": base | {"width": ARCHITECTURE.width},
+        "variants": summary(breaths).round(4).to_dict("records"),
+    }
 
 
 def _judged(
@@ -212,7 +221,6 @@ def finish(
     jobs: Mapping[str, tuple[Any, ...]],
     *,
     workers: int = 0,
-    scheduler: str | None = None,
     progress: Progress = lambda *_: None,
 ) -> None:
     """Compute the results that a folder does not have yet.
@@ -223,18 +231,17 @@ def finish(
             JSON values.
         jobs: arguments by name of the result.
         workers: processes, each with a training at a time; 0 for this one alone.
-        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: what happens within a training can only be told where it runs in this process.
 
     Raises:
-        InputError: if the scheduler cannot be reached, or a worker process has died.
+        InputError: if a worker process has died.
     """
     done = 0
 
     def tell(name: str, share: float) -> None:
         progress(name, (done + share) / len(jobs))
 
-    with executor(workers, scheduler) as pool:
+    with executor(workers) as pool:
         here = isinstance(pool, InProcess)
         told = {
             name: (*arguments, partial(tell, name) if here else None)

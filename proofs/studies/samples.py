@@ -34,6 +34,9 @@ CUT = 0.25
 #: How close to its final score counts as having reached it.
 CLOSE = 0.02
 
+#: Points of a stored curve.
+STORED_POINTS = 40
+
 
 def interquartile_mean(values: ArrayLike) -> Floats:
     """Mean of what is left after cutting a quarter at each end; over the first axis.
@@ -112,6 +115,29 @@ class SampleStudy:
     def summary(self) -> pd.DataFrame:
         """One row for each method; ``episodes_...`` is blank where it is not reached."""
         return pd.DataFrame([self._row(curve) for curve in self.curves])
+
+    def stored(self) -> dict[str, Any]:
+        """JSON values for the paper's page: the table, and a few points of each curve.
+
+        The points are evenly apart in logarithms.
+        """
+        seeds, lines = len(self.curves[0].scores), {}
+        for curve in self.curves:
+            last = max(len(curve.episodes) - 1, 1)
+            at = np.unique(np.geomspace(1, last, STORED_POINTS).round().astype(int))
+            lines[curve.method] = {
+                "episodes": curve.episodes[at].tolist(),
+                "score": np.round(curve.middle[at], 4).tolist(),
+            }
+        return {
+            "about": {
+                "command": f"python -m proofs study samples --seeds {seeds}", "simulators": 1,
+            },
+            "lung": self.lung,
+            "seeds": seeds,
+            "methods": files.json_values(self.summary().to_dict("records")),
+            "curves": lines,
+        }  # fmt: skip
 
     def _row(self, curve: LearningCurve) -> dict[str, object]:
         low, high = band(curve.scores[:, -1:])

@@ -75,7 +75,7 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
     assert evaluate.begun_plan(out) is not None
     analysed = invoke("trial", str(out))
     assert analysed.exit_code == 0, analysed.output
-    assert f"pid_best: error {made.score:.3f}" in analysed.output
+    assert f"pid_best: error {made.score:.4g}" in analysed.output
     assert "no whole dry run" in analysed.output
 
 

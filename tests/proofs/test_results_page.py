@@ -8,7 +8,8 @@ import pytest
 
 from hardware_eval.emulation.cases import Effect
 from proofs import code_version
-from proofs.challenge.figures import Figure
+from proofs.challenge import reveal
+from proofs.challenge.figures import Figure, by_kind
 from proofs.challenge.reveal import Board, Draw, Judged
 from proofs.real.rig import Claim, Proof
 from proofs.results_page import (
@@ -36,19 +37,23 @@ def test_a_section_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
     assert (tmp_path / "fresh.md").read_text().startswith("<!-- proof -->")
 
 
-def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
+def test_a_challenge_tells_its_seed_its_commitment_and_its_code(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     leak = Effect("leak", "strong", "library", {"conductance": 20.0})
     right = judged("single", [leak], answer((1.0, "leak")))
     wrong = judged("single", [leak], answer((0.9, "unknown:lung valve_lag"), (0.1, "")), worth=0.1)
     result = Judged(
         "refit", "stranger", (Draw("words", "abc123", 40, 1), Draw("-more", "def456", 8, 1)),
-        {(0, "case_0001"): right, (1, "case_0001"): wrong}, ("case_0003",), ("1a2b3c",), (
-            Figure("strong: more", 0.9, ">= 98%", 20, (0.7, 0.97), False, True),
-            Figure("seconds a case, median", 5.25, "", 20, None, None),
-            Figure("another score", 0.51, "", 20, (0.4, 0.625), None),
-            Figure("nothing missing: false", None, "<= 0%", 0, None, None, True),
-        ),
+        {(0, "case_0001"): right, (1, "case_0001"): wrong}, ("case_0003",), ("1a2b3c",),
     )  # fmt: skip
+    more = (
+        Figure("strong: more", 0.9, ">= 98%", 20, (0.7, 0.97), False, True),
+        Figure("seconds a case, median", 5.25, "", 20, None, None),
+        Figure("another score", 0.51, "", 20, (0.4, 0.625), None),
+        Figure("nothing missing: false", None, "<= 0%", 0, None, None, True),
+    )
+    monkeypatch.setattr(reveal, "by_kind", lambda cases: (*by_kind(cases), *more))
     text = challenge_section(result)
     make = "python -m proofs challenge make --generator stranger"
     assert f"{make} --seed=words --cases 40 --out runs/stranger\n" in text

@@ -7,7 +7,6 @@ import hmac
 import json
 import re
 from datetime import UTC, datetime, timedelta
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +16,6 @@ from typer.testing import CliRunner
 
 from proofs import rounds
 from proofs.__main__ import app
-from proofs.challenge.faults.laboratory import record
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.reveal import Board
 from proofs.rounds import Round, draw, freeze, load, play
@@ -114,7 +112,7 @@ def test_who_cannot_take_part(frozen: Round, tmp_path: Path) -> None:
 
 def test_a_round_is_played_and_goes_on_where_it_stopped(frozen: Round) -> None:
     own = draw(frozen, referee.value(SECRET, frozen.number))
-    result = play(own, record=partial(record, steps=4))
+    result = play(own)
     folder = ChallengeFolder(own.folder / "faults")
     assert set(folder.answers("mine")) == set(folder.answers("other")) == {"case_0001"}
     (rows,) = result.tables.values()

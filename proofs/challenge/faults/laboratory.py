@@ -87,15 +87,12 @@ class _Faults:
         return np.broadcast_to(chosen, time.shape)
 
 
-def record(
-    case: Case, rng: np.random.Generator, *, steps: int | None = None, share: float = 1.0
-) -> Breaths:
+def record(case: Case, rng: np.random.Generator, *, share: float = 1.0) -> Breaths:
     """Record a case: volume-controlled, pressure-controlled and explored breaths.
 
     Args:
         case: a case of this generator.
         rng: source of everything that varies.
-        steps: not used; the number of steps is fixed.
         share: scales pressures above PEEP and flows.
     """
     assert isinstance(case, FaultsCase)
@@ -138,27 +135,7 @@ def record(
     return _run(case, rng, time, u_out, command, np.arange(n), noise)
 
 
-def record_commands(
-    case: Case, time: Floats, u_in: Floats, u_out: NDArray[np.int8],
-    rng: np.random.Generator, *, steps: int | None = None,
-) -> Breaths:  # fmt: skip
-    """Record given commands, open loop, after the case's own breaths.
-
-    Args:
-        case: a case of this generator.
-        time: times of the samples, s, ``(k, T)``.
-        u_in: %, ``(k, T)``.
-        u_out: 0/1, ``(k, T)``.
-        rng: source of noise.
-        steps: not used.
-    """
-    assert isinstance(case, FaultsCase)
-    number = case.breaths + np.arange(len(time))
-    noise = coloured_noise(case, 0.7, rng, time.shape)
-    return _run(case, rng, time, u_out, lambda k, pressure: u_in[:, k], number, noise)
-
-
-def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:
+def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
     """Readings without noise under recorded commands, cmH2O, ``(n, T)``.
 
     Args:
@@ -166,7 +143,6 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
         breaths: commands and times.
         start: airway pressure at rest, ``(n,)``.
         seed: not used; which breaths are affected belongs to the case.
-        steps: not used.
     """
     assert isinstance(case, FaultsCase)
     quiet = np.zeros(breaths.time.shape)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, draw_base
 from proofs.challenge.first.circuit import READING, Circuit, Disturbances
 from proofs.challenge.first.instruments import Floats, Sensor, Valve
-from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
 #: Means of the sampling interval that a breath may have, s.
@@ -114,30 +113,6 @@ def record(
     time = sampling_times(case.breaths, case.samples, case.jitter, rng)
     command = RecordingController(case, time, rng, share).command
     return _run(case, base, time, expiratory(time), command, np.arange(len(time)), rng, steps)
-
-
-def record_commands(
-    case: Case, time: Floats, u_in: Floats, u_out: NDArray[np.int8],
-    rng: np.random.Generator, *, steps: int | None = None,
-) -> Breaths:  # fmt: skip
-    """Record given commands on the case's rig, open loop, after the case's own breaths.
-
-    Args:
-        case: case with its base.
-        time: times of the samples, s, ``(k, T)``.
-        u_in: %, ``(k, T)``.
-        u_out: 0/1, ``(k, T)``.
-        rng: source of noise and efforts.
-        steps: see :func:`record`.
-
-    Raises:
-        InputError: if the case has no base: a new one would be another rig.
-    """
-    if case.base is None:
-        raise InputError(f"{case.name}: the rig of this case is not known")
-    sized = replace(case, samples=time.shape[1])
-    number = case.breaths + np.arange(len(time))
-    return _run(sized, case.base, time, u_out, lambda k, p: u_in[:, k], number, rng, steps)
 
 
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:

@@ -104,39 +104,7 @@ def record(
     )  # fmt: skip
 
 
-def record_commands(
-    case: Case, time: Floats, u_in: Floats, u_out: NDArray[np.int8],
-    rng: np.random.Generator, *, steps: int | None = None,
-) -> Breaths:  # fmt: skip
-    """Record given commands on the case's rig, open loop, after the case's own breaths.
-
-    Args:
-        case: a case of this generator.
-        time: times of the samples, s, ``(k, T)``.
-        u_in: %, ``(k, T)``.
-        u_out: 0/1, ``(k, T)``.
-        rng: source of noise and efforts.
-        steps: not used.
-    """
-    assert isinstance(case, StrangerCase)
-    n = len(time)
-    noise = coloured_noise(case, case.correlation, rng, time.shape)
-
-    def command(k: int, shown: Floats, due: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        measured = shown + noise[:, k]
-        if case.step > 0:
-            measured = case.step * np.round(measured / case.step)
-        return measured, u_in[:, k]
-
-    number = case.breaths + np.arange(n)
-    pressure, _ = _run(case, rng, time, u_out, command, number, STEP)
-    ones = np.ones(n)
-    return make_breaths(
-        number + 1, case.lung_R * ones, case.lung_C * ones, time, u_in, u_out, pressure
-    )
-
-
-def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:
+def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
     """Pressures without noise under recorded commands, cmH2O, ``(n, T)``.
 
     Args:
@@ -144,7 +112,6 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
         breaths: commands and times.
         start: airway pressure at rest, ``(n,)``.
         seed: seed of efforts and phases.
-        steps: not used.
     """
     assert isinstance(case, StrangerCase)
     quiet = replace(case, gain_scatter=0.0)

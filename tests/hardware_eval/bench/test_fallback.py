@@ -90,7 +90,7 @@ def test_whatever_an_entry_asks_for_the_gate_holds(lung: Lung) -> None:
 
 
 def with_fallback(bench: Bench) -> Bench:
-    return Bench(bench.client, bench.clock, bench.settings, bench.operator, None, 2.0, DEFAULT)
+    return Bench(bench.client, bench.clock, bench.settings, bench.operator, (), 2.0, DEFAULT)
 
 
 def test_it_takes_over_for_a_late_answer_and_hands_back(bench: Bench) -> None:

@@ -15,9 +15,8 @@ from hardware_eval.bench.collect import collect
 from hardware_eval.bench.identity import measured_lung
 from hardware_eval.bench.loop import Bench, SilentOperator
 from hardware_eval.bench.selftest import LIMITS, Driven, selftest, span_finding
-from hardware_eval.emulation.faults import LineFault, LineFaultKind
+from hardware_eval.emulation.faults import Fault, FaultKind, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
-from hardware_eval.emulation.simulated import FaultKind, LungFault
 from ventbench.base.errors import InputError
 
 from .test_identity import probed
@@ -58,7 +57,7 @@ def test_what_a_slow_line_spoils_is_repeated(bench: Bench, device: LoopbackDevic
     now = device.clock.now() - device.start
     # Silent for 0.3 s within the first part, and for a step within the second.
     device.line.faults = tuple(
-        LineFault(LineFaultKind.SILENT, now + start, now + start + length)
+        Fault(LineFaultKind.SILENT, now + start, now + start + length)
         for start, length in ((4.0, 0.3), (16.0, 0.02))
     )
     sheet = selftest(bench, LUNG, simulator="physics")
@@ -72,7 +71,7 @@ def test_a_line_that_stays_silent_is_a_no_go_that_says_so(
     bench: Bench, device: LoopbackDevice
 ) -> None:
     now = device.clock.now() - device.start
-    each = [LineFault(LineFaultKind.SILENT, now + 2.3 + k, now + 2.8 + k) for k in range(200)]
+    each = [Fault(LineFaultKind.SILENT, now + 2.3 + k, now + 2.8 + k) for k in range(200)]
     device.line.faults = tuple(each)
     sheet = selftest(replace(bench, rest=0.5), LUNG, simulator="physics")
     assert not sheet.go
@@ -176,10 +175,10 @@ def test_a_span_that_is_off_shows_on_a_calibrated_lung(off: float) -> None:
 
 
 FAULTS = {
-    "sensor_zero": LungFault(FaultKind.SENSOR_OFFSET, 0.0, strength=3.0),
-    "leak": LungFault(FaultKind.LEAK, 0.0, strength=0.05),
-    "valve_gain": LungFault(FaultKind.VALVE_WEAK, 0.0, strength=0.3),
-    "safety": LungFault(FaultKind.DISCONNECTED, 0.0),
+    "sensor_zero": Fault(FaultKind.SENSOR_OFFSET, 0.0, strength=3.0),
+    "leak": Fault(FaultKind.LEAK, 0.0, strength=0.05),
+    "valve_gain": Fault(FaultKind.VALVE_WEAK, 0.0, strength=0.3),
+    "safety": Fault(FaultKind.DISCONNECTED, 0.0),
 }
 
 
@@ -210,7 +209,7 @@ def test_exploring_stops_when_nothing_can_be_trusted(
 ) -> None:
     collect(bench, LUNG, 1, tmp_path)
     hal: Any = device.service.hal
-    hal.faults = (LungFault(FaultKind.DISCONNECTED, device.clock.now()),)
+    hal.faults = (Fault(FaultKind.DISCONNECTED, device.clock.now()),)
     told: list[str] = []
 
     class Listens(SilentOperator):

@@ -10,7 +10,7 @@ import pytest
 
 from hardware_eval.device.program import OLDEST_SEEN, PERIOD, SENSOR_TIMEOUT, DeviceSettings
 from hardware_eval.emulation.loopback import LoopbackDevice
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, RefusedError
 from hardware_eval.wire.messages import (
     Command,
     Flag,
@@ -20,7 +20,6 @@ from hardware_eval.wire.messages import (
     Reason,
     encode,
 )
-from hardware_eval.wire.parser import RefusedError
 from tests.hardware_eval.stand_in import Bench
 
 #: From the last command to vented valves, s.

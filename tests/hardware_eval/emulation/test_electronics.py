@@ -26,10 +26,9 @@ from hardware_eval.device.program import Sample
 from hardware_eval.emulation import electronics
 from hardware_eval.emulation.electronics import Electronics
 from hardware_eval.emulation.loopback import LoopbackDevice
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, LinkError, RefusedError
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Mode
-from hardware_eval.wire.parser import LinkError, RefusedError
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 

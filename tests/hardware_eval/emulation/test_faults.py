@@ -8,19 +8,11 @@ from typing import Any
 import flax.struct
 import pytest
 
-from hardware_eval.emulation.faults import (
-    FaultKind,
-    Line,
-    LineFault,
-    LineFaultKind,
-    LungFault,
-    parse,
-)
+from hardware_eval.emulation.faults import Fault, FaultKind, Line, LineFaultKind, parse
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, DisconnectedError, NoAnswerError
 from hardware_eval.wire.messages import Capability, Flag, Mode
-from hardware_eval.wire.parser import DisconnectedError, NoAnswerError
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
@@ -39,7 +31,7 @@ def hal_of_a_textbook_lung() -> SimulatedHal:
 
 
 def _inspire(
-    hal: SimulatedHal, *faults: LungFault, u_in: float = 10.0, steps: int = STEPS
+    hal: SimulatedHal, *faults: Fault, u_in: float = 10.0, steps: int = STEPS
 ) -> list[float]:
     """Pressures at the steps of an inspiration with a constant command, cmH2O."""
     fresh = hal.at_rest(faults)
@@ -76,13 +68,13 @@ def test_faults_change_the_pressure_as_they_say(hal_of_a_textbook_lung: Simulate
     healthy = _inspire(hal)
 
     def last(kind: FaultKind, strength: float = 1.0) -> float:
-        return _inspire(hal, LungFault(kind, 0.3, strength=strength))[-1]
+        return _inspire(hal, Fault(kind, 0.3, strength=strength))[-1]
 
-    offset = _inspire(hal, LungFault(FaultKind.SENSOR_OFFSET, 0.3, 0.6, 2.0))
+    offset = _inspire(hal, Fault(FaultKind.SENSOR_OFFSET, 0.3, 0.6, 2.0))
     assert [b - a for a, b in zip(healthy, offset, strict=True)] == pytest.approx(
         [2.0 if 0.3 <= 0.03 * (k + 1) < 0.6 - 1e-9 else 0.0 for k in range(STEPS)], abs=1e-3
     )
-    stuck = _inspire(hal, LungFault(FaultKind.SENSOR_STUCK, 0.305))
+    stuck = _inspire(hal, Fault(FaultKind.SENSOR_STUCK, 0.305))
     assert set(stuck[10:]) == {stuck[9]}
     assert math.isnan(last(FaultKind.SENSOR_LOST))
     assert last(FaultKind.VALVE_WEAK, 0.5) < healthy[-1] - 3.0
@@ -119,7 +111,7 @@ def test_a_plant_without_flow_says_so() -> None:
 
 
 def test_a_stuck_valve_keeps_its_position(hal_of_a_textbook_lung: SimulatedHal) -> None:
-    fresh = hal_of_a_textbook_lung.at_rest((LungFault(FaultKind.VALVE_STUCK, 0.1),))
+    fresh = hal_of_a_textbook_lung.at_rest((Fault(FaultKind.VALVE_STUCK, 0.1),))
     for k in range(10):
         fresh.actuate(0.03 * k, 10.0, 0)
         before = fresh.sample(0.03 * (k + 1)).pressure
@@ -128,7 +120,7 @@ def test_a_stuck_valve_keeps_its_position(hal_of_a_textbook_lung: SimulatedHal) 
 
 
 def test_the_device_vents_an_occluded_lung(hal_of_a_textbook_lung: SimulatedHal) -> None:
-    hal = hal_of_a_textbook_lung.at_rest((LungFault(FaultKind.OCCLUDED, 0.3),))
+    hal = hal_of_a_textbook_lung.at_rest((Fault(FaultKind.OCCLUDED, 0.3),))
     device = LoopbackDevice(hal)
     client = Client(device, device.clock)
     client.hello()
@@ -185,7 +177,7 @@ def test_faults_of_the_line(kind: LineFaultKind, strength: float, times_out: boo
     client = Client(device, device.clock)
     client.hello()
     client.arm()
-    line.faults = (LineFault(kind, device.clock.now(), device.clock.now() + 0.5, strength),)
+    line.faults = (Fault(kind, device.clock.now(), device.clock.now() + 0.5, strength),)
     if times_out:
         with pytest.raises(NoAnswerError, match="within 20 ms"):
             client.command(10.0, 0)
@@ -195,9 +187,8 @@ def test_faults_of_the_line(kind: LineFaultKind, strength: float, times_out: boo
         assert device.clock.now() - before >= strength
     device.clock.advance(1.0)
     assert client.vent().mode is Mode.VENTED  # the line is in order again
-    counted = client.statistics()
-    assert counted.unanswered == int(times_out)
-    assert counted.unexpected == int(kind is LineFaultKind.LATE and times_out)
+    assert client.counts["unanswered"] == int(times_out)
+    assert client.counts["unexpected"] == int(kind is LineFaultKind.LATE and times_out)
 
 
 def test_a_pulled_cable_vents_and_the_client_comes_back() -> None:
@@ -214,14 +205,14 @@ def test_a_pulled_cable_vents_and_the_client_comes_back() -> None:
     assert bench.valves[-1][1:] == (0.0, 1)
     device.plug()
     assert client.reconnect().pressure_limit == 40.0
-    assert client.statistics().disconnections == 1
+    assert client.counts["disconnections"] == 1
     assert client.arm().mode is Mode.RUNNING
 
 
 def test_faults_as_text() -> None:
-    assert parse("leak@10-13:0.1") == LungFault(FaultKind.LEAK, 10.0, 13.0, 0.1)
-    assert parse("late@0:0.02", now=5.0) == LineFault(LineFaultKind.LATE, 5.0, math.inf, 0.02)
-    assert parse("sensor_offset@1:-2") == LungFault(FaultKind.SENSOR_OFFSET, 1.0, strength=-2.0)
+    assert parse("leak@10-13:0.1") == Fault(FaultKind.LEAK, 10.0, 13.0, 0.1)
+    assert parse("late@0:0.02", now=5.0) == Fault(LineFaultKind.LATE, 5.0, math.inf, 0.02)
+    assert parse("sensor_offset@1:-2") == Fault(FaultKind.SENSOR_OFFSET, 1.0, strength=-2.0)
     for wrong in ("leak", "fire@1", "leak@3-2", "leak@1..2", "leak@x"):
         with pytest.raises(InputError, match="KIND@START"):
             parse(wrong)

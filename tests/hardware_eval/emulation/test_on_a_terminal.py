@@ -28,10 +28,9 @@ from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, RefusedError
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Capability, Flag, Mode
-from hardware_eval.wire.parser import RefusedError
 from ventbench.board import record
 from ventbench.board.record import HardwareRecord
 from ventbench.cli import app as ventbench

@@ -27,11 +27,10 @@ from typer.testing import CliRunner
 from hardware_eval import cli, realtime
 from hardware_eval.emulation.emulator import Emulator
 from hardware_eval.emulation.firmware import Firmware, Order
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, NoAnswerError, RefusedError
 from hardware_eval.wire.conformance import conformance
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Flag, Mode
-from hardware_eval.wire.parser import NoAnswerError, RefusedError
 from tests.hardware_eval.firmware.core import FIRMWARE, tool
 from ventbench.base.errors import InputError
 

@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from hardware_eval import cli
 from hardware_eval.bench.loop import SilentOperator
 from hardware_eval.bench.plan import make_plan
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results import record as records
-from hardware_eval.results.compare import compare, recorded_breaths, replay
 from hardware_eval.results.evaluate import Line
+from hardware_eval.results.replay import recorded_breaths, replay
+from hardware_eval.results.trial import analyse
 from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, gate, record, store
 from ventbench.board.record import HardwareRecord
@@ -74,9 +77,10 @@ def test_the_record_holds_score_device_and_recording(done: ev.Evaluation, path: 
 
 
 def test_the_log_gives_the_errors_of_the_record(done: ev.Evaluation, path: Path) -> None:
-    report = replay(done.log, record=path)
-    assert report.problems == ()
-    assert report.errors["pid_best"][LUNG] == pytest.approx(loaded(path).score, abs=1e-3)
+    assert replay(done.log, record=path).problems == ()
+    assert analyse([done.log]).entries["pid_best"].score.value == pytest.approx(
+        loaded(path).score, abs=1e-3
+    )
 
 
 def changed(path: Path, change: Any) -> bytes:
@@ -149,13 +153,16 @@ def test_the_board_shows_it_beside_the_simulated_score(path: Path, tmp_path: Pat
 
 
 def test_the_recording_is_compared_with_simulators(path: Path) -> None:
-    breaths = recorded_breaths(path)
-    own = compare(breaths, simulator="physics", diagnose=False).lungs[LUNG]
-    frozen = compare(breaths, diagnose=False).lungs[LUNG]
+    figures = []
+    for plant in ("physics", "frozen"):
+        words = ["compare", str(path), "--plant", plant, "--no-diagnose", "--json", "-"]
+        done = CliRunner().invoke(cli.app, words)
+        assert done.exit_code == 0, done.output
+        figures.append(json.loads(done.stdout)["lungs"][LUNG])
+    own, frozen = figures
     # The emulated lung is the physics; its own simulator is nearer to it than the real rig's.
-    assert own.mae < 0.35 < frozen.mae
-    waveforms = compare(breaths, simulator="physics", diagnose=False).waveforms[LUNG]
-    assert sum(part.breaths for part in waveforms.values()) == len(breaths)
+    assert own["mae"] < 0.35 < frozen["mae"]
+    assert own["breaths"] == frozen["breaths"] == len(recorded_breaths(path))
 
 
 def test_a_record_without_its_log_says_where_to_look(path: Path, tmp_path: Path) -> None:

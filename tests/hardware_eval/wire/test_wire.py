@@ -13,17 +13,21 @@ from hypothesis import strategies as st
 
 from hardware_eval.wire import messages
 from hardware_eval.wire.messages import (
+    LONGEST_FRAME,
     LONGEST_PACKET,
     Arm,
     Capability,
     Command,
     Counters,
+    Event,
+    Fault,
     Flag,
     Heartbeat,
     Hello,
     Kind,
     Mode,
     Packet,
+    ParserState,
     Reading,
     Reason,
     Refusal,
@@ -32,10 +36,11 @@ from hardware_eval.wire.messages import (
     Welcome,
     decode,
     encode,
+    feed,
+    feed_bytes,
     to_frame,
     to_packet,
 )
-from hardware_eval.wire.parser import LONGEST_FRAME, Event, Fault, ParserState, feed, feed_bytes
 
 #: Enough to find what a table forgets; the benchmark of hostile frames has the million.
 QUICK = settings(max_examples=40)

@@ -45,11 +45,6 @@ def parameters(path: str, **given: Any) -> dict[str, Any]:
     return good(parameters={path: {"value": 1.0, "low": 0.5, "high": 2.0} | given})
 
 
-def next_breath(**given: Any) -> dict[str, Any]:
-    breath = {"time": [0, 0.03], "u_in": [3, 4], "u_out": [0, 1]} | given
-    return good(record_next=[breath])
-
-
 FLAT = [10.0] * SAMPLES
 MALFORMED: list[tuple[Any, str]] = [
     (b"", "not an answer"),
@@ -93,11 +88,6 @@ MALFORMED: list[tuple[Any, str]] = [
     (good(parameters={"R": 20.0}), "Expected `object`"),
     (good(active={"1": [[0.5, 0.1]]}), r"active\[1\]: 0.5 to 0.1"),
     (good(active={"1": [[0.5]]}), "length 2"),
-    (next_breath(u_in=[3, 400]), "u_in must be 0..100"),
-    (next_breath(u_out=[0, 7]), "u_out 0 or 1"),
-    (next_breath(time=[0, 0]), "must start at 0 and rise"),
-    (next_breath(time=[0]), "the same length"),
-    (good(record_next=next_breath()["record_next"] * 11), "11 breaths"),
 ]
 
 

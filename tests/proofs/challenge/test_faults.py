@@ -11,7 +11,7 @@ import pytest
 from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.detectability import LIMIT, log_likelihood_loss
 from proofs.challenge.faults.effects import FAULTS, PARTIAL, SHARES, FaultsCase, draw
-from proofs.challenge.faults.laboratory import active, record, record_commands, replay
+from proofs.challenge.faults.laboratory import active, record, replay
 from proofs.challenge.folder import decode_answers, encode_answers
 from proofs.challenge.truth import true_values
 from proofs.challenge.vocabulary import PARAMETERS, VOCABULARY
@@ -133,12 +133,3 @@ def test_a_faint_fault_is_below_detection_and_a_strong_one_above():
         rig = replace(noisy, effects=case("gain_step", change=share, breath=5.0).effects)
         recorded = record(rig, np.random.default_rng(3))
         assert (log_likelihood_loss(rig, recorded, 0) > LIMIT) == seen
-
-
-def test_requested_breaths_go_on_after_the_session():
-    rig = case("zero_step", change=2.0, breath=5.0)
-    time: Any = np.tile(0.03 * np.arange(60), (2, 1))
-    out = (time > 1.0).astype(np.int8)
-    more = record_commands(rig, time, np.where(out == 0, 15.0, 0.0), out, np.random.default_rng(1))
-    assert more.breath_id.tolist() == [9, 10]
-    np.testing.assert_allclose(more.pressure[:, 10] - PLAIN[0, 10], 2.0, atol=1.0)

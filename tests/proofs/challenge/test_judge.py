@@ -14,7 +14,6 @@ from proofs.challenge.figures import (
     full_answer,
     paired,
     scores,
-    second_round,
     share,
     wilson,
 )
@@ -214,15 +213,6 @@ def test_differences_are_paired():
     assert found.ci95 is not None
     assert found.value is not None
     assert found.ci95[0] < found.value < found.ci95[1] < 0.0
-
-
-def test_second_round_counts_what_was_open():
-    sure = judged("single", [LEAK], SURE)
-    unsure = judged("single", [LEAK], answer((0.6, "leak"), (0.4, "valve_dead_band")))
-    mistaken = judged("single", [LEAK], answer((1.0, "valve_dead_band")))
-    before = {"a": sure, "b": unsure, "c": mistaken, "d": unsure}
-    found = second_round(before, {"a": sure, "b": sure, "c": mistaken, "d": sure})
-    assert (found.value, found.count) == (pytest.approx(2 / 3), 3)
 
 
 def test_a_share_of_nothing_has_no_value():

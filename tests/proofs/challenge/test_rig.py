@@ -8,14 +8,9 @@ import pytest
 from scipy.linalg import expm
 
 from hardware_eval.emulation.cases import EFFECTS, Base, Case, Effect, draw_base, draw_effect
-from proofs.challenge.first.rig import (
-    record,
-    record_commands,
-    replay,
-    sampling_times,
-    step_grid,
-)
+from proofs.challenge.first.rig import record, replay, sampling_times, step_grid
 from proofs.challenge.truth import has_library_form
+from ventbench.recordings.breaths import make_breaths
 
 from .truths import case
 
@@ -25,12 +20,16 @@ TIME = np.linspace(0.0, (T - 1) * 0.032, T)
 OPENED = (np.arange(T) >= 40).astype(np.int8)
 
 
+def one_breath(u_in, u_out):
+    """Commands of the first breath after a session of six; without pressures."""
+    return make_breaths([7], [10.0], [20.0], TIME[None], u_in[None], u_out[None], 0 * TIME[None])
+
+
 def driven(*effects, u=10.0, until=20, opened=OPENED, base=None):
     """One breath at a level command, then none; pressure, cmH2O, ``(T,)``, from near PEEP."""
-    u_in = np.where(np.arange(T) < until, u, 0.0)[None]
+    breath = one_breath(np.where(np.arange(T) < until, u, 0.0), opened)
     one = case(*effects, **({"base": base} if base else {}))
-    rng = np.random.default_rng(0)
-    return record_commands(one, TIME[None], u_in, opened[None], rng, steps=STEPS).pressure[0]
+    return replay(one, breath, np.array([5.1]), 0, steps=STEPS)[0]
 
 
 def test_plain_breath_is_the_closed_form():
@@ -44,11 +43,8 @@ def test_plain_breath_is_the_closed_form():
 
 
 def test_flow_out_is_one_way():
-    deep = np.full(T, 1, np.int8)
     one = case(base=Base(10.0, 20.0, peep=5.0))
-    rng = np.random.default_rng(0)
-    breaths = record_commands(one, TIME[None], np.zeros((1, T)), deep[None], rng, steps=1)
-    p = replay(one, breaths, np.array([3.0]), 0)
+    p = replay(one, one_breath(np.zeros(T), np.ones(T, np.int8)), np.array([3.0]), 0)
     np.testing.assert_allclose(p, 3.0, atol=1e-9)
 
 

@@ -85,16 +85,11 @@ def sees_nothing(folder: Path) -> dict[str, Any]:
     return _flat(folder, [])
 
 
-def asks(folder: Path) -> dict[str, Any]:
-    """Is not sure, and asks for two breaths."""
-    time = np.arange(80) * 0.033
-    u_in = [np.where(time < 0.6, level, 0.0) for level in (5.0, 8.0)]
+def unsure(folder: Path) -> dict[str, Any]:
+    """Is not sure."""
     return _flat(folder, ["leak"]) | {
         "hypotheses": [
             {"terms": ["leak"], "probability": 0.6}, {"terms": [], "probability": 0.4},
-        ],
-        "record_next": [
-            {"time": time, "u_in": u, "u_out": (time > 1.6).astype(int)} for u in u_in
         ],
     }  # fmt: skip
 

@@ -44,7 +44,7 @@ def material() -> Material:
         f"{day}#4": run(21.0, 52.0, (20.0, 20.0), 4),  # somebody forgot to set the lung
     }
     drives = {name: "blower" for name in runs} | {"other#1": "proportional valve"}
-    return Material(runs, drives, {})
+    return Material(runs, drives)
 
 
 def test_pairs_know_their_truth_and_their_half(material):

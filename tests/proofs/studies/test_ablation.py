@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from proofs.__main__ import app
+from proofs.paper.paper import load_stored
 from proofs.studies import controllers, networks
 from tests.train.conftest import synthetic
 from ventbench.base.errors import InputError
@@ -129,6 +130,9 @@ def test_the_table_of_controllers_pairs_seeds():
     assert rows.loc["wide", "nominal_change_high"] == pytest.approx(0.2)
     assert rows.loc["base", "nominal_change_high"] == 0.0
     assert rows.loc["wide", "draws_change_low"] == 0.0
+    stored, known = controllers.stored(runs, SMALL), load_stored()["controllers"]
+    assert stored["variants"][1]["nominal"] == pytest.approx(2.25)
+    assert stored["variants"][0].keys() == known["variants"][0].keys()
 
 
 @pytest.mark.slow
@@ -172,6 +176,9 @@ def test_networks_are_compared(tmp_path):
     assert rows.loc["H_p 1", "mean"] == pytest.approx(mean)
     assert rows.loc["H_p 1", "change"] == pytest.approx(mean - rows.loc["base", "mean"])
     assert rows.loc["base", "low95"] == rows.loc["base", "high95"] == 0.0
+    stored, known = networks.stored(breaths), load_stored()["networks"]
+    assert stored["base"] == known["base"]
+    assert stored["variants"][0].keys() <= known["variants"][0].keys()
     told.clear()
     pd.testing.assert_frame_equal(compare(), breaths)
     assert len(told) == 2

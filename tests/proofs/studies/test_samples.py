@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import jax
 import numpy as np
 import pandas as pd
@@ -10,6 +12,8 @@ from scipy.stats import trim_mean
 from typer.testing import CliRunner
 
 from proofs.__main__ import app
+from proofs.paper import controller_sections
+from proofs.paper.paper import load_stored
 from proofs.studies import samples
 from proofs.studies.samples import LearningCurve, SampleStudy
 from ventbench.controllers.rl_policy import GAINS
@@ -73,6 +77,14 @@ def test_table_has_a_row_for_each_point(made):
     assert {f"seed{i}" for i in range(5)} < set(points.columns)
 
 
+def test_what_is_stored_has_the_form_of_the_papers_page(made):
+    stored, known = made.stored(), load_stored()["samples"]
+    assert stored.keys() == known.keys()
+    assert stored["methods"][0].keys() == known["methods"][0].keys()
+    assert stored["about"]["command"] == "python -m proofs study samples --seeds 5"
+    json.dumps(stored, allow_nan=False)
+
+
 def test_picture(made):
     pytest.importorskip("matplotlib", reason="the picture needs the extra view")
     content = samples.learning_curves_png(made)
@@ -89,9 +101,17 @@ def test_the_short_recipe_is_done_after_96_breaths():
 
 @pytest.mark.slow
 def test_study_samples(tmp_path):
+    store = tmp_path / "stored.json"
+    store.write_text('{"networks": 1}')
     asked = ["study", "samples", "--seeds", "2", "--share", "0.01", "--out", str(tmp_path)]
-    result = CliRunner().invoke(app, asked)
+    result = CliRunner().invoke(app, [*asked, "--store", str(store)])
     assert result.exit_code == 0, result.output
+    kept = json.loads(store.read_text())
+    assert kept["networks"] == 1
+    section = controller_sections.sample_efficiency(kept["samples"])
+    lines = {line.name: line for line in section.charts[0].lines}
+    assert set(lines) == {"policy-gradient-short", "policy-gradient", "ppo", "dqn"}
+    assert all(np.all(np.diff(line.x) > 0) for line in lines.values())
     summary = pd.read_csv(tmp_path / "summary.csv").set_index("method")
     assert list(summary.index) == ["policy-gradient-short", "policy-gradient", "ppo", "dqn"]
     points = pd.read_csv(tmp_path / "samples.csv")

@@ -44,6 +44,12 @@ Lungs = Annotated[
         autocompletion=options.known_lungs,
     ),
 ]
+Control = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="SOCKET", help="Control socket of an emulator, which then disturbs the tube itself."
+    ),
+]
 Skip = Annotated[
     list[str] | None,
     typer.Option(
@@ -73,6 +79,10 @@ def run(
     track: Annotated[
         str | None,
         typer.Option(help="performance (the lung is told) or robustness; default: the entry's."),
+    ] = None,
+    perturb: Annotated[
+        list[str] | None,
+        typer.Option(help="Also run with a disturbed tube: leak or pinch; repeatable."),
     ] = None,
     control_every: Annotated[
         int, typer.Option(min=0, help="Scored runs between two control runs of the PID; 0: none.")
@@ -109,6 +119,7 @@ def run(
         typer.Option(metavar="FILE|live", help="Also show breaths in rerun: a file, or live."),
     ] = None,
     calibration: Calibrated = None,
+    control: Control = None,
     yes: Yes = False,
     json: JsonFile = None,
 ) -> None:
@@ -136,7 +147,7 @@ def run(
         seed = secrets.randbits(32) if begun is None else int(begun["seed"])
     plan = make_plan(
         [x.manifest.name for x in entries], lung, track=track, pips=chosen, repeats=repeats,
-        control_every=control_every, seed=seed,
+        control_every=control_every, perturbations=perturb or (), seed=seed,
     )  # fmt: skip
     settings = SafetySettings(largest_u_in=largest_u_in, largest_rise=largest_rise)
     shows = [show_bars, *([RerunView(rerun).breath] if rerun else [])]
@@ -150,7 +161,7 @@ def run(
         print(sheet, flush=True)
         return sheet
 
-    with bench_on(port, yes=yes) as (line, _, person):
+    with bench_on(port, yes=yes, control=control) as (line, _, person):
         calibrated = calibration_of(line, calibration)
         masked = Blind(person, plan)
         done = ev.evaluate(

@@ -39,7 +39,9 @@ def told(json: Path | None) -> TextIO:
 
 
 @contextlib.contextmanager
-def bench_on(port: str, *, yes: bool) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
+def bench_on(
+    port: str, *, yes: bool, control: Path | None = None
+) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
     """A bench with a person at it, whose keys are stops; the line is released at the end."""
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench
@@ -48,7 +50,7 @@ def bench_on(port: str, *, yes: bool) -> Iterator[tuple[Line, Bench, ConsoleOper
 
     line = ev.connect(port)
     try:
-        person = ConsoleOperator(yes=yes)
+        person = ConsoleOperator(yes=yes, control=control, device=line.device)
         with keys(person):
             yield line, Bench(line.client, line.clock, DEFAULT, person), person
     finally:

@@ -8,18 +8,34 @@ import math
 import os
 import re
 import select
+import socket
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
+from hardware_eval.emulation.faults import parse
 from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
+
+if TYPE_CHECKING:
+    from hardware_eval.emulation.loopback import LoopbackDevice
+
+#: What the emulator is told for a perturbation; see :mod:`hardware_eval.emulation.emulator`. A
+#: leak as if the expiratory valve stood open by a twentieth; a tube pinched to three times the
+#: resistance.
+EMULATED = {"leak": "leak@0-60:0.05", "pinch": "pinched@0-60:3"}
+
+#: What the operator does by hand.
+_BY_HAND = {
+    "leak": ("open the leak port NOW", "close the leak port"),
+    "pinch": ("pinch the tube NOW", "let the tube go"),
+}
 
 #: Time that a person takes at least to answer what has just been shown, s.
 REACTION = 0.2
@@ -38,11 +54,21 @@ class ConsoleOperator:
 
     Args:
         yes: confirm everything; for an emulator and for tests.
+        control: control socket of an emulator, which then does perturbations by itself.
+        device: a device that is emulated in this process, to which the same applies.
         reaction: time after a question was shown in which a key cannot be an answer yet, s.
     """
 
-    def __init__(self, *, yes: bool = False, reaction: float = REACTION) -> None:
-        self._yes, self._reaction = yes, reaction
+    def __init__(
+        self,
+        *,
+        yes: bool = False,
+        control: Path | None = None,
+        device: LoopbackDevice | None = None,
+        reaction: float = REACTION,
+    ) -> None:
+        self._yes, self._control, self._device = yes, control, device
+        self._reaction = reaction
         self._terminal: int | None = None
 
     @contextlib.contextmanager
@@ -131,6 +157,23 @@ class ConsoleOperator:
         """Print a line."""
         print(text, flush=True)
 
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """Have a leak opened or the tube pinched, by hand or by the emulator."""
+        if self._device is not None:
+            hal: Any = self._device.service.hal
+            hal.faults = (parse(EMULATED[perturbation], self._device.clock.now()),) if on else ()
+            return
+        if self._control is not None:
+            text = EMULATED[perturbation] if on else "clear"
+            # A session must not fail because nobody disturbs it.
+            with (
+                contextlib.suppress(OSError),
+                socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender,
+            ):
+                sender.sendto(text.encode(), str(self._control))
+            return
+        print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
+
 
 class Blind:
     """An operator to whom entries are called by numbers, whatever is asked, told or shown.
@@ -164,6 +207,10 @@ class Blind:
     def stop(self) -> bool:
         """Whether the emergency stop has been pressed."""
         return self._operator.stop()
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """Open a leak or pinch the tube now, or undo it."""
+        self._operator.disturb(perturbation, on)
 
     def hiding(self, show: Show) -> Show:
         """What shows breaths, without the names of entries."""

@@ -24,7 +24,7 @@ from hardware_eval import realtime
 from hardware_eval.bench import fallback, safety
 from hardware_eval.bench.controllers import ControllerFailedError, LiveController
 from hardware_eval.bench.fallback import FallbackSettings
-from hardware_eval.bench.plan import PlannedRun
+from hardware_eval.bench.plan import PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.realtime import Clock
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError, RefusedError
@@ -73,6 +73,10 @@ class Operator(Protocol):
         """Whether the emergency stop has been pressed; called at every step."""
         ...
 
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """Open a leak or pinch the tube now, or undo it."""
+        ...
+
 
 class SilentOperator:
     """Confirms everything; for dry runs, tests and ``--yes``."""
@@ -87,6 +91,9 @@ class SilentOperator:
     def stop(self) -> bool:
         """No key to press."""
         return False
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """No hand to do it."""
 
 
 @dataclass(frozen=True)
@@ -246,6 +253,7 @@ class _Loop:
         self._breaths: list[BreathLog] = []
         self._asked = self._late_answers = self._limited = self._unanswered = 0
         self._command = (0.0, 1)
+        self._disturbed = False
 
     def run(self) -> RunResult:
         """All breaths."""
@@ -307,6 +315,7 @@ class _Loop:
         if bench.operator.stop():
             bench.client.vent()
             raise EmergencyStop
+        self._disturb(breath, step)
         try:
             reading: Reading | None = bench.client.heartbeat()
         except NoAnswerError:
@@ -412,9 +421,18 @@ class _Loop:
             return self._vented_by_device(flags)
         return self._ended("aborted", str(error))
 
+    def _disturb(self, breath: int, step: int) -> None:
+        """Announce and undo the perturbation of a perturbed run."""
+        tube = self._run.perturbation
+        if tube and not self._disturbed and (breath, step) == (PERTURBED_BREATH, PERTURBED_STEP):
+            self._bench.operator.disturb(tube, True)
+            self._disturbed = True
+
     def _ended(
         self, status: str, reason: str, vented_after: float = math.nan, held_up: bool = False
     ) -> RunResult:
+        if self._disturbed:
+            self._bench.operator.disturb(self._run.perturbation, False)
         return RunResult(
             status, reason, self._safety.trips, tuple(self._breaths), self._late_answers,
             self._limited, vented_after, held_up, self._asked, self._controller.longest_answer,

@@ -20,8 +20,14 @@ from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS, scored_lung
 
 #: Kinds of runs: PIP rises step by step before an entry is scored on a lung; scored; the PID
-#: between them; exploring for recordings.
-Kind = Literal["ramp", "scored", "control", "explore"]
+#: between them; with a leak or a pinched tube at an announced moment; exploring for recordings.
+Kind = Literal["ramp", "scored", "control", "perturbed", "explore"]
+
+#: What happens to the tube in a perturbed run.
+PERTURBATIONS = ("leak", "pinch")
+
+#: Breath of a perturbed run, from 0, and step in it, from which on the tube is disturbed.
+PERTURBED_BREATH, PERTURBED_STEP = 1, 10
 
 #: Name of the control; no submission has it.
 CONTROL = "control_pid"
@@ -52,6 +58,7 @@ class PlannedRun:
     lung: str  #: label of the lung that must be mounted.
     pip: float  #: cmH2O.
     repeat: int  #: repetition, from 1.
+    perturbation: str = ""  #: what happens to the tube; empty for nothing.
 
 
 @dataclass(frozen=True)
@@ -64,6 +71,7 @@ class Plan:
     pips: tuple[float, ...]  #: cmH2O.
     repeats: int  #: repetitions of each cell.
     control_every: int  #: see :data:`CONTROL_EVERY`; 0 for no control.
+    perturbations: tuple[str, ...]  #: of each entry on each lung, see :data:`PERTURBATIONS`.
     seed: int  #: of the order.
     runs: tuple[PlannedRun, ...]  #: all runs in their order.
 
@@ -87,6 +95,7 @@ def make_plan(
     pips: Sequence[float] = protocol.PIPS,
     repeats: int = REPEATS,
     control_every: int = CONTROL_EVERY,
+    perturbations: Sequence[str] = (),
     seed: int = 0,
 ) -> Plan:
     """Plan the evaluation of entries.
@@ -101,6 +110,7 @@ def make_plan(
         pips: cmH2O, of the protocol.
         repeats: repetitions of each cell.
         control_every: see :data:`CONTROL_EVERY`; 0 for no control.
+        perturbations: see :data:`PERTURBATIONS`; each once, at the middle PIP of ``pips``.
         seed: of the order.
 
     Raises:
@@ -114,6 +124,9 @@ def make_plan(
     for pip in pips:
         if pip not in protocol.PIPS:
             raise InputError(f"PIP {pip:g} cmH2O is not one of {_listed(protocol.PIPS)}")
+    for name in perturbations:
+        if name not in PERTURBATIONS:
+            raise InputError(f"perturbation {name!r} is not one of {', '.join(PERTURBATIONS)}")
     if repeats < 1:
         raise InputError(f"{repeats} repetitions: run each cell once at least")
     if CONTROL in entries:
@@ -125,23 +138,34 @@ def make_plan(
     rising = tuple(sorted(float(pip) for pip in pips))
     runs: list[PlannedRun] = []
 
-    def add(kind: Kind, entry: str, lung: str, pip: float, repeat: int) -> None:
-        runs.append(PlannedRun(len(runs), kind, entry, lung, pip, repeat))
+    def add(kind: Kind, entry: str, lung: str, pip: float, repeat: int, tube: str = "") -> None:
+        runs.append(PlannedRun(len(runs), kind, entry, lung, pip, repeat, tube))
 
     for lung in mounted:
         for entry, pip in itertools.product(entries, rising):
             add("ramp", entry, lung, pip, 1)
-        scored = list(itertools.product(entries, rising, range(1, repeats + 1)))
+        scored = [
+            ("scored", entry, pip, repeat, "")
+            for entry, pip, repeat in itertools.product(entries, rising, range(1, repeats + 1))
+        ]
+        middle = rising[len(rising) // 2]
+        scored += [
+            ("perturbed", entry, middle, 1, tube)
+            for entry, tube in itertools.product(entries, perturbations)
+        ]
         controls = 0
         for place, index in enumerate(order.permutation(len(scored)).tolist()):
             if control_every and place % control_every == 0:
                 controls += 1
                 add("control", CONTROL, lung, CONTROL_PIP, controls)
-            entry, pip, repeat = scored[index]
-            add("scored", entry, lung, pip, repeat)
+            kind, entry, pip, repeat, tube = scored[index]
+            add(kind, entry, lung, pip, repeat, tube)  # type: ignore[arg-type]
         if control_every:
             add("control", CONTROL, lung, CONTROL_PIP, controls + 1)
-    return Plan(tuple(entries), track, mounted, rising, repeats, control_every, seed, tuple(runs))
+    return Plan(
+        tuple(entries), track, mounted, rising, repeats, control_every, tuple(perturbations),
+        seed, tuple(runs),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from ventbench.task.lungs import lung as parse_lung
 LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
 
 #: First line of every log.
-FORMAT = "ventbench-hardware-log-2"
+FORMAT = "ventbench-hardware-log-1"
 
 #: What follows a line that was cut off.
 _CUT = {"type": "cut_off"}

@@ -262,7 +262,7 @@ def dry_run(
     mounted, bench = "", None
     for run in plan.runs:
         key = (run.kind == "control", run.entry, run.lung, run.pip)
-        if key in seen:
+        if key in seen or run.kind == "perturbed":
             continue
         seen.add(key)
         if bench is None or run.lung != mounted:

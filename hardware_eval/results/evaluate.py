@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from hardware_eval.emulation.loopback import LoopbackDevice
     from hardware_eval.wire.link import Link
 
-#: Kinds of runs of a plan.
-PLANNED = ("ramp", "scored", "control")
+#: Kinds of runs whose lung is as its label says.
+UNDISTURBED = ("ramp", "scored", "control")
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,8 @@ class Line:
 
     client: Client  #: of the device.
     clock: Clock  #: real, or the loopback device's.
+    #: the device if it is emulated in this process, else None.
+    device: LoopbackDevice | None = None
     port: str = "virtual"  #: what carries the bytes, see :func:`port_kind`.
 
     @property
@@ -132,6 +134,8 @@ def connect(port: str) -> Line:
         LinkError: if it cannot be opened, or no device answers.
         InputError: if there is no such emulated lung.
     """
+    from hardware_eval.wire.link import Link
+
     transport, clock = carrier(port)
     client = Client(transport, clock)
     try:
@@ -139,7 +143,8 @@ def connect(port: str) -> Line:
     except InputError:
         client.close()
         raise
-    return Line(client, clock, port_kind(port))
+    device = None if isinstance(transport, Link) else transport
+    return Line(client, clock, device, port_kind(port))
 
 
 def device_about(line: Line) -> dict[str, Any]:
@@ -282,7 +287,7 @@ def evaluate(
         )  # fmt: skip
     written: Path | None = None
     with contextlib.suppress(InputError):  # no whole breath yet
-        breaths = recording(log_path, kinds=PLANNED)
+        breaths = recording(log_path, kinds=UNDISTURBED)
         written = out / RECORDING
         write(breaths, written)
     made: dict[str, Path] = {}

@@ -75,7 +75,8 @@ def plan_of(logged: list[dict[str, Any]], label: str) -> Plan:
             return make_plan(
                 given["entries"], given["lungs"], track=given["track"],
                 pips=given["pips"], repeats=given["repeats"],
-                control_every=given["control_every"], seed=given["seed"],
+                control_every=given["control_every"], perturbations=given["perturbations"],
+                seed=given["seed"],
             )  # fmt: skip
     raise InputError(f"{label} holds no plan: no session has begun")
 

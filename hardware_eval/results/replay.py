@@ -16,7 +16,7 @@ import numpy as np
 from hardware_eval.bench.loop import BreathLog
 from hardware_eval.bench.plan import PlannedRun, progress
 from hardware_eval.bench.raw_log import LoggedBreath, breaths, lines, recording
-from hardware_eval.results.evaluate import LOG, PLANNED
+from hardware_eval.results.evaluate import LOG, UNDISTURBED
 from hardware_eval.results.record import Jitter, jitter, plan_of
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -159,7 +159,7 @@ def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
     if path.is_dir():
         path = path / LOG
     if path.name.endswith(".jsonl"):
-        return recording(path)
+        return recording(path, kinds=(*UNDISTURBED, "explore"))
     if not path.name.endswith(".json"):
         return load(path)
     loaded = records.load(path)
@@ -170,4 +170,4 @@ def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
         raise InputError(f"{log} is not there: give --log FILE, the raw recording of {path}")
     if files.sha256(log) != loaded.header.recording.sha256:
         raise InputError(f"{log} is not the raw recording that {path} names by its hash")
-    return recording(log, kinds=PLANNED)
+    return recording(log, kinds=UNDISTURBED)

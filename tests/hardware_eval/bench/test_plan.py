@@ -50,7 +50,7 @@ def test_the_order_depends_on_the_seed_and_not_on_how_lungs_are_listed() -> None
     "wrong",
     [
         {"entries": []}, {"lungs": []}, {"lungs": ["R5C10", "R5C10"]}, {"lungs": ["R50C10"]},
-        {"pips": [12.0]}, {"repeats": 0}, {"entries": [CONTROL]},
+        {"pips": [12.0]}, {"repeats": 0}, {"perturbations": ["kick"]}, {"entries": [CONTROL]},
     ],
 )  # fmt: skip
 def test_wrong_plans_are_refused(wrong: dict) -> None:

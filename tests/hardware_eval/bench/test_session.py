@@ -213,6 +213,22 @@ def test_ctrl_c_anywhere_leaves_the_lung_vented(bench: Bench, device: LoopbackDe
     assert vented(device)
 
 
+class Disturbs(SilentOperator):
+    def __init__(self) -> None:
+        self.done: list[tuple[str, bool]] = []
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        self.done.append((perturbation, on))
+
+
+def test_a_perturbed_run_disturbs_the_tube_and_undoes_it(bench: Bench) -> None:
+    person = Disturbs()
+    run_once(
+        replace(bench, operator=person), run(kind="perturbed", perturbation="leak"), Scripted()
+    )
+    assert person.done == [("leak", True), ("leak", False)]
+
+
 class CrashError(BaseException):
     """Stands for ``kill -9``: nothing of the session runs after it but what cleans up itself."""
 

@@ -187,11 +187,7 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
 
 
 def with_form_error(
-    estimates: Mapping[str, Estimate],
-    name: str,
-    form_error: float = FORM_ERROR,
-    *,
-    alone: bool = True,
+    estimates: Mapping[str, Estimate], name: str, *, alone: bool = True
 ) -> dict[str, Estimate]:
     """Estimates whose intervals also contain what the library's equations miss.
 
@@ -202,11 +198,10 @@ def with_form_error(
     Args:
         estimates: estimates of a mechanism's parameters, by short name.
         name: name of the mechanism.
-        form_error: share of a parameter that the equations miss, as a standard deviation.
         alone: False if the mechanism acts beside others, whose forms shift its parameters too.
     """
     widened, description = {}, mechanism(name).description
-    share = np.hypot(form_error, 0.0 if alone else description.beside_error)
+    share = np.hypot(FORM_ERROR, 0.0 if alone else description.beside_error)
     for about in description.parameters:
         if about.name not in estimates:
             continue

@@ -326,17 +326,7 @@ class Evaluator:
         plain = problem.log_likelihood(x)
         return plain + self.breath_term(fitted).log_likelihood_gain(problem, x, fitted)
 
-    def training_log_likelihood(self, fitted: FittedModel, noise: Noise | None = None) -> float:
-        """Log-likelihood of the training breaths, nats; patient effort is integrated out.
-
-        Args:
-            fitted: a model of the training breaths.
-            noise: the likelihood's; that of the fit if None.
-        """
-        term = self.breath_term(fitted)
-        return float(term.marginal_log_likelihood(fitted, noise or fitted.noise).sum())
-
-    def criterion(self, fitted: FittedModel, noise: Noise | None = None) -> float:
+    def criterion(self, fitted: FittedModel) -> float:
         """Bayesian information criterion (BIC) on the training breaths; less is better.
 
         Only shared unknowns count: each breath's own are integrated out, or the same in all
@@ -344,12 +334,11 @@ class Evaluator:
 
         Args:
             fitted: a model of the training breaths.
-            noise: the likelihood's; that of the fit if None.
         """
         count = float(self.training.data.weight.sum())
         penalty = fitted.shared_count * float(np.log(count))
-        evidence = self.training_log_likelihood(fitted, noise) + self.label_log_density(fitted)
-        return penalty - 2.0 * evidence
+        breaths = float(self.breath_term(fitted).marginal_log_likelihood(fitted).sum())
+        return penalty - 2.0 * (breaths + self.label_log_density(fitted))
 
     def label_log_density(self, fitted: FittedModel) -> float:
         """Logarithm of the prior density of each lung's R and C, less its largest value, nats.

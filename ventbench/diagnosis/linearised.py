@@ -337,12 +337,6 @@ class Known:
         which = slice(self.shared.shape[1] - self.latent, self.shared.shape[1])
         return np.einsum("nkt,k->nt", self.shared[:, which], self.mean[which])
 
-    @cached_property
-    def gains(self) -> Floats:
-        """Posterior mean of the logarithm of each breath's gain beside what all share, ``(n,)``."""
-        count = self.shared.shape[1]
-        return self.scatter * self.mean[count : count + self.n]
-
     @property
     def left(self) -> Noise:
         """Noise beside all that is known here."""

@@ -78,13 +78,10 @@ class Noise:
         return ar * linked, sigma * np.sqrt(1.0 - linked * ar**2), weight
 
 
-def robust_noise(
-    residual: Floats, weight: Floats, *, floor: float = LEAST_SIGMA, tail: float = Noise.tail
-) -> Noise:
+def robust_noise(residual: Floats, weight: Floats) -> Noise:
     """Estimate the noise from residuals ``(n, c, T)``, robust against outliers.
 
-    ``weight`` is 1 where measured, else 0. ``floor`` is the smallest sigma of pressure, cmH2O; that
-    of flow is 20 times as large, mL/s.
+    ``weight`` is 1 where measured, else 0.
     """
     sigma, ar = [], []
     for channel in range(residual.shape[1]):
@@ -95,6 +92,6 @@ def robust_noise(
         both = w[:, 1:] & w[:, :-1]
         power = np.sum(clipped[:, 1:][both] ** 2) + np.sum(clipped[:, :-1][both] ** 2)
         product = np.sum((clipped[:, 1:] * clipped[:, :-1])[both])
-        sigma.append(max(float(size), floor * (20.0 if channel else 1.0)))
+        sigma.append(max(float(size), LEAST_SIGMA * (20.0 if channel else 1.0)))
         ar.append(float(np.clip(2.0 * product / power, -MOST_AR, MOST_AR)) if power > 0 else 0.0)
-    return Noise(tuple(sigma), tuple(ar), tail)
+    return Noise(tuple(sigma), tuple(ar))

@@ -76,7 +76,6 @@ def html(diagnosis: Diagnosis) -> str:
         more=max(len(diagnosis.location) - PLACES, 0),
         axes=charts.by_axis(diagnosis),
         slot=diagnosis.form or diagnosis.nonparametric,
-        open_loop=report_text.open_loop(diagnosis),
         slot_words=report_text.nonparametric_term(diagnosis),
         slot_title="The form of what is missing"
         if diagnosis.form is not None
@@ -90,7 +89,6 @@ def html(diagnosis: Diagnosis) -> str:
         lungs=[report_text.lung(match) for match in diagnosis.lungs],
         notes=diagnosis.notes,
         about=_about(diagnosis),
-        version=ventbench.__version__,
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
 
+from ventbench import mechanics
 from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
@@ -473,8 +474,9 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
     """The lungs; from flow or volume where they are recorded, which needs no model of the valve."""
     if breaths.flow is not None or breaths.volume is not None:
         try:
-            matches, notes = estimates.lung_matches_by_flow(breaths)
-            return matches, list(notes)
+            lungs = mechanics.identify(breaths)
+            notes = [note for each in lungs for note in each.notes]
+            return tuple(each.match for each in lungs), notes
         except InputError as error:
             return estimates.lung_matches(fit), [f"R and C are from pressure alone: {error}."]
     return estimates.lung_matches(fit), []

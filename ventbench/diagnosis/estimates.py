@@ -30,7 +30,6 @@ from ventbench.physics.catalogue import (
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.physics.nonparametric.basis import BasisTerm, Curve
 from ventbench.physics.parameters import BASE_PARAMETERS
-from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import ConfidenceInterval, Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.predictor import START, Predictor
@@ -254,7 +253,7 @@ def lung_matches(fitted: Fit) -> tuple[LungMatch, ...]:
 
     The label is judged by :func:`~ventbench.mechanics.match_labels`, at the flow of its definition.
     """
-    settings, matches = mechanics.settings_by_label(fitted), []
+    matches = []
     for group, match in enumerate(mechanics.match_labels(fitted)):
         ends = {path: fitted.ci95(path)[group] for path in ("R", "C")}
         matches.append(
@@ -264,26 +263,9 @@ def lung_matches(fitted: Fit) -> tuple[LungMatch, ...]:
                 fitted_C=float(fitted.value("C")[group]),
                 ci95_R=(float(ends["R"][0]), float(ends["R"][1])),
                 ci95_C=(float(ends["C"][0]), float(ends["C"][1])),
-                settings=tuple(setting.id for setting in settings[match.label]),
             )
         )
     return tuple(matches)
-
-
-def lung_matches_by_flow(breaths: Breaths) -> tuple[tuple[LungMatch, ...], tuple[str, ...]]:
-    """R and C of each lung from pressure and flow or volume, and notes.
-
-    Needs no model of the valve.
-
-    Raises:
-        InputError: if too little flow or volume is recorded.
-    """
-    lungs = mechanics.identify(breaths)
-    matches = [
-        replace(lung.match, settings=tuple(setting.id for setting in lung.settings))
-        for lung in lungs
-    ]
-    return tuple(matches), tuple(note for lung in lungs for note in lung.notes)
 
 
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:

@@ -186,8 +186,6 @@ class Mechanics:
     offset: Estimate  #: pressure at the start of a breath without the effect of flow, cmH2O.
     terms: tuple[Term, ...]  #: effects beyond R and C, the most important first.
     match: LungMatch  #: comparison with the label, with R at the flow for which the label holds.
-    #: known settings that this lung may be: the label if it holds, then the nearest.
-    settings: tuple[Lung, ...]
     noise: float  #: standard deviation of the residual, cmH2O.
     breaths: int  #: number of breaths that were used.
     samples: int  #: number of smoothed samples.
@@ -258,8 +256,8 @@ def _doubted(lung: Mechanics, shown: dict[str, int], count: int) -> Mechanics:
         f"{who} {FAULTS[fault][0]}, which is likelier than a wrong label, so that whether "
         f"{lung.label} holds is unknown."
     )
-    match = replace(match, informative=False, doubt=doubt)
-    return replace(lung, match=match, settings=(), notes=(*lung.notes, doubt))
+    match = replace(match, settings=(), informative=False, doubt=doubt)
+    return replace(lung, match=match, notes=(*lung.notes, doubt))
 
 
 def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -> Mechanics:
@@ -292,17 +290,14 @@ def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -
         R, C = (Estimate(math.nan, unit, (math.nan, math.nan)) for unit in _UNITS)
         match = LungMatch(name, R.value, C.value, R.ci95, C.ci95, False, source)
         return Mechanics(
-            name, R, C, full.offset(), (), match, (), noise, len(table), samples,
-            (problem, *notes), faults,
+            name, R, C, full.offset(), (), match, noise, len(table), samples, (problem, *notes),
+            faults,
         )  # fmt: skip
     match = match_label(label, best.resistance, best.compliance(), source)
-    known = matching_settings(best.resistance, best.compliance())
-    if match.label_matches:  # what holds comes first, whatever is nearer
-        known = tuple(sorted(known, key=lambda setting: setting != label))
     return Mechanics(
         name, best.resistance(0.0), best.compliance(), full.offset(),
         (*_delay_term(delayed_by, best), *(full.term(term) for term in selected)),
-        match, known, noise, len(table), samples, notes, faults,
+        match, noise, len(table), samples, notes, faults,
     )  # fmt: skip
 
 

@@ -193,10 +193,6 @@ class Mechanics:
     faults: tuple[str, ...] = ()  #: what may be wrong with the sensors, of :data:`FAULTS`.
 
 
-#: Shares of the time that a lung takes, measured: smoothing, and what delays the pressure.
-_SMOOTHING, _DELAY = 0.08, 0.62
-
-
 def identify(
     breaths: Breaths, progress: Callable[[int, int], object] | None = None
 ) -> tuple[Mechanics, ...]:
@@ -204,22 +200,17 @@ def identify(
 
     Args:
         breaths: the recording.
-        progress: called with how much is done and of how much, in breaths: the breaths of the
-            lungs that are identified, and a share of those of the lung under way.
+        progress: called after each lung with how many breaths are done, and of how many.
 
     Raises:
         InputError: if neither is recorded, or too little of a lung to tell R from C.
     """
     lungs, done = [], 0
     for name, part in breaths.by_lung().items():
-
-        def told(share: float, done: int = done, count: int = len(part)) -> None:
-            if progress is not None:
-                progress(done + int(share * count), len(breaths))
-
-        lungs.append(_identify_lung(name, part, told))
-        told(1.0)
+        lungs.append(_identify_lung(name, part))
         done += len(part)
+        if progress is not None:
+            progress(done, len(breaths))
     return share_faults(lungs)
 
 
@@ -260,15 +251,14 @@ def _doubted(lung: Mechanics, shown: dict[str, int], count: int) -> Mechanics:
     return replace(lung, match=match, notes=(*lung.notes, doubt))
 
 
-def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -> Mechanics:
+def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     measured = segments(breaths)
     if not measured:
         raise InputError(
             f"{name}: no piece of a breath has pressure with flow or volume for about a second; "
             "record longer pieces"
         )
-    told(_SMOOTHING)
-    at_lung, delayed_by = delay(measured, lambda share: told(_SMOOTHING + _DELAY * share))
+    at_lung, delayed_by = delay(measured)
     table = cross_products(at_lung)
     selected = select_terms(table)
     full = _fit_lung(table, selected, at_lung, breaths)

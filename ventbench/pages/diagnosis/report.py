@@ -14,6 +14,7 @@ from markupsafe import Markup, escape
 
 import ventbench
 from ventbench import palette
+from ventbench.base.arrays import runs
 from ventbench.base.text import page_templates
 from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.findings import (
@@ -200,8 +201,7 @@ def timeline(diagnosis: Diagnosis, missing: MissingMechanism) -> list[tuple[floa
     acts = np.isin(ids, missing.affected)
     if missing.breaths is not None:
         acts = ids >= missing.breaths[0]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], acts, [False]]).astype(int)))
-    shares = np.round(100.0 * edges / max(len(ids), 1), 2).reshape(-1, 2)
+    shares = np.round(100.0 * np.reshape(runs(acts), (-1, 2)) / max(len(ids), 1), 2)
     return [(float(low), float(high - low)) for low, high in shares]
 
 

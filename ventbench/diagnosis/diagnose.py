@@ -27,7 +27,7 @@ from ventbench.diagnosis.findings import (
     Traces,
     Verdict,
 )
-from ventbench.diagnosis.hypothesis import make_partition, varies_by_breath
+from ventbench.diagnosis.hypothesis import varies_by_breath
 from ventbench.diagnosis.identification import (
     IdentifiedModel,
     Split,
@@ -425,7 +425,7 @@ def _helps(
     evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
     if conclusion.base.hypothesis == conclusion.full.hypothesis:
         return by_breath or correction.helps
-    partition = make_partition(judging, evaluator.training.predictor.names, evaluator.settings)
+    partition = evaluator.partition(judging)
     base = evaluator.fit(conclusion.base.hypothesis, conclusion.full.noise)
     gained = evaluator.log_likelihood(conclusion.full, partition)
     return bool(np.sum(gained - evaluator.log_likelihood(base, partition)) > 0.0)
@@ -530,4 +530,4 @@ def _missing_mechanism(
 def _request(conclusion: Conclusion) -> BreathRequest | None:
     rivals = [rival for other in conclusion.alternatives.values() for rival in other.models]
     noise = Noise((conclusion.noise.sigma[0],), (0.0,))
-    return request_breaths(conclusion.named, rivals, noise=noise)
+    return request_breaths(conclusion.named, rivals, noise)

@@ -265,6 +265,10 @@ class Evaluator:
         """Mechanisms of the library that may act."""
         return tuple(name for name in library() if name not in self.excluded)
 
+    def partition(self, data: Data) -> Partition:
+        """Combine breaths with a predictor that has the parameters of this evaluator."""
+        return make_partition(data, self.training.predictor.names, self.settings)
+
     def fit(
         self,
         hypothesis: Hypothesis,
@@ -294,9 +298,7 @@ class Evaluator:
         index = self._ranking_breaths
         if len(index) == len(self.training.data):
             return self
-        names = self.training.predictor.names
-        partition = make_partition(self.training.data.select(index), names, self.settings)
-        return replace(self, training=partition)
+        return replace(self, training=self.partition(self.training.data.select(index)))
 
     @cached_property
     def _ranking_breaths(self) -> NDArray[np.intp]:
@@ -382,10 +384,9 @@ class Evaluator:
         """
         partition, settings = partition or self.held_out, self.settings.fit
         own = (START, "gain") if self.gain_sd else (START,)
-        values, names = self.transferred_values(fitted, partition), partition.predictor.names
-        fixed = {name: values[:, k] for k, name in enumerate(names) if name != "position"}
+        fixed = self.transferred(fitted, partition)
         problem = make_problem(partition, own, fitted.noise, fixed, self.gain_sd)
-        columns, layout = (*names, START), problem.unknowns
+        columns, layout = (*partition.predictor.names, START), problem.unknowns
         first = {p: problem.fixed[:, columns.index(p)] for p in own}
         low, high = layout.bounds()
         minimum = minimise(
@@ -417,6 +418,18 @@ class Evaluator:
                 value = fitted.values[first, names.index(name)]
                 values[:, column] = np.clip(value, parameter.low, parameter.high)
         return values
+
+    def transferred(self, fitted: FittedModel, partition: Partition) -> dict[str, Floats]:
+        """The same by path, ``(n,)`` each, without the breaths' starts and positions."""
+        values = self.transferred_values(fitted, partition)
+        names = partition.predictor.names
+        return {name: values[:, k] for k, name in enumerate(names) if name != "position"}
+
+    def square_error(self, fitted: FittedModel, partition: Partition) -> float:
+        """Sum of the squared errors of breaths that start from their first readings, cmH2O^2."""
+        data = partition.data
+        left = self.predict(fitted, partition) - data.measured
+        return float(np.sum(np.square(left[data.weight > 0.0])))
 
     def breath_term(self, fitted: FittedModel) -> BreathTerm:
         """Term of a model whose parameters differ from breath to breath."""
@@ -470,8 +483,7 @@ def cross_validated_gain(
     def evaluate(work: tuple[tuple[Partition, Partition], FittedModel]) -> Floats:
         (training, held_out), fitted = work
         fold = replace(evaluator, training=training, held_out=held_out, folds=())
-        values, names = fold.transferred_values(fitted, training), training.predictor.names
-        start = {path: values[:, k] for k, path in enumerate(names) if path != START}
+        start = fold.transferred(fitted, training)
         return fold.held_out_log_likelihood(fold.fit(fitted.hypothesis, fitted.noise, start=start))
 
     likelihoods = parallel_map(evaluate, product(evaluator.folds, (with_term, without_term)))

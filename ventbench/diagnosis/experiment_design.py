@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ventbench.base.arrays import Floats, Ints
 from ventbench.diagnosis.candidate_breaths import Family, Rig, families
 from ventbench.diagnosis.findings import BreathRequest
-from ventbench.physics.catalogue import parameter, strength_path
+from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.system_id.data import Data
-from ventbench.system_id.levenberg_marquardt import Minimum
+from ventbench.system_id.fit import Fit
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import Problem, parameter_of
@@ -39,25 +39,12 @@ _RIDGE = 1e-9
 _REFITS = 4
 
 
-class FittedHypothesis(Protocol):
-    """A hypothesis at its optimum: a fit, or anything with its problem and its minimum."""
-
-    @property
-    def problem(self) -> Problem:
-        """Problem of the breaths recorded so far."""
-        ...
-
-    @property
-    def minimum(self) -> Minimum:
-        """Minimum of the cost."""
-        ...
+#: A hypothesis at its optimum, on the breaths recorded so far.
+Fitted: TypeAlias = FittedModel | Fit
 
 
 def request_breaths(
-    chosen: FittedHypothesis,
-    alternatives: Sequence[FittedHypothesis],
-    *,
-    noise: Noise | None = None,
+    chosen: Fitted, alternatives: Sequence[Fitted], noise: Noise
 ) -> BreathRequest | None:
     """Find the breaths to record next.
 
@@ -68,14 +55,14 @@ def request_breaths(
     Args:
         chosen: the best hypothesis, on the recorded breaths.
         alternatives: hypotheses to distinguish it from.
-        noise: model of the measurement noise; that of ``chosen`` if not given.
+        noise: model of the measurement noise.
 
     Returns:
         Commands with what to do in words, or None if no safe breaths would distinguish them.
     """
     if not alternatives:
         return None
-    noise, data = noise or chosen.problem.noise, chosen.problem.data
+    data = chosen.problem.data
     best: _Design | None = None
     for label in np.unique(data.lung):
         recorded_rows = np.flatnonzero((data.lung == label) & (data.weight[:, 0].any(axis=1)))
@@ -89,20 +76,6 @@ def request_breaths(
     return _worded(best, (chosen, *alternatives), float(np.median(data.dt)))
 
 
-def acting(fitted: FittedHypothesis) -> tuple[str, ...]:
-    """Mechanisms of a hypothesis: free ones, and fixed ones that are not neutral."""
-    problem = fitted.problem
-    free = {path.rpartition(".")[0] for path in problem.unknowns.paths}
-    owners = dict.fromkeys(path.rpartition(".")[0] for path in problem.predictor.names)
-    names = []
-    for name in filter(None, owners):
-        path = strength_path(name)
-        column = problem.fixed[:, problem.predictor.names.index(path)]
-        if name in free or np.any(column != parameter(path).neutral):
-            names.append(name)
-    return tuple(names)
-
-
 @dataclass(frozen=True, eq=False)
 class Forecast:
     """Prediction of m new breaths by a hypothesis."""
@@ -114,7 +87,7 @@ class Forecast:
     known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
 
 
-def values_of(fitted: FittedHypothesis, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
+def values_of(fitted: Fitted, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
     """Physical values for new breaths, taken in turn from recorded ones, ``(m, P + 1)``.
 
     Args:
@@ -134,7 +107,7 @@ def values_of(fitted: FittedHypothesis, data: Data, lung: NDArray[np.intp], star
 
 
 def forecast(
-    fitted: FittedHypothesis, data: Data, predictor: Predictor, lung: NDArray[np.intp],
+    fitted: Fitted, data: Data, predictor: Predictor, lung: NDArray[np.intp],
     start: float, noise: Noise,
 ) -> Forecast:  # fmt: skip
     """Predict new breaths with derivatives; for the arguments see :func:`values_of`."""
@@ -228,7 +201,7 @@ class _Design:
 
 
 def _best_on_lung(
-    chosen: FittedHypothesis, alternatives: Sequence[FittedHypothesis], noise: Noise,
+    chosen: Fitted, alternatives: Sequence[Fitted], noise: Noise,
     recorded_rows: NDArray[np.intp],
 ) -> _Design | None:  # fmt: skip
     """The best design on the lung of the recorded breaths ``here``."""
@@ -281,7 +254,7 @@ def _best(
 
 
 def _safe(
-    kinds: tuple[Family, ...], hypotheses: Sequence[FittedHypothesis], recorded: Data,
+    kinds: tuple[Family, ...], hypotheses: Sequence[Fitted], recorded: Data,
     recorded_rows: NDArray[np.intp], start: float,
 ) -> tuple[Family, ...]:  # fmt: skip
     """Breaths that every hypothesis predicts within the pressure limits, weakened where needed."""
@@ -321,7 +294,7 @@ def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.int
     )  # fmt: skip
 
 
-def _worded(design: _Design, hypotheses: Sequence[FittedHypothesis], dt: float) -> BreathRequest:
+def _worded(design: _Design, hypotheses: Sequence[Fitted], dt: float) -> BreathRequest:
     parts = [
         f"{len(members)} x {kind.title}"
         for kind, members in zip(design.families, design.members, strict=True)
@@ -329,11 +302,9 @@ def _worded(design: _Design, hypotheses: Sequence[FittedHypothesis], dt: float) 
     pairs = list(zip(design.families, design.members, strict=True))
     u_in = np.concatenate([kind.u_in[list(members)] for kind, members in pairs])
     u_out = np.concatenate([kind.u_out[list(members)] for kind, members in pairs])
-    acts = [acting(hypothesis) for hypothesis in hypotheses]
-    common = set(acts[0]).intersection(*acts[1:])
-    names = [
-        " + ".join(n for n in own if n not in common) or "no further mechanism" for own in acts
-    ]
+    acts = [set(hypothesis.names) for hypothesis in hypotheses]
+    common = acts[0].intersection(*acts[1:])
+    names = [" + ".join(sorted(own - common)) or "no further mechanism" for own in acts]
     return BreathRequest(
         f"{'; '.join(parts)} (lung {design.lung.id})", tuple(dict.fromkeys(names)), design.nats,
         u_in, u_out, np.full(u_in.shape, dt),

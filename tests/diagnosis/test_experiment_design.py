@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_breaths import Rig, families
-from ventbench.diagnosis.experiment_design import contrast, forecast, request_breaths
+from ventbench.diagnosis.experiment_design import Rig, contrast, families, forecast, request_breaths
 from ventbench.physics import paths
 from ventbench.system_id import Data, Noise, Predictor, fit, parameter_values
 

@@ -14,7 +14,7 @@ from ventbench.physics.catalogue import basis_terms, special_cases
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.system_id import Predictor, fit, make_data, parameter_values
-from ventbench.system_id.noise import Noise
+from ventbench.system_id.data import Noise
 from ventbench.system_id.problem import free_paths, make_unknowns
 from ventbench.task.rollouts import open_loop
 

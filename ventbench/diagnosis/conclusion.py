@@ -32,7 +32,7 @@ from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
 from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
 from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.data import Noise, robust_noise
 
 #: Receives the current step, in words.
 Progress: TypeAlias = Callable[[str], None]

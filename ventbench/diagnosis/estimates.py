@@ -16,7 +16,7 @@ from ventbench.diagnosis.conclusion import Conclusion, Swing, UnnamedEffect, com
 from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
-from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY
+from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics.catalogue import (
     basis_terms,

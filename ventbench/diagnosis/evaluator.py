@@ -30,9 +30,8 @@ from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import library, mechanism
 from ventbench.system_id import problem as problems
-from ventbench.system_id.data import Data
+from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
-from ventbench.system_id.noise import Noise, robust_noise
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import Problem, make_unknowns, parameter_of
 

@@ -37,8 +37,7 @@ from ventbench.diagnosis.linearised import (
     within,
 )  # fmt: skip
 from ventbench.physics.catalogue import basis_terms, library, mechanism
-from ventbench.system_id.data import Data
-from ventbench.system_id.noise import Noise
+from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.problem import parameter_of
 
 #: Effects of some breaths, and what acts in time of which there is no parameter.

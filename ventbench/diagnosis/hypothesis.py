@@ -24,9 +24,8 @@ from ventbench.physics.catalogue import (
     paths,
     strength_path,
 )
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data, Floats, Noise
 from ventbench.system_id.levenberg_marquardt import Minimum
-from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import Problem, free_paths
 

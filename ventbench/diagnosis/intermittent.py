@@ -10,7 +10,7 @@ a spike and a slab. Onsets and durations are uniform on the grid of the event's 
 lie around one of all affected breaths (a normal density of their logarithm). That strength and the
 share are the likeliest on the training breaths. Parameters that breaths share are fitted to the
 breaths in which the effect does not act, in turn with the question which these are. Commands that
-were lost or late have no grid: each of them was followed or not (:mod:`.command_path`).
+were lost or late have no grid: each of them was followed or not (:mod:`.in_time`).
 
 The effect is told if it predicts the held-out breaths better than all that was found without it. A
 set of breaths that begins or ends at one breath of the recording is a change of the session and no
@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis.adequacy import order_p_value
-from ventbench.diagnosis.command_path import Paths, follow
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.evidence import COMMANDS, told_posterior
 from ventbench.diagnosis.findings import MissingMechanism
@@ -40,6 +39,7 @@ from ventbench.diagnosis.hypothesis import (
     linearise,
 )
 from ventbench.diagnosis.identification import IdentifiedModel, held_out
+from ventbench.diagnosis.in_time import Paths, follow
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism

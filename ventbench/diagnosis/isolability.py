@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.base.errors import InputError, InputTypeError
-from ventbench.diagnosis.candidate_breaths import Rig, families
+from ventbench.diagnosis.experiment_design import Rig, families
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.parameters import REFITTED

@@ -121,13 +121,14 @@ class Diagnosis(Findings):
             OSError: if a file cannot be written.
         """
         errors.require("jinja2", "rerun")
-        views, folder = import_module(_VIEWS), Path(folder)
+        report, log = (import_module(f"{_VIEWS}.{name}") for name in ("report", "rerun_log"))
+        folder = Path(folder)
         plain, corrected = folder / "diagnosis.json", folder / "corrected.json"
         files.write_json(plain, self.as_dict())
         written = [
             plain,
-            views.write_report(folder / "report.html", self),
-            views.write_rerun(folder / "diagnosis.rrd", self),
+            report.write(folder / "report.html", self),
+            log.write(folder / "diagnosis.rrd", self),
         ]
         commands = folder / RECORD_NEXT
         if self.request is None:

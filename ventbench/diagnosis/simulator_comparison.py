@@ -25,8 +25,7 @@ from ventbench.diagnosis.identification import IdentifiedModel, identify
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id import Fit, fit
-from ventbench.system_id.data import Data
-from ventbench.system_id.noise import Noise
+from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.problem import free_paths, parameter_of
 
 

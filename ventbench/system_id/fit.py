@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike
 from ventbench.base.arrays import Floats
 from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
-from ventbench.system_id.data import Data
+from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
-from ventbench.system_id.noise import Noise, robust_noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import (
     Problem,

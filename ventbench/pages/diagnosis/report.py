@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from markupsafe import Markup, escape
 
 import ventbench
 from ventbench import palette
+from ventbench.base import files
 from ventbench.base.arrays import runs
 from ventbench.base.text import page_templates
 from ventbench.diagnosis import number_text, report_text
@@ -23,7 +25,7 @@ from ventbench.diagnosis.findings import (
     NonparametricTerm,
     OpenLoopError,
 )
-from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY
+from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
 from ventbench.pages.diagnosis import charts
 from ventbench.physics import mechanism
@@ -40,6 +42,16 @@ _SYMBOL = re.compile(
 )
 _SIGNS = {"-": "−", "-+": "∓", "<=": "≤", "..": " to ", "...": "…"}
 _LETTERS = {"tau": "τ", "pi": "π", "sum": "∑"}
+
+
+def write(path: Path, diagnosis: Diagnosis) -> Path:
+    """Write the report, ``.html`` by custom, and return the path.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    files.write_text(path, html(diagnosis))
+    return path
 
 
 def html(diagnosis: Diagnosis) -> str:

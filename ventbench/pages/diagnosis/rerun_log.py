@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from ventbench import palette
+from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.text import escape_markdown
 from ventbench.diagnosis import number_text, report_text
@@ -29,8 +32,8 @@ _ZOOM = 6
 TIMELINE = "recording_time"
 
 
-def recording(diagnosis: Diagnosis) -> bytes:
-    """Return a whole ``.rrd`` file.
+def write(path: Path, diagnosis: Diagnosis) -> Path:
+    """Write a recording with its blueprint, ``.rrd`` by custom, and return the path.
 
     Entities, for each lung: ``/<lung>/pressure/{recorded,before,refit,after}``,
     ``/<lung>/error/{before,refit,after}`` (recorded - simulated), ``/<lung>/u_in``,
@@ -39,6 +42,7 @@ def recording(diagnosis: Diagnosis) -> bytes:
 
     Raises:
         InputError: if rerun is switched off by its environment variable.
+        OSError: if the file cannot be written.
     """
 
     def log(stream: rr.RecordingStream) -> None:
@@ -48,7 +52,9 @@ def recording(diagnosis: Diagnosis) -> bytes:
         log_maps(stream, diagnosis)
 
     name = f"diagnosis of {known(diagnosis.simulator)}"
-    return written(name, blueprint(diagnosis), markdown(diagnosis), log)
+    content = written(name, blueprint(diagnosis), markdown(diagnosis), log)
+    files.write_atomically(path, lambda file: file.write(content))
+    return path
 
 
 def markdown(diagnosis: Diagnosis) -> str:

@@ -18,7 +18,7 @@ from ventbench.diagnosis.residual_analysis import profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.mechanics.labels import Estimate
-from ventbench.pages.diagnosis import report, rerun_log
+from ventbench.pages.diagnosis import report
 from ventbench.pages.diagnosis.charts import (
     Chart,
     by_axis,
@@ -297,6 +297,8 @@ def test_the_first_line_counts_expirations_too(found: Diagnosis) -> None:
 
 def test_rerun(found: Diagnosis, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
+    from ventbench.pages.diagnosis import rerun_log
+
     path = rerun_log.write(tmp_path / "diagnosis.rrd", found)
     assert [item.name for item in tmp_path.iterdir()] == ["diagnosis.rrd"]
     assert path.stat().st_size < 2_000_000
@@ -304,8 +306,6 @@ def test_rerun(found: Diagnosis, tmp_path: Path) -> None:
     expected = {f"/R20C50/pressure/{x}" for x in ("recorded", "before", "refit", "after")}
     expected |= {f"/R20C50/error/{x}" for x in ("before", "refit", "after")}
     expected |= {"/R20C50/u_in", "/R20C50/u_out", "/R20C50/held_out", "/about"}
-    expected |= {f"/by_breath/{x}" for x in ("before", "refit", "after")}
-    expected |= {"/map/refit", "/map/after"}
     assert {name for name in entities if not name.startswith("/__")} == expected
     breaths = found.traces.breaths
     recorded = entities["/R20C50/pressure/recorded"]
@@ -320,9 +320,11 @@ def test_rerun(found: Diagnosis, tmp_path: Path) -> None:
 
 def test_rerun_of_other_verdicts_and_names(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
+    from ventbench.pages.diagnosis import rerun_log
+
     odd = dataclasses.replace(made.nothing(6), simulator="\u673a ![i](http:)")
     entities = read(rerun_log.write(tmp_path / "n.rrd", odd))
-    assert "/map/after" not in entities
+    assert "/R20C50/error/after" not in entities
     text = entities["/about"]["text"][0]
     assert all(ord(c) < 0x180 for c in text), "the viewer ends itself over what its font lacks"
     assert "\\!\\[i\\]" in text, "a name is neither link nor image"

@@ -164,7 +164,7 @@ def test_simulate_answers_commands_with_the_official_pressures(commands, tmp_pat
     found = columns(text)
     assert list(found) == ["time_step", "u_in", "u_out", "pressure"]
     np.testing.assert_allclose(found["time_step"], 0.033 * np.arange(60), atol=1e-6)
-    given, plant = read_controls(commands), take(frozen.load().plants, LUNG_IDS.index(name))
+    (given,), plant = read_controls(commands), take(frozen.load().plants, LUNG_IDS.index(name))
     with precision.float64():
         row = [jnp.asarray(x)[None] for x in (given.u_in, given.u_out, given.dt)]
         wanted = open_loop(plant, jnp.asarray([6.0]), *row)[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -121,7 +120,7 @@ def simulate(
         True
     """
     if isinstance(controls, str | Path):
-        controls = read_controls(Path(controls))
+        (controls,) = read_controls(controls)
     elif not isinstance(controls, Controls):
         controls = _controls(controls)
     simulators = load_simulators(simulator)
@@ -201,14 +200,14 @@ def _controls(u_in: ArrayLike) -> Controls:
     return Controls(_steps(values.size), values, np.zeros_like(values))
 
 
-def read_controls(path: Path, *, by_breath: bool = False) -> Controls:
-    """Read a CSV file of commands.
+def read_controls(path: Path | str, *, by_breath: bool = False) -> list[Controls]:
+    """Read a CSV file of commands: one sequence, or one for each breath.
 
     Args:
         path: header line and one row a sample; column ``u_in``, optionally ``u_out`` (0 if missing)
             and ``time_step`` in s (steps of 30 ms if missing); others are ignored, so that a
             recording of one breath is such a file too.
-        by_breath: times may start anew with another ``breath_id``.
+        by_breath: whether another ``breath_id`` begins another sequence; its times may start anew.
 
     Raises:
         InputError: if a column is missing or a value is wrong; it says which.
@@ -233,14 +232,16 @@ def read_controls(path: Path, *, by_breath: bool = False) -> Controls:
     out = (u_in < 0) | (u_in > protocol.U_MAX)
     _first(path, "u_in", out, u_in, "is outside 0..100 %. Fix the row.")
     _first(path, "u_out", (u_out != 0) & (u_out != 1), u_out, "is neither 0 nor 1. Fix the row.")
+    breath = [row.get("breath_id") if by_breath else None for row in rows]
+    starts = [k for k in range(1, len(rows)) if breath[k] != breath[k - 1]]
     back = np.append(False, np.diff(time) <= 0)
-    if by_breath:
-        back[1:] &= [a["breath_id"] == b["breath_id"] for a, b in pairwise(rows)]
+    back[starts] = False
     _first(path, "time_step", back, time, "s is not later than the row before. Give one breath.")
-    return Controls(time, u_in, u_out)
+    parts = zip(*(np.split(column, starts) for column in (time, u_in, u_out)), strict=True)
+    return [Controls(*part) for part in parts]
 
 
-def _numbers(path: Path, column: str, text: list[str]) -> Floats:
+def _numbers(path: Path | str, column: str, text: list[str]) -> Floats:
     values = np.empty(len(text))
     for row, cell in enumerate(text):
         try:
@@ -254,7 +255,7 @@ def _numbers(path: Path, column: str, text: list[str]) -> Floats:
     return values
 
 
-def _first(path: Path, column: str, bad: Bools, values: Floats, why: str) -> None:
+def _first(path: Path | str, column: str, bad: Bools, values: Floats, why: str) -> None:
     if np.any(bad):
         row = int(np.argmax(bad))
         raise InputError(f"{path} line {row + 2}, column {column}: {values[row]:g} {why}")

@@ -39,15 +39,15 @@ def diagnose(folder: Path) -> dict[str, Any]:
     best = fitted(())
     rivals: dict[tuple[str, ...], float] = {(): best.bic}
     held = refit_breath_parameters(best, test).log_likelihood.sum()
-    while len(best.mechanisms) < _MOST:
-        left = [name for name in (*candidates(), "patient_effort") if name not in best.mechanisms]
-        ranked = sorted((fitted((*best.mechanisms, name), _QUICK) for name in left), key=_bic)
-        finished = sorted((fitted(each.mechanisms) for each in ranked[:_BEST]), key=_bic)
+    while len(best.names) < _MOST:
+        left = [name for name in (*candidates(), "patient_effort") if name not in best.names]
+        ranked = sorted((fitted((*best.names, name), _QUICK) for name in left), key=_bic)
+        finished = sorted((fitted(each.names) for each in ranked[:_BEST]), key=_bic)
         gained = refit_breath_parameters(finished[0], test).log_likelihood.sum() - held
         if finished[0].bic >= best.bic or gained < _NATS:
             break
         best, held = finished[0], held + gained
-        rivals |= {each.mechanisms: each.bic for each in finished}
+        rivals |= {each.names: each.bic for each in finished}
     weights = {names: np.exp(-_FLATTENED * (bic - best.bic)) for names, bic in rivals.items()}
     total = sum(weights.values())
     hypotheses = [
@@ -58,9 +58,9 @@ def diagnose(folder: Path) -> dict[str, Any]:
         {"terms": [f"unknown:{place}"], "probability": _UNKNOWN / len(_places(seen))}
         for place in _places(seen)
     ]
-    final = fit(data, best.mechanisms)
+    final = fit(data, best.names)
     known = seen.question["vocabulary"]["names"]
-    own = [f"{name}.{key}" for name in best.mechanisms for key in known[name]["parameters"]]
+    own = [f"{name}.{key}" for name in best.names for key in known[name]["parameters"]]
     free = [path for path in ("R", "C", *own) if path in final.problem.unknowns.paths]
     return {
         "hypotheses": hypotheses,

@@ -54,8 +54,7 @@ def answer(pair: Pair, material: Material) -> Answered:
 
 
 def _label(pair: Pair, material: Material) -> Answered:
-    lung = material.mechanics(pair.second)
-    settings = [setting.id for setting in lung.settings]
+    settings = material.mechanics(pair.second).match.settings
     shown = settings[0] if settings else "none known"
     return Answered(pair, shown, shown == pair.truth)
 

@@ -9,7 +9,7 @@ import pytest
 
 from ventbench.diagnosis.estimates import nonparametric_term, split_form
 from ventbench.diagnosis.findings import NonparametricTerm
-from ventbench.diagnosis.input_response import ALVEOLUS, SUPPLY
+from ventbench.diagnosis.in_time import ALVEOLUS, SUPPLY
 from ventbench.recordings import join
 
 from . import small

@@ -134,16 +134,19 @@ def test_a_better_hypothesis_is_likelier_on_other_breaths(late):
     assert lost == pytest.approx(np.log(8 * small.SAMPLES) - fallen, abs=1e-6)
 
 
-def test_criterion_at_another_noise(late):
+def test_the_criterion_is_that_of_gaussian_residuals(late):
     fitted = late.fit(DELAY, GAUSSIAN)
+    size, square = fitted.residual.size, np.sum(fitted.residual**2)
+
+    def density(sd: float) -> float:
+        return -0.5 * square / sd**2 - size * (np.log(sd) + 0.5 * np.log(2 * np.pi))
+
     loud = Noise((0.4,), (0.0,), np.inf)
-    size = fitted.residual.size
-    square = np.sum(fitted.residual**2)
-    want = -0.5 * square / 0.16 - size * (np.log(0.4) + 0.5 * np.log(2 * np.pi))
-    assert fitted.log_likelihood_at(loud) == pytest.approx(want, rel=1e-9)
+    assert fitted.log_likelihood_at(loud) == pytest.approx(density(0.4), rel=1e-9)
     penalty = fitted.shared_count * np.log(size) - 2.0 * late.label_log_density(fitted)
     assert fitted.shared_count == 5
-    assert late.criterion(fitted, loud) == pytest.approx(-2 * want + penalty, rel=1e-9)
+    want = -2.0 * density(GAUSSIAN.sigma[0]) + penalty
+    assert late.criterion(fitted) == pytest.approx(want, rel=1e-9)
 
 
 def test_labels_count_once_for_each_lung(late):

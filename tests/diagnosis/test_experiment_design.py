@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_breaths import Rig, families
-from ventbench.diagnosis.experiment_design import contrast, forecast, request_breaths
+from ventbench.diagnosis.experiment_design import Rig, contrast, families, forecast, request_breaths
 from ventbench.physics import paths
 from ventbench.system_id import Data, Noise, Predictor, fit, parameter_values
 
@@ -79,7 +78,7 @@ def test_pulses_tell_a_lag_from_a_delay():
     # Smooth commands: of those that ring at the sampling rate, a delay explains nothing, and any
     # breath refutes it.
     lag, delay = both({"valve_lag.tau": 0.04}, "valve_lag", "valve_delay", gain=0.4)
-    found = request_breaths(lag, [delay])
+    found = request_breaths(lag, [delay], NOISE)
     assert found is not None
     assert "pulse" in found.title
     assert found.title.endswith("(lung R20C20)")
@@ -93,7 +92,7 @@ def test_pulses_tell_a_lag_from_a_delay():
 
 def test_a_hold_tells_a_leak_from_creep():
     leak, creep = both({"leak.conductance": 3.0}, "leak", "viscoelasticity")
-    found = request_breaths(leak, [creep])
+    found = request_breaths(leak, [creep], NOISE)
     assert found is not None
     assert "hold" in found.title
     held = (found.u_in == 0) & (found.u_out == 0)
@@ -108,7 +107,7 @@ def test_what_is_asked_for_is_safe_also_with_another_lung():
     data = recorded(stiff)
     one = fit(data, ["nonlinear_compliance", "valve_delay"], noise=NOISE)
     two = fit(data, ["nonlinear_compliance", "valve_lag"], noise=NOISE)
-    found = request_breaths(one, [two])
+    found = request_breaths(one, [two], NOISE)
     assert found is not None
     assert found.why == ("valve_delay", "valve_lag")
     seen = simulated(found.u_in, found.u_out, stiff).measured
@@ -118,9 +117,9 @@ def test_what_is_asked_for_is_safe_also_with_another_lung():
 
 def test_nothing_to_ask():
     plain, _ = both({}, "valve_lag", "valve_delay")
-    assert request_breaths(plain, []) is None
+    assert request_breaths(plain, [], NOISE) is None
     # The same hypothesis twice: no breath tells it from itself.
-    assert request_breaths(plain, [plain]) is None
+    assert request_breaths(plain, [plain], NOISE) is None
 
 
 def test_commands_of_all_kinds_are_possible():
@@ -145,7 +144,7 @@ def test_nats_against_new_recordings():
     gains, foretold = [], []
     for seed in range(4):
         leak, band = both({"leak.conductance": 2.0}, "leak", "valve_dead_band", seed=seed)
-        found = request_breaths(leak, [band])
+        found = request_breaths(leak, [band], NOISE)
         assert found is not None
         # The rig is what the fit says: what the fit does not know is not to be tested here.
         truth = {path: leak.column(path)[0] for path in ("leak.conductance", "R_ex", "PEEP")}

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.input_response import ALVEOLUS, SUPPLY, input_responses
+from ventbench.diagnosis.in_time import ALVEOLUS, SUPPLY, input_responses
 from ventbench.system_id import Predictor
 
 from . import small

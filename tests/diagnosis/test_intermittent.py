@@ -18,7 +18,7 @@ from ventbench.diagnosis.evidence import COMMANDS, EVENTS, search
 from ventbench.diagnosis.hypothesis import Hypothesis, all_parameter_paths
 from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.intermittent import Intermittent, find
-from ventbench.pages.diagnosis import write_report
+from ventbench.pages.diagnosis import report
 from ventbench.physics import paths
 from ventbench.physics.catalogue import intermittent
 from ventbench.recordings.breaths import Breaths
@@ -144,7 +144,7 @@ def test_the_affected_breaths_stand_in_the_first_sentence_the_json_and_the_page(
     assert "never reach the valve, or commands that reach the valve late" in first
     assert "in breaths 2 to 4, 9 and 12" in first
     assert told.as_dict()["mechanisms"][0]["affected_breaths"] == [2, 3, 4, 9, 12]
-    page = write_report(tmp_path / "r.html", told).read_text()
+    page = report.write(tmp_path / "r.html", told).read_text()
     drawn = re.findall(r'<rect x="([\d.]+)" width="([\d.]+)" height="4"/>', page)
     # Three runs among twelve breaths, as % of the session.
     expected = [(100 / 12, 300 / 12), (800 / 12, 100 / 12), (1100 / 12, 100 / 12)]

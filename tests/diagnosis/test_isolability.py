@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from ventbench.base.errors import InputError
 from ventbench.cli import app
-from ventbench.diagnosis.isolability import isolability, read_plan
+from ventbench.diagnosis.isolability import isolability
 from ventbench.recordings.breaths import make_breaths
 from ventbench.simulation import Controls, read_controls
 from ventbench.system_id import Noise, Predictor, fit, make_data, parameter_values
@@ -99,15 +99,15 @@ def write(path: Path, breaths: list[Controls]) -> Path:
 
 def test_a_plan_is_read_breath_by_breath(tmp_path: Path) -> None:
     given = plan(10.0, 20.0)
-    read = read_plan(write(tmp_path / "plan.csv", given))
+    read = read_controls(write(tmp_path / "plan.csv", given), by_breath=True)
     for a, b in zip(read, given, strict=True):
         np.testing.assert_allclose(a.u_in, b.u_in, atol=1e-6)
         np.testing.assert_allclose(a.time, b.time, atol=1e-6)
-    (one,) = read_plan(write(tmp_path / "one.csv", given[:1]))
+    (one,) = read_controls(write(tmp_path / "one.csv", given[:1]), by_breath=True)
     assert len(one.time) == 60
     back = [Controls(given[0].time[::-1], given[0].u_in, given[0].u_out), given[1]]
     with pytest.raises(InputError, match="line 3, column time_step"):
-        read_plan(write(tmp_path / "back.csv", back))
+        read_controls(write(tmp_path / "back.csv", back), by_breath=True)
     with pytest.raises(InputError, match="line 62, column time_step"):
         read_controls(tmp_path / "plan.csv")
     assert all(np.all(np.diff(a.time) > 0) for a, _ in pairwise([*read, one]))

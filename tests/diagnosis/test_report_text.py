@@ -55,8 +55,8 @@ def test_a_named_mechanism():
     assert said[0] == (
         "Missing in the physics simulator: dead time of the inspiratory valve (odds above a "
         "million to one on held-out breaths); mending it takes the error on 4 breaths set aside "
-        f"from {loop.refit.rmse:.2f} (R and C refitted) to {loop.after.rmse:.2f} cmH2O, and hardly "
-        "more than the noise of 0.20 is left."
+        f"from {loop.refit.rmse:.2f} (R and C refitted; {loop.before.rmse:.2f} as given) to "
+        f"{loop.after.rmse:.2f} cmH2O, and hardly more than the noise of 0.20 is left."
     )
     assert said[1].startswith(
         "Dead time of the inspiratory valve (valve_delay): 41 ms [38, 44]; held-out evidence 212"
@@ -102,9 +102,7 @@ def test_a_simulator_that_is_left_as_it_is_was_not_refitted():
     same = dataclasses.replace(loop, refit=loop.before, after=loop.before)
     left = dataclasses.replace(found, open_loop=same, nonparametric=None)
     assert report_text.effect(left).startswith("The simulated pressure is ")
-    assert f"{loop.before.rmse:.2f} cmH2O as given; measurement noise" in report_text.open_loop(
-        left
-    )
+    assert f"the error stays at {loop.before.rmse:.2f} cmH2O, and" in report_text.answer(left)
     nothing = dataclasses.replace(left, verdict="nothing_missing")
     assert report_text.verdict(nothing) == (
         "Nothing is missing: the physics simulator explains the recording"
@@ -190,10 +188,12 @@ def test_distances_and_a_lung_that_matches():
         noise_floor=0.21,
         held_out_breaths=tuple(range(20)),
     )
-    assert report_text.open_loop(dataclasses.replace(found, open_loop=distances)) == (
-        "Root-mean-square open-loop error on 20 held-out breaths: 1.24 cmH2O as given, 0.62 with "
-        "R and C refitted, 0.22 corrected; measurement noise 0.21."
+    assert report_text.worth(dataclasses.replace(found, open_loop=distances)).startswith(
+        "mending it takes the error on 20 breaths set aside from 0.62 (R and C refitted; 1.24 as "
+        "given) to 0.22 cmH2O, and "
     )
+    nothing = dataclasses.replace(made.nothing(12), open_loop=distances)
+    assert report_text.worth(nothing).startswith("it errs by 0.22 cmH2O (1.24 as given) on 20 br")
     match = dataclasses.replace(found.lungs[0], label_matches=True, source="pressure and flow")
     assert report_text.lung(match) == (
         "The lung matches its label R20C50: R 22.1 cmH2O/(L/s) [21.8, 22.4] and "

@@ -156,7 +156,7 @@ def test_the_commands_to_record_next_can_be_played(tmp_path):
     assert request is not None
     path = tmp_path / "record_next.csv"
     path.write_text(request.to_csv())
-    controls = read_controls(path)
+    (controls,) = read_controls(path)
     assert controls.u_in.shape == (request.u_in.size,)
     np.testing.assert_allclose(controls.u_in, request.u_in.ravel(), atol=1e-4)
     np.testing.assert_array_equal(controls.u_out, request.u_out.ravel())

@@ -14,7 +14,7 @@ from ventbench.physics import paths
 from ventbench.plants import frozen
 from ventbench.recordings import load
 from ventbench.system_id import Noise, make_data
-from ventbench.system_id.noise import robust_noise
+from ventbench.system_id.data import robust_noise
 from ventbench.system_id.problem import parameter_of
 from ventbench.task.lungs import LUNG_IDS
 

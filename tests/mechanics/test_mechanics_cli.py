@@ -67,10 +67,7 @@ def test_lungs_of_the_public_schema(recording, tmp_path):
 def test_progress_counts_breaths_lung_by_lung(recording):
     told = []
     identify(load(recording), lambda *counts: told.append(counts))
-    assert told == sorted(told)
-    assert len(set(told)) > 6
-    assert (6, 12) in told
-    assert told[-1] == (12, 12)
+    assert told == [(6, 12), (12, 12)]
 
 
 def test_another_label_is_said_so(tmp_path):

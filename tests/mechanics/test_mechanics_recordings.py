@@ -46,10 +46,10 @@ def test_the_lungs_are_what_their_labels_say(surveyed):
     good = [one for one in known if one.mechanics.match.label_matches]
     assert len(good) >= 32
     for one in good:
-        assert one.mechanics.settings[0].id == one.mechanics.label
+        assert one.mechanics.match.settings[0] == one.mechanics.label
     # Wherever the label does not hold, no wrong setting is claimed without a warning.
     for one in known:
-        if one not in good and one.mechanics.settings:
+        if one not in good and one.mechanics.match.settings:
             assert one.mechanics.notes
 
 

@@ -13,12 +13,12 @@ import pytest
 from tests.diagnosis import made
 from ventbench.diagnosis import number_text
 from ventbench.diagnosis.findings import MissingMechanism
-from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY
+from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.diagnosis.residual_analysis import profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.mechanics.labels import Estimate
-from ventbench.pages.diagnosis import report, write_report, write_rerun
+from ventbench.pages.diagnosis import report
 from ventbench.pages.diagnosis.charts import (
     Chart,
     by_axis,
@@ -44,7 +44,7 @@ def found() -> Diagnosis:
 
 
 def test_report(found: Diagnosis, tmp_path: Path) -> None:
-    path = write_report(tmp_path / "report.html", found)
+    path = report.write(tmp_path / "report.html", found)
     page = Page(path.read_text())
     assert path.stat().st_size < 200_000
     (heading,) = [tag for tag, _ in page.tags if tag == "h1"]
@@ -76,7 +76,7 @@ def test_nothing_from_outside(found: Diagnosis, tmp_path: Path) -> None:
     bad = dataclasses.replace(
         found, simulator="<script>alert('x')</script>", notes=("<img src=http://x>",)
     )
-    text = write_report(tmp_path / "r.html", bad).read_text()
+    text = report.write(tmp_path / "r.html", bad).read_text()
     page = Page(text)
     assert not {"script", "iframe", "img", "object", "link"} & {tag for tag, _ in page.tags}
     assert "&lt;script&gt;" in text
@@ -88,31 +88,31 @@ def test_nothing_from_outside(found: Diagnosis, tmp_path: Path) -> None:
 
 
 def test_other_verdicts(tmp_path: Path) -> None:
-    unnamed = Page(write_report(tmp_path / "u.html", made.unnamed(12)).read_text())
+    unnamed = Page(report.write(tmp_path / "u.html", made.unnamed(12)).read_text())
     assert "Shape of R(V)" in unnamed.text
     assert "Each effect by itself" not in unnamed.text
-    nothing = Page(write_report(tmp_path / "n.html", made.nothing(12)).read_text())
+    nothing = Page(report.write(tmp_path / "n.html", made.nothing(12)).read_text())
     assert "Nothing is missing" in nothing.text
     assert "Nowhere" in nothing.text
     assert "corrected" not in nothing.text
     assert "What would have been seen" not in nothing.text
     limits = {"leak": 0.25, "inertance": float("inf")}
     known = dataclasses.replace(made.nothing(12), detection_limits=limits)
-    page = Page(write_report(tmp_path / "l.html", known).read_text())
+    page = Page(report.write(tmp_path / "l.html", known).read_text())
     assert "leak at the airwayleak0.25 mL/s" in page.text
     assert "not at any strength" in page.text
 
 
 def test_the_guilty_part_of_the_rig_is_lit(found: Diagnosis, tmp_path: Path) -> None:
-    page = Page(write_report(tmp_path / "r.html", found).read_text())
+    page = Page(report.write(tmp_path / "r.html", found).read_text())
     (rig,) = [attrs for _, attrs in page.tags if attrs.get("class") == "rig"]
     assert rig["aria-label"].endswith("inspiratory valve: dead time of the inspiratory valve.")
     looks = [attrs["class"] for _, attrs in page.tags if attrs.get("class", "").startswith("part")]
     assert len(looks) == len(report.PARTS)
     assert [look.split()[1:] for look in looks].count(["lit"]) == 1
-    unnamed = Page(write_report(tmp_path / "u.html", made.unnamed(12)).read_text())
+    unnamed = Page(report.write(tmp_path / "u.html", made.unnamed(12)).read_text())
     assert "part suspect" in {attrs.get("class") for _, attrs in unnamed.tags}
-    nothing = Page(write_report(tmp_path / "n.html", made.nothing(12)).read_text())
+    nothing = Page(report.write(tmp_path / "n.html", made.nothing(12)).read_text())
     assert "No part of it is guilty" in nothing.text
     both = dataclasses.replace(
         found, mechanisms=found.mechanisms * 2, nonparametric=made.unnamed(12).nonparametric
@@ -137,7 +137,7 @@ def test_every_mechanism_has_a_page(name: str, tmp_path: Path) -> None:
     estimate = Estimate(strength.strong, strength.unit, (strength.mild, strength.high))
     missing = MissingMechanism(name, {strength.name: estimate}, 0.9, (), 20.0)
     shown = dataclasses.replace(made.diagnosis(12), mechanisms=(missing,), plants={})
-    text = write_report(tmp_path / "r.html", shown).read_text()
+    text = report.write(tmp_path / "r.html", shown).read_text()
     page = Page(text)
     formula = text.partition('<p class="eq">')[2].partition("</p>")[0]
     assert "<i>" in formula
@@ -164,13 +164,13 @@ def test_no_nan_reaches_the_page(found: Diagnosis, tmp_path: Path) -> None:
         ),
         open_loop=dataclasses.replace(found.open_loop, noise_floor=float("nan")),
     )
-    text = write_report(tmp_path / "r.html", broken).read_text()
+    text = report.write(tmp_path / "r.html", broken).read_text()
     assert not re.search(r"\bnan\b|\binf\b", text.lower())
     assert "breath 3," not in text
 
 
 def test_equal_input_gives_equal_bytes(found: Diagnosis, tmp_path: Path) -> None:
-    one, two = (write_report(tmp_path / name, found).read_bytes() for name in "ab")
+    one, two = (report.write(tmp_path / name, found).read_bytes() for name in "ab")
     assert one == two
 
 
@@ -279,10 +279,10 @@ def test_sentences_and_charts_agree(found: Diagnosis) -> None:
 def test_what_is_left_after_the_correction_is_shown(found: Diagnosis, tmp_path: Path) -> None:
     place = dataclasses.replace(found.location[0], mean_error=0.123)
     shown = dataclasses.replace(found, remaining=(place,))
-    text = write_report(tmp_path / "report.html", shown).read_text("utf-8")
+    text = report.write(tmp_path / "report.html", shown).read_text("utf-8")
     assert "What is left after the correction" in text
     assert "0.12 cmH2O too low" in text
-    clean = write_report(tmp_path / "clean.html", found).read_text("utf-8")
+    clean = report.write(tmp_path / "clean.html", found).read_text("utf-8")
     assert "Nothing: no range of any quantity has a significant error." in clean
 
 
@@ -297,15 +297,15 @@ def test_the_first_line_counts_expirations_too(found: Diagnosis) -> None:
 
 def test_rerun(found: Diagnosis, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
-    path = write_rerun(tmp_path / "diagnosis.rrd", found)
+    from ventbench.pages.diagnosis import rerun_log
+
+    path = rerun_log.write(tmp_path / "diagnosis.rrd", found)
     assert [item.name for item in tmp_path.iterdir()] == ["diagnosis.rrd"]
     assert path.stat().st_size < 2_000_000
     entities = read(path)
     expected = {f"/R20C50/pressure/{x}" for x in ("recorded", "before", "refit", "after")}
     expected |= {f"/R20C50/error/{x}" for x in ("before", "refit", "after")}
     expected |= {"/R20C50/u_in", "/R20C50/u_out", "/R20C50/held_out", "/about"}
-    expected |= {f"/by_breath/{x}" for x in ("before", "refit", "after")}
-    expected |= {"/map/refit", "/map/after"}
     assert {name for name in entities if not name.startswith("/__")} == expected
     breaths = found.traces.breaths
     recorded = entities["/R20C50/pressure/recorded"]
@@ -320,9 +320,11 @@ def test_rerun(found: Diagnosis, tmp_path: Path) -> None:
 
 def test_rerun_of_other_verdicts_and_names(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
+    from ventbench.pages.diagnosis import rerun_log
+
     odd = dataclasses.replace(made.nothing(6), simulator="\u673a ![i](http:)")
-    entities = read(write_rerun(tmp_path / "n.rrd", odd))
-    assert "/map/after" not in entities
+    entities = read(rerun_log.write(tmp_path / "n.rrd", odd))
+    assert "/R20C50/error/after" not in entities
     text = entities["/about"]["text"][0]
     assert all(ord(c) < 0x180 for c in text), "the viewer ends itself over what its font lacks"
     assert "\\!\\[i\\]" in text, "a name is neither link nor image"

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ventbench.physics import library
+from ventbench.physics import library, mechanism
+from ventbench.physics.catalogue import basis_terms
 from ventbench.physics.characteristics import characteristic
 
 
-@pytest.mark.parametrize("name", library())
+@pytest.mark.parametrize("name", [*library(), *basis_terms()])
 def test_every_mechanism_has_one_that_vanishes_with_its_strength(name: str) -> None:
-    about = library()[name].description
+    about = mechanism(name).description
     strong = {about.strength.name: about.strength.strong}
     shown = characteristic(name, {"R": 10.0, "C": 30.0} | strong)
     assert shown is not None

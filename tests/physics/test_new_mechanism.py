@@ -100,5 +100,5 @@ def test_the_search_names_it(relieved):
         names = all_parameter_paths(settings)
         evaluator = make_evaluator(relieved[1], np.arange(12) % 2 == 1, names, settings=settings)
         found = search(evaluator)
-    assert found.best.terms[0].name == "pop_off_valve"
+    assert found.fitted[0].terms[0].name == "pop_off_valve"
     assert found.weights[frozenset({"pop_off_valve"})] > 0.5

@@ -6,15 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
-from ventbench.diagnosis.estimates import component_curves
 from ventbench.physics import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
+from ventbench.physics.characteristics import characteristic
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
+from ventbench.physics.nonparametric.basis import BasisTerm
 from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.system_id import Predictor, fit, make_data, parameter_values
-from ventbench.system_id.noise import Noise
+from ventbench.system_id.data import Noise
 from ventbench.system_id.problem import free_paths, make_unknowns
 from ventbench.task.rollouts import open_loop
 
@@ -76,11 +76,6 @@ def drawn_coefficients(names, seed, share=0.3):
 
 def rms(x):
     return float(np.sqrt(np.mean(np.asarray(x) ** 2)))
-
-
-def mean_values(found):
-    """Of the base and of the terms, as :func:`component_curves` takes them."""
-    return {path: float(found.column(path).mean()) for path in paths(found.mechanisms)}
 
 
 def test_components_are_complete_and_outside_the_library():
@@ -157,24 +152,36 @@ def test_shapes_are_recovered(bench, names):
     assert rms(bench.predictor.predict(found.values)[:, 0] - truth) < 0.025
 
 
+#: Where the data say something of a term, and what base parameters could produce there.
 SEEN = {
-    "f(u)": (3.0, 20.0), "f(Q)": (-0.4, 0.4), "f(V)": (120.0, 350.0), "f(p)": (6.0, 20.0),
-    "measurement": (6.0, 20.0), "R(V)": (150.0, 320.0),
+    "valve_shape": (3.0, 20.0), "flow_shape": (-0.4, 0.4), "recoil_shape": (120.0, 350.0),
+    "leak_shape": (6.0, 20.0), "sensor_shape": (6.0, 20.0), "volume_resistance": (150.0, 320.0),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("component", SEEN)
-def test_drawn_shapes_are_those_that_were_put_in(bench, component):
-    first = NONPARAMETRIC_COMPONENTS[component].terms[0]
-    given = drawn_coefficients([first], 7, 0.5)
-    values = mean_values(bench.fit(bench.predict(given), [first]))
-    truth = component_curves(component, {"R": 11.0, "C": 23.0} | given, SEEN[component])[0]
-    found = component_curves(component, values, SEEN[component])[0]
-    assert found.x_unit == NONPARAMETRIC_COMPONENTS[component].axis
-    size = np.abs(truth.y).max()
+def drawn(name, values):
+    """Where a term is seen, and its curve there less what base parameters absorb."""
+    shown = characteristic(name, {path.rpartition(".")[2]: x for path, x in values.items()})
+    assert shown is not None
+    seen = (shown.x >= SEEN[name][0]) & (shown.x <= SEEN[name][1])
+    x, y = shown.x[seen], (shown.acting - shown.without)[seen]
+    term = basis_terms()[name]
+    assert isinstance(term, BasisTerm)
+    if term.absorbed:
+        powers = np.stack([x**power for power in term.absorbed], axis=1)
+        y = y - powers @ np.linalg.lstsq(powers, y, rcond=None)[0]
+    return x, y
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_drawn_shapes_are_those_that_were_put_in(bench, name):
+    given = drawn_coefficients([name], 7, 0.5)
+    found = bench.fit(bench.predict(given), [name])
+    x, truth = drawn(name, {"R": 11.0, "C": 23.0} | given)
+    there, y = drawn(name, {path: float(found.column(path).mean()) for path in paths((name,))})
+    size = np.abs(truth).max()
     assert size > 0
-    there = np.interp(truth.x, found.x, found.y)
-    assert np.abs(there - truth.y).max() < 0.3 * size
+    assert np.abs(np.interp(x, there, y) - truth).max() < 0.3 * size
 
 
 @pytest.mark.parametrize(
@@ -277,34 +284,3 @@ def test_a_fit_with_a_drift_gives_a_plant_with_positions(bench):
         plant = found.plant()
         np.testing.assert_allclose(plant.get("position"), bench.data.position)
         assert float(plant.get("drift_shape.c4")[0]) == pytest.approx(1.0, abs=0.1)
-
-
-def test_what_base_parameters_absorb_is_not_drawn():
-    """A resistance that is everywhere the same is R."""
-    values = {"C": 20.0, "R": 10.0} | {f"volume_resistance.c{k}": 0.5 for k in range(1, 6)}
-    whole = component_curves("R(V)", values)[0]
-    assert whole.x.max() == pytest.approx(900.0)
-    assert whole.y.max() == pytest.approx(5.0)
-    cut = component_curves("R(V)", values, (200.0, 600.0))[0]
-    assert (cut.x.min(), cut.x.max()) == pytest.approx((200.0, 600.0))
-    np.testing.assert_allclose(cut.y, 0.0, atol=1e-9)
-
-
-def test_the_strongest_element_is_drawn_first():
-    shapes = component_curves("measurement", {"drift_shape.c4": 3.0, "sensor_memory.c1": 0.1})
-    assert shapes[0].x_unit == "position in the recording, 0..1"
-    assert shapes[0].y[-1] == pytest.approx(3.0)
-    assert len(shapes) == 3
-    late = component_curves("exhalation path", {"outlet_memory.c2": 1.0, "outlet_shape.c1": 0.1})
-    assert late[0].y[0] == pytest.approx(1.0)
-    for component in NONPARAMETRIC_COMPONENTS:
-        for shape in component_curves(component, {}):
-            np.testing.assert_array_equal(shape.y, 0.0)
-            assert shape.x.shape == shape.y.shape
-
-
-def test_bad_drawings():
-    with pytest.raises(InputError, match="no nonparametric component 'f"):
-        component_curves("f(x)", {})
-    with pytest.raises(InputError, match="give a range within"):
-        component_curves("f(u)", {}, (200.0, 300.0))

@@ -91,16 +91,16 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def json_values(value: Any) -> Any:
-    """Plain JSON values of nested dicts, sequences and NumPy or JAX numbers.
+    """Plain JSON values of nested dicts, sequences, and NumPy or JAX arrays and numbers.
 
     A number that is not finite becomes None.
     """
     if isinstance(value, dict):
         return {str(key): json_values(part) for key, part in value.items()}
+    if hasattr(value, "tolist"):  # an array or a number of NumPy or JAX
+        value = value.tolist()
     if isinstance(value, list | tuple):
         return [json_values(part) for part in value]
-    if hasattr(value, "item"):  # a number of NumPy or JAX
-        value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

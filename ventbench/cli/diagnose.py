@@ -123,9 +123,7 @@ def _lung(mechanics: Mechanics) -> dict[str, Any]:
     """Return JSON values; numbers that are not finite become null."""
     import dataclasses
 
-    plain = dataclasses.asdict(mechanics) | {
-        "settings": [setting.id for setting in mechanics.settings]
-    }
+    plain = dataclasses.asdict(mechanics) | {"settings": mechanics.match.settings}
     return files.json_values(plain)
 
 
@@ -157,7 +155,7 @@ def _table(lungs: dict[str, Mechanics]) -> Any:
             label,
             value_text(lung.match.fitted_R, lung.match.ci95_R),
             value_text(lung.match.fitted_C, lung.match.ci95_C),
-            *label_texts(lung.match, lung.settings),
+            *label_texts(lung.match),
             ", ".join(term.name for term in lung.terms) or "-",
         )
         for label, lung in lungs.items()

@@ -32,7 +32,7 @@ from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
 from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
 from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.data import Noise, robust_noise
 
 #: Receives the current step, in words.
 Progress: TypeAlias = Callable[[str], None]
@@ -223,13 +223,8 @@ def _fitted(evaluator: Evaluator, best: Scored) -> FittedModel:
     hypothesis = best.fitted.hypothesis
     if EFFORT in names_of(best.terms):
         hypothesis = hypothesis.plus(Hypothesis((EFFORT,)))
-    values = evaluator.transferred_values(best.fitted, evaluator.training)
-    names = evaluator.training.predictor.names
-    start = {
-        path: values[:, k]
-        for k, path in enumerate(names)
-        if path != "position" and path.rpartition(".")[0] != EFFORT
-    }
+    values = evaluator.transferred(best.fitted, evaluator.training)
+    start = {path: x for path, x in values.items() if path.rpartition(".")[0] != EFFORT}
     first = evaluator.fit(hypothesis, best.noise, None, start)
     return fit_with_noise(evaluator, hypothesis, first)
 
@@ -277,9 +272,8 @@ def _supported(
 
 def _square(evaluator: Evaluator, model: FittedModel) -> float:
     """Mean square of the open-loop error on held-out breaths, cmH2O^2."""
-    data = evaluator.held_out.data
-    left = evaluator.predict(model, evaluator.held_out) - data.measured
-    return float(np.mean(np.square(left[data.weight > 0.0])))
+    count = np.sum(evaluator.held_out.data.weight > 0.0)
+    return evaluator.square_error(model, evaluator.held_out) / float(count)
 
 
 def _marginal_gains(

@@ -335,9 +335,8 @@ def _least_error_model(
     if any(varies_by_breath(name) for name in full.names):
         return None
     reduced = less_unmodelled(data, before, simulator_model).select(split.fitted)
-    names, settings = evaluator.training.predictor.names, evaluator.settings
-    partition = make_partition(reduced, names, settings)
-    return fit_open_loop(evaluator, full, partition, settings.correction)
+    partition = evaluator.partition(reduced)
+    return fit_open_loop(evaluator, full, partition, evaluator.settings.correction)
 
 
 def fit_open_loop(
@@ -366,7 +365,7 @@ def fit_open_loop(
         starts.append({"R": data.R, "C": data.C})
         starts.append(_best_lung(partition, settings))
     models = [evaluator.fit(fitted.hypothesis, noise, start=s, partition=partition) for s in starts]
-    return min(models, key=lambda model: _square(evaluator, model, partition))
+    return min(models, key=lambda model: evaluator.square_error(model, partition))
 
 
 def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, Floats]:
@@ -388,10 +387,3 @@ def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, 
         for path in start:
             start[path][own] = points[best][own, names.index(path)]
     return start
-
-
-def _square(evaluator: Evaluator, model: FittedModel, partition: Partition) -> float:
-    """Sum of squared errors of a simulation that starts from the first readings."""
-    data = partition.data
-    error = (evaluator.predict(model, partition) - data.measured) * data.weight
-    return float(np.sum(error**2))

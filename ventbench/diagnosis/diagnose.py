@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
 
+from ventbench import mechanics
 from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
@@ -26,7 +27,7 @@ from ventbench.diagnosis.findings import (
     Traces,
     Verdict,
 )
-from ventbench.diagnosis.hypothesis import make_partition, varies_by_breath
+from ventbench.diagnosis.hypothesis import varies_by_breath
 from ventbench.diagnosis.identification import (
     IdentifiedModel,
     Split,
@@ -424,7 +425,7 @@ def _helps(
     evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
     if conclusion.base.hypothesis == conclusion.full.hypothesis:
         return by_breath or correction.helps
-    partition = make_partition(judging, evaluator.training.predictor.names, evaluator.settings)
+    partition = evaluator.partition(judging)
     base = evaluator.fit(conclusion.base.hypothesis, conclusion.full.noise)
     gained = evaluator.log_likelihood(conclusion.full, partition)
     return bool(np.sum(gained - evaluator.log_likelihood(base, partition)) > 0.0)
@@ -473,8 +474,9 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
     """The lungs; from flow or volume where they are recorded, which needs no model of the valve."""
     if breaths.flow is not None or breaths.volume is not None:
         try:
-            matches, notes = estimates.lung_matches_by_flow(breaths)
-            return matches, list(notes)
+            lungs = mechanics.identify(breaths)
+            notes = [note for each in lungs for note in each.notes]
+            return tuple(each.match for each in lungs), notes
         except InputError as error:
             return estimates.lung_matches(fit), [f"R and C are from pressure alone: {error}."]
     return estimates.lung_matches(fit), []
@@ -528,4 +530,4 @@ def _missing_mechanism(
 def _request(conclusion: Conclusion) -> BreathRequest | None:
     rivals = [rival for other in conclusion.alternatives.values() for rival in other.models]
     noise = Noise((conclusion.noise.sigma[0],), (0.0,))
-    return request_breaths(conclusion.named, rivals, noise=noise)
+    return request_breaths(conclusion.named, rivals, noise)

@@ -6,20 +6,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ventbench import mechanics
-from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
-from ventbench.diagnosis.conclusion import Conclusion, Swing, UnnamedEffect, component_of
+from ventbench.diagnosis.conclusion import Conclusion, Swing, UnnamedEffect
 from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
-from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY
+from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics.catalogue import (
-    basis_terms,
     library,
     mechanism,
     parameter,
@@ -27,75 +23,13 @@ from ventbench.physics.catalogue import (
     special_cases,
     strength_path,
 )
+from ventbench.physics.characteristics import characteristic
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.physics.nonparametric.basis import BasisTerm, Curve
-from ventbench.physics.parameters import BASE_PARAMETERS
-from ventbench.recordings.breaths import Breaths
+from ventbench.physics.nonparametric.basis import BasisTerm
 from ventbench.system_id import ConfidenceInterval, Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.task.interfaces import Plant
-
-
-def component_curves(
-    component: str, values: Mapping[str, float], within: tuple[float, float] | None = None
-) -> tuple[Curve, ...]:
-    """Curves of a nonparametric component; those of its strongest basis term come first.
-
-    Volumes count from where a linear lung has no recoil.
-
-    Args:
-        component: public name, such as ``f(V)``.
-        values: fitted values by path: coefficients, R, C, gain, R_ex. What is missing is neutral.
-        within: range of the component's axis that the data cover. A curve over that axis is cut to
-            it, and what base parameters could absorb there (a constant, a straight line through
-            zero) is subtracted.
-
-    Raises:
-        InputError: if there is no such component, or the range contains no part of the curve.
-    """
-    if component not in NONPARAMETRIC_COMPONENTS:
-        raise InputError(
-            f"no nonparametric component {component!r}; choose one of "
-            f"{', '.join(NONPARAMETRIC_COMPONENTS)}"
-        )
-    about = NONPARAMETRIC_COMPONENTS[component]
-    base = {p.name: float(values.get(p.name, p.neutral)) for p in BASE_PARAMETERS}
-    weighted = []
-    with float64():
-        for name in about.terms:
-            term = basis_terms()[name]
-            assert isinstance(term, BasisTerm)  # as all terms of the package are
-            own = {
-                p.name: jnp.asarray(float(values.get(f"{name}.{p.name}", p.neutral)))
-                for p in term.description.parameters
-            }
-            weighted.append((term.magnitude(own), term.curves(own, base)))
-    weighted.sort(key=lambda pair: -pair[0])
-    curves = [curve for _, of_term in weighted for curve in of_term]
-    if within is None:
-        return tuple(curves)
-    return tuple(_cut(curve, *within) if curve.x_unit == about.axis else curve for curve in curves)
-
-
-def _cut(curve: Curve, low: float, high: float) -> Curve:
-    covered = (curve.x >= low) & (curve.x <= high)
-    x, y = curve.x[covered], curve.y[covered]
-    if len(x) <= len(curve.absorbed):
-        raise InputError(
-            f"{curve.x_unit} from {low:g} to {high:g}: the curve goes from {curve.x[0]:g} to "
-            f"{curve.x[-1]:g}; give a range within that"
-        )
-    return without_absorbed(replace(curve, x=x, y=y))
-
-
-def without_absorbed(curve: Curve) -> Curve:
-    """Subtract the part that a change of base parameters would produce as well."""
-    if not curve.absorbed:
-        return curve
-    powers = np.stack([curve.x**power for power in curve.absorbed], axis=1)
-    return replace(curve, y=curve.y - powers @ np.linalg.lstsq(powers, curve.y, rcond=None)[0])
-
 
 #: Share of a parameter that the equations of the library miss, as a standard deviation. Lags, dead
 #: times and compliances that strangers' recordings know to 1 % by their noise were 1 to 3 % off:
@@ -187,11 +121,7 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
 
 
 def with_form_error(
-    estimates: Mapping[str, Estimate],
-    name: str,
-    form_error: float = FORM_ERROR,
-    *,
-    alone: bool = True,
+    estimates: Mapping[str, Estimate], name: str, *, alone: bool = True
 ) -> dict[str, Estimate]:
     """Estimates whose intervals also contain what the library's equations miss.
 
@@ -202,11 +132,10 @@ def with_form_error(
     Args:
         estimates: estimates of a mechanism's parameters, by short name.
         name: name of the mechanism.
-        form_error: share of a parameter that the equations miss, as a standard deviation.
         alone: False if the mechanism acts beside others, whose forms shift its parameters too.
     """
     widened, description = {}, mechanism(name).description
-    share = np.hypot(form_error, 0.0 if alone else description.beside_error)
+    share = np.hypot(FORM_ERROR, 0.0 if alone else description.beside_error)
     for about in description.parameters:
         if about.name not in estimates:
             continue
@@ -259,7 +188,7 @@ def lung_matches(fitted: Fit) -> tuple[LungMatch, ...]:
 
     The label is judged by :func:`~ventbench.mechanics.match_labels`, at the flow of its definition.
     """
-    settings, matches = mechanics.settings_by_label(fitted), []
+    matches = []
     for group, match in enumerate(mechanics.match_labels(fitted)):
         ends = {path: fitted.ci95(path)[group] for path in ("R", "C")}
         matches.append(
@@ -269,26 +198,9 @@ def lung_matches(fitted: Fit) -> tuple[LungMatch, ...]:
                 fitted_C=float(fitted.value("C")[group]),
                 ci95_R=(float(ends["R"][0]), float(ends["R"][1])),
                 ci95_C=(float(ends["C"][0]), float(ends["C"][1])),
-                settings=tuple(setting.id for setting in settings[match.label]),
             )
         )
     return tuple(matches)
-
-
-def lung_matches_by_flow(breaths: Breaths) -> tuple[tuple[LungMatch, ...], tuple[str, ...]]:
-    """R and C of each lung from pressure and flow or volume, and notes.
-
-    Needs no model of the valve.
-
-    Raises:
-        InputError: if too little flow or volume is recorded.
-    """
-    lungs = mechanics.identify(breaths)
-    matches = [
-        replace(lung.match, settings=tuple(setting.id for setting in lung.settings))
-        for lung in lungs
-    ]
-    return tuple(matches), tuple(note for lung in lungs for note in lung.notes)
 
 
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
@@ -413,12 +325,18 @@ def _input(place: UnnamedEffect, source: Swing, explains: float) -> Nonparametri
     )  # fmt: skip
 
 
-def _curve(full: FittedModel, element: str) -> tuple[np.ndarray, np.ndarray, str, str]:
-    own = [f"{element}.{p.name}" for p in mechanism(element).description.parameters]
-    values = {
-        name: float(np.median(full.column(name)))
-        for name in (*own, "R", "C", "gain", "R_ex", "PEEP")
-    }
-    # The component's other terms are neutral; the strongest curve is the first.
-    curve = without_absorbed(component_curves(component_of(element), values)[0])
-    return np.asarray(curve.x, float), np.asarray(curve.y, float), curve.x_unit, curve.y_unit
+def _curve(full: FittedModel, element: str) -> tuple[Floats, Floats, str, str]:
+    """What a basis term adds to a quantity, less what base parameters could add as well."""
+    term = mechanism(element)
+    paths = {p.name: f"{element}.{p.name}" for p in term.description.parameters}
+    paths |= {name: name for name in ("R", "C", "gain", "R_ex", "PEEP")}
+    values = {name: float(np.median(full.column(path))) for name, path in paths.items()}
+    shown = characteristic(element, values)
+    if shown is None:  # it acts beyond what is drawn
+        return np.linspace(0.0, 1.0, 2), np.zeros(2), "share of the range", "no change"
+    added = shown.acting - shown.without
+    assert isinstance(term, BasisTerm)
+    if term.absorbed:
+        powers = np.stack([shown.x**power for power in term.absorbed], axis=1)
+        added = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
+    return shown.x, added, shown.x_label, f"extra {shown.y_label}"

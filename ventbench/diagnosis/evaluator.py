@@ -30,9 +30,8 @@ from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import library, mechanism
 from ventbench.system_id import problem as problems
-from ventbench.system_id.data import Data
+from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
-from ventbench.system_id.noise import Noise, robust_noise
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import Problem, make_unknowns, parameter_of
 
@@ -265,6 +264,10 @@ class Evaluator:
         """Mechanisms of the library that may act."""
         return tuple(name for name in library() if name not in self.excluded)
 
+    def partition(self, data: Data) -> Partition:
+        """Combine breaths with a predictor that has the parameters of this evaluator."""
+        return make_partition(data, self.training.predictor.names, self.settings)
+
     def fit(
         self,
         hypothesis: Hypothesis,
@@ -294,9 +297,7 @@ class Evaluator:
         index = self._ranking_breaths
         if len(index) == len(self.training.data):
             return self
-        names = self.training.predictor.names
-        partition = make_partition(self.training.data.select(index), names, self.settings)
-        return replace(self, training=partition)
+        return replace(self, training=self.partition(self.training.data.select(index)))
 
     @cached_property
     def _ranking_breaths(self) -> NDArray[np.intp]:
@@ -326,17 +327,7 @@ class Evaluator:
         plain = problem.log_likelihood(x)
         return plain + self.breath_term(fitted).log_likelihood_gain(problem, x, fitted)
 
-    def training_log_likelihood(self, fitted: FittedModel, noise: Noise | None = None) -> float:
-        """Log-likelihood of the training breaths, nats; patient effort is integrated out.
-
-        Args:
-            fitted: a model of the training breaths.
-            noise: the likelihood's; that of the fit if None.
-        """
-        term = self.breath_term(fitted)
-        return float(term.marginal_log_likelihood(fitted, noise or fitted.noise).sum())
-
-    def criterion(self, fitted: FittedModel, noise: Noise | None = None) -> float:
+    def criterion(self, fitted: FittedModel) -> float:
         """Bayesian information criterion (BIC) on the training breaths; less is better.
 
         Only shared unknowns count: each breath's own are integrated out, or the same in all
@@ -344,12 +335,11 @@ class Evaluator:
 
         Args:
             fitted: a model of the training breaths.
-            noise: the likelihood's; that of the fit if None.
         """
         count = float(self.training.data.weight.sum())
         penalty = fitted.shared_count * float(np.log(count))
-        evidence = self.training_log_likelihood(fitted, noise) + self.label_log_density(fitted)
-        return penalty - 2.0 * evidence
+        breaths = float(self.breath_term(fitted).marginal_log_likelihood(fitted).sum())
+        return penalty - 2.0 * (breaths + self.label_log_density(fitted))
 
     def label_log_density(self, fitted: FittedModel) -> float:
         """Logarithm of the prior density of each lung's R and C, less its largest value, nats.
@@ -393,10 +383,9 @@ class Evaluator:
         """
         partition, settings = partition or self.held_out, self.settings.fit
         own = (START, "gain") if self.gain_sd else (START,)
-        values, names = self.transferred_values(fitted, partition), partition.predictor.names
-        fixed = {name: values[:, k] for k, name in enumerate(names) if name != "position"}
+        fixed = self.transferred(fitted, partition)
         problem = make_problem(partition, own, fitted.noise, fixed, self.gain_sd)
-        columns, layout = (*names, START), problem.unknowns
+        columns, layout = (*partition.predictor.names, START), problem.unknowns
         first = {p: problem.fixed[:, columns.index(p)] for p in own}
         low, high = layout.bounds()
         minimum = minimise(
@@ -428,6 +417,18 @@ class Evaluator:
                 value = fitted.values[first, names.index(name)]
                 values[:, column] = np.clip(value, parameter.low, parameter.high)
         return values
+
+    def transferred(self, fitted: FittedModel, partition: Partition) -> dict[str, Floats]:
+        """The same by path, ``(n,)`` each, without the breaths' starts and positions."""
+        values = self.transferred_values(fitted, partition)
+        names = partition.predictor.names
+        return {name: values[:, k] for k, name in enumerate(names) if name != "position"}
+
+    def square_error(self, fitted: FittedModel, partition: Partition) -> float:
+        """Sum of the squared errors of breaths that start from their first readings, cmH2O^2."""
+        data = partition.data
+        left = self.predict(fitted, partition) - data.measured
+        return float(np.sum(np.square(left[data.weight > 0.0])))
 
     def breath_term(self, fitted: FittedModel) -> BreathTerm:
         """Term of a model whose parameters differ from breath to breath."""
@@ -481,8 +482,7 @@ def cross_validated_gain(
     def evaluate(work: tuple[tuple[Partition, Partition], FittedModel]) -> Floats:
         (training, held_out), fitted = work
         fold = replace(evaluator, training=training, held_out=held_out, folds=())
-        values, names = fold.transferred_values(fitted, training), training.predictor.names
-        start = {path: values[:, k] for k, path in enumerate(names) if path != START}
+        start = fold.transferred(fitted, training)
         return fold.held_out_log_likelihood(fold.fit(fitted.hypothesis, fitted.noise, start=start))
 
     likelihoods = parallel_map(evaluate, product(evaluator.folds, (with_term, without_term)))

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -38,8 +37,7 @@ from ventbench.diagnosis.linearised import (
     within,
 )  # fmt: skip
 from ventbench.physics.catalogue import basis_terms, library, mechanism
-from ventbench.system_id.data import Data
-from ventbench.system_id.noise import Noise
+from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.problem import parameter_of
 
 #: Effects of some breaths, and what acts in time of which there is no parameter.
@@ -79,7 +77,6 @@ class Posterior:
 
     fitted: tuple[Scored, ...]  #: sets that were fitted, likeliest first.
     weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
-    base: FittedModel  #: the base model.
     scatter: float  #: standard deviation of the logarithm of the breaths' gains.
 
     def swaps(self, names: frozenset[str], name: str) -> dict[str, float]:
@@ -92,19 +89,15 @@ class Posterior:
         }
         return dict(sorted(odds.items(), key=lambda pair: -pair[1]))
 
-    @cached_property
-    def best(self) -> Scored:
-        """The likeliest set."""
-        return self.fitted[0]
-
     def undecided(self, nats: float) -> Scored:
         """The likeliest term, if none at all is likelier by so little; else the best set.
 
         A further term beside others may be no more than their form.
         """
-        most = _log_posterior(self.best)
-        near = (s for s in self.fitted[1:] if len(s.terms) == 1 and not self.best.terms)
-        return next((s for s in near if most - _log_posterior(s) < nats), self.best)
+        best, *others = self.fitted
+        most = _log_posterior(best)
+        near = (s for s in others if len(s.terms) == 1 and not best.terms)
+        return next((s for s in near if most - _log_posterior(s) < nats), best)
 
 
 def search(wide: Evaluator, also: Sequence[str] = ()) -> Posterior:
@@ -303,7 +296,7 @@ class _Search:
             self.rescore(around, noise)
         ordered = self.ordered()
         ranked = main.ways[main.scatters.index(ordered[0].scatter)]
-        return Posterior(tuple(ordered), weigh(ordered, ranked), self.base, ordered[0].scatter)
+        return Posterior(tuple(ordered), weigh(ordered, ranked), ordered[0].scatter)
 
     def leading(self) -> list[Scored]:
         """The likeliest set, and the likeliest of names alone if it is not far behind."""

@@ -24,9 +24,8 @@ from ventbench.physics.catalogue import (
     paths,
     strength_path,
 )
-from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.data import Data, Floats, Noise
 from ventbench.system_id.levenberg_marquardt import Minimum
-from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import Problem, free_paths
 
@@ -66,17 +65,6 @@ class Linearisation:
         """Part of another prediction ``(n, c, T)`` that no refit can absorb, ``(n, m)``."""
         white = self.without_own(self.whiten(prediction - self.prediction)[:, None])
         return self.without_shared(white)[:, 0]
-
-    def gain(self, template: Floats) -> tuple[float, float]:
-        """Log-likelihood that the best multiple of a template gains, nats, and that multiple.
-
-        The multiple is negative if the opposite effect would help.
-        """
-        power = float(np.sum(template**2))
-        if power < 1e-12:
-            return 0.0, 0.0
-        share = -float(np.sum(self.residual * template)) / power
-        return 0.5 * share**2 * power, share
 
 
 def linearise(problem: Problem, x: Floats, *, clip: float = 4.0) -> Linearisation:

@@ -22,7 +22,6 @@ from ventbench.diagnosis.hypothesis import (
     FittedModel,
     Partition,
     all_parameter_paths,
-    make_partition,
     varies_by_breath,
 )
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
@@ -187,9 +186,7 @@ class IdentifiedModel:
             first: pressures that the breaths start from, cmH2O, ``(n,)``; their first readings if
                 None.
         """
-        names = self.evaluator.training.predictor.names
-        partition = make_partition(data, names, self.evaluator.settings)
-        return self.evaluator.predict(fitted, partition, first)[:, 0]
+        return self.evaluator.predict(fitted, self.evaluator.partition(data), first)[:, 0]
 
     def sensitivities(self, data: Data) -> tuple[Floats, Floats]:
         """Change of the pressures of n breaths by what is a breath's own, cmH2O, ``(n, T)`` each.
@@ -201,7 +198,7 @@ class IdentifiedModel:
             By the logarithm of the valve's gain, and by the pressure that the breath starts from.
         """
         evaluator, model = self.evaluator, self.conclusion.full
-        partition = make_partition(data, evaluator.training.predictor.names, evaluator.settings)
+        partition = evaluator.partition(data)
         values, names = evaluator.transferred_values(model, partition), partition.predictor.names
         gain = names.index("gain")
         slopes = partition.predictor.derivatives(values, (gain, len(names)))[1][:, :, 0]
@@ -213,7 +210,7 @@ class IdentifiedModel:
         ``(n, T)``, or a zero that stands for all where there is no effort.
         """
         evaluator, model = self.evaluator, self.conclusion.full
-        partition = make_partition(data, evaluator.training.predictor.names, evaluator.settings)
+        partition = evaluator.partition(data)
         values = evaluator.transferred_values(model, partition)
         return evaluator.breath_term(model).spread(model, partition.predictor, values)[:, 0]
 
@@ -246,16 +243,14 @@ def identify(
     evaluator = make_evaluator(data, held, names, excluded, settings)
     # Breaths that judge are in no search, though they test: few breaths have both uses.
     chosen = ~held if fitted is None else fitted
-    searched = make_partition(data.select(chosen), names, settings)
+    searched = evaluator.partition(data.select(chosen))
     conclusion = conclude(evaluator, searched, tell, earlier)
     # Gains that differ between breaths are parameters of each breath, unknown of held-out ones.
     evaluator = replace(evaluator, gain_sd=conclusion.gain_sd)
     while True:
         has_term = conclusion.unnamed is not None and conclusion.unnamed.term is not None
         # A nonparametric term is fitted to the training breaths alone, to save time.
-        final = evaluator.training
-        if not has_term:
-            final = make_partition(data.select(chosen), names, settings)
+        final = evaluator.training if has_term else evaluator.partition(data.select(chosen))
         fit = estimates.final_fit(conclusion.full, final, evaluator)
         vague = [
             name
@@ -297,15 +292,13 @@ def place_of_change(
     or, beside a nonparametric term, a testing one. Starts are fitted on either side of the change;
     gains of single breaths are as usual, since they would make up for a wrong place.
     """
-    names = evaluator.training.predictor.names
-    partition = make_partition(data, names, evaluator.settings)
-    values = evaluator.transferred_values(fitted, partition)
-    fixed = {name: values[:, k] for k, name in enumerate(names) if name != "position"}
+    partition = evaluator.partition(data)
+    fixed = evaluator.transferred(fitted, partition)
     starts, about = [], parameter_of(path)
     for place in (about.high, about.low):  # all breaths before, and after
         fixed[path] = np.full(len(data), place)
         side = make_problem(partition, (START,), fitted.noise, fixed, 0.0)
-        first = side.unknowns.pack({START: values[:, -1]})
+        first = side.unknowns.pack({START: side.fixed[:, -1]})
         starts.append(minimise(side.cost, side.normal, first, *side.unknowns.bounds()).x)
     places, costs = side.change_costs(starts[0], path, after=starts[1])
     return likely_places(places, costs, float(places[np.argmin(costs)]))

@@ -2,7 +2,12 @@
 
 A breath is affected or not, and the share of affected breaths is uniform: the likeliest set of
 breaths is found by flips. A swing has one frequency and in each breath a size and phase of its own.
-Commands that were lost or late are followed from sample to sample (:mod:`.command_path`).
+
+Commands may be lost, which leaves the valve at the one before, or come late by ``lag`` samples, and
+then act only if none that was sent after them has arrived. At each sample the valve thus either
+follows or keeps what it has, and readings up to the next sample depend on no later command: a
+search from sample to sample that keeps the likeliest paths (a beam) has their exact likelihoods.
+The sum over the paths that are kept is a lower bound of the likelihood with all of them.
 """
 
 from __future__ import annotations
@@ -10,17 +15,20 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
 
 from ventbench.base.arrays import Floats
-from ventbench.diagnosis.command_path import follow
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition
-from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY, input_responses
 from ventbench.diagnosis.linearised import CONSTANT, EFFORT, OPEN, Known, Term, gaussian
 from ventbench.diagnosis.settings import SelectionConfig
+from ventbench.physics.events import HALF_SWING
+from ventbench.system_id.problem import Problem
+
+#: Public names of the places where an input may act.
+ALVEOLUS, SUPPLY, CIRCUIT = "f(t) at the alveolus", "f(t) at the supply", "f(t) in the circuit"
 
 #: Pushes of the muscles: sign, size, cmH2O, durations and onsets, s; and shares of the size that
 #: harmonics have, as forms are unsure.
@@ -39,6 +47,9 @@ SWINGS = {
 
 #: Shares of the commands that are expected to be lost, or late; samples by which they are late.
 _COMMANDS = {"lost_commands": (0.08, (None,)), "late_commands": (0.18, (2, 3, 4))}
+
+#: Paths that are kept in each breath, and difference of commands, %, that is none.
+_PATHS, _SAME = 6, 0.3
 
 
 def _share(n: int, k: int) -> float:
@@ -205,3 +216,113 @@ def _commands(
         odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2 + np.log(len(lags))
         terms.append(Term(name, [1.0], odds=float(odds), latent=[column]))
     return terms
+
+
+def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
+    """Change of the pressure by a unit input at one sample that no command explains, cmH2O.
+
+    Only resistance, compliance and the expiratory valve are modelled. Other mechanisms are left
+    out, so that an input's course is right to about 10 %.
+
+    Args:
+        partition: n breaths of T samples.
+        values: physical values of its parameters, ``(n, P + 1)``.
+        place: pressure at the alveolus, cmH2O; flow of the supply, as a share of it; or pressure
+            in the circuit at a large flow, cmH2O.
+
+    Returns:
+        ``(n, T, T)``, input first.
+    """
+    data, names = partition.data, partition.predictor.names
+    n, samples = data.u_in.shape
+    R, C, R_ex, gain = (values[:, names.index(name)] for name in ("R", "C", "R_ex", "gain"))
+    C = C * 1e-3
+    volume, responses = np.zeros((n, samples)), np.zeros((n, samples, samples))
+    if place == CIRCUIT:
+        above = values[:, -1] - values[:, names.index("PEEP")]  # pressure in the lung
+        for k in range(1, samples):
+            expiratory, dt = data.u_out[:, k - 1] > 0, data.dt[:, k - 1]
+            above = np.where(expiratory, above * np.exp(-dt / ((R + R_ex) * C)), above)
+            inwards = gain * 1e-3 * data.u_in[:, k - 1]
+            flow = np.abs(np.where(expiratory, above / (R + R_ex), inwards))
+            above = np.where(expiratory, above, above + inwards * dt / C)
+            responses[:, k, k] = flow / (flow + HALF_SWING)
+        return responses
+    for k in range(1, samples):
+        expiratory = data.u_out[:, k - 1] > 0
+        decay = np.where(expiratory, np.exp(-data.dt[:, k - 1] / ((R + R_ex) * C)), 1.0)
+        share = np.where(expiratory, R_ex / (R + R_ex), 1.0)
+        volume = volume * decay[:, None]
+        direct = 0.0 * R
+        if place == ALVEOLUS:
+            direct = direct + 1.0
+            volume[:, k] -= np.where(expiratory, (1.0 - decay) * C, 0.0)
+        else:
+            flow = gain * 1e-3 * data.u_in[:, k - 1]
+            direct = R * flow
+            filled = np.where(expiratory, (1.0 - decay) * C * R_ex, data.dt[:, k - 1])
+            volume[:, k] += filled * flow
+        responses[:, :, k] = share[:, None] * volume / C[:, None]
+        responses[:, k, k] += share * direct
+    return responses
+
+
+class Paths(NamedTuple):
+    """What lost or late commands do for n breaths."""
+
+    nats: Floats  #: log-likelihood with them, ``(n,)``.
+    u_in: Floats  #: commands on the likeliest path, %, ``(n, T)``.
+    kept: Floats  #: at how many samples the valve did not follow a new command, ``(n,)``.
+    sent: Floats  #: how many new commands there were, ``(n,)``.
+
+
+def follow(
+    problem: Problem, x: Floats, partition: Partition, share: float, lag: int | None
+) -> Paths:
+    """Find the commands that reached the valve.
+
+    Args:
+        problem: problem of the breaths with the commands that were sent.
+        x: its unknowns, ``(U,)``.
+        partition: the breaths.
+        share: share of the commands that are lost or late.
+        lag: samples by which a command is late; None if it is lost.
+    """
+    data, noise = partition.data, problem.noise
+    n, samples = data.u_in.shape
+    unit = replace(partition, data=replace(data, u_in=np.ones_like(data.u_in)))
+    by_command = np.zeros((n, samples, samples))  # (n, command, reading)
+    by_command[:, :-1] = input_responses(unit, problem.values(x), SUPPLY)[:, 1:]
+    white = noise.whiten(by_command[:, :, None], data.weight)[:, :, 0]
+    first = noise.whiten(problem.residual(x), data.weight)
+    left = np.repeat(first, _PATHS, axis=1)  # (n, b, T)
+    score = np.full((n, _PATHS), -np.inf)
+    score[:, 0] = 0.0
+    path, held = np.zeros((n, _PATHS, samples)), np.zeros((n, _PATHS), int)
+    rows = np.arange(n)[:, None]
+    kept = np.zeros((n, _PATHS))
+    for k in range(samples - 1):
+        sent = data.u_in[:, k, None]
+        valve = path[:, :, k - 1] if k else np.zeros((n, _PATHS))
+        if lag is not None and k >= lag:  # the late one arrives, as none has overtaken it
+            valve = np.where(held >= lag, data.u_in[:, k - lag, None], valve)
+        new = np.abs(valve - sent) > _SAME
+        moved = np.concatenate([np.zeros_like(valve), valve - sent], axis=1)
+        prior = np.concatenate(
+            [np.where(new, np.log1p(-share), 0.0), np.where(new, np.log(share), -np.inf)], axis=1
+        )
+        both = np.concatenate([left, left], axis=1)[:, :, k + 1] + moved * white[:, k, None, k + 1]
+        total = np.concatenate([score, score], axis=1) + prior - noise.loss(both)
+        best = np.argsort(-total, axis=1)[:, :_PATHS]
+        parent, moved = best % _PATHS, np.take_along_axis(moved, best, axis=1)
+        stays = best >= _PATHS
+        score = np.take_along_axis(total, best, axis=1)
+        left = left[rows, parent] + moved[:, :, None] * white[:, k, None]
+        path, kept = path[rows, parent], kept[rows, parent] + stays
+        path[:, :, k] = sent + moved
+        held = np.where(stays, held[rows, parent] + 1, 0)
+    path[:, :, -1] = data.u_in[:, -1:]
+    changes = np.abs(np.diff(data.u_in[:, :-1], axis=1, prepend=0.0)) > _SAME
+    constant = noise.log_scale(data.weight) + data.weight.sum(axis=(1, 2)) * noise.log_norm()
+    nats = np.logaddexp.reduce(score, axis=1) - noise.loss(first[:, 0, 0]) - constant
+    return Paths(nats, path[:, 0], kept[:, 0], changes.sum(axis=1))

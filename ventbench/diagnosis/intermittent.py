@@ -10,7 +10,7 @@ a spike and a slab. Onsets and durations are uniform on the grid of the event's 
 lie around one of all affected breaths (a normal density of their logarithm). That strength and the
 share are the likeliest on the training breaths. Parameters that breaths share are fitted to the
 breaths in which the effect does not act, in turn with the question which these are. Commands that
-were lost or late have no grid: each of them was followed or not (:mod:`.command_path`).
+were lost or late have no grid: each of them was followed or not (:mod:`.in_time`).
 
 The effect is told if it predicts the held-out breaths better than all that was found without it. A
 set of breaths that begins or ends at one breath of the recording is a change of the session and no
@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis.adequacy import order_p_value
-from ventbench.diagnosis.command_path import Paths, follow
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.evidence import COMMANDS, told_posterior
 from ventbench.diagnosis.findings import MissingMechanism
@@ -38,9 +37,9 @@ from ventbench.diagnosis.hypothesis import (
     Hypothesis,
     Partition,
     linearise,
-    make_partition,
 )
 from ventbench.diagnosis.identification import IdentifiedModel, held_out
+from ventbench.diagnosis.in_time import Paths, follow
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism
@@ -194,7 +193,7 @@ def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _Found | None:
     The first breaths are found at white noise, as coloured noise excuses whole breaths. Where most
     breaths are affected, the model is one of these, and the others show the opposite effect.
     """
-    training, names = evaluator.training, evaluator.training.predictor.names
+    training = evaluator.training
     fitted, known = fit_with_white_noise(evaluator, alone), np.zeros(len(training.data), bool)
     for k in range(_ROUNDS):
         evidence = _Evidence.of(evaluator, fitted, training, name)
@@ -210,9 +209,8 @@ def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _Found | None:
             break
         if (~acts).sum() < _LEFT or not acts.any():
             return None
-        known, rest = acts, make_partition(training.data.select(~acts), names, evaluator.settings)
-        values = evaluator.transferred_values(fitted, rest)
-        start = {path: values[:, k] for k, path in enumerate(names) if path != "position"}
+        known, rest = acts, evaluator.partition(training.data.select(~acts))
+        start = evaluator.transferred(fitted, rest)
         now = replace(evaluator, training=rest, folds=())
         fitted = fit_with_noise(
             now, alone.hypothesis, now.fit(alone.hypothesis, fitted.noise, start=start)
@@ -271,8 +269,7 @@ def _paths(
 
 
 def _with_commands(evaluator: Evaluator, partition: Partition, paths: Paths) -> Partition:
-    data = replace(partition.data, u_in=paths.u_in)
-    return make_partition(data, partition.predictor.names, evaluator.settings)
+    return evaluator.partition(replace(partition.data, u_in=paths.u_in))
 
 
 def _from_first_readings(
@@ -287,8 +284,7 @@ def _from_first_readings(
 def _everywhere(found: _Found, data: Data) -> tuple[Bools, Floats | None, dict[str, Estimate]]:
     """In which of n breaths the effect acts, with which commands, and how strong it is."""
     evaluator, name = found.evaluator, found.name
-    names = evaluator.training.predictor.names
-    partition = make_partition(data, names, evaluator.settings)
+    partition = evaluator.partition(data)
     if name in COMMANDS:
         paths = _paths(evaluator, found.fitted, partition, found.share, found.strength)
         kept, sent = int(paths.kept.sum()), max(int(paths.sent.sum()), 1)
@@ -307,7 +303,7 @@ def _everywhere(found: _Found, data: Data) -> tuple[Bools, Floats | None, dict[s
     about, centre = mechanism(name).description.strength, evidence.strengths[found.strength]
     if len(evidence.strengths) < 2 or not acts.any():
         return acts, None, {}
-    some = make_partition(data.select(acts), names, evaluator.settings)
+    some = evaluator.partition(data.select(acts))
     fine = _Evidence.of(evaluator, found.fitted, some, name, tuple(centre * _MULTIPLES))
     logs, each = (
         np.log(centre * _MULTIPLES),

@@ -10,7 +10,6 @@ counts. (Fault isolability by sensitivities: the angle between residual subspace
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.base.errors import InputError, InputTypeError
-from ventbench.diagnosis.candidate_breaths import Rig, families
+from ventbench.diagnosis.experiment_design import Rig, families
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.parameters import REFITTED
@@ -114,7 +113,9 @@ def isolability(
     chosen = tuple(names or (name for name in library() if name != "patient_effort"))
     for name in chosen:
         mechanism(name)  # says what there is if the name is wrong
-    planned = read_plan(controls) if isinstance(controls, str | Path) else controls
+    planned = controls
+    if isinstance(planned, str | Path):
+        planned = read_controls(planned, by_breath=True)
     if isinstance(planned, Breaths):
         rows = zip(planned.time, planned.u_in, planned.u_out, planned.valid, strict=True)
         planned = [Controls(t[own], u[own], np.asarray(out[own], float)) for t, u, out, own in rows]
@@ -168,23 +169,6 @@ def isolability(
         label.id, tuple(sensors), threshold, detectable, nats, tuple(confused), tuple(unseen),
         _groups(seen, confused),
     )  # fmt: skip
-
-
-def read_plan(path: Path | str) -> list[Controls]:
-    """Read planned breaths, those of a recording or of ``record_next.csv`` too.
-
-    Raises:
-        InputError: if a column is missing or a value is wrong.
-        OSError: if the file cannot be read.
-    """
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        rows = [row.get("breath_id") for row in csv.DictReader(file)]
-    if None in rows or len(set(rows)) < 2:
-        return [read_controls(Path(path))]
-    whole = read_controls(Path(path), by_breath=True)
-    edges = [k for k in range(1, len(rows)) if rows[k] != rows[k - 1]]
-    parts = zip(*(np.split(c, edges) for c in (whole.time, whole.u_in, whole.u_out)), strict=True)
-    return [Controls(time - time[0], u_in, u_out) for time, u_in, u_out in parts]
 
 
 def _data(breaths: Sequence[Controls], planned: int, R: float, C: float, samples: int) -> Data:

@@ -15,8 +15,7 @@ from ventbench.base.arrays import Floats
 from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.physics.catalogue import library, mechanism, strength_path
 from ventbench.physics.parameters import Parameter
-from ventbench.system_id.data import Data
-from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import parameter_of
 
@@ -336,12 +335,6 @@ class Known:
         """Expected change of pressure by what acts in time, cmH2O, ``(n, T)``."""
         which = slice(self.shared.shape[1] - self.latent, self.shared.shape[1])
         return np.einsum("nkt,k->nt", self.shared[:, which], self.mean[which])
-
-    @cached_property
-    def gains(self) -> Floats:
-        """Posterior mean of the logarithm of each breath's gain beside what all share, ``(n,)``."""
-        count = self.shared.shape[1]
-        return self.scatter * self.mean[count : count + self.n]
 
     @property
     def left(self) -> Noise:

@@ -3,10 +3,10 @@
 Each breath has an effort of its own amplitude and onset, so that the likelihood at the best values
 proves nothing. Both are integrated out: the amplitude is Gaussian, the onset uniform, and a breath
 has no effort at all with some probability. Where efforts are weak, sums over a grid of onsets are
-exact to first order (:class:`Evidence`). Where they are strong, an onset that is late by a tenth of
-a second is off by more than the noise, and no small step of a fit mends an effort that is put where
-there is none: each breath's effort is then started where the breath is likeliest, fitted, and
-integrated out around the fit (Laplace's method).
+exact to first order. Where they are strong, an onset that is late by a tenth of a second is off by
+more than the noise, and no small step of a fit mends an effort that is put where there is none:
+each breath's effort is then started where the breath is likeliest, fitted, and integrated out
+around the fit (Laplace's method).
 
 The rest of the diagnosis does not know about efforts: it treats hypotheses with and without them
 alike, through :class:`BreathTerm`.
@@ -15,26 +15,25 @@ alike, through :class:`BreathTerm`.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ventbench.diagnosis.hypothesis import FittedModel, Linearisation, linearise
 from ventbench.system_id.data import Floats
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
-from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import Problem, make_unknowns
 
 EFFORT = "patient_effort"
 AMPLITUDE, ONSET, DURATION = (f"{EFFORT}.{p}" for p in ("amplitude", "onset", "duration"))
 
-#: Prior of efforts: standard deviation of the amplitude, cmH2O; grids of onsets after the breath's
-#: start and of durations, s; length of time in which efforts begin, s, the grid and one step; share
-#: of the breaths that have one.
+#: Prior of efforts: standard deviation of the amplitude, cmH2O; grid of onsets after the breath's
+#: start, s; length of time in which efforts begin, s, the grid and one step; share of the breaths
+#: that have one.
 AMPLITUDE_SD, ONSETS = 3.0, np.array([0.1 * k for k in range(17)])
-_DURATIONS, _SPAN, PROBABILITY = (0.4, 0.6, 0.8, 1.0, 1.3), ONSETS[-1] - ONSETS[0] + 0.1, 0.6
+_SPAN, PROBABILITY = ONSETS[-1] - ONSETS[0] + 0.1, 0.6
 
 #: 1 / variance of amplitude, 1 / cmH2O^2, and of a uniform onset, 1 / s^2.
 _PRECISION = (AMPLITUDE_SD**-2.0, 12.0 / _SPAN**2)
@@ -47,8 +46,8 @@ _TEMPLATE = 1.0
 _RESTART_GAIN, _TOLERANCE, _STEPS = 1.0, 0.2, 7
 
 
-class BreathTerm(Protocol):
-    """The part of a hypothesis that differs from breath to breath."""
+class BreathTerm:
+    """The part of a hypothesis that differs from breath to breath; here there is none."""
 
     def start(
         self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
@@ -61,11 +60,11 @@ class BreathTerm(Protocol):
             fitted_names: terms of the model that the unknowns come from.
             refit: fit what is tried to each breath before it is compared, as ``x`` is.
         """
-        ...
+        return x
 
-    def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
-        """Log-likelihood of the breaths of a fit under a noise, ``(n,)``."""
-        ...
+    def marginal_log_likelihood(self, fitted: FittedModel) -> Floats:
+        """Log-likelihood of the breaths of a fit, ``(n,)``."""
+        return fitted.noise.log_likelihood(fitted.residual, fitted.problem.data.weight)
 
     def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
         """Log-likelihood that the term gains in breaths that no fit has seen, ``(n,)``.
@@ -75,59 +74,31 @@ class BreathTerm(Protocol):
             x: point in the coordinates of its unknowns, which differ from breath to breath.
             fitted: the model, fitted to other breaths.
         """
-        ...
+        return np.zeros(len(problem.data))
 
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Expected readings of breaths to come, ``(n, c, T)``, at values ``(n, P + 1)``."""
-        ...
+        return predictor.predict(values)
 
     def spread(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Standard deviation of these, as nobody knows what a breath to come has of its own."""
-        ...
+        return np.zeros((1, 1, 1))
 
 
 def breath_term(names: Iterable[str]) -> BreathTerm:
     """The breath term of a hypothesis with the terms ``names``."""
-    return PatientEffortTerm() if EFFORT in tuple(names) else NoBreathTerm()
+    return PatientEffortTerm() if EFFORT in tuple(names) else BreathTerm()
 
 
-class NoBreathTerm:
-    """Stands for a hypothesis whose parameters are equal in all breaths."""
-
-    def start(
-        self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
-    ) -> Floats:
-        """Leave the unknowns as they are."""
-        return x
-
-    def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
-        """Log-likelihood of the residuals."""
-        return noise.log_likelihood(fitted.residual, fitted.problem.data.weight)
-
-    def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
-        """Return zeros, ``(n,)``."""
-        return np.zeros(len(problem.data))
-
-    def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
-        """Simulate the values as they are."""
-        return predictor.predict(values)
-
-    def spread(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
-        """Return a zero for all: ``(1, 1, 1)``."""
-        return np.zeros((1, 1, 1))
-
-
-class Evidence(NamedTuple):
+class _Evidence(NamedTuple):
     """Log Bayes factor of an effort in each breath, and the likeliest effort."""
 
     nats: Floats  #: ``(n,)``.
-    duration: float  #: s, the one with the largest sum.
     amplitude: Floats  #: cmH2O, expected at the likeliest onset, ``(n,)``.
     onset: Floats  #: s, the likeliest, ``(n,)``.
 
 
-@dataclass(frozen=True)
-class PatientEffortTerm:
+class PatientEffortTerm(BreathTerm):
     """Efforts of a patient, integrated out in each breath."""
 
     def start(
@@ -144,7 +115,7 @@ class PatientEffortTerm:
         own, none = make_unknowns(problem.data, (START,)), np.zeros(len(values))
         passive_problem = replace(problem, unknowns=own, fixed=passive, mean=none, precision=none)
         at = own.pack({START: values[:, -1]})
-        evidence = self.evidence([linearise(passive_problem, at, clip=np.inf)], duration)[0]
+        evidence = self._evidence(linearise(passive_problem, at, clip=np.inf), duration)
         tried = {AMPLITUDE: evidence.amplitude, ONSET: evidence.onset}
         if refit:
             breathwise, minimum = self._fit_each_breath(passive_problem, at, evidence)
@@ -163,7 +134,7 @@ class PatientEffortTerm:
     def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
         """Integrate efforts out of breaths without any, at the fitted duration, ``(n,)``."""
         duration = float(fitted.column(DURATION)[0])
-        start = self.evidence([linearise(problem, x)], duration)[0]
+        start = self._evidence(linearise(problem, x), duration)
         breathwise, minimum = self._fit_each_breath(problem, x, start)
         curvature = minimum.hessian[
             breathwise.unknowns.index[:, :, None], breathwise.unknowns.index[:, None, :]
@@ -175,9 +146,9 @@ class PatientEffortTerm:
         # A weak effort's onset is free, as on the grid; for a strong one that is too coarse.
         return np.maximum(start.nats, laplace)
 
-    def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
+    def marginal_log_likelihood(self, fitted: FittedModel) -> Floats:
         """Integrate efforts out around the efforts that the fit found, ``(n,)``."""
-        problem = replace(fitted.problem, noise=noise)
+        problem, noise = fitted.problem, fitted.noise
         layout, data = problem.unknowns, problem.data
         every = range(len(layout.paths))
         own = [k for k in every if len(np.unique(layout.index[:, k])) == len(data)]
@@ -218,48 +189,19 @@ class PatientEffortTerm:
             mean, square = mean + pressure / count, square + pressure**2 / count
         return np.asarray(mean), np.asarray(square)
 
-    def evidence(
-        self, linearisations: list[Linearisation], duration: float | None = None
-    ) -> list[Evidence]:
-        """Integrate efforts out of the breaths of one model at several noises.
-
-        Args:
-            linearisations: linearisations of the model; they share its predictions.
-            duration: duration of the efforts, s; the best of the grid if not given.
-        """
-        best: list[Evidence] = []
-        for length in _DURATIONS if duration is None else (duration,):
-            effects = self._effects(linearisations[0], length)
-            new = [
-                self._grid_evidence(linearisation, length, effects)
-                for linearisation in linearisations
-            ]
-            best = best or new
-            best = [
-                after if after.nats.sum() > before.nats.sum() else before
-                for after, before in zip(new, best, strict=True)
-            ]
-        return best
-
-    def _effects(self, linearisation: Linearisation, duration: float) -> list[Floats]:
-        """Change of the prediction by an effort at each onset of the grid, ``(n, c, T)`` each."""
-        predictor = linearisation.problem.predictor
+    def _evidence(self, linear: Linearisation, duration: float) -> _Evidence:
+        """Integrate efforts of a duration, s, out of a model's breaths on the grid of onsets."""
+        predictor, logs, means = linear.problem.predictor, [], []
         columns = [predictor.names.index(path) for path in (AMPLITUDE, ONSET, DURATION)]
-        points = np.repeat(linearisation.values[None], len(ONSETS), axis=0)
+        points = np.repeat(linear.values[None], len(ONSETS), axis=0)
         for point, onset in zip(points, ONSETS, strict=True):
             point[:, columns] = (_TEMPLATE, onset, duration)
-        return list(predictor.predict_all(points) - linearisation.prediction)
-
-    def _grid_evidence(
-        self, linearisation: Linearisation, duration: float, effects: list[Floats]
-    ) -> Evidence:
-        logs, means = [], []
         precision = (_TEMPLATE / AMPLITUDE_SD) ** 2
-        for effect in effects:
-            white = linearisation.whiten(effect)
-            template = linearisation.without_own(white[:, None])[:, 0]
+        for effect in predictor.predict_all(points) - linear.prediction:
+            white = linear.whiten(effect)
+            template = linear.without_own(white[:, None])[:, 0]
             power = np.sum(template**2, axis=1)
-            match = -np.sum(linearisation.residual * template, axis=1)
+            match = -np.sum(linear.residual * template, axis=1)
             logs.append(0.5 * match**2 / (power + precision) - 0.5 * np.log1p(power / precision))
             means.append(match / (power + precision) * _TEMPLATE)
         log_factors, amplitudes = np.stack(logs, 1), np.stack(means, 1)
@@ -267,11 +209,10 @@ class PatientEffortTerm:
         mixed = mixed - np.log(len(ONSETS)) + np.log(PROBABILITY)
         top = np.argmax(log_factors, axis=1)
         nats = np.logaddexp(np.log(1.0 - PROBABILITY), mixed)
-        rows = np.arange(len(top))
-        return Evidence(nats, duration, amplitudes[rows, top], ONSETS[top])
+        return _Evidence(nats, amplitudes[np.arange(len(top)), top], ONSETS[top])
 
     def _fit_each_breath(
-        self, passive_problem: Problem, x: Floats, start: Evidence
+        self, passive_problem: Problem, x: Floats, start: _Evidence
     ) -> tuple[Problem, Minimum]:
         """Fit an effort to each breath, together with the breath's other own parameters."""
         paths, none = passive_problem.unknowns.paths, np.zeros(len(passive_problem.data))

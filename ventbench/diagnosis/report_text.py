@@ -56,8 +56,8 @@ def sentences(findings: Findings) -> list[str]:
     """Everything a reader should know, the most important first."""
     texts = [answer(findings), *map(missing_mechanism, findings.mechanisms)]
     texts += [effect(findings), *alternatives(findings), nonparametric_term(findings)]
-    texts += [open_loop(findings), remaining(findings), *map(lung, findings.lungs)]
-    texts += [visible(findings), scatter(findings), request(findings)]
+    texts += [remaining(findings), *map(lung, findings.lungs), visible(findings)]
+    texts += [scatter(findings), request(findings)]
     texts += [*would_change(findings), *findings.notes]
     return [text for text in texts if text]
 
@@ -220,26 +220,28 @@ def worth(findings: Findings) -> str:
         rounded(out[stage].rmse, 2) if stage in out else "unknown" for stage in ("refit", "after")
     )
     also = "" if after_out == "unknown" else f" in inspiration and {after_out} in expiration"
+    given = "" if _is_unchanged(findings) else f"{rounded(errors.before.rmse, 2)} as given"
+    stays = f"{after} cmH2O{also}{given and f' ({given})'}"
     if findings.verdict == "nothing_missing":
-        return f"it errs by {after} cmH2O{also} on {count} breaths set aside, and {left}"
+        return f"it errs by {stays} on {count} breaths set aside, and {left}"
     refit = rounded(errors.refit.rmse, 2)
     term = findings.nonparametric
     by_breath = term is not None and term.x_unit.startswith("sample") and not findings.mechanisms
     if by_breath or _swings(findings):
         return (
             "it differs from breath to breath, so that no correction of the simulator mends it: "
-            f"the error on {count} breaths set aside stays at {after} cmH2O{also}, and {left}"
+            f"the error on {count} breaths set aside stays at {stays}, and {left}"
         )
     if errors.after == errors.refit or (after, after_out) == (refit, before_out):
         return (
             f"mending {_it(findings)} is worth nothing on the {count} breaths set aside, where the "
-            f"error stays at {after} cmH2O{also}, and {left}"
+            f"error stays at {stays}, and {left}"
         )
     if also:
         worse = out["after"].rmse - out["refit"].rmse >= findings.settings.residuals.negligible
         also = f" in inspiration, and from {before_out} to {after_out} in expiration"
         also += ", where it gets worse" if worse else ""
-    start = " (R and C refitted)" if errors.refit != errors.before else ""
+    start = given and f" (R and C refitted; {given})"
     return (
         f"mending {_it(findings)} takes the error on {count} breaths set aside from {refit}{start} "
         f"to {after} cmH2O{also}, and {left}"
@@ -494,24 +496,6 @@ def _places(term: NonparametricTerm) -> str:
 def place(term: NonparametricTerm) -> str:
     """Place of a term with its meaning: ``f(V) (the recoil of the lung depends on ...)``."""
     return f"{term.name} ({term.meaning.removeprefix(f'{term.name}: ')})"
-
-
-def open_loop(findings: Findings) -> str:
-    """Open-loop errors before and after the correction."""
-    errors = findings.open_loop
-    given, refit, after, noise = (
-        rounded(value, 2)
-        for value in (
-            errors.before.rmse, errors.refit.rmse, errors.after.rmse, errors.noise_floor,
-        )
-    )  # fmt: skip
-    others = "" if _is_unchanged(findings) else f", {refit} with R and C refitted"
-    if findings.verdict != "nothing_missing" and errors.after != errors.refit:
-        others += f", {after} corrected"
-    return (
-        f"Root-mean-square open-loop error on {len(errors.held_out_breaths)} held-out breaths: "
-        f"{given} cmH2O as given{others}; measurement noise {noise}."
-    )
 
 
 def _it(findings: Findings) -> str:

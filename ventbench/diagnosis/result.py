@@ -11,15 +11,11 @@ from typing import TYPE_CHECKING, Any
 from ventbench.base import VERSION, errors, files
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import (
-    BreathRequest,
     ErrorRegion,
     Findings,
     MissingMechanism,
     NonparametricTerm,
-    OpenLoopComparison,
-    OpenLoopError,
 )
-from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics import mechanism
 from ventbench.plants.plant_files import save_plants
 from ventbench.system_id.data import Floats
@@ -125,13 +121,14 @@ class Diagnosis(Findings):
             OSError: if a file cannot be written.
         """
         errors.require("jinja2", "rerun")
-        views, folder = import_module(_VIEWS), Path(folder)
+        report, log = (import_module(f"{_VIEWS}.{name}") for name in ("report", "rerun_log"))
+        folder = Path(folder)
         plain, corrected = folder / "diagnosis.json", folder / "corrected.json"
         files.write_json(plain, self.as_dict())
         written = [
             plain,
-            views.write_report(folder / "report.html", self),
-            views.write_rerun(folder / "diagnosis.rrd", self),
+            report.write(folder / "report.html", self),
+            log.write(folder / "diagnosis.rrd", self),
         ]
         commands = folder / RECORD_NEXT
         if self.request is None:
@@ -176,38 +173,37 @@ class Diagnosis(Findings):
 
         R is in cmH2O/(L/s), C in mL/cmH2O, errors in cmH2O. ``lung`` is the first of ``lungs``.
         """
-        lungs = [_lung(match) for match in self.lungs]
+        lungs = [asdict(match) for match in self.lungs]
+        comparison = {"unit": "cmH2O", "unexplained": self.open_loop.unexplained}
         plain = {
             "verdict": self.verdict,
             "mechanisms": [_mechanism(missing) for missing in self.mechanisms],
-            "slot": None if self.nonparametric is None else _nonparametric(self.nonparametric),
-            "form": None
-            if self.form is None
-            else {"of": list(self.form.form_of), **_nonparametric(self.form)},
+            "slot": _nonparametric(self.nonparametric),
+            "form": _nonparametric(self.form),
             "location": [_region(region) for region in self.location],
             "remaining": [_region(region) for region in self.remaining],
-            "open_loop": _open_loop(self.open_loop),
+            "open_loop": asdict(self.open_loop) | comparison,
             "lung": lungs[0] if lungs else None,
             "lungs": lungs,
-            "request": None if self.request is None else _request(self.request),
+            "request": None if self.request is None else asdict(self.request),
             "noise": {"sd": self.noise[0], "correlation": self.noise[1], "unit": "cmH2O"},
             "plant": self.simulator,
-            "split": {name: list(ids) for name, ids in self.split.items()},
-            "chosen": dict(self.chosen),
+            "split": self.split,
+            "chosen": self.chosen,
             "rigs": [asdict(rig) for rig in self.rigs],
             "changes": [asdict(change) for change in self.changes],
             "saturated": None
             if self.saturated is None
             else {"reading": self.saturated[0], "share": self.saturated[1]},
             "gain_scatter": self.gain_scatter,
-            "posterior": [{"terms": list(t), "probability": p} for t, p in self.posterior],
+            "posterior": [{"terms": t, "probability": p} for t, p in self.posterior],
             "detection_limits": {
                 name: {"strength": limit, "unit": mechanism(name).description.strength.unit}
                 for name, limit in self.detection_limits.items()
             },
             "sentences": report_text.sentences(self),
             "would_change": report_text.would_change(self),
-            "notes": list(self.notes),
+            "notes": self.notes,
             "seconds": self.seconds,
             "settings": self.settings.as_dict(),
             "format": FORMAT,
@@ -217,96 +213,23 @@ class Diagnosis(Findings):
 
 
 def _mechanism(missing: MissingMechanism) -> dict[str, Any]:
-    return {
-        "name": missing.name,
-        "parameters": {name: _estimate(value) for name, value in missing.parameters.items()},
-        "confidence": missing.confidence,
+    plain = asdict(missing)
+    return plain | {
         "preferred_over_other_names": missing.confidence,
-        "alternatives": list(missing.alternatives),
-        "nats": missing.nats,
-        "worth": missing.worth,
-        "changed": missing.changed,
-        "simulator_has": missing.simulator_values,
-        "first_breath": missing.breaths,
-        "affected_breaths": list(missing.affected),
-        "explains": missing.explains,
+        "simulator_has": plain.pop("simulator_values"),
+        "first_breath": plain.pop("breaths"),
+        "affected_breaths": plain.pop("affected"),
     }
 
 
-def _estimate(estimate: Estimate) -> dict[str, Any]:
-    return {"value": estimate.value, "unit": estimate.unit, "ci95": list(estimate.ci95)}
-
-
-def _nonparametric(term: NonparametricTerm) -> dict[str, Any]:
-    return {
-        "name": term.name,
-        "meaning": term.meaning,
-        "explains": term.explains,
-        "nats": term.nats,
-        "places": dict(term.places),
-        "shape": {
-            "x": term.x.tolist(),
-            "x_unit": term.x_unit,
-            "y": term.y.tolist(),
-            "y_unit": term.y_unit,
-        },
-    }
+def _nonparametric(term: NonparametricTerm | None) -> dict[str, Any] | None:
+    if term is None:
+        return None
+    plain = asdict(term)
+    shape = {key: plain.pop(key) for key in ("x", "x_unit", "y", "y_unit")}
+    return plain | {"of": plain.pop("form_of"), "places": dict(term.places), "shape": shape}
 
 
 def _region(region: ErrorRegion) -> dict[str, Any]:
-    return {
-        "axis": region.axis,
-        "range": [region.low, region.high],
-        "unit": region.unit,
-        "mean_error": region.mean_error,
-        "p_value": region.p_value,
-        "share": region.share,
-    }
-
-
-def _error(error: OpenLoopError) -> dict[str, float]:
-    return {"mae": error.mae, "rmse": error.rmse}
-
-
-def _open_loop(comparison: OpenLoopComparison) -> dict[str, Any]:
-    return {
-        "unit": "cmH2O",
-        "held_out_breaths": [int(breath) for breath in comparison.held_out_breaths],
-        "before": _error(comparison.before),
-        "refit": _error(comparison.refit),
-        "after": _error(comparison.after),
-        "noise_floor": comparison.noise_floor,
-        "sensor_noise": comparison.sensor_noise,
-        "scatter_error": comparison.scatter_error,
-        "usual": comparison.usual,
-        "unexplained": comparison.unexplained,
-        "groups": {
-            name: {stage: _error(value) for stage, value in group.items()}
-            for name, group in comparison.groups.items()
-        },
-    }
-
-
-def _lung(match: LungMatch) -> dict[str, Any]:
-    return {
-        "label": match.label,
-        "fitted_R": match.fitted_R,
-        "fitted_C": match.fitted_C,
-        "label_matches": match.label_matches,
-        "informative": match.informative,
-        "ci95_R": list(match.ci95_R),
-        "ci95_C": list(match.ci95_C),
-        "source": match.source,
-    }
-
-
-def _request(request: BreathRequest) -> dict[str, Any]:
-    """JSON values of requested breaths, with the commands for a rig to run."""
-    return {
-        "title": request.title,
-        "why": list(request.why),
-        "nats": request.nats,
-        "u_in": request.u_in.tolist(),
-        "u_out": request.u_out.tolist(),
-        "dt": request.dt.tolist(),
-    }
+    plain = asdict(region)
+    return plain | {"range": [plain.pop("low"), plain.pop("high")]}

@@ -18,9 +18,8 @@ import numpy as np
 from ventbench.base.arrays import Floats, Ints
 from ventbench.diagnosis.evaluator import Evaluator, make_problem
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition, varies_by_breath
-from ventbench.system_id.data import Data
+from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.levenberg_marquardt import minimise
-from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import make_unknowns, parameter_of
 

@@ -25,8 +25,7 @@ from ventbench.diagnosis.identification import IdentifiedModel, identify
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id import Fit, fit
-from ventbench.system_id.data import Data
-from ventbench.system_id.noise import Noise
+from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.problem import free_paths, parameter_of
 
 
@@ -355,12 +354,9 @@ def _fit_beside(
 ) -> Fit:
     """Fit the parameters of the mechanisms asked for; all others stay at the simulator's values."""
     partition = evaluator.training
-    names = partition.predictor.names
-    values = evaluator.transferred_values(own, partition)
     free = [p for p in (*free_paths(asked), *hypothesis.free) if p.rpartition(".")[0] in asked]
-    fixed: dict[str, ArrayLike] = {
-        name: values[:, k] for k, name in enumerate(names) if name not in (*free, "position")
-    }
+    values = evaluator.transferred(own, partition)
+    fixed: dict[str, ArrayLike] = {p: x for p, x in values.items() if p not in free}
     given = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in asked}
     by_breath = ("gain",) if evaluator.gain_sd else ()
     neutral = float(np.log(parameter_of("gain").neutral))

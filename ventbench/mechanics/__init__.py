@@ -4,7 +4,6 @@ from ventbench.mechanics.identify import Mechanics as Mechanics
 from ventbench.mechanics.identify import identify as identify
 from ventbench.mechanics.identify import share_faults as share_faults
 from ventbench.mechanics.labels import match_labels as match_labels
-from ventbench.mechanics.labels import settings_by_label as settings_by_label
 from ventbench.mechanics.respiraworks import RespiraWorksRun as RespiraWorksRun
 from ventbench.mechanics.respiraworks import SurveyedRun as SurveyedRun
 from ventbench.mechanics.respiraworks import breaths_of as breaths_of

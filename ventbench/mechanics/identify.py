@@ -186,17 +186,11 @@ class Mechanics:
     offset: Estimate  #: pressure at the start of a breath without the effect of flow, cmH2O.
     terms: tuple[Term, ...]  #: effects beyond R and C, the most important first.
     match: LungMatch  #: comparison with the label, with R at the flow for which the label holds.
-    #: known settings that this lung may be: the label if it holds, then the nearest.
-    settings: tuple[Lung, ...]
     noise: float  #: standard deviation of the residual, cmH2O.
     breaths: int  #: number of breaths that were used.
     samples: int  #: number of smoothed samples.
     notes: tuple[str, ...]  #: warnings to the reader.
     faults: tuple[str, ...] = ()  #: what may be wrong with the sensors, of :data:`FAULTS`.
-
-
-#: Shares of the time that a lung takes, measured: smoothing, and what delays the pressure.
-_SMOOTHING, _DELAY = 0.08, 0.62
 
 
 def identify(
@@ -206,22 +200,17 @@ def identify(
 
     Args:
         breaths: the recording.
-        progress: called with how much is done and of how much, in breaths: the breaths of the
-            lungs that are identified, and a share of those of the lung under way.
+        progress: called after each lung with how many breaths are done, and of how many.
 
     Raises:
         InputError: if neither is recorded, or too little of a lung to tell R from C.
     """
     lungs, done = [], 0
     for name, part in breaths.by_lung().items():
-
-        def told(share: float, done: int = done, count: int = len(part)) -> None:
-            if progress is not None:
-                progress(done + int(share * count), len(breaths))
-
-        lungs.append(_identify_lung(name, part, told))
-        told(1.0)
+        lungs.append(_identify_lung(name, part))
         done += len(part)
+        if progress is not None:
+            progress(done, len(breaths))
     return share_faults(lungs)
 
 
@@ -258,19 +247,18 @@ def _doubted(lung: Mechanics, shown: dict[str, int], count: int) -> Mechanics:
         f"{who} {FAULTS[fault][0]}, which is likelier than a wrong label, so that whether "
         f"{lung.label} holds is unknown."
     )
-    match = replace(match, informative=False, doubt=doubt)
-    return replace(lung, match=match, settings=(), notes=(*lung.notes, doubt))
+    match = replace(match, settings=(), informative=False, doubt=doubt)
+    return replace(lung, match=match, notes=(*lung.notes, doubt))
 
 
-def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -> Mechanics:
+def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     measured = segments(breaths)
     if not measured:
         raise InputError(
             f"{name}: no piece of a breath has pressure with flow or volume for about a second; "
             "record longer pieces"
         )
-    told(_SMOOTHING)
-    at_lung, delayed_by = delay(measured, lambda share: told(_SMOOTHING + _DELAY * share))
+    at_lung, delayed_by = delay(measured)
     table = cross_products(at_lung)
     selected = select_terms(table)
     full = _fit_lung(table, selected, at_lung, breaths)
@@ -292,17 +280,14 @@ def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -
         R, C = (Estimate(math.nan, unit, (math.nan, math.nan)) for unit in _UNITS)
         match = LungMatch(name, R.value, C.value, R.ci95, C.ci95, False, source)
         return Mechanics(
-            name, R, C, full.offset(), (), match, (), noise, len(table), samples,
-            (problem, *notes), faults,
+            name, R, C, full.offset(), (), match, noise, len(table), samples, (problem, *notes),
+            faults,
         )  # fmt: skip
     match = match_label(label, best.resistance, best.compliance(), source)
-    known = matching_settings(best.resistance, best.compliance())
-    if match.label_matches:  # what holds comes first, whatever is nearer
-        known = tuple(sorted(known, key=lambda setting: setting != label))
     return Mechanics(
         name, best.resistance(0.0), best.compliance(), full.offset(),
         (*_delay_term(delayed_by, best), *(full.term(term) for term in selected)),
-        match, known, noise, len(table), samples, notes, faults,
+        match, noise, len(table), samples, notes, faults,
     )  # fmt: skip
 
 

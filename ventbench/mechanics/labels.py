@@ -57,7 +57,7 @@ class LungMatch:
     #: match.
     label_matches: bool
     source: str  #: ``pressure`` (given the valve's gain) or ``pressure and flow``.
-    #: ids of known settings that the lung may be, the nearest first.
+    #: ids of known settings that the lung may be: the label if it holds, then the nearest.
     settings: tuple[str, ...] = ()
     #: False if the label is within tolerance only because the intervals are wide.
     informative: bool = True
@@ -116,9 +116,12 @@ def match_label(
     at = resistance(REFERENCE_FLOW)
     same = fits(resistance, compliance, label, scale)
     known = _is_informative(at.ci95, APPARATUS) and _is_informative(compliance.ci95)
+    near = [setting.id for setting in matching_settings(resistance, compliance, scale)]
+    if same and known:  # what holds comes first, whatever is nearer
+        near.sort(key=lambda setting: setting != label.id)
     return LungMatch(
         label.id, at.value, compliance.value, at.ci95, compliance.ci95, same and known, source,
-        informative=known or not same,
+        tuple(near), informative=known or not same,
     )  # fmt: skip
 
 
@@ -133,16 +136,11 @@ def value_text(value: float, ci95: tuple[float, float]) -> str:
     return f"{value:.1f} [{ci95[0]:.1f}, {ci95[1]:.1f}]" if math.isfinite(value) else "unknown"
 
 
-def label_texts(match: LungMatch, settings: tuple[Lung, ...]) -> tuple[str, str]:
-    """Whether a label holds, and what else the lung may be, for tables.
-
-    Args:
-        match: comparison with the label.
-        settings: known settings within tolerance, the label first if it holds.
-    """
+def label_texts(match: LungMatch) -> tuple[str, str]:
+    """Whether a label holds, and what else the lung may be, for tables."""
     if not math.isfinite(match.fitted_C):
         return "unknown", "unknown"
-    others = [setting.id for setting in settings if setting.id != match.label]
+    others = [setting for setting in match.settings if setting != match.label]
     if match.doubt:
         return "unknown", match.label
     if not match.informative:
@@ -165,42 +163,24 @@ def match_labels(fit: Fit) -> tuple[LungMatch, ...]:
 
     The unknown gain of the valve scales R and 1/C by a common factor of up to 1.2.
     """
-    return tuple(
-        match_label(setting, resistance, compliance, "pressure", GAIN)
-        for setting, resistance, compliance in _of_fit(fit)
-    )
-
-
-def settings_by_label(fit: Fit) -> dict[str, tuple[Lung, ...]]:
-    """Return the known settings within tolerance of each lung of a fit to pressure, by label."""
-    return {
-        setting.id: matching_settings(resistance, compliance, GAIN)
-        for setting, resistance, compliance in _of_fit(fit)
-    }
-
-
-def _of_fit(fit: Fit) -> list[tuple[Lung, Resistance, Estimate]]:
-    """Label, resistance by flow, and compliance of each lung of a fit."""
-    data, lungs = fit.problem.data, []
+    data, matches = fit.problem.data, []
     quadratics = fit.column("turbulent_resistance.quadratic")
     for group in range(int(data.lung.max()) + 1):
         breath = int((data.lung == group).argmax())
-        ends = {path: fit.ci95(path)[group] for path in ("R", "C")}
         R, C = (float(fit.value(path)[group]) for path in ("R", "C"))
+        ends = [[float(end) for end in fit.ci95(path)[group]] for path in ("R", "C")]
         quadratic = float(quadratics[breath])
 
         def resistance(
-            flow: float, R: float = R, quadratic: float = quadratic, ci95: object = ends["R"]
+            flow: float, R: float = R, quadratic: float = quadratic, ci95: list[float] = ends[0]
         ) -> Estimate:
-            low, high = ci95  # type: ignore[misc]
             more = quadratic * flow
-            return Estimate(R + more, "cmH2O/(L/s)", (float(low) + more, float(high) + more))
+            return Estimate(R + more, "cmH2O/(L/s)", (ci95[0] + more, ci95[1] + more))
 
-        low, high = ends["C"]
-        compliance = Estimate(C, "mL/cmH2O", (float(low), float(high)))
-        setting = Lung(float(data.R[breath]), float(data.C[breath]))
-        lungs.append((setting, resistance, compliance))
-    return lungs
+        compliance = Estimate(C, "mL/cmH2O", (ends[1][0], ends[1][1]))
+        label = Lung(float(data.R[breath]), float(data.C[breath]))
+        matches.append(match_label(label, resistance, compliance, "pressure", GAIN))
+    return tuple(matches)
 
 
 def _log(ratio: float) -> float:

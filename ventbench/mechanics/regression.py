@@ -19,7 +19,7 @@ from itertools import product
 
 import numpy as np
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats
 from ventbench.mechanics.segments import Segment
 
 #: Autocorrelations between neighbouring smoothed samples.
@@ -152,7 +152,6 @@ class CrossProducts:
     freedom: Floats  #: number of samples less offsets, ``(b,)``.
     #: part of the log-likelihood that depends on the model of noise alone, ``(b, g)``.
     constant: Floats
-    breaths: Ints  #: index of each breath in the recording, ``(b,)``.
 
     def __len__(self) -> int:
         """Number of breaths b."""
@@ -226,7 +225,7 @@ def cross_products(
         taken = (scatter / grown)[..., None, None] * outer[:, None]
         products[row] += (squares[:, None] - taken).reshape(len(GRID), size, size)
         constant[row] += (known[:, None] - 0.5 * np.log(grown)).reshape(-1)
-    return CrossProducts(products, freedom, constant, np.array(indices, np.int64))
+    return CrossProducts(products, freedom, constant)
 
 
 def fit(table: CrossProducts, which: Bools, columns: Sequence[int]) -> RegressionFit:

@@ -154,7 +154,7 @@ def survey_table(surveyed: tuple[SurveyedRun, ...]) -> str:
             continue
         match = lung.match
         R, C = value_text(match.fitted_R, match.ci95_R), value_text(match.fitted_C, match.ci95_C)
-        holds, may = label_texts(match, lung.settings)
+        holds, may = label_texts(match)
         needs = ", ".join(term.name for term in lung.terms)
         holds = "**no**" if holds == "no" else holds
         lines.append(f"{head} {R} | {C} | {holds} | {may} | {needs} |")

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats, Ints, runs
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
@@ -82,7 +82,7 @@ def segments(breaths: Breaths) -> tuple[Segment, ...]:
         parts = [(0, end)]
         if volume is None:
             assert flow is not None
-            parts = _runs(np.isfinite(flow[i, :end]))
+            parts = runs(np.isfinite(flow[i, :end]))
         for start, stop in parts:
             part = slice(start, stop)
             signals = _smoothed(
@@ -113,7 +113,7 @@ def _smoothed(
     flows = np.isfinite(filled)
     flows &= True if flow is None else np.isfinite(flow)
     fine = np.concatenate([
-        np.arange(start + half, stop - half, step) for start, stop in _runs(flows)
+        np.arange(start + half, stop - half, step) for start, stop in runs(flows)
     ] or [np.zeros(0, int)])  # fmt: skip
     rows, begins = _compared(fine, flows & np.isfinite(pressure), half, step)
     if len(rows) < FEWEST_SAMPLES:
@@ -140,7 +140,7 @@ def _compared(fine: NDArray[np.intp], known: Bools, half: int, step: int) -> tup
     samples apart; at the samples ``known`` the pressure is known too.
     """
     complete = np.zeros(len(known), bool)
-    for start, stop in _runs(known):
+    for start, stop in runs(known):
         complete[start + half : stop - half] = True
     whole = complete[fine]
     # A run ends where a window is incomplete, and where the next centre is further away.
@@ -148,18 +148,12 @@ def _compared(fine: NDArray[np.intp], known: Bools, half: int, step: int) -> tup
     rows: list[Ints] = []
     for part in np.split(np.arange(len(fine)), ends):
         offset = int(part[0]) if len(part) else 0
-        for start, stop in _runs(whole[part]):
+        for start, stop in runs(whole[part]):
             rows.append(np.arange(offset + start, offset + stop, -(-(half + 1) // step)))
     if not rows:
         return np.zeros(0, np.int64), np.zeros(0, bool)
     begins = np.concatenate([np.arange(len(run)) == 0 for run in rows])
     return np.concatenate(rows), begins
-
-
-def _runs(known: Bools) -> list[tuple[int, int]]:
-    """Starts and ends of the runs of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def _unclipped(values: Floats) -> Floats:
@@ -174,7 +168,7 @@ def _clipped(values: Floats) -> Bools:
         return out
     for end in (np.nanmax(values), np.nanmin(values)):
         for row, at_end in enumerate(values == end):
-            for start, stop in _runs(at_end):
+            for start, stop in runs(at_end):
                 out[row, start:stop] = stop - start >= _CLIPPED_RUN
     return out
 

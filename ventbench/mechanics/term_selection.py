@@ -187,9 +187,7 @@ class DelayEstimate:
     alternatives: tuple[str, ...]  #: the other name if it would explain nearly as much.
 
 
-def delay(
-    segments: Sequence[Segment], progress: Callable[[float], object] = lambda share: None
-) -> tuple[tuple[Segment, ...], DelayEstimate | None]:
+def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], DelayEstimate | None]:
     """Estimate what delays the pressure, and take it into account.
 
     Since a delay changes the signals of every other term, it is estimated first, on a grid.
@@ -204,21 +202,16 @@ def delay(
     from the pressure that the best lag predicts, which has no noise (an instrumental variable).
 
     Returns the segments with the delay, if there is one: with the sensor's lag, or with flow and
-    volume behind the circuit. The delay is None if the breaths do not need it. ``progress`` is
-    called with the share of the grids that is done.
+    volume behind the circuit. The delay is None if the breaths do not need it.
     """
     if len({segment.breath for segment in segments}) < FEWEST_BREATHS:
         return tuple(segments), None
-    steps, done = len(_CIRCUIT.grid) + len(_SENSOR.grid), 0
 
     def tables_of(family: _DelayFamily, change: _Change) -> list[CrossProducts]:
-        nonlocal done
         tables = []
         for strength in family.grid:
             changed = [change(k, strength) for k in range(len(segments))]
             tables.append(cross_products(changed, _COLUMNS))
-            done += 1
-            progress(done / steps)
         return tables
 
     sensor = tables_of(_SENSOR, lambda k, lag: replace(segments[k], lag=lag))

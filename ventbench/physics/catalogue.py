@@ -6,8 +6,7 @@ import importlib
 import pkgutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, lru_cache
 from types import ModuleType
 
 from ventbench.base.errors import InputError
@@ -16,25 +15,8 @@ from ventbench.physics import mechanisms, nonparametric
 from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
 
-
-@dataclass(frozen=True, eq=False)
-class Catalogue:
-    """Mechanisms and basis terms that a model can be built of."""
-
-    library: dict[str, Mechanism]  #: mechanisms by name, in alphabetical order.
-    #: basis terms of nonparametric components, by name, in alphabetical order.
-    basis_terms: dict[str, Mechanism]
-    #: what happens to a circuit in operation, by name, in alphabetical order.
-    events: dict[str, Mechanism]
-
-    @cached_property
-    def everything(self) -> dict[str, Mechanism]:
-        """The library, then the basis terms, then the events."""
-        return self.library | self.basis_terms | self.events
-
-
-#: The catalogue in use, once it has been asked for.
-_current: Catalogue | None = None
+#: What :func:`extended` adds to the library, by name.
+_added: dict[str, Mechanism] = {}
 
 
 @contextmanager
@@ -46,45 +28,54 @@ def extended(*added: Mechanism) -> Iterator[None]:
     Raises:
         InputError: if the catalogue already has a mechanism or basis term of that name.
     """
-    global _current
-    before = _catalogue()
     names = [mechanism.description.name for mechanism in added]
     for name in names:
-        if name in before.everything or names.count(name) > 1:
+        if name in everything() or names.count(name) > 1:
             raise InputError(f"the catalogue already has a mechanism {name!r}; choose another name")
-    library = before.library | dict(zip(names, added, strict=True))
-    _current = replace(before, library=dict(sorted(library.items())))
+    _added.update(zip(names, added, strict=True))
+    _forget()
     try:
         yield
     finally:
-        _current = before
+        for name in names:
+            del _added[name]
+        _forget()
 
 
+def _forget() -> None:
+    """Make the library anew when it is next asked for."""
+    for made in (library, everything, paths):
+        made.cache_clear()
+
+
+@cache
 def library() -> dict[str, Mechanism]:
     """Every mechanism by name, in alphabetical order.
 
     A module of the package ``mechanisms`` defines one or several alike: classes with a description,
     and what it lists in ``MECHANISMS``.
     """
-    return _catalogue().library
+    return dict(sorted((_of(mechanisms) | _added).items()))
 
 
+@cache
 def basis_terms() -> dict[str, Mechanism]:
     """Every basis term of the nonparametric components by name, in alphabetical order.
 
     Modules of the package ``nonparametric`` define them. They are not in the library;
     a fit has those that its caller names.
     """
-    return _catalogue().basis_terms
+    return _of(nonparametric)
 
 
+@cache
 def events() -> dict[str, Mechanism]:
     """Every event by name, in alphabetical order.
 
     Modules of the package ``events`` define them. They are not in the library: they act in some
     breaths only, or with a phase of each breath.
     """
-    return _catalogue().events
+    return _of(happening)
 
 
 def intermittent() -> tuple[str, ...]:
@@ -93,9 +84,10 @@ def intermittent() -> tuple[str, ...]:
     return tuple(name for name, strength in found if strength.scope == "breath")
 
 
+@cache
 def everything() -> dict[str, Mechanism]:
     """The library, then the basis terms, then the events."""
-    return _catalogue().everything
+    return library() | basis_terms() | events()
 
 
 def mechanism(name: str) -> Mechanism:
@@ -130,35 +122,23 @@ def parameter(path: str) -> Parameter:
     raise InputError(f"no parameter {path!r}; {owner or 'the base'} has {_names(among)}")
 
 
+@lru_cache
 def paths(names: tuple[str, ...] | None = None) -> tuple[str, ...]:
     """Paths of the base parameters and of those of some mechanisms, or of the whole library.
 
     ``paths((*library(), *basis_terms()))`` has those of the basis terms as well.
     """
-    return _paths(_catalogue(), names)
+    own = [
+        f"{name}.{parameter.name}"
+        for name in (library() if names is None else names)
+        for parameter in mechanism(name).description.parameters
+    ]
+    return (*(parameter.name for parameter in BASE_PARAMETERS), *own)
 
 
 def strength_path(name: str) -> str:
     """Path of a mechanism's strength."""
     return f"{name}.{mechanism(name).description.strength.name}"
-
-
-def _catalogue() -> Catalogue:
-    global _current
-    if _current is None:
-        _current = Catalogue(_of(mechanisms), _of(nonparametric), _of(happening))
-    return _current
-
-
-@lru_cache
-def _paths(catalogue: Catalogue, names: tuple[str, ...] | None) -> tuple[str, ...]:
-    chosen = catalogue.library if names is None else {name: mechanism(name) for name in names}
-    own = [
-        f"{name}.{parameter.name}"
-        for name, each in chosen.items()
-        for parameter in each.description.parameters
-    ]
-    return (*(parameter.name for parameter in BASE_PARAMETERS), *own)
 
 
 def _of(home: ModuleType) -> dict[str, Mechanism]:

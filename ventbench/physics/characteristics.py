@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -19,6 +20,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism
 from ventbench.physics.mechanism import Mechanism, Network, Pair, Values, View
+from ventbench.physics.nonparametric.basis import FilterBank
 from ventbench.physics.parameters import BASE_PARAMETERS
 
 #: Points of a static curve and of a response in time.
@@ -27,8 +29,9 @@ _STATIC, _STEPS = 241, 160
 #: Steps that are tried: of the flow, L/s, and of the pressure, cmH2O.
 _FLOW, _LOW, _HIGH = 0.5, 5.0, 20.0
 
-#: Largest pressure, cmH2O, flow, L/s, and acceleration, L/s2, of a static curve.
-_PRESSURE, _AIRWAY_FLOW, _ACCELERATION = 40.0, 1.0, 20.0
+#: Largest pressures, at the airway and across the expiratory valve, cmH2O, flow, L/s, and
+#: acceleration, L/s2, of a static curve.
+_PRESSURE, _ACROSS, _AIRWAY_FLOW, _ACCELERATION = 40.0, 30.0, 1.0, 20.0
 
 #: A response is shown for this many of its longest times, and within these limits, s.
 _TIMES, _SHORTEST, _LONGEST = 5.0, 0.1, 3.0
@@ -66,6 +69,7 @@ def characteristic(
         base = {p.name: float(values.get(p.name, p.neutral)) for p in BASE_PARAMETERS}
         neutral = {p.name: jnp.asarray(float(p.neutral)) for p in about}
         times = [float(own[p.name]) for p in about if p.unit == "s"]
+        times += shown.taus if isinstance(shown, FilterBank) else ()
         end = float(np.clip(_TIMES * max(times, default=0.0), _SHORTEST, _LONGEST))
         if shown.has("of_breath"):
             return _in_session(shown, own, base)
@@ -73,7 +77,7 @@ def characteristic(
             return _command(shown, own, largest_command)
         if shown.has("dead_time"):
             return _late(float(jnp.asarray(shown.dead_time(own, jnp.asarray(1.0)))), end)
-        if shown.has("outlet_dead_time"):
+        if shown.stateful and shown.description.site == "expiratory valve":
             return _late_outlet(shown, own, base, end)
         if shown.has("inflow"):
             return _flow_step(shown, own, end)
@@ -156,12 +160,15 @@ def _late_outlet(
     )
     told = (x >= 0) & (x < end)
     done = ((x >= opening) & (x < end + closing)).astype(np.float64)
-    if shown.stateful:  # how far it is open
-        view, state = _view(base, length=jnp.asarray(x[1] - x[0]))[0], jnp.asarray(0.0)
-        for k, far in enumerate(done):
-            told_now = view.replace(opened=jnp.asarray(far))  # type: ignore[attr-defined]
-            state = shown.next_state(own, state, jnp.asarray(0.0), told_now)
-            done[k] = float(state)
+    zero, length = jnp.asarray(0.0), jnp.asarray(x[1] - x[0])
+
+    def step(state: Array, far: Array) -> tuple[Array, Array]:
+        view, network = _view(base, state, length=length, opened=far)
+        opened = shown.network(own, network, view).outlet / view.outlet
+        return shown.next_state(own, state, zero, view), opened
+
+    shut = 0.0 * shown.initial_state(own, zero, zero)
+    done = _floats(jax.lax.scan(step, shut, jnp.asarray(done))[1])
     labels = ("time since it is told to open, ms", "expiratory valve, 1 open")
     return Characteristic(x * 1e3, told.astype(np.float64), done, *labels)
 
@@ -220,7 +227,9 @@ def _sensor(shown: Mechanism, own: Values) -> Characteristic:
     )
 
 
-def _view(base: Mapping[str, float], **changed: Array) -> tuple[View, Network]:
+def _view(
+    base: Mapping[str, float], state: Array | float = 0.0, **changed: Array
+) -> tuple[View, Network]:
     """A lung at rest with the expiratory valve shut, and its network; some quantities as given."""
     shape = jnp.broadcast_shapes(*(jnp.shape(value) for value in changed.values()), ())
     zero = jnp.zeros(shape)
@@ -228,9 +237,10 @@ def _view(base: Mapping[str, float], **changed: Array) -> tuple[View, Network]:
     view = View(
         zero, zero, zero, zero, zero, zero + 1e-3, zero + elastance, zero + base["PEEP"], zero,
         zero + base["R"], zero + 1.0 / base["R_ex"], zero,
-    ).replace(**changed)  # type: ignore[attr-defined]  # fmt: skip
+    ).replace(state=jnp.asarray(state), **changed)  # type: ignore[attr-defined]  # fmt: skip
     network = Network(
-        inflow=zero + _FLOW, circuit=zero, leak=zero, leak_flow=zero, outlet=zero,
+        inflow=zero + _FLOW, circuit=zero, leak=zero, leak_flow=zero,
+        outlet=view.opened * view.outlet,
         behind=view.peep, resistance=view.resistance, quadratic=zero, inertance=zero,
         recoil=view.elastance * view.volume, elastance=view.elastance,
     )  # fmt: skip
@@ -268,11 +278,15 @@ def _network(
     acceleration = np.linspace(0.0, _ACCELERATION, _STATIC)
     flow = np.linspace(-_AIRWAY_FLOW, _AIRWAY_FLOW, _STATIC)
     a, b = both(flow=jnp.asarray(flow))
-    before, after = (n.resistance * flow + n.quadratic * flow * np.abs(flow) for n in (a, b))
+    before, after = (
+        n.recoil + n.resistance * flow + n.quadratic * flow * np.abs(flow) for n in (a, b)
+    )
     volume = np.linspace(0.0, 25.0 * base["C"] * 1e-3, _STATIC)
     c, d = both(volume=jnp.asarray(volume))
     time = np.linspace(0.0, 2.0, _STATIC)
     e, f = both(time=jnp.asarray(time))
+    across = np.linspace(0.0, _ACROSS, _STATIC)
+    g, h = both(pressure=jnp.asarray(base["PEEP"] + across), opened=jnp.ones(_STATIC))
     return (
         curve(flow, before, after, "flow into the lung, L/s", "pressure along the airway, cmH2O")
         or curve(
@@ -285,6 +299,14 @@ def _network(
         )
         or curve(time, -e.recoil, -f.recoil, "time in the breath, s", "pull of the muscles, cmH2O")
         or curve(1e3 * volume, c.recoil, d.recoil, "volume, mL", "recoil of the lung, cmH2O")
+        or curve(
+            1e3 * volume, c.resistance, d.resistance, "volume, mL",
+            "resistance of the airway, cmH2O/(L/s)",
+        )
+        or curve(
+            across, 1e3 * g.outlet, 1e3 * h.outlet, "pressure above PEEP, cmH2O",
+            "conductance of the open expiratory valve, mL/s per cmH2O",
+        )
     )  # fmt: skip
 
 
@@ -300,7 +322,7 @@ def _hold(
     linear, acting = [0.0], [0.0]
     for now in flow:
         view, network = _view(
-            base, volume=jnp.asarray(volume), state=state, length=jnp.asarray(length),
+            base, state, volume=jnp.asarray(volume), length=jnp.asarray(length),
             flow=jnp.asarray(now),
         )  # fmt: skip
         after = shown.network(own, network, view)

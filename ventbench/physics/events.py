@@ -20,7 +20,7 @@ class LostCommands(Mechanism):
     """Commands that never come: the valve keeps the one before.
 
     Which ones, no parameter says, nor of :class:`LateCommands`: models follow the commands that
-    reached the valve (:mod:`ventbench.diagnosis.command_path` finds them).
+    reached the valve (:mod:`ventbench.diagnosis.in_time` finds them).
     """
 
     description = Description(

@@ -127,9 +127,6 @@ class Description:
     signature: str  #: what it changes in a recording.
     #: names of mechanisms, or of other effects, with a similar signature.
     confusable: tuple[str, ...] = ()
-    #: smallest strength that about 20 breaths of one lung reveal, in the unit of the strength; None
-    #: if nobody has measured it.
-    detectable: float | None = None
     #: smallest strength that a diagnosis names, in the unit of the strength. Even where the data
     #: ask for less, such a strength is within the integrator, the clock, or the form of another
     #: mechanism.

@@ -1,7 +1,9 @@
 """System identification: data, noise, predictions, least squares, fits and their intervals."""
 
 from ventbench.system_id.data import Data as Data
+from ventbench.system_id.data import Noise as Noise
 from ventbench.system_id.data import make_data as make_data
+from ventbench.system_id.data import robust_noise as robust_noise
 from ventbench.system_id.fit import ConfidenceInterval as ConfidenceInterval
 from ventbench.system_id.fit import Fit as Fit
 from ventbench.system_id.fit import fit as fit
@@ -9,8 +11,6 @@ from ventbench.system_id.fit import interval as interval
 from ventbench.system_id.fit import likely_places as likely_places
 from ventbench.system_id.fit import profile_interval as profile_interval
 from ventbench.system_id.fit import refit_breath_parameters as refit_breath_parameters
-from ventbench.system_id.noise import Noise as Noise
-from ventbench.system_id.noise import robust_noise as robust_noise
 from ventbench.system_id.predictor import START as START
 from ventbench.system_id.predictor import Predictor as Predictor
 from ventbench.system_id.problem import Unknowns as Unknowns

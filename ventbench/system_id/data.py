@@ -1,7 +1,8 @@
-"""Data of a fit: commands, sample times and measurements, as plain arrays."""
+"""Data of a fit: commands, sample times and measurements as plain arrays, and their noise."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,12 @@ from numpy.typing import ArrayLike
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
+
+#: Highest autocorrelation of noise: above it, the model is taken to fit badly.
+MOST_AR = 0.95
+
+#: Least standard deviation of the noise of pressure that is believed, cmH2O.
+LEAST_SIGMA = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,3 +91,84 @@ def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | Non
     plain = {name: getattr(breaths, name).astype(float) for name in names}
     known = np.where(weight > 0, measured, 0.0)
     return Data(measured=known, weight=weight, position=np.asarray(position, float), **plain)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """First-order autoregressive noise of each channel, Gaussian with exponential tails (Huber)."""
+
+    #: standard deviations of pressure, cmH2O, and of flow, mL/s, one for each channel.
+    sigma: tuple[float, ...] = (0.25, 20.0)
+    #: correlations of neighbouring samples, one for each channel, within -1..1.
+    ar: tuple[float, ...] = (0.0, 0.0)
+    #: whitened size from which the tails are exponential; ``inf`` for a Gaussian.
+    tail: float = 3.0
+
+    def whiten(self, residual: Floats, weight: Floats) -> Floats:
+        """Transform residuals to independent ones of unit variance; 0 where ``weight`` is 0.
+
+        Args:
+            residual: ``(n, ..., c, T)``.
+            weight: ``(n, c, T)``.
+        """
+        between = (slice(None),) + (None,) * (residual.ndim - weight.ndim)
+        coupled, scale, weight = (x[between] for x in self._chain(weight))
+        before = np.zeros_like(residual)
+        before[..., 1:] = residual[..., :-1]
+        return weight * (residual - coupled * before) / scale
+
+    def loss(self, white: Floats) -> Floats:
+        """Negative log density of whitened residuals, without :meth:`log_norm`."""
+        size = np.abs(white)
+        core = np.minimum(size, self.tail)
+        return 0.5 * core**2 + (self.tail * (size - core) if math.isfinite(self.tail) else 0.0)
+
+    def influence(self, white: Floats) -> Floats:
+        """Huber weight of each squared residual in the normal equations, 1 in the core."""
+        return np.minimum(1.0, self.tail / np.maximum(np.abs(white), 1e-12))
+
+    def log_norm(self) -> float:
+        """Logarithm of the integral of ``exp(-loss)``."""
+        c = self.tail
+        tails = 2.0 / c * math.exp(-0.5 * c * c) if math.isfinite(c) else 0.0
+        return math.log(math.sqrt(2.0 * math.pi) * math.erf(c / math.sqrt(2.0)) + tails)
+
+    def log_likelihood(self, residual: Floats, weight: Floats) -> Floats:
+        """Log-likelihood of the residuals ``(n, c, T)`` of each breath, ``(n,)``."""
+        white = self.whiten(residual, weight)
+        _, scale, _ = self._chain(weight)
+        terms = -self.loss(white) - weight * (np.log(scale) + self.log_norm())
+        return terms.sum(axis=(1, 2))
+
+    def log_scale(self, weight: Floats) -> Floats:
+        """Logarithm of the product of all scales by which residuals are whitened, ``(n,)``."""
+        _, scale, weight = self._chain(weight)
+        return np.sum(weight * np.log(scale), axis=(1, 2))
+
+    def _chain(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
+        """Coupling to the sample before, standard deviation of the innovation, and weight."""
+        channels = weight.shape[1]
+        ar = np.asarray(self.ar[:channels], float)[None, :, None]
+        sigma = np.asarray(self.sigma[:channels], float)[None, :, None]
+        linked = np.zeros_like(weight)
+        linked[..., 1:] = weight[..., 1:] * weight[..., :-1]
+        return ar * linked, sigma * np.sqrt(1.0 - linked * ar**2), weight
+
+
+def robust_noise(residual: Floats, weight: Floats) -> Noise:
+    """Estimate the noise from residuals ``(n, c, T)``, robust against outliers.
+
+    ``weight`` is 1 where measured, else 0.
+    """
+    sigma, ar = [], []
+    for channel in range(residual.shape[1]):
+        r, w = residual[:, channel], weight[:, channel] > 0
+        size = 1.4826 * np.median(np.abs(r[w])) if w.any() else 0.0
+        # Autocorrelation of clipped residuals, so that outliers have a bounded influence.
+        clipped = np.clip(r, -3.0 * size, 3.0 * size)
+        both = w[:, 1:] & w[:, :-1]
+        power = np.sum(clipped[:, 1:][both] ** 2) + np.sum(clipped[:, :-1][both] ** 2)
+        product = np.sum((clipped[:, 1:] * clipped[:, :-1])[both])
+        sigma.append(max(float(size), LEAST_SIGMA * (20.0 if channel else 1.0)))
+        ar.append(float(np.clip(2.0 * product / power, -MOST_AR, MOST_AR)) if power > 0 else 0.0)
+    return Noise(tuple(sigma), tuple(ar))

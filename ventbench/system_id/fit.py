@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike
 from ventbench.base.arrays import Floats
 from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
-from ventbench.system_id.data import Data
+from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
-from ventbench.system_id.noise import Noise, robust_noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import (
     Problem,
@@ -46,7 +45,7 @@ _LEVERAGE = 0.98
 class Fit:
     """Result of a fit."""
 
-    mechanisms: tuple[str, ...]  #: names of the hypothesis.
+    names: tuple[str, ...]  #: mechanisms of the hypothesis.
     problem: Problem  #: the problem with the estimated or given noise.
     minimum: Minimum  #: minimum of its cost.
     values: Floats  #: physical values of all columns of the predictor, ``(n, P + 1)``.
@@ -90,8 +89,8 @@ class Fit:
 
     def plant(self, breath: int | slice = slice(None)) -> Physics:
         """The fitted model as a plant in float64: of one breath, or stacked over breaths."""
-        names = [name for name in paths(self.mechanisms) if name != "position"]
-        names += ["position"] if any(mechanism(m).uses_position for m in self.mechanisms) else []
+        names = [name for name in paths(self.names) if name != "position"]
+        names += ["position"] if any(mechanism(m).uses_position for m in self.names) else []
         return self.problem.predictor.plant({name: self.column(name)[breath] for name in names})
 
 
@@ -156,7 +155,7 @@ def refit_breath_parameters(fitted: Fit, data: Data, *, free: Iterable[str] = ()
     layout, names = fitted.problem.unknowns, fitted.problem.predictor.names
     own = {p for p in layout.paths if parameter_of(p).scope == "breath"} | set(free) | {"position"}
     fixed = {name: _label_mean(fitted, data, name) for name in names if name not in own}
-    return fit(data, fitted.mechanisms, free=free, fixed=fixed, noise=fitted.problem.noise)
+    return fit(data, fitted.names, free=free, fixed=fixed, noise=fitted.problem.noise)
 
 
 def _label_mean(fitted: Fit, data: Data, path: str) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ventbench import palette
-from ventbench.base.arrays import Floats
+from ventbench.base.arrays import Floats, runs
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
 from ventbench.diagnosis.residual_analysis import Profile, profiles
@@ -382,10 +382,8 @@ def request(wanted: BreathRequest) -> list[Chart]:
 
 def _open(time: np.ndarray, u_out: np.ndarray) -> list[tuple[float, float]]:
     """Times during which the expiratory valve is open."""
-    is_open = np.concatenate([[False], u_out > 0.5, [False]])
-    changes = np.flatnonzero(np.diff(is_open.astype(int)))
     ends = np.append(time, time[-1])
-    return [(float(ends[a]), float(ends[b])) for a, b in changes.reshape(-1, 2)]
+    return [(float(ends[a]), float(ends[b])) for a, b in runs(u_out > 0.5)]
 
 
 #: Colours of the recording and of the three simulators in the figure, on white.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from markupsafe import Markup, escape
 
 import ventbench
 from ventbench import palette
+from ventbench.base import files
+from ventbench.base.arrays import runs
 from ventbench.base.text import page_templates
 from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.findings import (
@@ -22,7 +25,7 @@ from ventbench.diagnosis.findings import (
     NonparametricTerm,
     OpenLoopError,
 )
-from ventbench.diagnosis.input_response import ALVEOLUS, CIRCUIT, SUPPLY
+from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
 from ventbench.pages.diagnosis import charts
 from ventbench.physics import mechanism
@@ -39,6 +42,16 @@ _SYMBOL = re.compile(
 )
 _SIGNS = {"-": "−", "-+": "∓", "<=": "≤", "..": " to ", "...": "…"}
 _LETTERS = {"tau": "τ", "pi": "π", "sum": "∑"}
+
+
+def write(path: Path, diagnosis: Diagnosis) -> Path:
+    """Write the report, ``.html`` by custom, and return the path.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    files.write_text(path, html(diagnosis))
+    return path
 
 
 def html(diagnosis: Diagnosis) -> str:
@@ -76,7 +89,6 @@ def html(diagnosis: Diagnosis) -> str:
         more=max(len(diagnosis.location) - PLACES, 0),
         axes=charts.by_axis(diagnosis),
         slot=diagnosis.form or diagnosis.nonparametric,
-        open_loop=report_text.open_loop(diagnosis),
         slot_words=report_text.nonparametric_term(diagnosis),
         slot_title="The form of what is missing"
         if diagnosis.form is not None
@@ -90,7 +102,6 @@ def html(diagnosis: Diagnosis) -> str:
         lungs=[report_text.lung(match) for match in diagnosis.lungs],
         notes=diagnosis.notes,
         about=_about(diagnosis),
-        version=ventbench.__version__,
     )
 
 
@@ -202,8 +213,7 @@ def timeline(diagnosis: Diagnosis, missing: MissingMechanism) -> list[tuple[floa
     acts = np.isin(ids, missing.affected)
     if missing.breaths is not None:
         acts = ids >= missing.breaths[0]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], acts, [False]]).astype(int)))
-    shares = np.round(100.0 * edges / max(len(ids), 1), 2).reshape(-1, 2)
+    shares = np.round(100.0 * np.reshape(runs(acts), (-1, 2)) / max(len(ids), 1), 2)
     return [(float(low), float(high - low)) for low, high in shares]
 
 

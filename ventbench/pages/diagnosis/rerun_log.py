@@ -1,12 +1,15 @@
-"""A diagnosis as a rerun recording: traces of every breath, errors by breath, maps of the error."""
+"""A diagnosis as a rerun recording: traces of every breath, and the answer in words."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from ventbench import palette
+from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.text import escape_markdown
 from ventbench.diagnosis import number_text, report_text
@@ -22,33 +25,30 @@ COLORS = {
     "recorded": palette.PIPS[2],
 }
 
-#: Pixels of a map for each sample and breath.
-_ZOOM = 6
-
 #: Name of the timeline; its values are seconds with a lung's breaths end to end.
 TIMELINE = "recording_time"
 
 
-def recording(diagnosis: Diagnosis) -> bytes:
-    """Return a whole ``.rrd`` file.
+def write(path: Path, diagnosis: Diagnosis) -> Path:
+    """Write a recording with its blueprint, ``.rrd`` by custom, and return the path.
 
     Entities, for each lung: ``/<lung>/pressure/{recorded,before,refit,after}``,
     ``/<lung>/error/{before,refit,after}`` (recorded - simulated), ``/<lung>/u_in``,
-    ``/<lung>/u_out``, ``/<lung>/held_out``, breaths end to end on the timeline;
-    ``/by_breath/{before,refit,after}``, ``/map/{refit,after}`` and ``/about``.
+    ``/<lung>/u_out``, ``/<lung>/held_out``, breaths end to end on the timeline; and ``/about``.
 
     Raises:
         InputError: if rerun is switched off by its environment variable.
+        OSError: if the file cannot be written.
     """
 
     def log(stream: rr.RecordingStream) -> None:
         for lung, index in diagnosis.traces.breaths.by_lung_index.items():
             log_lung(stream, diagnosis, lung, index)
-        log_by_breath(stream, diagnosis)
-        log_maps(stream, diagnosis)
 
     name = f"diagnosis of {known(diagnosis.simulator)}"
-    return written(name, blueprint(diagnosis), markdown(diagnosis), log)
+    content = written(name, blueprint(diagnosis), markdown(diagnosis), log)
+    files.write_atomically(path, lambda file: file.write(content))
+    return path
 
 
 def markdown(diagnosis: Diagnosis) -> str:
@@ -69,9 +69,6 @@ def markdown(diagnosis: Diagnosis) -> str:
         "**green**: recorded, **grey**: simulator as given, **orange**: R and C refitted, "
         "**blue**: corrected; the bar at the bottom marks breaths that no fit has seen",
         "- error: recorded minus simulated, cmH2O",
-        "- Errors by breath: root mean square of each breath's inspiration, cmH2O; each "
-        "simulator on its own scale",
-        "- Maps: one row a breath, time to the right; red: simulated too low, blue: too high",
     ]
     return "\n".join(lines) + "\n"
 
@@ -101,57 +98,13 @@ def log_lung(
     line("held_out", held, "held out of every fit", palette.REFERENCES[0], 6.0)
 
 
-def log_by_breath(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
-    """Root mean square errors of every breath, in the order of the recording."""
-    number = np.arange(1, len(diagnosis.traces.breaths) + 1)
-    for key, _, _ in stages(diagnosis):
-        values = np.nan_to_num(rmse(diagnosis.traces, getattr(diagnosis.traces, key)))
-        bars = rr.BarChart(values, color=palette.rgb(COLORS[key]), abscissa=number)
-        stream.log(f"/by_breath/{key}", bars, static=True)
-
-
-def log_maps(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
-    """Errors of all breaths as pictures on one scale of colours, the first breath on top."""
-    traces = diagnosis.traces
-    errors = {
-        key: traces.breaths.pressure - getattr(traces, key) for key, _, _ in stages(diagnosis)
-    }
-    errors.pop("before")
-    refit = np.abs(errors["refit"][np.isfinite(errors["refit"])])
-    top = max(3.0 * diagnosis.noise[0], float(np.quantile(refit, 0.98)) if refit.size else 0.0, 0.1)
-    for key, error in errors.items():
-        picture = np.repeat(np.repeat(diverging(error / top), _ZOOM, axis=0), _ZOOM, axis=1)
-        stream.log(f"/map/{key}", rr.Image(picture), static=True)
-
-
-def diverging(share: Floats) -> np.ndarray:
-    """Blue below zero, white at zero, red above; grey where unknown, uint8 ``(..., 3)``."""
-    known = np.clip(np.nan_to_num(share), -1.0, 1.0)[..., None]
-    red, blue = np.array(palette.rgb("#c4370a")), np.array(palette.rgb("#0065b3"))
-    end = np.where(known > 0, red, blue)
-    color = 255.0 + np.abs(known) * (end - 255.0)
-    return np.where(np.isfinite(share)[..., None], color, 128.0).round().astype(np.uint8)
-
-
 def blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     """Layout of the views."""
     lungs = diagnosis.traces.breaths.by_lung_index
-    keys = ["before", "refit", "after"][: 2 if diagnosis.verdict == "nothing_missing" else 3]
-    names = {"before": "as given", "refit": "R and C refitted", "after": "corrected"}
-    bars = [
-        rrb.BarChartView(origin=f"/by_breath/{key}", name=f"RMSE by breath, {names[key]}, cmH2O")
-        for key in keys
-    ]
-    maps = [
-        rrb.Spatial2DView(origin=f"/map/{key}", name=f"Error over time and breath, {names[key]}")
-        for key in keys[1:]
-    ]
     linked = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
     tabs = rrb.Tabs(
         _lung(*_worst(diagnosis), "Worst held-out breath"),
         *(_lung(lung, linked, lung) for lung in lungs),
-        rrb.Vertical(*bars, name="Errors by breath"),
-        rrb.Horizontal(*maps, name="Maps of the error"),
         active_tab=0,
         name="Diagnosis",
     )

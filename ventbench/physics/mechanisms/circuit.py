@@ -43,7 +43,7 @@ class SupplyDroop(Mechanism):
         "from it and recovers in about a second. A regulator's pressure falls in proportion to the "
         "flow (ISO 6953), and the flow of a sonic valve in proportion to that pressure (ISO 6358).",
         signature="Flow is lost late in inspiration and in big breaths; after a pause it is back.",
-        confusable=("valve_curve", "leak", "viscoelasticity"), detectable=0.02, least=0.03,
+        confusable=("valve_curve", "leak", "viscoelasticity"), least=0.03,
         least_reason="regulators hold their pressure to a few percent",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )  # fmt: skip
@@ -132,7 +132,7 @@ class CircuitCompliance(Mechanism):
         ),
         signature="Edges of pressure are rounded, the more the higher R, in inspiration and at the "
         "start of expiration.",
-        confusable=("valve_lag", "sensor_lag"), detectable=0.4, least=0.3,
+        confusable=("valve_lag", "sensor_lag"), least=0.3,
         least_reason="a syringe's worth of tubing; less moves no edge of 30 samples a second",
         ubiquitous=True,
     )  # fmt: skip
@@ -164,7 +164,7 @@ class Leak(Mechanism):
         "mL/s per cmH2O is a usual leak of masks and cuffs.",
         signature="Pressure is lost late in inspiration and most in long, high plateaus; nearly "
         "all of it can hide in R and C.",
-        confusable=("viscoelasticity", "valve_dead_band", "supply_droop"), detectable=0.25,
+        confusable=("viscoelasticity", "valve_dead_band", "supply_droop"),
         least=1.0, least_reason="less than connectors are allowed to leak",
         special_case_of=("leak_shape",),
     )  # fmt: skip

@@ -35,7 +35,7 @@ class TurbulentResistance(Mechanism):
         "smooth tube the exponent is 1.75 (Blasius).",
         signature="Pressure drop grows faster than flow: error at high flow, in inspiration and at "
         "the start of expiration, most in lungs with low R; fitted R falls below the label.",
-        confusable=("valve_curve",), detectable=0.5, least=1.0,
+        confusable=("valve_curve",), least=1.0,
         least_reason="the curvature of a straight tracheal tube; less is within R",
         special_case_of=("flow_shape",),
     )  # fmt: skip
@@ -72,7 +72,7 @@ class Inertance(Mechanism):
         "Lung Mechanics, Cambridge 2009), behind 0.1 to 1 mL/cmH2O of tubing.",
         signature="Overshoot and ringing after edges, above all at the start of expiration with "
         "low R; below 0.15 cmH2O s2/L without tubing invisible at 30 samples a second.",
-        confusable=("circuit_compliance", "exhalation_valve_delay"), detectable=0.16, least=0.008,
+        confusable=("circuit_compliance", "exhalation_valve_delay"), least=0.008,
         least_reason="less than the gas in a tracheal tube alone",
     )  # fmt: skip
 
@@ -114,7 +114,7 @@ class NonlinearCompliance(Mechanism):
         "at 30 cmH2O.",
         signature="Pressure rises faster at high volume: end of inspiration of big breaths; "
         "expiration begins faster.",
-        confusable=("valve_curve", "leak"), detectable=0.01, least=0.003,
+        confusable=("valve_curve", "leak"), least=0.003,
         least_reason="stiffening by 5 % at 15 cmH2O; less is within the spread of springs",
         special_case_of=("recoil_shape",),
     )  # fmt: skip
@@ -168,7 +168,7 @@ class Viscoelasticity(Mechanism):
         "ratio 0.05 to 0.7, 0.3 to 2 s. A second compartment has an impedance of the same order.",
         signature="Pressure creeps down while volume is held and lags behind slow changes, in "
         "inspiration and expiration; nearly all of it can hide in R and C.",
-        confusable=("leak", "supply_droop"), detectable=0.02, least=0.04,
+        confusable=("leak", "supply_droop"), least=0.04,
         least_reason="creep below that of rubber bellows", special_case_of=("recoil_memory",),
         # Its slow stress trades against C, and what is left of another mechanism's form decides.
         beside_error=0.2, equivalents=("second_compartment",),
@@ -241,7 +241,7 @@ class PatientEffort(Mechanism):
         "s (S. A. Esau et al., J. Appl. Physiol. 55, 1983, 731).",
         signature="A dent in pressure that the commands do not explain and that differs from "
         "breath to breath: absent in some, early or late in others.",
-        confusable=("a source at the alveolus that repeats in every breath",), detectable=0.3,
+        confusable=("a source at the alveolus that repeats in every breath",),
         least=0.5, least_reason="a muscle pressure that a trigger would hardly see",
     )  # fmt: skip
 

@@ -30,7 +30,7 @@ class SensorLag(Mechanism):
         source="Low-pass filter of sensor, sampling line and electronics: 5 to 120 ms.",
         signature="All edges of pressure are rounded, in inspiration and at the start of "
         "expiration alike, whatever R is.",
-        confusable=("valve_lag", "circuit_compliance", "valve_delay"), detectable=0.019,
+        confusable=("valve_lag", "circuit_compliance", "valve_delay"),
         least=0.012, least_reason="a third of a sample: less is an offset between two clocks",
         special_case_of=("sensor_memory",),
         interchangeable=(("tau", "second"),),

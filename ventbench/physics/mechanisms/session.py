@@ -172,7 +172,7 @@ MECHANISMS = (
         signature=(
             "An error that grows with the number of the breath and is the same at all its samples."
         ),
-        confusable=("zero_step", "a PEEP that changes during the recording"), detectable=0.05,
+        confusable=("zero_step", "a PEEP that changes during the recording"),
         least=0.15, least_reason="two steps of a usual converter", special_case_of=("drift_shape",),
     )),
 )  # fmt: skip

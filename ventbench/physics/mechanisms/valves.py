@@ -76,7 +76,7 @@ class ValveDeadBand(Mechanism):
         signature="Too little flow at every small command, none at the smallest: late in "
         "inspiration, and in lungs with high R and low C, which are ventilated with small "
         "commands.",
-        confusable=("leak", "command_rounding", "valve_hysteresis"), detectable=0.1, least=0.25,
+        confusable=("leak", "command_rounding", "valve_hysteresis"), least=0.25,
         least_reason="a quarter of a percent of stroke, the resolution of drivers",
         special_case_of=("valve_shape",),
     )  # fmt: skip
@@ -123,7 +123,7 @@ class ValveHysteresis(Mechanism):
         "memory is that of the travel, not of time.",
         signature="After each reversal of the command flow stays where it was; error of one sign "
         "while the command rises and of the other while it falls.",
-        confusable=("valve_dead_band", "valve_delay"), detectable=0.1, least=0.3,
+        confusable=("valve_dead_band", "valve_delay"), least=0.3,
         least_reason="a little more than the resolution of drivers",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )  # fmt: skip
@@ -162,7 +162,7 @@ class ValveDelay(Mechanism):
         "of recorded breaths ask for.",
         signature="Pressure runs ahead of the recording after every edge of the command during "
         "inspiration, by one constant time.",
-        confusable=("valve_lag", "sensor_lag", "circuit_compliance"), detectable=0.009, least=0.008,
+        confusable=("valve_lag", "sensor_lag", "circuit_compliance"), least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )  # fmt: skip
@@ -187,7 +187,7 @@ class ValveLag(Mechanism):
         "solenoid valves.",
         signature="Edges of the command arrive rounded during inspiration; the start of expiration "
         "is not affected.",
-        confusable=("sensor_lag", "circuit_compliance", "valve_delay"), detectable=0.009,
+        confusable=("sensor_lag", "circuit_compliance", "valve_delay"),
         least=0.008,
         least_reason="a quarter of a sample: less rounds no edge that a recording shows",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
@@ -225,8 +225,7 @@ class ValveCurve(Mechanism):
         signature="Error of one sign that grows with the command: during the first samples of "
         "inspiration, at high flow.",
         confusable=("turbulent_resistance", "supply_droop", "nonlinear_compliance"),
-        detectable=0.015, least=0.04,
-        least_reason="linearised valves hold their curve to a few percent",
+        least=0.04, least_reason="linearised valves hold their curve to a few percent",
         special_case_of=("valve_shape",),
     )  # fmt: skip
 
@@ -266,7 +265,7 @@ class ExhalationValveDelay(Mechanism):
         "closing apart. A diaphragm on a vented pilot opens as its pilot empties.",
         signature="Pressure stays up after the command to open, or falls slowly at first, whatever "
         "the lung; inspiration is not affected, unless closing is late too.",
-        confusable=("inertance", "sensor_lag"), detectable=0.003, least=0.008,
+        confusable=("inertance", "sensor_lag"), least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("outlet_memory",),
     )  # fmt: skip

@@ -15,7 +15,6 @@ class NonparametricComponent:
     name: str  #: public name, such as ``f(V)``.
     terms: tuple[str, ...]  #: names of its basis terms, which are fitted together.
     meaning: str  #: the component in words.
-    axis: str  #: variable that its curve depends on, with the unit.
 
 
 #: All nonparametric components, by public name.
@@ -24,45 +23,43 @@ NONPARAMETRIC_COMPONENTS = {
     for component in (
         NonparametricComponent(
             "f(u)", ("valve_shape",),
-            "flow of the inspiratory valve depends on the command in another way", "command, %",
+            "flow of the inspiratory valve depends on the command in another way",
         ),
         NonparametricComponent(
             "memory of u", ("command_memory", "command_plays", "supply_memory"),
             "flow of the inspiratory valve depends on what the command was before",
-            "time after a step, s",
         ),
         NonparametricComponent(
             "f(p)", ("leak_shape",),
-            "gas leaves beside the lung, by the pressure at the airway", "airway pressure, cmH2O",
+            "gas leaves beside the lung, by the pressure at the airway",
         ),
         NonparametricComponent(
             "f(Q)", ("flow_shape",),
-            "the pressure drop of the airway depends on flow in another way", "flow, L/s",
+            "the pressure drop of the airway depends on flow in another way",
         ),
         NonparametricComponent(
             "R(V)", ("volume_resistance",),
-            "the resistance of the airway depends on the volume of the lung", "volume, mL",
+            "the resistance of the airway depends on the volume of the lung",
         ),
         NonparametricComponent(
             "R(direction)", ("direction_resistance",),
-            "the resistance of the airway is another one outwards than inwards", "flow, L/s",
+            "the resistance of the airway is another one outwards than inwards",
         ),
         NonparametricComponent(
             "f(V)", ("recoil_shape",),
-            "the recoil of the lung depends on volume in another way", "volume, mL",
+            "the recoil of the lung depends on volume in another way",
         ),
         NonparametricComponent(
             "memory of p", ("recoil_memory",),
-            "the recoil of the lung depends on what its volume was before", "time after a step, s",
+            "the recoil of the lung depends on what its volume was before",
         ),
         NonparametricComponent(
             "exhalation path", ("outlet_shape", "outlet_memory"),
-            "the expiratory valve conducts in another way, or opens slowly", "p - PEEP, cmH2O",
+            "the expiratory valve conducts in another way, or opens slowly",
         ),
         NonparametricComponent(
             "measurement", ("sensor_shape", "sensor_memory", "drift_shape"),
             "the sensor shows another pressure than that at the airway",
-            "airway pressure, cmH2O",
         ),
     )
 }  # fmt: skip

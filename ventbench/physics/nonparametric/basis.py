@@ -1,15 +1,13 @@
-"""Base of the basis terms: curves that are linear in their coefficients, and how to plot them."""
+"""Base of the basis terms: curves that are linear in their coefficients."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from ventbench.base.arrays import Floats
 from ventbench.physics.mechanism import Mechanism, Values
 from ventbench.physics.parameters import Parameter
 
@@ -50,20 +48,11 @@ def per_state(constants: tuple[float, ...], state: Array) -> Array:
     return jnp.asarray(constants, state.dtype).reshape(-1, *[1] * (state.ndim - 1))
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A curve for a plot."""
-
-    x: Floats  #: argument, ``(k,)``.
-    y: Floats  #: values, ``(k,)``.
-    x_unit: str  #: name and unit of the argument, such as ``volume, mL``.
-    y_unit: str  #: name and unit of the values.
-    #: powers of ``x`` that a change of base parameters could produce as well.
-    absorbed: tuple[int, ...] = ()
-
-
 class BasisTerm(Mechanism):
     """A mechanism whose parameters are the coefficients of a basis; it has no physical name."""
+
+    #: Powers of what its curve depends on that a change of base parameters could produce as well.
+    absorbed: tuple[int, ...] = ()
 
     def coefficients(self, values: Values) -> list[Array]:
         """Values of all coefficients, in order."""
@@ -73,15 +62,6 @@ class BasisTerm(Mechanism):
         """Coefficients in the shape of several states, ``(K, ...)``."""
         own = self.coefficients(values)[: len(state)]
         return jnp.stack([jnp.broadcast_to(c, state.shape[1:]) for c in own])
-
-    def magnitude(self, values: Values) -> float:
-        """Largest coefficient, as a multiple of its prior standard deviation."""
-        parameters = self.description.parameters
-        return max(abs(float(values[p.name])) / (p.spread or 1.0) for p in parameters)
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Curves for a plot, given the own and the base parameters."""
-        raise NotImplementedError
 
 
 class Lines(BasisTerm):
@@ -133,11 +113,6 @@ class FilterBank(BasisTerm):
     def weighed(self, values: Values, states: Array) -> Array:
         """Sum of the filters ``(K, ...)``, weighed by the coefficients."""
         return jnp.sum(self.stacked(values, states) * states, axis=0)
-
-    def decay(self, values: Values, time: Floats) -> Floats:
-        """Sum over the coefficients, each decaying with its time constant, at ``time``."""
-        rates = np.exp(-time[:, None] / np.asarray(self.taus))
-        return rates @ np.array([float(c) for c in self.coefficients(values)[: len(self.taus)]])
 
     def lasting(self, x: Array) -> Array:
         """Filters of what has lasted for long, ``(K, ...)``."""

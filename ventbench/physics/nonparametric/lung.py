@@ -1,15 +1,11 @@
 """The lung: a leak, a pressure drop and factors of its resistance, recoil and relaxing stresses."""
 
-from collections.abc import Mapping
-
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Network, Values, View
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
-    Curve,
     FilterBank,
     Lines,
     PiecewiseQuadratic,
@@ -45,12 +41,6 @@ class LeakShape(BasisTerm):
         flow, slope = PiecewiseQuadratic(_LEAK_KNOTS)(view.pressure, self.coefficients(values))
         return network.plus(leak=1e-3 * slope, leak_flow=1e-3 * (flow - slope * view.pressure))
 
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Outflow over pressure."""
-        p = np.linspace(0.0, 50.0, 201)
-        flow, _ = PiecewiseQuadratic(_LEAK_KNOTS)(jnp.asarray(p), self.coefficients(values))
-        return (Curve(p, np.asarray(flow), "airway pressure, cmH2O", "extra outflow, mL/s"),)
-
 
 #: Sizes of flow at which the slope is given, L/s; at the first it is zero.
 _FLOW_KNOTS = (0.0, 0.2, 0.6, 1.4)
@@ -74,17 +64,12 @@ class FlowShape(BasisTerm):
         signature="Error that follows the flow into and out of the lung, at any volume.",
         confusable=("turbulent_resistance", "valve_curve"),
     )  # fmt: skip
+    absorbed = (1,)
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Tangent of the curve at the last flow."""
         drop, slope = self._drop(values, view.flow)
         return network.plus(resistance=slope, recoil=drop - slope * view.flow)
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Pressure drop over flow."""
-        q = np.linspace(-1.5, 1.5, 301)
-        drop, _ = self._drop(values, jnp.asarray(q))
-        return (Curve(q, np.asarray(drop), "flow, L/s", "extra pressure drop, cmH2O", (1,)),)
 
     def _drop(self, values: Values, flow: Array) -> tuple[Array, Array]:
         c = self.coefficients(values)
@@ -113,18 +98,13 @@ class VolumeResistance(Lines):
         signature="The drop at edges of the flow depends on the volume at which they occur.",
         confusable=("turbulent_resistance", "nonlinear_compliance"),
     )  # fmt: skip
+    absorbed = (0,)
     knots, fixed = _VOLUME_KNOTS, _VOLUME_KNOTS[:1]
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Resistance at the volume that the last flow leads to."""
         filled = view.elastance * (view.volume + view.length * view.flow)
         return network.plus(resistance=view.resistance * self.curve(values, filled))
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Resistance over volume."""
-        s = np.linspace(5.0, 45.0, 161)
-        y = base["R"] * np.asarray(self.curve(values, jnp.asarray(s)))
-        return (Curve(s * base["C"], y, "volume, mL", "extra resistance, cmH2O/(L/s)", (0,)),)
 
 
 class DirectionResistance(BasisTerm):
@@ -142,17 +122,12 @@ class DirectionResistance(BasisTerm):
         signature="Expiration is slower or faster than the R of inspiration allows.",
         confusable=("exhalation_valve_delay", "turbulent_resistance"),
     )  # fmt: skip
+    absorbed = (1,)
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Resistance in the direction of the last flow."""
         outwards = jnp.where(view.flow < 0.0, values["c1"], 0.0)
         return network.plus(resistance=view.resistance * outwards)
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Pressure drop over flow."""
-        q = np.linspace(-1.5, 1.5, 301)
-        y = base["R"] * float(values["c1"]) * np.minimum(q, 0.0)
-        return (Curve(q, y, "flow, L/s", "extra pressure drop, cmH2O", (1,)),)
 
 
 #: V / C at which the slope is given, cmH2O, so that they suit any lung. Below the second it does
@@ -184,6 +159,7 @@ class RecoilShape(BasisTerm):
         signature="Error that follows the volume of the lung, in inspiration and expiration alike.",
         confusable=("nonlinear_compliance",),
     )  # fmt: skip
+    absorbed = (0, 1)
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Tangent of the curve at the last volume."""
@@ -191,14 +167,6 @@ class RecoilShape(BasisTerm):
             view.elastance * view.volume, self._slopes(values)
         )
         return network.plus(recoil=extra, elastance=slope * view.elastance)
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Recoil over volume."""
-        s = np.linspace(0.0, 45.0, 181)
-        extra, _ = PiecewiseQuadratic(_RECOIL_KNOTS)(jnp.asarray(s), self._slopes(values))
-        return (
-            Curve(s * base["C"], np.asarray(extra), "volume, mL", "extra recoil, cmH2O", (0, 1)),
-        )
 
     def _slopes(self, values: Values) -> list[Array]:
         """Slopes of the recoil less that of a linear lung, at the knots."""
@@ -249,10 +217,3 @@ class RecoilMemory(FilterBank):
         """Stresses, cmH2O."""
         gained = self.stacked(values, state) * (view.length * view.elastance * flow)
         return (state + gained) / (1.0 + view.length / per_state(_MEMORY_TAUS, state))
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Stress after a volume that would raise a linear lung by 10 cmH2O."""
-        t = np.linspace(0.0, 5.0, 501)
-        stress = 10.0 * self.decay(values, t)
-        unit = "stress after a step of 10 cmH2O x C, cmH2O"
-        return (Curve(t, stress, "time after a step, s", unit, (0,)),)

@@ -1,15 +1,11 @@
 """Errors of the pressure sensor: a curve, filters, and a drift over the recording."""
 
-from collections.abc import Mapping
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Pair, Values
 from ventbench.physics.nonparametric.basis import (
-    Curve,
     FilterBank,
     Lines,
     coefficients,
@@ -43,6 +39,7 @@ class SensorShape(Lines):
         signature="Error that follows the pressure itself, whatever the flow is.",
         confusable=("nonlinear_compliance", "leak"),
     )  # fmt: skip
+    absorbed = (0, 1)
     rank = 2
     knots, fixed = _SENSOR_KNOTS, _SENSOR_FIXED
 
@@ -61,12 +58,6 @@ class SensorShape(Lines):
         # In the shape that the steps have.
         first = shown + sum(0.0 * x for x in self.at_knots(values))
         return jax.lax.scan(nearer, first, None, length=_SENSOR_STEPS)[0]
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Error over pressure."""
-        p = np.linspace(0.0, 45.0, 181)
-        y = np.asarray(self.curve(values, jnp.asarray(p)))
-        return (Curve(p, y, "airway pressure, cmH2O", "error of the reading, cmH2O", (0, 1)),)
 
 
 #: Time constants, s.
@@ -100,13 +91,6 @@ class SensorMemory(FilterBank):
         after = self.step(state, pressure, length)
         return pressure + self.weighed(values, after - pressure), after
 
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Error of the reading after a step of the pressure."""
-        t = np.linspace(0.0, 1.0, 401)
-        missing = self.decay(values, t)
-        unit = "error after a step of 10 cmH2O, cmH2O"
-        return (Curve(t, -10.0 * missing, "time after a step, s", unit),)
-
 
 #: Positions in the recording where the curve bends; at the first it is zero.
 _DRIFT_KNOTS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -126,6 +110,7 @@ class DriftShape(Lines):
         signature="An error that is the same at all samples of a breath and differs between them.",
         confusable=("sensor_drift",),
     )  # fmt: skip
+    absorbed = (0,)
     rank = 3
     knots, fixed = _DRIFT_KNOTS, _DRIFT_KNOTS[:1]
     uses_position = True
@@ -137,9 +122,3 @@ class DriftShape(Lines):
     def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
         """Take it away."""
         return shown - self.curve(values, position)
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Offset over the recording."""
-        x = np.linspace(0.0, 1.0, 101)
-        y = np.asarray(self.curve(values, jnp.asarray(x)))
-        return (Curve(x, y, "position in the recording, 0..1", "offset, cmH2O", (0,)),)

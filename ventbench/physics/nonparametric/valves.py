@@ -1,15 +1,11 @@
 """The valves: curve, filters and plays of the command, memory of the supply, and the outlet."""
 
-from collections.abc import Mapping
-
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Network, Pair, Values, View
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
-    Curve,
     FilterBank,
     Lines,
     coefficients,
@@ -45,18 +41,13 @@ class ValveShape(Lines):
         signature="Error that follows the command, whatever flow and pressure are.",
         confusable=("valve_curve", "valve_dead_band", "command_rounding"),
     )  # fmt: skip
+    absorbed = (1,)
     rank = 5
     knots, fixed = _VALVE_KNOTS, _VALVE_FIXED
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Add the curve to the command."""
         return u_in + self.curve(values, u_in), memory
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Change of the flow over the command."""
-        u = np.linspace(0.0, 100.0, 401)
-        y = base["gain"] * np.asarray(self.curve(values, jnp.asarray(u)))
-        return (Curve(u, y, "command, %", "extra flow, mL/s", (1,)),)
 
 
 #: Time constants, s.
@@ -89,12 +80,6 @@ class CommandMemory(FilterBank):
         """Implicit step of all filters."""
         after = self.step(state, flow, length)
         return flow + self.weighed(values, after - flow), after
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Answer of the flow to a step of the command."""
-        t = np.linspace(0.0, 2.0, 401)
-        missing = self.decay(values, t)
-        return (Curve(t, -missing, "time after a step, s", "flow that is missing (-), share"),)
 
 
 #: Widths of the plays, %.
@@ -131,17 +116,6 @@ class CommandPlays(BasisTerm):
         shift = jnp.sum(self.stacked(values, positions) * (positions - u_in), axis=0)
         return u_in + shift, positions
 
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Change of the flow while the command rises to 30 % and falls again."""
-        u = np.concatenate([np.linspace(0.0, 30.0, 121), np.linspace(30.0, 0.0, 121)[1:]])
-        positions, change = np.zeros(len(_PLAYS_WIDTHS)), []
-        half = 0.5 * np.array(_PLAYS_WIDTHS)
-        for command in u:
-            positions = np.clip(positions, command - half, command + half)
-            shift = np.array([float(c) for c in self.coefficients(values)]) @ (positions - command)
-            change.append(base["gain"] * shift)
-        return (Curve(u, np.array(change), "command up and down, %", "extra flow, mL/s"),)
-
 
 #: Time constants, s, and the flow whose effect the coefficients are, L/s.
 _SUPPLY_TAUS = (0.3, 1.0, 3.0)
@@ -171,12 +145,6 @@ class SupplyMemory(FilterBank):
         after = self.step(state, flow, length)
         return flow * (1.0 + self.weighed(values, after) / _SUPPLY_FLOW), after
 
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Flow at a constant command, over time."""
-        t = np.linspace(0.0, 2.0, 401)
-        y = self.decay(values, np.zeros(1)) - self.decay(values, t)
-        return (Curve(t, y, "time since 0.5 L/s began, s", "flow that is gained, share", (0,)),)
-
 
 #: p - PEEP where the factor bends, cmH2O; where it is 1, the conductance is 1 / R_ex.
 _OUTLET_KNOTS = (0.0, 2.0, 5.0, 10.0, 20.0)
@@ -203,6 +171,7 @@ class OutletShape(Lines):
         signature="Error during expiration only, whatever the inspiration was.",
         confusable=("exhalation_valve_delay", "inertance"),
     )  # fmt: skip
+    absorbed = (0,)
     rank = 1  # a factor of how far the valve is open, however late that is
     knots, fixed = _OUTLET_KNOTS, _OUTLET_FIXED
 
@@ -210,12 +179,6 @@ class OutletShape(Lines):
         """Conductance at the last pressure."""
         excess = self.curve(values, view.pressure - view.peep)
         return network.plus(outlet=network.outlet * excess)
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Conductance over pressure."""
-        d = np.linspace(0.0, 30.0, 121)
-        y = 1e3 / base["R_ex"] * np.asarray(self.curve(values, jnp.asarray(d)))
-        return (Curve(d, y, "p - PEEP, cmH2O", "extra conductance, mL/s per cmH2O", (0,)),)
 
 
 #: Time constants of the opening, s.
@@ -257,9 +220,3 @@ class OutletMemory(FilterBank):
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
         """How far filters of the command are open, 0..1; they close at once."""
         return jnp.minimum(self.step(state, view.opened, view.length), view.opened)
-
-    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
-        """Opening over time."""
-        t = np.linspace(0.0, 0.5, 251)
-        shut = np.minimum(self.decay(values, t), 1.0)
-        return (Curve(t, shut, "time after the command to open, s", "share that is still shut"),)

@@ -38,9 +38,6 @@ from ventbench.task.lungs import Lung
 #: Roles with units.
 _MEASURED = ("time", "pressure", "flow", "volume", "u_in")
 
-#: Rows of the preview.
-_PREVIEW = 5
-
 #: Flow, mL/s, and volume, mL, below which another unit is likely; pressure, cmH2O, from which it
 #: is absolute.
 _SMALL_FLOW, _SMALL_VOLUME, _ABSOLUTE = 150.0, 5.0, 500.0
@@ -58,7 +55,11 @@ class Imported:
     columns: Mapping[str, str]  #: role of each column of the file that is used.
     understood: tuple[str, ...]  #: what was understood, a sentence each.
     warnings: tuple[str, ...]  #: what may be wrong, a sentence each.
-    preview: str  #: the first rows as they are written.
+
+    @property
+    def preview(self) -> str:
+        """The first rows as they are written."""
+        return self.breaths.to_frame().head(5).to_string(index=False)
 
     def __repr__(self) -> str:
         """Breaths and columns."""
@@ -209,7 +210,7 @@ def import_recording(
     warnings += [str(finding) for finding in found]
     notes += [few] if few is not None else []
     used = {name: role for name, role in roles.items() if role != "unused"}
-    return Imported(breaths, changes, used, tuple(notes), tuple(warnings), _preview(breaths))
+    return Imported(breaths, changes, used, tuple(notes), tuple(warnings))
 
 
 def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
@@ -507,18 +508,3 @@ def _breaths(
         lengths, np.concatenate(parts), columns, breath_id=np.arange(1, len(pieces) + 1),
         R=R[first].astype(float), C=C[first].astype(float), source=source, notes=tuple(notes),
     )  # fmt: skip
-
-
-def _preview(breaths: Breaths) -> str:
-    """The first rows as text."""
-    names = ["time_step", "u_in", "u_out", "pressure"]
-    columns = [breaths.time, breaths.u_in, breaths.u_out, breaths.pressure]
-    for name in ("flow", "volume"):
-        values = getattr(breaths, name)
-        if values is not None:
-            names.append(name)
-            columns.append(values)
-    lines = ["  ".join(f"{name:>9}" for name in names)]
-    for k in range(min(_PREVIEW, breaths.time.shape[1])):
-        lines.append("  ".join(f"{float(column[0, k]):>9.4g}" for column in columns))
-    return "\n".join(lines)

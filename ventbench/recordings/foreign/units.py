@@ -63,11 +63,7 @@ class Conversion:
 
     def apply(self, values: Floats) -> Floats:
         """Convert; one rounding to the nearest number at most for each of two integers."""
-        return _times(values, self.factor)
-
-    def invert(self, values: Floats) -> Floats:
-        """Convert back to the unit of the file."""
-        return _times(values, 1 / self.factor)
+        return np.asarray(values, float) * self.factor.numerator / self.factor.denominator
 
     def __str__(self) -> str:
         """The change in words, with the way back."""
@@ -132,10 +128,6 @@ def stem(name: str) -> str:
     if match is not None and is_unit(match[2]):
         name = match[1]
     return re.sub(r"[^\w]|_", "", name.rpartition(".")[2] or name).lower()
-
-
-def _times(values: Floats, factor: Fraction) -> Floats:
-    return np.asarray(values, float) * factor.numerator / factor.denominator
 
 
 def _in_words(factor: Fraction) -> str:

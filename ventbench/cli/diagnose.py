@@ -15,20 +15,17 @@ from ventbench.cli.options import (
     JsonFile,
     Pad,
     PlantName,
-    TrustFmu,
     bar,
     claim_out,
     known_lungs,
     notes,
     read_recording,
-    simulator_of,
     table_of,
     told,
 )
 
 if TYPE_CHECKING:
     from ventbench.mechanics import Mechanics, SurveyedRun
-    from ventbench.plants.fmu import Fmu
 
 
 def mechanics(
@@ -215,7 +212,6 @@ def diagnose(
             "option the lung is a test lung, which makes no effort.",
         ),
     ] = False,
-    in_process: TrustFmu = False,
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
@@ -240,7 +236,7 @@ def diagnose(
 
     require("jinja2", "rerun")
     breaths = read_recording(recordings, clip=clip, pad=pad)
-    diagnosis = _diagnose(breaths, simulator_of(plant, in_process), simulated, lung, patient, drive)
+    diagnosis = _diagnose(breaths, plant, simulated, lung, patient, drive)
     written = diagnosis.save(out)
     console = told(diagnosis.as_dict(), json)
     verdict, *others = str(diagnosis).splitlines()
@@ -252,7 +248,7 @@ def diagnose(
 
 
 def _diagnose(
-    breaths: Breaths, plant: str | Fmu, simulated: Path | None, lung: str | None, patient: bool,
+    breaths: Breaths, plant: str, simulated: Path | None, lung: str | None, patient: bool,
     drive: str,
 ) -> Diagnosis:  # fmt: skip
     """Diagnose with a progress bar that says what is done and how long it will take."""

@@ -10,7 +10,6 @@ What is given                         What it stands for
 ``FOLDER``                            what ``ventbench train simulator`` wrote
 ``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
 ``module:name``                       a function or class in plain Python, or a plant; or a mapping
-an ``Fmu``                            an FMU that is trusted; see :mod:`~ventbench.plants.fmu`
 a plant                               that plant for every lung
 a mapping                             plants, functions or classes by lung id
 a function, class or object           a simulator in plain Python or NumPy; see
@@ -41,7 +40,6 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
-from ventbench.plants.fmu import Fmu
 from ventbench.plants.plant_files import FAMILIES, load_plants, origin
 from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
 from ventbench.plants.simulators import Simulators
@@ -109,8 +107,6 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
             return _python_by_lung(given, "the given simulators")
         digest = _leaves_sha256(given)
         return _plants(dict(given), "the given plants", _about("plants", digest), digest)
-    if isinstance(given, Fmu):
-        return _of_function(given, given.path.name, given.sha256)
     if _is_python(given):
         name = getattr(given, "__qualname__", type(given).__name__)
         return _of_function(given, name)
@@ -185,9 +181,8 @@ def _by_text(text: str) -> Simulators:
             return _pressures_file(path)
         if name.endswith(".fmu"):
             raise InputError(
-                f"{path} holds machine code, which runs with all your rights. If you trust it, "
-                "simulate, open-loop and diagnose take it with --in-process, and functions of "
-                "Python as ventbench.plants.fmu.Fmu(path); a closed loop needs states to set back"
+                f"{path} is an FMU, whose machine code nothing here runs; give --plant module:name "
+                "of an object that steps it with fmpy, as docs/own_rig.md shows"
             )
         return _plant_file(path)
     module, colon, attribute = text.partition(":")

@@ -27,7 +27,7 @@ from ventbench.base.executor import executor, results
 from ventbench.entries.scoring import score
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
-from ventbench.plants.stacking import take
+from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS, lung
 from ventbench.train import pid_grid
 
@@ -84,7 +84,7 @@ def reproduce_paper(
         out: folder in which ``full`` keeps finished trainings, so that the same call continues.
         seeds: trainings of each method and of each part of the controller with ``full``.
         sizes: of the studies of ``full``.
-        workers: processes for grid, entries and the studies of controllers and networks; 0 for
+        workers: processes for entries and the studies of controllers and networks; 0 for
             this one alone.
         scheduler: address of a Dask scheduler instead.
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given. They must
@@ -113,14 +113,11 @@ def reproduce_paper(
         source = None if recordings is None else Path(recordings)
         parallel = {"workers": workers, "scheduler": scheduler}
         kept |= _studies(Path(out), source, seeds, sizes or StudySizes(), parallel, tell)
+    tell("PID grid", 0.1)
+    tried = pid_grid.paper_gains() if gains is None else gains
+    error = pid_grid.errors(official.plants, tried)
+    grid = pid_grid.PIDGrid(LUNG_IDS, protocol.PIPS, tried, error)
     with executor(workers, scheduler) as pool:
-        tell("PID grid", 0.1)
-        grid = pid_grid.search(
-            {name: take(official.plants, index) for index, name in enumerate(LUNG_IDS)},
-            settings=official.about(),
-            gains=gains,
-            pool=pool,
-        )
         jobs = dict(ENTRIES)
         scored: dict[str, tuple[Floats, Floats]] = {}
         for name, result in results(pool, _scored, jobs):

@@ -188,7 +188,8 @@ def table_of(
     table, kept = Table(title=title, caption=caption), set(left)
     for place, name in enumerate(columns):
         justify = "left" if place == 0 or name in kept else "right"
-        table.add_column(name, justify=justify, no_wrap=no_wrap)
+        overflow = "ellipsis" if no_wrap else "fold"
+        table.add_column(name, justify=justify, no_wrap=no_wrap, overflow=overflow)
     for row in rows:
         table.add_row(*row)
     return table

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Floats, Ints
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, arranged
 from ventbench.recordings.foreign.breath_onsets import (
@@ -87,7 +87,7 @@ class Imported:
 
 
 def import_recording(
-    path: str | Path, *, columns: Mapping[str, str] | None = None,
+    path: str | Path | Table, *, columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None, layout: str | None = None, lung: str | None = None,
     rate: float | None = None, split_breaths: bool = False, invert: Iterable[str] = (),
     offsets: Mapping[str, float] | None = None, select: Mapping[str, str] | None = None,
@@ -97,7 +97,7 @@ def import_recording(
 
     Args:
         path: text with any separator (also gzipped), a spreadsheet, Parquet, MATLAB, EDF, BDF, the
-            header (.hea) of a WFDB record, or PIRDS as JSON.
+            header (.hea) of a WFDB record, or PIRDS as JSON; or what has been read of one.
         columns: role of each column, ``{"Paw": "pressure"}``; the roles are ``time``,
             ``pressure``, ``flow``, ``volume``, ``u_in``, ``u_out``, ``R``, ``C``, ``breath``,
             ``group`` (a breath ends where it changes), ``target`` (inspiration is where it is
@@ -126,7 +126,9 @@ def import_recording(
         ...     "lab.csv", columns={"Paw": "pressure"}, units={"flow": "L/min"}, lung="R20C50"
         ... )  # doctest: +SKIP
     """
-    table = read_table(path, separator=separator, decimal=decimal)
+    table = path
+    if not isinstance(table, Table):
+        table = read_table(table, separator=separator, decimal=decimal)
     table, selected = _selected(table, dict(select or {}))
     known = _layout(layout, table)
     roles = _roles(table, dict(columns or {}), known)
@@ -202,7 +204,7 @@ def import_recording(
     pieces, left = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
     notes += left
     warnings += _suspicious(samples, changes)
-    breaths = _breaths(str(path), pieces, time, samples, R, C, notes)
+    breaths = _breaths(table.file, pieces, time, samples, R, C, notes)
     few = few_breaths(len(breaths))
     found = check_roles(breaths)
     if found and found[0].level == "refused":
@@ -211,6 +213,38 @@ def import_recording(
     notes += [few] if few is not None else []
     used = {name: role for name, role in roles.items() if role != "unused"}
     return Imported(breaths, changes, used, tuple(notes), tuple(warnings))
+
+
+def import_runs(path: str | Path) -> dict[str, Breaths]:
+    """Read each recording of a Parquet file whose layout tells several apart.
+
+    Returns:
+        Breaths by the values of the columns that do, in the order of the file: of RespiraWorks by
+        run and test, ``"2020-07-31-UFlow-Performance 4"``. Nothing of any other file.
+
+    Raises:
+        InputError: as :func:`import_recording`.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        layout = recognise(tuple(parquet.read_schema(path).names))
+    except (pa.ArrowException, OSError):
+        return {}
+    groups = [name for name, role in layout.columns.items() if role == "group"] if layout else []
+    if not groups:
+        return {}
+    table = read_table(path)
+    cells = (
+        [f"{value:g}" if isinstance(value, float) else value for value in column]
+        for column in (table.columns[name].tolist() for name in groups)
+    )
+    keys = np.array([" ".join(row) for row in zip(*cells, strict=True)])
+    return {
+        key: import_recording(_rows(table, keys == key)).breaths
+        for key in dict.fromkeys(keys.tolist())
+    }
 
 
 def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
@@ -228,10 +262,13 @@ def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
         raise InputError(f"{table.file}: no row has {asked}")
     if keep.all():
         return table, []
+    return _rows(table, keep), [f"{int(keep.sum())} of {len(keep)} rows were selected."]
+
+
+def _rows(table: Table, keep: Bools) -> Table:
     columns = {name: values[keep] for name, values in table.columns.items()}
     lines = None if table.lines is None else table.lines[keep]
-    note = f"{int(keep.sum())} of {len(keep)} rows were selected."
-    return replace(table, columns=columns, lines=lines), [note]
+    return replace(table, columns=columns, lines=lines)
 
 
 def _same(cell: Any, value: str) -> bool:

@@ -7,7 +7,6 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from ventbench.base.files import example
 from ventbench.recordings import RecordingError, check, load, write
 
 
@@ -96,6 +95,13 @@ def test_missing_columns(table, tmp_path):
     assert f"{path}, column pressure: missing column pressure." in str(check(path).problems[0])
 
 
+def test_a_spreadsheet_is_sent_to_the_import(tmp_path):
+    (path := tmp_path / "breaths.xlsx").write_bytes(b"PK\x03\x04")
+    (problem,) = check(path).problems
+    assert "spreadsheet" in problem.what
+    assert "data import" in problem.advice
+
+
 def test_the_file_of_another_ventilator_is_sent_to_its_reader(tmp_path):
     names = ("run", "test", "breath", "cmd_inh_valve", "cmd_exh_valve", "R", "C", "pressure")
     path = tmp_path / "rw.parquet"
@@ -104,22 +110,3 @@ def test_the_file_of_another_ventilator_is_sent_to_its_reader(tmp_path):
         RecordingError, match=r"missing columns id, breath_id.*data import --select"
     ):
         load(path)
-
-
-def test_a_spreadsheet_is_a_recording_too(tmp_path):
-    pytest.importorskip("openpyxl", reason="needs the extra ventbench[excel]")
-    breaths = load(example("concealed"))[:2]
-    path = tmp_path / "breaths.xlsx"
-    table = breaths.to_frame()
-    table.to_excel(path, index=False)
-    again = load(path)
-    np.testing.assert_array_equal(again.pressure, breaths.pressure)
-    assert again.sha256 is not None
-    report = check(path)
-    assert (report.ok, report.kind, report.breaths) == (True, "xlsx", 2)
-    table.loc[4, "u_in"] = 130.0
-    table.to_excel(path, index=False)
-    (problem,) = check(path).problems
-    assert (problem.column, problem.line) == ("u_in", 6), "the row that a spreadsheet shows"
-    path.write_bytes(b"PK\x03\x04 and no more")
-    assert "cannot be read" in str(check(path).problems[0])

@@ -170,7 +170,7 @@ def _text(value: np.generic) -> str:
 
 
 #: Formats of files, and a table in memory.
-Kind = Literal["csv", "csv.gz", "parquet", "xlsx", "table"]
+Kind = Literal["csv", "csv.gz", "parquet", "table"]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from ventbench.base.errors import InputTypeError, require
+from ventbench.base.errors import InputTypeError
 from ventbench.base.files import sha256
 from ventbench.recordings.schema import (
     COLUMNS,
@@ -247,7 +247,7 @@ def open_bytes(path: str | os.PathLike[str], kind: Kind) -> IO[bytes]:
 
 @dataclass
 class ParquetSource(Source):
-    """A Parquet file, a spreadsheet, or a table in memory."""
+    """A Parquet file, or a table in memory."""
 
     kind: Kind = "parquet"
     table: pa.Table | None = None  #: the table in memory; None for Parquet.
@@ -326,12 +326,10 @@ def open_source(path: str | os.PathLike[str] | pd.DataFrame) -> Source:
     if not isinstance(path, str | os.PathLike):
         return _table_source(path)
     kind = kind_of(path)
-    if kind == "xlsx":
-        return _spreadsheet_source(str(path))
     return ParquetSource(str(path)) if kind == "parquet" else CsvSource(str(path), kind)
 
 
-def _table_source(frame: object, file: str = _TABLE, kind: Kind = "table") -> ParquetSource:
+def _table_source(frame: object) -> ParquetSource:
     import pandas as pd
     import pyarrow as pa
 
@@ -344,29 +342,14 @@ def _table_source(frame: object, file: str = _TABLE, kind: Kind = "table") -> Pa
         table = pa.Table.from_pandas(named, preserve_index=False)
     except (pa.ArrowException, ValueError) as error:
         what = f"the table cannot be read ({str(error).splitlines()[0]})"
-        raise fail(file, what, "Write numbers in every column.") from None
-    return ParquetSource(file, kind, table)
-
-
-def _spreadsheet_source(file: str) -> ParquetSource:
-    """First sheet of a workbook; its rows count from the header."""
-    import zipfile
-
-    import pandas as pd
-
-    require("openpyxl", extra="excel", what="spreadsheets")
-    try:
-        frame = pd.read_excel(file)
-    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
-        what = f"the spreadsheet cannot be read ({str(error).splitlines()[0]})"
-        raise fail(file, what, "Save it again, or as CSV.") from None
-    return _table_source(frame, file, "xlsx")
+        raise fail(_TABLE, what, "Write numbers in every column.") from None
+    return ParquetSource(_TABLE, "table", table)
 
 
 def locate(source: Source, rows: Collection[int]) -> Mapping[int, Place]:
     """Find data rows (0 for the first) in a file: CSV lines and cells, or Parquet rows from 1."""
     if isinstance(source, ParquetSource):
-        return {row: (row + 1 + (source.kind == "xlsx"), {}) for row in rows}
+        return {row: (row + 1, {}) for row in rows}
     return locate_rows(source.file, source.kind, source.names, rows)
 
 
@@ -396,14 +379,13 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
         raise fail(name, "this is not a Parquet file", advice)
     if first.startswith(b"\x1f\x8b"):
         return "csv.gz"
-    if first.startswith(b"PK\x03\x04") and name.endswith(".xlsx"):
-        return "xlsx"
+    spreadsheet = first == b"PK\x03\x04" and name.endswith(".xlsx")
+    if spreadsheet or first in (b"MATL", b"\x89HDF"):
+        what = {b"MATL": "MATLAB", b"\x89HDF": "HDF5 (MATLAB 7.3)"}.get(first, "spreadsheet")
+        advice = "Bring it into the schema with `ventbench data import`."
+        raise fail(name, f"this is a {what} file", advice)
     if first.startswith(b"PK\x03\x04"):
         raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
     if first.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise fail(name, "this is UTF-16 text", "Save the file as UTF-8.")
-    if first in (b"MATL", b"\x89HDF"):
-        what = "MATLAB" if first == b"MATL" else "HDF5 (MATLAB 7.3)"
-        advice = "Bring it into the schema with `ventbench data import`."
-        raise fail(name, f"this is a {what} file", advice)
     return "csv"

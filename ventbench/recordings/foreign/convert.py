@@ -96,8 +96,8 @@ def import_recording(
     """Read a recording of another laboratory.
 
     Args:
-        path: text with any separator (also gzipped), a spreadsheet, Parquet, MATLAB, EDF, BDF, the
-            header (.hea) of a WFDB record, or PIRDS as JSON; or what has been read of one.
+        path: text with any separator (also gzipped), a spreadsheet, Parquet, MATLAB, EDF, BDF, or
+            the header (.hea) of a WFDB record; or what has been read of one.
         columns: role of each column, ``{"Paw": "pressure"}``; the roles are ``time``,
             ``pressure``, ``flow``, ``volume``, ``u_in``, ``u_out``, ``R``, ``C``, ``breath``,
             ``group`` (a breath ends where it changes), ``target`` (inspiration is where it is

@@ -121,7 +121,7 @@ def test_the_corrected_plant_can_be_diagnosed_itself(recording, tmp_path, calls)
     out = tmp_path / "out"
     run(recording, "--lung", "R20C50", "--out", out)
     corrected = out / "corrected.json"
-    found = load_plants(corrected)
+    found, _ = load_plants(corrected)
     assert list(found) == ["R20C50"]
     run(recording, "--lung", "R20C50", "--plant", corrected, "--out", tmp_path / "again")
     given = calls[-1]["simulator"]

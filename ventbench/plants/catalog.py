@@ -6,7 +6,7 @@ What is given                         What it stands for
 ``frozen`` (or ``hybrid``)            the official simulators
 ``physics``                           R-C lungs at their labels
 ``two_balloon``, ...                  another family of ``plant_files.FAMILIES`` at the labels
-``FILE.json``, ``FILE.npz``           plants of some lungs, such as a ``corrected.json``
+``FILE.json``                         plants of some lungs, such as a ``corrected.json``
 ``FOLDER``                            what ``ventbench train simulator`` wrote
 ``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
 ``module:name``                       a function or class in plain Python, or a plant; or a mapping
@@ -40,7 +40,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
-from ventbench.plants.plant_files import FAMILIES, load_plants, origin
+from ventbench.plants.plant_files import FAMILIES, load_plants
 from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
 from ventbench.plants.simulators import Simulators
 from ventbench.plants.single_compartment import single_compartment
@@ -190,7 +190,7 @@ def _by_text(text: str) -> Simulators:
         return _imported(module, attribute)
     raise InputError(
         f"--plant {text!r}: there is no such file, nor a simulator of that name; choose "
-        f"{', '.join(names())}, a file of plants (.json, .npz), a CSV or Parquet file of simulated "
+        f"{', '.join(names())}, a file of plants (.json), a CSV or Parquet file of simulated "
         "pressures, or module:function"
     )
 
@@ -285,7 +285,8 @@ def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
 def _plant_file(path: Path) -> Simulators:
     digest = files.sha256(path)
     about = _about("file", digest, file=path.name)
-    return replace(_plants(load_plants(path), path.name, about, digest), origin=origin(path))
+    plants, origin = load_plants(path)
+    return replace(_plants(plants, path.name, about, digest), origin=origin)
 
 
 def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:

@@ -24,8 +24,7 @@ from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.write import write
+from ventbench.recordings.breaths import Breaths, write
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.train.exploration import RANGES, explore

@@ -12,9 +12,8 @@ from proofs.challenge.contract import Answer
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.generators import generator_of
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import join
+from ventbench.recordings.breaths import join, write
 from ventbench.recordings.read import load
-from ventbench.recordings.write import write
 
 
 def record(folder: ChallengeFolder, secret: str, diagnoser: str) -> list[str]:

@@ -16,7 +16,7 @@ from ventbench.base.errors import InputError
 from ventbench.cli.data import app
 from ventbench.recordings import check, load, write
 from ventbench.recordings.foreign import import_recording, import_runs
-from ventbench.recordings.foreign.units import UNITS, conversion
+from ventbench.recordings.foreign.layouts import UNITS, conversion
 
 RATE, PERIOD = 50.0, 3.0
 

@@ -13,7 +13,7 @@ What is given                         What it stands for
 a plant                               that plant for every lung
 a mapping                             plants, functions or classes by lung id
 a function, class or object           a simulator in plain Python or NumPy; see
-                                      :mod:`~ventbench.plants.python_simulator`
+                                      :mod:`~ventbench.plants.simulators`
 an array                              simulated pressures of given breaths
 ====================================  ============================================================
 """
@@ -41,8 +41,7 @@ from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.plant_files import FAMILIES, load_plants
-from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
-from ventbench.plants.simulators import Simulators
+from ventbench.plants.simulators import PythonSimulator, Simulators, is_jax_plant, python_simulator
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
@@ -52,7 +51,7 @@ from ventbench.task.lungs import LUNGS, Lung, lung
 
 
 class Stepping(Protocol):
-    """A simulator in plain Python that runs sample by sample; see ``python_simulator``."""
+    """A simulator in plain Python that runs sample by sample; see ``simulators``."""
 
     @property
     def step(self) -> Callable[..., Any]:

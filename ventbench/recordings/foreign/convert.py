@@ -19,18 +19,21 @@ from numpy.typing import NDArray
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, arranged
-from ventbench.recordings.foreign.breath_onsets import (
+from ventbench.recordings.foreign.formats import read_table
+from ventbench.recordings.foreign.layouts import (
     LAYOUTS,
     ROLES,
     USUAL,
+    Conversion,
     Layout,
+    conversion,
     expiratory_valve,
     find_breaths,
+    in_file_unit,
     recognise,
+    stem,
 )
-from ventbench.recordings.foreign.formats import read_table
 from ventbench.recordings.foreign.tables import Table
-from ventbench.recordings.foreign.units import Conversion, conversion, in_file_unit, stem
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung

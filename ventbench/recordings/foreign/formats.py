@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError, require
-from ventbench.recordings.foreign.breath_onsets import USUAL
+from ventbench.recordings.foreign.layouts import USUAL, spelled, stem, unit_of
 from ventbench.recordings.foreign.tables import RATES, Table, read_spreadsheet, read_text
-from ventbench.recordings.foreign.units import spelled, stem, unit_of
 
 
 def read_table(

@@ -23,8 +23,7 @@ from ventbench.plants.stacking import stack
 from ventbench.task.lungs import LUNGS
 from ventbench.train.rl import episodes
 from ventbench.train.rl import train as parallel
-from ventbench.train.rl.dqn import DQN
-from ventbench.train.rl.ppo import PPO, PolicyGradient
+from ventbench.train.rl.learners import DQN, PPO, PolicyGradient
 
 PG = PolicyGradient(breaths=6, iterations=160, widths=(8,), learning_rate=1e-2)
 SMALL_PPO = PPO(breaths=12, iterations=4, widths=(8,), epochs=2, minibatches=2)

@@ -36,8 +36,7 @@ from ventbench.train.plants import (
     plants_to_train_on,
 )
 from ventbench.train.rl import episodes
-from ventbench.train.rl.dqn import DQN
-from ventbench.train.rl.ppo import PPO, PolicyGradient
+from ventbench.train.rl.learners import DQN, PPO, PolicyGradient
 
 #: Settings of a way of learning: hashable, static in ``jit``; their methods are pure.
 Method = PolicyGradient | PPO | DQN

@@ -159,14 +159,6 @@ def diagnose(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ],
     plant: PlantName = "physics",
-    simulated: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Instead of --plant: CSV or Parquet with breath_id, a column simulated (cmH2O) "
-            "and perhaps time_step (s); may be the recording itself with that column.",
-        ),
-    ] = None,
     drive: Annotated[
         str,
         typer.Option(
@@ -202,18 +194,16 @@ def diagnose(
     which every `--plant` option accepts.
 
     Sampling rates from 20 to 1000 Hz are taken as they are. A simulator in plain Python is
-    `--plant module:function`; one in another program writes `--simulated answers.csv`.
+    `--plant module:function`; one in another program writes `--plant answers.csv`, with breath_id,
+    a column simulated (cmH2O) and perhaps time_step (s): perhaps the recording with that column.
 
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
     """
     if drive not in ("auto", "valve", "flow"):
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
-    if simulated is not None and plant != "physics":
-        raise InputError("--simulated stands in place of --plant; give one of them")
-
     require("jinja2", "rerun")
     breaths = read_recording(recordings, clip=clip, pad=pad)
-    diagnosis = _diagnose(breaths, plant, simulated, lung, patient, drive)
+    diagnosis = _diagnose(breaths, plant, lung, patient, drive)
     written = diagnosis.save(out)
     console = told(diagnosis.as_dict(), json)
     verdict, *others = str(diagnosis).splitlines()
@@ -225,16 +215,15 @@ def diagnose(
 
 
 def _diagnose(
-    breaths: Breaths, plant: str, simulated: Path | None, lung: str | None, patient: bool,
-    drive: str,
+    breaths: Breaths, plant: str, lung: str | None, patient: bool, drive: str
 ) -> Diagnosis:  # fmt: skip
     """Diagnose with a progress bar that says what is done and how long it will take."""
     from ventbench.base import compilation
     from ventbench.diagnosis.diagnose import diagnose as find
-    from ventbench.plants.catalog import load_simulated, load_simulators
+    from ventbench.plants.catalog import load_simulators
 
     compilation.keep()
-    simulators = load_simulated(simulated, breaths) if simulated else load_simulators(plant)
+    simulators = load_simulators(plant)
     lungs = 1 if lung is not None else len(breaths.by_lung_index)
     notes().print(expected_time(len(breaths), lungs, compilation.is_warm()))
     with bar("diagnosing") as diagnosing:

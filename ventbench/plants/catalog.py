@@ -8,7 +8,7 @@ What is given                         What it stands for
 ``two_balloon``, ...                  another family of ``plant_files.FAMILIES`` at the labels
 ``FILE.json``                         plants of some lungs, such as a ``corrected.json``
 ``FOLDER``                            what ``ventbench train simulator`` wrote
-``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
+``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths
 ``module:name``                       a function or class in plain Python, or a plant; or a mapping
 a plant                               that plant for every lung
 a mapping                             plants, functions or classes by lung id
@@ -34,9 +34,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench import recordings
 from ventbench.base import files, precision
-from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
@@ -45,7 +43,7 @@ from ventbench.plants.simulators import PythonSimulator, Simulators, is_jax_plan
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.read import read_simulated
+from ventbench.recordings.read import COLUMNS, read_simulated, simulated_pressures
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNGS, Lung, lung
 
@@ -114,14 +112,6 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
     return _of_array(given, breaths)
 
 
-def load_simulated(path: str | Path, breaths: Breaths) -> Simulators:
-    """Simulated pressures in a table; see :func:`~ventbench.recordings.read.read_simulated`."""
-    digest, name = files.sha256(Path(path)) if Path(path).is_file() else None, Path(path).name
-    pressures = read_simulated(path, breaths)
-    about: dict[str, Any] = {"kind": "pressures", "file": name, "sha256": digest}
-    return _of_pressures(breaths, pressures, name, about, digest)
-
-
 def _is_python(value: Any) -> bool:
     """Whether a value is a simulator in plain Python: a function, or a class or object with step.
 
@@ -177,7 +167,7 @@ def _by_text(text: str) -> Simulators:
     if path.is_file():
         name = path.name.lower()
         if name.endswith((".csv", ".csv.gz", ".parquet")):
-            return _pressures_file(path)
+            return _of_table(read_simulated(path), path.name, str(path), files.sha256(path))
         if name.endswith(".fmu"):
             raise InputError(
                 f"{path} is an FMU, whose machine code nothing here runs; give --plant module:name "
@@ -322,13 +312,6 @@ def _imported(module: str, attribute: str) -> Simulators:
     )
 
 
-def _pressures_file(path: Path) -> Simulators:
-    breaths = recordings.load(path, pad=True)
-    digest = files.sha256(path)
-    about = _about("pressures", digest, file=path.name)
-    return _of_pressures(breaths, breaths.pressure, path.name, about, digest)
-
-
 def _of_array(given: Any, breaths: Breaths | None) -> Simulators:
     try:
         pressures = np.asarray(given, float)
@@ -339,17 +322,15 @@ def _of_array(given: Any, breaths: Breaths | None) -> Simulators:
         raise InputError(
             f"an array of simulated pressures, shape {pressures.shape}, needs {wanted}"
         )
-    return _of_pressures(breaths, pressures, "the given pressures", {"kind": "pressures"}, None)
+    columns = {name: getattr(breaths, name) for name in ("breath_id", "R", "C")}
+    table = {name: np.repeat(x, breaths.valid.sum(axis=1)) for name, x in columns.items()}
+    table |= {"u_in": breaths.u_in[breaths.valid], COLUMNS[0]: pressures[breaths.valid]}
+    return _of_table(table, "the given pressures", "the given pressures")
 
 
-def _of_pressures(
-    breaths: Breaths, pressures: Floats, name: str, about: Mapping[str, Any], sha256: str | None
+def _of_table(
+    table: Mapping[str, np.ndarray], name: str, file: str, sha256: str | None = None
 ) -> Simulators:
-    table = {}
-    for i, number in enumerate(breaths.breath_id.tolist()):
-        samples = breaths.valid[i]
-        if not np.all(np.isfinite(pressures[i, samples])):
-            raise InputError(f"{name}: breath {number} has a blank pressure; simulate every sample")
-        label = Lung(float(breaths.R[i]), float(breaths.C[i]))
-        table[number] = (label, breaths.u_in[i, samples], pressures[i, samples])
-    return Simulators("pressures", name, about, sha256=sha256, _table=table)
+    about = _about("pressures", sha256, **({} if sha256 is None else {"file": name}))
+    answers = partial(simulated_pressures, table, file, sha256=sha256)
+    return Simulators("pressures", name, about, sha256=sha256, _answers=answers)

@@ -37,9 +37,6 @@ from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import Lung, lung
 from ventbench.task.rollouts import open_loop
 
-#: Commands of a table of simulated pressures may differ from the recorded ones by rounding, %.
-_SAME_COMMAND = 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class Simulators:
@@ -62,7 +59,7 @@ class Simulators:
     _training: frozen.Frozen | None = field(default=None, repr=False)
     _make: Callable[[Lung], Plant] | None = None
     _function: PythonSimulator | None = None
-    _table: Mapping[int, tuple[Lung, Floats, Floats]] = field(default_factory=dict, repr=False)
+    _answers: Callable[[Breaths], Floats] | None = field(default=None, repr=False)
     #: JSON values that a file of plants says of its making, such as the recording that they were
     #: fitted to and its breaths that no fit has seen.
     origin: Mapping[str, Any] = field(default_factory=dict, repr=False)
@@ -184,8 +181,9 @@ class Simulators:
         """
         if self._function is not None:
             return self._by_function(self._function, breaths, progress)
-        if self._for_breaths is None:
-            answers = self._by_table(breaths)
+        if self._answers is not None:
+            answers = self._answers(breaths)
+            answers[~np.isfinite(breaths.pressure[:, 0])] = np.nan
             if progress is not None:
                 progress(len(breaths))
             return answers
@@ -274,30 +272,6 @@ class Simulators:
         if not np.all(np.isfinite(pressure)):
             raise InputError(f"{self.name} answered to {what} with a pressure that is not finite")
         return pressure
-
-    def _by_table(self, breaths: Breaths) -> Floats:
-        answers = np.full(breaths.pressure.shape, np.nan)
-        for i, number in enumerate(breaths.breath_id.tolist()):
-            if number not in self._table:
-                raise InputError(f"{self.name} has no breath {number} of the recording")
-            label, u_in, pressure = self._table[number]
-            samples = int(np.count_nonzero(breaths.valid[i]))
-            if label.id != breaths.lung_ids[i] or len(pressure) != samples:
-                raise InputError(
-                    f"{self.name}: breath {number} is of lung {label} with {len(pressure)} "
-                    f"samples, in the recording of {breaths.lung_ids[i]} with {samples}"
-                )
-            apart = np.abs(u_in - breaths.u_in[i, :samples])
-            if apart.max() > _SAME_COMMAND:
-                raise InputError(
-                    f"{self.name}: breath {number} has another command than the recording, u_in "
-                    f"{u_in[apart.argmax()]:g} at sample {apart.argmax() + 1}; simulate the "
-                    "recorded commands"
-                )
-            if np.isfinite(breaths.pressure[i, 0]):
-                answers[i, :samples] = pressure
-                answers[i, samples:] = pressure[-1]
-        return answers
 
 
 #: What a simulator may ask for, in the order of arguments that have other names.

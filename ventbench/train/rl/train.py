@@ -122,7 +122,7 @@ def _start(
     numbers = jnp.asarray(np.asarray(seeds, np.uint32))
     keys = jax.vmap(jax.random.key)(numbers)
     states = jax.vmap(method.init)(keys)
-    best = jax.vmap(method.policy)(states)
+    best = jax.vmap(method.policy)(states)  # type: ignore[arg-type]
     errors = np.asarray(jax.jit(jax.vmap(nominal_error))(plants, best))
     return _Run(states, best, jnp.full(len(seeds), jnp.inf)), errors
 

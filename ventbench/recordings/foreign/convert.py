@@ -221,12 +221,11 @@ def import_recording(
 def import_runs(path: str | Path) -> dict[str, Breaths]:
     """Read each recording of a Parquet file whose layout tells several apart.
 
+    Errors are those of :func:`import_recording`.
+
     Returns:
         Breaths by the values of the columns that do, in the order of the file: of RespiraWorks by
         run and test, ``"2020-07-31-UFlow-Performance 4"``. Nothing of any other file.
-
-    Raises:
-        InputError: as :func:`import_recording`.
     """
     import pyarrow as pa
     from pyarrow import parquet

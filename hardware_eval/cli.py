@@ -367,7 +367,6 @@ def collect(
     from ventbench.cli.options import bar
     from ventbench.task import protocol
     from ventbench.task.lungs import scored_lung
-    from ventbench.train.exploration import Limits
 
     label = scored_lung(lung).id
     highest = protocol.SAFETY_PRESSURE
@@ -380,7 +379,7 @@ def collect(
             raise typer.Exit(1)
         with bar("exploring") as exploring:
             done = collection.collect(
-                bench, label, breaths, out, seed=seed, limits=Limits(ease=ease),
+                bench, label, breaths, out, seed=seed, ease=ease,
                 about={"device": ev.device_about(line)},
                 progress=lambda number: exploring(number, breaths),
             )  # fmt: skip

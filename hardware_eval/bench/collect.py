@@ -24,11 +24,10 @@ from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.wire.client import LinkError, NoAnswerError, RefusedError
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.write import write
+from ventbench.recordings.breaths import Breaths, write
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
-from ventbench.train.exploration import RANGES, Limits, explore
+from ventbench.train.exploration import RANGES, explore
 
 #: Rest before a breath in time constants of the labelled lung with its expiratory valve, and its
 #: limits, s.
@@ -134,7 +133,7 @@ class BenchVentilator:
 
 def collect(
     bench: Bench, lung: str, count: int, out: Path, *, seed: int = 0,
-    limits: Limits | None = None, about: dict[str, Any] | None = None,
+    ease: float = protocol.SAFETY_PRESSURE, about: dict[str, Any] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Collection:  # fmt: skip
     """Explore a lung at all PIPs in turn; a folder with breaths of the same seed is continued.
@@ -145,7 +144,7 @@ def collect(
         count: breaths in all.
         out: folder of the log and the recording.
         seed: of the disturbances.
-        limits: pressures at which exploring is interrupted.
+        ease: pressure above which the valve closes, cmH2O.
         about: device, operator and notes for the log.
         progress: called with the number of finished breaths.
 
@@ -177,7 +176,7 @@ def collect(
                 # A breath at a time, each with a seed of its own: a restart repeats none.
                 own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
                 with realtime.priority():
-                    explore(ventilator, lung, 1, seed=own, limits=limits, pips=(pip,))
+                    explore(ventilator, lung, 1, seed=own, ease=ease, pips=(pip,))
                 run = PlannedRun(number, "explore", "exploration", lung, pip, number)
                 line = ventilator.log.line(run, 0, 0)
                 log.append({**line, "whole": not ventilator.stopped})

@@ -35,7 +35,7 @@ from ventbench.board import record
 from ventbench.board.record import HardwareRecord
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import Submission, open_submission
-from ventbench.recordings.write import write
+from ventbench.recordings.breaths import write
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 

@@ -16,8 +16,7 @@ import msgspec
 from proofs.challenge.vocabulary import PARAMETERS, PUBLISHED, TERMS
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.write import write
+from ventbench.recordings.breaths import Breaths, write
 
 #: Names of the files in a case's folder.
 RECORDING, QUESTION = "recording.csv", "case.json"

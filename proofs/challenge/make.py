@@ -19,9 +19,8 @@ from proofs.challenge.questions import DrawnCase, Kind
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.breaths import Breaths, write
 from ventbench.recordings.schema import COLUMNS
-from ventbench.recordings.write import write
 
 #: Limits of a recorded pressure.
 PRESSURE = COLUMNS["pressure"]

@@ -25,7 +25,7 @@ from ventbench.base.executor import executor, results
 from ventbench.entries.scoring import score
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
-from ventbench.plants.stacking import take
+from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.train import pid_grid
 
@@ -56,7 +56,7 @@ def reproduce_paper(
 
     Args:
         recordings: folder of the public recordings: errors by horizon are measured again.
-        workers: processes for grid and entries; 0 for this one alone.
+        workers: processes for entries; 0 for this one alone.
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given. They must
             contain those of the paper's table.
         stored: results of minutes; those of ``proofs/paper/stored.json`` if not given.
@@ -78,14 +78,11 @@ def reproduce_paper(
     if recordings is not None:
         tell("errors by horizon", 0.0)
         kept["horizon"] = simulators.measure_horizon(Path(recordings) / MEASURED)
+    tell("PID grid", 0.1)
+    tried = pid_grid.paper_gains() if gains is None else gains
+    error = pid_grid.errors(official.plants, tried)
+    grid = pid_grid.PIDGrid(LUNG_IDS, protocol.PIPS, tried, error)
     with executor(workers) as pool:
-        tell("PID grid", 0.1)
-        grid = pid_grid.search(
-            {name: take(official.plants, index) for index, name in enumerate(LUNG_IDS)},
-            settings=official.about(),
-            gains=gains,
-            pool=pool,
-        )
         jobs = dict(ENTRIES)
         scored: dict[str, tuple[Floats, Floats]] = {}
         for name, result in results(pool, _scored, jobs):

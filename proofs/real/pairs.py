@@ -20,10 +20,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
+
 from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import Mechanics, identify
-from ventbench.mechanics.respiraworks import RespiraWorksRun, breaths_of, load_respiraworks
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.foreign import import_runs
 
 Split = Literal["development", "sealed"]
 
@@ -86,16 +88,14 @@ def load(folder: Path) -> Material:
     if not (folder / FLOW_FILE).is_file():
         raise InputError(f"{folder / FLOW_FILE} is missing; the real pairs need it")
     runs, drives = {}, {}
-    for run in load_respiraworks(folder / FLOW_FILE):
-        breaths = breaths_of(run)
+    read = import_runs(folder / FLOW_FILE)
+    columns = pd.read_parquet(folder / FLOW_FILE, columns=["run", "test", "drive"])
+    for day, test, drive in columns.drop_duplicates().itertuples(index=False):
+        breaths = read[f"{day} {test}"]
         if breaths.flow is not None or breaths.volume is not None:
-            runs[_run_name(run)] = breaths
-            drives[_run_name(run)] = "blower" if "blower" in run.drive else "proportional valve"
+            runs[f"{day}#{test}"] = breaths
+            drives[f"{day}#{test}"] = "blower" if "blower" in drive else "proportional valve"
     return Material(runs, drives)
-
-
-def _run_name(run: RespiraWorksRun) -> str:
-    return f"{run.name}#{run.test}"
 
 
 def pairs(material: Material) -> list[Pair]:

@@ -84,7 +84,7 @@ def _removed(breaths: Breaths, out: Path) -> Setting | str:
         return "rc names nothing that all breaths share, so that there is nothing to remove"
     plants = {
         lung: without(plant, (name,)) if isinstance(plant, Physics) else plant
-        for lung, plant in load_plants(corrected).items()
+        for lung, plant in load_plants(corrected)[0].items()
     }
     about = {"removed": name, "corrected_sha256": files.sha256(corrected)}
     return Setting(breaths, plants, f"corrected R-C without {name}", name, about)

@@ -25,7 +25,7 @@ from ventbench.task.lungs import LUNG_IDS, Lung
 from ventbench.task.metrics import bootstrap
 from ventbench.train import pid_grid
 from ventbench.train.rl import episodes
-from ventbench.train.rl.ppo import PolicyGradient
+from ventbench.train.rl.learners import PolicyGradient
 from ventbench.train.rl.train import METHODS, Method, TrainedPolicies, method_for, train
 
 #: Share of the values that the interquartile mean cuts off at each end.

@@ -121,7 +121,7 @@ def test_the_corrected_plant_can_be_diagnosed_itself(recording, tmp_path, calls)
     out = tmp_path / "out"
     run(recording, "--lung", "R20C50", "--out", out)
     corrected = out / "corrected.json"
-    found = load_plants(corrected)
+    found, _ = load_plants(corrected)
     assert list(found) == ["R20C50"]
     run(recording, "--lung", "R20C50", "--plant", corrected, "--out", tmp_path / "again")
     given = calls[-1]["simulator"]
@@ -132,7 +132,7 @@ def test_the_corrected_plant_can_be_diagnosed_itself(recording, tmp_path, calls)
 
 
 def test_simulated_pressures_and_drive(recording, tmp_path, calls):
-    """A table beside the recording stands in place of --plant; --drive is passed on."""
+    """A table of simulated pressures is a plant; --drive is passed on."""
     import pandas as pd
 
     table = pd.read_csv(recording)
@@ -140,13 +140,11 @@ def test_simulated_pressures_and_drive(recording, tmp_path, calls):
     both = tmp_path / "both.csv"
     table.to_csv(both, index=False)
     out = tmp_path / "out"
-    run(both, "--simulated", both, "--drive", "valve", "--out", out)
+    run(both, "--plant", both, "--drive", "valve", "--out", out)
     given = calls[0]["simulator"]
     assert (given.kind, given.name, calls[0]["drive"]) == ("pressures", "both.csv", "valve")
     breaths = calls[0]["breaths"]
     np.testing.assert_allclose(given.pressures(breaths), breaths.pressure + 1.0, atol=1e-6)
-    message = run(both, "--simulated", both, "--plant", "frozen", "--out", out, code=2)
-    assert "--simulated stands in place of --plant" in message
     assert "choose auto, valve or flow" in run(both, "--drive", "gas", "--out", out, code=2)
 
 

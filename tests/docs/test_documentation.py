@@ -50,7 +50,7 @@ WHOLE = {
 #: Examples of ``--help`` that run as they are written.
 EXAMPLES = (
     "ventbench lungs", "ventbench stressors", "ventbench doctor",
-    "ventbench simulate", "ventbench open-loop", "ventbench fmu", "ventbench coverage",
+    "ventbench simulate", "ventbench open-loop", "ventbench coverage",
     "ventbench data import",
     "ventbench board show", "ventbench board new-key",
 )  # fmt: skip

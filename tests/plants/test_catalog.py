@@ -201,12 +201,13 @@ def test_simulated_pressures_from_a_table_or_an_array(breaths, tmp_path):
             found.pressures(other)
         with pytest.raises(InputError, match="another command than the recording"):
             found.pressures(dataclasses.replace(breaths, u_in=breaths.u_in + 1.0))
-        with pytest.raises(InputError, match="is of lung R20C50"):
+        with pytest.raises(InputError, match=r"of R 20, in the recording of lung R5C50"):
             found.pressures(dataclasses.replace(breaths, R=np.full(3, 5.0)))
     with pytest.raises(InputError, match="needs the breaths it answers to"):
         load_simulators(simulated)
-    with pytest.raises(InputError, match="blank pressure"):
-        load_simulators(np.full_like(simulated, np.nan), breaths=breaths)
+    blank = load_simulators(np.full_like(simulated, np.nan), breaths=breaths)
+    with pytest.raises(InputError, match="blank or infinite simulated"):
+        blank.pressures(breaths)
 
 
 @pytest.mark.parametrize("given", ["magic", "no/such/file.json", "a b:c", 3 + 0j, object()])
@@ -214,6 +215,12 @@ def test_what_stands_for_nothing_is_refused(given):
     refused = r"choose frozen|stands for no simulators|give a name, a file"
     with pytest.raises(InputError, match=refused):
         load_simulators(given)
+
+
+def test_machine_code_of_others_is_refused_with_the_way_to_run_it(tmp_path):
+    (path := tmp_path / "lung.FMU").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"lung\.FMU is an FMU.*--plant module:name.*own_rig\.md"):
+        load_simulators(path)
 
 
 def test_learned_simulators_know_what_they_have_seen(breaths):

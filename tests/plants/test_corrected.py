@@ -101,7 +101,7 @@ def test_back_from_json_to_the_bit(base, textbook, tmp_path):
     plant = Corrected(textbook, with_delay(gain=21.3), base)
     path = tmp_path / "corrected.json"
     save_plants(path, {"R20C50": plant})
-    found = load_plants(path)["R20C50"]
+    found = load_plants(path)[0]["R20C50"]
     assert type(found) is Corrected
     assert jax.tree.structure(found) == jax.tree.structure(plant)
     assert np.array_equal(run(found), run(plant))
@@ -122,7 +122,7 @@ def test_files_name_the_two_physics_wanted_and_had(tmp_path):
     }
     path = tmp_path / "corrected.json"
     path.write_text(json.dumps(content))
-    plant = load_plants(path)["R5C20"]
+    plant = load_plants(path)[0]["R5C20"]
     assert isinstance(plant, Corrected)
     assert (plant.with_mechanisms.R, plant.without_mechanisms.R) == (20.0, 10.0)
     save_plants(tmp_path / "again.json", {"R5C20": plant})

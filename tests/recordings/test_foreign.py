@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.io import savemat
 from typer.testing import CliRunner
@@ -14,8 +15,8 @@ import ventbench
 from ventbench.base.errors import InputError
 from ventbench.cli.data import app
 from ventbench.recordings import check, load, write
-from ventbench.recordings.foreign import import_recording
-from ventbench.recordings.foreign.units import UNITS, conversion
+from ventbench.recordings.foreign import import_recording, import_runs
+from ventbench.recordings.foreign.layouts import UNITS, conversion
 
 RATE, PERIOD = 50.0, 3.0
 
@@ -70,7 +71,7 @@ def test_units_are_exact_both_ways():
     for role, units in UNITS.items():
         for unit in units:
             change = conversion(role, unit)
-            back = change.invert(change.apply(values))
+            back = change.apply(values) * float(1 / change.factor)
             np.testing.assert_allclose(back, values, rtol=4e-16)
     assert conversion("flow", "lpm").apply(np.array([60.0]))[0] == 1000.0
     assert conversion("pressure", "kPa").apply(np.array([0.0980665]))[0] == pytest.approx(1.0)
@@ -126,6 +127,31 @@ def test_respiraworks_by_run_and_test(recordings_folder):
     assert imported.breaths.lung_ids[0] == "R20C20"
     assert len(imported.breaths) >= 7
     assert imported.breaths.flow is not None
+
+
+def test_runs_of_one_file_begin_before_their_numbers_change(tmp_path):
+    time = np.arange(1000) * 0.01
+    target = np.where((time % 4) < 1, 30.0, 5.0)
+    one = {
+        "run": "a day", "test": 1, "breath": np.repeat([0, 1, 2, 3], [30, 400, 500, 70]),
+        "time_step": time, "R": 20, "C": 50, "pressure": time, "target": target,
+        "flow": np.nan, "volume": 10.0 * time, "cmd_inh_valve": 0.0,
+    }  # fmt: skip
+    table = pd.concat([pd.DataFrame(one), pd.DataFrame(one | {"test": 2, "C": 10})])
+    table.to_parquet(tmp_path / "runs.parquet")
+    runs = import_runs(tmp_path / "runs.parquet")
+    assert {name: breaths.lung_ids[0] for name, breaths in runs.items()} == {
+        "a day 1": "R20C50", "a day 2": "R20C10",
+    }  # fmt: skip
+    breaths = runs["a day 1"]
+    # Cut 0.25 s before each breath, so that the steep rise lies within; the stub is left out.
+    assert breaths.valid.sum(axis=1).tolist() == [400, 500, 95]
+    assert breaths.pressure[1, 0] == pytest.approx(4.05)
+    assert breaths.time[:, 0].tolist() == [0.0, 0.0, 0.0]
+    assert breaths.flow is None
+    assert breaths.volume is not None
+    np.testing.assert_array_equal(breaths.u_out[0][breaths.valid[0]], target[5:405] < 17.5)
+    assert import_runs(ventbench.example("concealed")) == {}
 
 
 @pytest.fixture

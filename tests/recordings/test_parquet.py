@@ -7,8 +7,6 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from ventbench.base.files import example
-from ventbench.mechanics import load_respiraworks
 from ventbench.recordings import RecordingError, check, load, write
 
 
@@ -97,43 +95,18 @@ def test_missing_columns(table, tmp_path):
     assert f"{path}, column pressure: missing column pressure." in str(check(path).problems[0])
 
 
-def test_respiraworks_schema_has_a_loader_of_its_own(tmp_path):
-    n = 6
-    names = ["target", "cmd_inh_valve", "cmd_exh_valve", "cmd_psol", "dp_inhale", "dp_exhale"]
-    columns = {name: np.zeros(n) for name in ("pressure", "flow", "volume", *names)}
-    columns |= {"run": ["day"] * n, "test": [1, 1, 1, 2, 2, 2], "breath": [0, 0, 1] * 2}
-    columns |= {"time_step": [0.0, 0.01, 0.02] * 2, "R": [5] * n, "C": [50] * n}
-    columns |= {"drive": ["blower"] * n}
-    path = tmp_path / "rw.parquet"
-    parquet.write_table(pa.table(columns), path)
-    with pytest.raises(RecordingError, match="missing columns id, breath_id, u_in, u_out"):
-        load(path)
-    with pytest.raises(RecordingError, match="load_respiraworks"):
-        load(path)
-    runs = load_respiraworks(path)
-    assert [(run.name, run.test, run.R, run.C, len(run.time)) for run in runs] == [
-        ("day", 1, 5.0, 50.0, 3),
-        ("day", 2, 5.0, 50.0, 3),
-    ]
-    parquet.write_table(pa.table(columns).drop_columns(["flow"]), path)
-    with pytest.raises(RecordingError, match="missing columns flow"):
-        load_respiraworks(path)
-
-
-def test_a_spreadsheet_is_a_recording_too(tmp_path):
-    pytest.importorskip("openpyxl", reason="needs the extra ventbench[excel]")
-    breaths = load(example("concealed"))[:2]
-    path = tmp_path / "breaths.xlsx"
-    table = breaths.to_frame()
-    table.to_excel(path, index=False)
-    again = load(path)
-    np.testing.assert_array_equal(again.pressure, breaths.pressure)
-    assert again.sha256 is not None
-    report = check(path)
-    assert (report.ok, report.kind, report.breaths) == (True, "xlsx", 2)
-    table.loc[4, "u_in"] = 130.0
-    table.to_excel(path, index=False)
+def test_a_spreadsheet_is_sent_to_the_import(tmp_path):
+    (path := tmp_path / "breaths.xlsx").write_bytes(b"PK\x03\x04")
     (problem,) = check(path).problems
-    assert (problem.column, problem.line) == ("u_in", 6), "the row that a spreadsheet shows"
-    path.write_bytes(b"PK\x03\x04 and no more")
-    assert "cannot be read" in str(check(path).problems[0])
+    assert "spreadsheet" in problem.what
+    assert "data import" in problem.advice
+
+
+def test_the_file_of_another_ventilator_is_sent_to_its_reader(tmp_path):
+    names = ("run", "test", "breath", "cmd_inh_valve", "cmd_exh_valve", "R", "C", "pressure")
+    path = tmp_path / "rw.parquet"
+    parquet.write_table(pa.table({name: np.zeros(6) for name in names}), path)
+    with pytest.raises(
+        RecordingError, match=r"missing columns id, breath_id.*data import --select"
+    ):
+        load(path)

@@ -10,9 +10,8 @@ import pytest
 
 import ventbench
 from ventbench.base.errors import InputError
-from ventbench.plants.catalog import load_simulated
+from ventbench.plants.catalog import load_simulators
 from ventbench.recordings import load
-from ventbench.recordings.read import read_simulated
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +27,8 @@ def test_the_recording_itself_with_one_more_column(table, tmp_path):
     for name in ("both.csv", "both.parquet"):
         path = tmp_path / name
         table.to_csv(path, index=False) if name.endswith("csv") else table.to_parquet(path)
-        answers = read_simulated(path, recorded)
         expected = table.simulated.to_numpy().reshape(recorded.pressure.shape)
-        np.testing.assert_allclose(answers, expected)
-        found = load_simulated(path, recorded)
+        found = load_simulators(path)
         assert (found.kind, found.name) == ("pressures", name)
         np.testing.assert_allclose(found.pressures(recorded), expected)
         some = recorded.select([3, 1])
@@ -44,7 +41,7 @@ def test_another_sampling_is_interpolated_in_time(tmp_path):
     rows = [(i, t, 5.0 + 3.0 * t + i) for i in recorded.breath_id for t in fine]
     path = tmp_path / "fine.csv"
     pd.DataFrame(rows, columns=["breath_id", "time_step", "pressure"]).to_csv(path, index=False)
-    answers = read_simulated(path, recorded)
+    answers = load_simulators(path).pressures(recorded)
     np.testing.assert_allclose(answers, 5.0 + 3.0 * recorded.time + recorded.breath_id[:, None])
 
 
@@ -55,7 +52,7 @@ def test_a_short_breath_takes_its_own_rows(table, tmp_path):
     drop = table.index[table.breath_id == recorded.breath_id[0]][-5:]
     path = tmp_path / "short.csv"
     table.drop(drop).to_csv(path, index=False)
-    answers = read_simulated(path, dataclasses.replace(recorded, valid=valid))
+    answers = load_simulators(path).pressures(dataclasses.replace(recorded, valid=valid))
     assert np.all(answers[0, -5:] == answers[0, -6])
 
 
@@ -66,7 +63,7 @@ def test_messages(table, tmp_path):
     def refused(frame: pd.DataFrame, message: str) -> None:
         frame.to_csv(path, index=False)
         with pytest.raises(InputError, match=message):
-            read_simulated(path, recorded)
+            load_simulators(path).pressures(recorded)
 
     refused(table[["breath_id", "u_in"]], "columns breath_id and simulated are needed")
     refused(table[table.breath_id != 3], "no breath 3 of the recording")
@@ -74,5 +71,7 @@ def test_messages(table, tmp_path):
     refused(table.assign(simulated="high"), "not all are numbers")
     refused(table.drop(columns="time_step").iloc[1:], "add a column time_step")
     refused(table[table.time_step < 1.0], "simulate the whole breath")
-    with pytest.raises(InputError, match="no such file of simulated pressures"):
-        read_simulated(tmp_path / "none.csv", recorded)
+    refused(table.assign(R=5), "breath 1 is of R 5, in the recording of lung R20C50")
+    refused(table.assign(u_in=table.u_in + 1.0), "another command than the recording")
+    with pytest.raises(InputError, match="is the recording itself"):
+        load_simulators(ventbench.example("concealed")).pressures(recorded)

@@ -20,7 +20,6 @@ from ventbench.train.exploration import (
     RANGES,
     Disturbance,
     ExplorationRanges,
-    Limits,
     SimulatedVentilator,
     draw_disturbances,
     explore,
@@ -168,7 +167,6 @@ def test_exploring_stops_after_three_vented_breaths():
     assert found.notes == ("exploring stopped: 3 breaths were vented, above 60 cmH2O",)
     found = explore(Fake([5.0, 61.0, 5.0]), "R5C10", 2)
     assert (len(found), found.notes) == (2, ())
-    assert len(explore(Fake([5.0, 61.0, 5.0]), "R5C10", 9, limits=Limits(vented=5))) == 5
 
 
 def test_unknown_lungs_and_no_breaths_are_errors():

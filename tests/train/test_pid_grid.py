@@ -1,11 +1,9 @@
-"""The PID grid: against the scorer's rollout, in parts, its table, picture, result and command."""
+"""The PID grid: against the scorer's rollout, its table, picture, result and command."""
 
 from __future__ import annotations
 
 import io
 import json
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 
 import jax
 import numpy as np
@@ -15,7 +13,6 @@ from typer.testing import CliRunner
 
 from ventbench.base import precision
 from ventbench.base.errors import InputError
-from ventbench.base.executor import executor
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.entries.folder import submission_of
@@ -34,98 +31,12 @@ from ventbench.train.plants import plants_to_train_on
 
 GAINS = np.array([(p, i, d) for p in (0.0, 2.0, 5.0) for i in (0.0, 4.0) for d in (0.0, 1.0)])
 PLANTS = {lung.id: single_compartment(lung) for lung in LUNGS[:3]}
-SETTINGS = {"version": "textbook"}
-
-
-def search(**options) -> PIDGrid:
-    return pid_grid.search(PLANTS, settings=SETTINGS, gains=GAINS, part=5, **options)
 
 
 @pytest.fixture(scope="module")
 def whole() -> PIDGrid:
-    return search()
-
-
-def test_parts_make_up_the_whole_grid(whole):
-    expected = pid_grid.errors(stack(list(PLANTS.values())), GAINS)
-    np.testing.assert_allclose(whole.error, expected, rtol=1e-6)
-    assert whole.lungs == tuple(PLANTS)
-    assert whole.pips == protocol.PIPS
-
-
-def test_tells_how_far_it_is():
-    told = []
-    search(progress=lambda done, total: told.append((done, total)))
-    sizes = 6 * np.array([0, 5, 5, 2] + 2 * [5, 5, 2])
-    assert told == [(done, 3 * 12 * 6) for done in np.cumsum(sizes)]
-
-
-def test_goes_on_after_ctrl_c_without_computing_anything_twice(whole, tmp_path):
-    calls = []
-
-    def counted(plant, gains):
-        calls.append(len(gains))
-        return pid_grid.errors(stack([plant]), gains)[0]
-
-    def stop(done, total):
-        if done >= total / 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        search(folder=tmp_path, errors_of=counted, progress=stop)
-    assert sorted(path.name for path in tmp_path.glob("*.npy"))[:2] == [
-        "R5C10-0.npy", "R5C10-10.npy",
-    ]  # fmt: skip
-    before = len(calls)
-    assert 0 < before < 9
-    found = search(folder=tmp_path, errors_of=counted)
-    np.testing.assert_array_equal(found.error, whole.error)
-    assert len(calls) == 9
-    assert sum(calls) == 3 * len(GAINS)
-    search(folder=tmp_path, errors_of=counted)
-    assert len(calls) == 9
-
-
-def test_parts_of_another_search_are_refused(tmp_path):
-    search(folder=tmp_path)
-    with pytest.raises(InputError, match=r"other settings \(simulators\); delete it"):
-        pid_grid.search(PLANTS, settings={"version": "x"}, gains=GAINS, part=5, folder=tmp_path)
-
-
-@pytest.mark.parametrize("content", [b"", b"not an array"], ids=["empty", "text"])
-def test_a_damaged_part_is_named(tmp_path, content):
-    search(folder=tmp_path)
-    (tmp_path / "R5C20-5.npy").write_bytes(content)
-    with pytest.raises(InputError, match=r"R5C20-5\.npy is damaged, delete it"):
-        search(folder=tmp_path)
-    np.save(tmp_path / "R5C20-5.npy", np.zeros((5, 5), np.float32))
-    with pytest.raises(InputError, match=r"R5C20-5\.npy holds float32 \(5, 5\)"):
-        search(folder=tmp_path)
-
-
-def test_parts_may_end_in_any_order(whole):
-    with ThreadPoolExecutor(3) as pool:
-        np.testing.assert_allclose(search(pool=pool).error, whole.error, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_processes_give_the_same(whole):
-    with executor(2) as pool:
-        np.testing.assert_allclose(search(pool=pool).error, whole.error, rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("default")
-def test_dask_gives_the_same_grid(whole, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
-    started = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None,
-        host="127.0.0.1", local_directory=str(tmp_path),
-    )  # fmt: skip
-    with started as cluster, executor(0, cluster.scheduler_address) as pool:
-        found = search(pool=pool, folder=tmp_path / "parts")
-    np.testing.assert_allclose(found.error, whole.error, rtol=1e-6)
-    assert len(list((tmp_path / "parts").glob("*.npy"))) == 9
+    error = pid_grid.errors(stack(list(PLANTS.values())), GAINS)
+    return PIDGrid(tuple(PLANTS), protocol.PIPS, GAINS, error)
 
 
 def test_the_table_is_the_grid(whole, tmp_path):
@@ -241,7 +152,7 @@ PIDS = np.array([(2.0, 4.0, 0.0), (5.0, 5.0, 0.0), (0.0, 0.1, 0.0)])
 
 
 @pytest.mark.slow
-def test_gains_are_tuned_on_draws_of_their_own(monkeypatch):
+def test_gains_are_tuned_on_draws_of_their_own():
     told = []
     grid, result = pid_grid.tune_pid(gains=PIDS, draws=2, progress=lambda *x: told.append(x))
     assert told[-1] == (6 * 3 * 6, 6 * 3 * 6)
@@ -251,19 +162,6 @@ def test_gains_are_tuned_on_draws_of_their_own(monkeypatch):
     assert result["single"]["gains"] in good
     assert result["draws"] == 2
     assert pid_grid.TUNING_SEED != draws.DEVELOPMENT_SEED
-
-    asked = []
-
-    @contextmanager
-    def cluster(*where):
-        asked.append(where)
-        with ThreadPoolExecutor(2) as pool:
-            yield pool
-
-    monkeypatch.setattr(pid_grid, "executor", cluster)
-    _, again = pid_grid.tune_pid(gains=PIDS, draws=2, scheduler="tcp://elsewhere:8786")
-    assert asked == [(0, "tcp://elsewhere:8786")]
-    assert again == result
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,20 +14,17 @@ from ventbench.cli.options import (
     JsonFile,
     Pad,
     PlantName,
-    TrustFmu,
     bar,
     claim_out,
     known_lungs,
     notes,
     read_recording,
-    simulator_of,
     table_of,
     told,
 )
 
 if TYPE_CHECKING:
-    from ventbench.mechanics import Mechanics, SurveyedRun
-    from ventbench.plants.fmu import Fmu
+    from ventbench.mechanics import Mechanics
 
 
 def mechanics(
@@ -47,46 +43,43 @@ def mechanics(
 
     Needs no model of a valve and therefore accepts recordings of any ventilator. Reports R, C and
     further terms of the lung, whether its label holds, and which known settings it may be. Files of
-    one session share what is wrong with its sensors. For a RespiraWorks file it prints a Markdown
-    table of the runs.
+    one session, and RespiraWorks' runs of one day, share what is wrong with their sensors.
 
     Example: `ventbench mechanics lab.csv`
     """
-    if _is_respiraworks(recordings):
-        with bar(f"identifying the lungs of {recordings}") as identifying:
-            runs = _survey(recordings, identifying)
-        _say_runs(told([_run(run) for run in runs], json), runs)
-        return
-    named = _of_session(recordings, clip=clip, pad=pad)
-    console = told([_lung(lung) for lung in named.values()], json)
+    named = _of_runs(recordings) or _of_session(recordings, clip=clip, pad=pad)
+    console = told([{"name": name} | _lung(lung) for name, lung in named.items()], json)
     console.print(_table(named))
     for name, lung in named.items():
         for note in lung.notes:
             console.print(f"{name}: {note}")
 
 
-def _is_respiraworks(path: Path) -> bool:
-    """Whether a file is Parquet with runs and tests; its reader reports what is wrong with it."""
-    import pyarrow as pa
-    from pyarrow import parquet
+def _of_runs(path: Path) -> dict[str, Mechanics]:
+    """Lungs of a file of many runs, by run; those of a day are a session. None of other files."""
+    from ventbench.mechanics import identify, share_faults
+    from ventbench.recordings.foreign import import_runs
 
-    from ventbench.recordings.sources import kind_of
-
-    if path.is_dir() or kind_of(path) != "parquet":
-        return False
-    try:
-        return {"run", "test", "breath"} <= set(parquet.read_schema(path).names)
-    except (pa.ArrowException, OSError):
-        return False
-
-
-def _survey(path: Path, progress: Callable[[int, int], None]) -> tuple[SurveyedRun, ...]:
-    from ventbench.mechanics import survey
-
-    runs = survey(path, progress)
-    if all(run.mechanics is None for run in runs):
+    runs = import_runs(path)
+    measured = {
+        name: breaths
+        for name, breaths in runs.items()
+        if breaths.flow is not None or breaths.volume is not None
+    }
+    if runs and not measured:
         raise InputError(f"{path}: no run has flow or volume; log one of them beside pressure")
-    return runs
+    if len(measured) < len(runs):
+        left = len(runs) - len(measured)
+        notes().print(f"note: {left} of {len(runs)} runs have neither flow nor volume")
+    found: dict[str, Mechanics] = {}
+    with bar(f"identifying the lungs of {path}") as identifying:
+        for name, breaths in measured.items():
+            found[name] = identify(breaths)[0]
+            identifying(len(found), len(measured))
+    for day in {name.rpartition(" ")[0] for name in found}:
+        own = [name for name in found if name.rpartition(" ")[0] == day]
+        found |= zip(own, share_faults([found[name] for name in own]), strict=True)
+    return {f"{name}: {lung.label}": lung for name, lung in found.items()}
 
 
 def _of_session(path: Path, *, clip: bool, pad: bool) -> dict[str, Mechanics]:
@@ -127,25 +120,6 @@ def _lung(mechanics: Mechanics) -> dict[str, Any]:
     return files.json_values(plain)
 
 
-def _run(surveyed: SurveyedRun) -> dict[str, Any]:
-    run, mechanics = surveyed.run, surveyed.mechanics
-    about = {"run": run.name, "test": run.test, "drive": run.drive, "R": run.R, "C": run.C}
-    return about | {"mechanics": None if mechanics is None else _lung(mechanics)}
-
-
-def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
-    from ventbench.mechanics import survey_table
-
-    # Lines of a Markdown table must not be broken.
-    console.print(survey_table(runs), soft_wrap=True)
-    known = [run.mechanics for run in runs if run.mechanics is not None]
-    holds = sum(lung.match.label_matches for lung in known)
-    console.print(
-        f"\nThe label holds in {holds} of {len(known)} runs; {len(runs) - len(known)} more have "
-        "neither flow nor volume."
-    )
-
-
 def _table(lungs: dict[str, Mechanics]) -> Any:
     from ventbench.mechanics.labels import label_texts, tolerance_text, value_text
 
@@ -183,14 +157,6 @@ def diagnose(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ],
     plant: PlantName = "physics",
-    simulated: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Instead of --plant: CSV or Parquet with breath_id, a column simulated (cmH2O) "
-            "and perhaps time_step (s); may be the recording itself with that column.",
-        ),
-    ] = None,
     drive: Annotated[
         str,
         typer.Option(
@@ -213,7 +179,6 @@ def diagnose(
             "option the lung is a test lung, which makes no effort.",
         ),
     ] = False,
-    in_process: TrustFmu = False,
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
@@ -227,18 +192,16 @@ def diagnose(
     which every `--plant` option accepts.
 
     Sampling rates from 20 to 1000 Hz are taken as they are. A simulator in plain Python is
-    `--plant module:function`; one in another program writes `--simulated answers.csv`.
+    `--plant module:function`; one in another program writes `--plant answers.csv`, with breath_id,
+    a column simulated (cmH2O) and perhaps time_step (s): perhaps the recording with that column.
 
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
     """
     if drive not in ("auto", "valve", "flow"):
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
-    if simulated is not None and plant != "physics":
-        raise InputError("--simulated stands in place of --plant; give one of them")
-
     require("jinja2", "rerun")
     breaths = read_recording(recordings, clip=clip, pad=pad)
-    diagnosis = _diagnose(breaths, simulator_of(plant, in_process), simulated, lung, patient, drive)
+    diagnosis = _diagnose(breaths, plant, lung, patient, drive)
     written = diagnosis.save(out)
     console = told(diagnosis.as_dict(), json)
     verdict, *others = str(diagnosis).splitlines()
@@ -250,16 +213,15 @@ def diagnose(
 
 
 def _diagnose(
-    breaths: Breaths, plant: str | Fmu, simulated: Path | None, lung: str | None, patient: bool,
-    drive: str,
+    breaths: Breaths, plant: str, lung: str | None, patient: bool, drive: str
 ) -> Diagnosis:  # fmt: skip
     """Diagnose with a progress bar that says what is done and how long it will take."""
     from ventbench.base import compilation
     from ventbench.diagnosis.diagnose import diagnose as find
-    from ventbench.plants.catalog import load_simulated, load_simulators
+    from ventbench.plants.catalog import load_simulators
 
     compilation.keep()
-    simulators = load_simulated(simulated, breaths) if simulated else load_simulators(plant)
+    simulators = load_simulators(plant)
     lungs = 1 if lung is not None else len(breaths.by_lung_index)
     notes().print(expected_time(len(breaths), lungs, compilation.is_warm()))
     with bar("diagnosing") as diagnosing:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ventbench.entries.folder import Submission
-    from ventbench.plants.fmu import Fmu
     from ventbench.recordings.breaths import Breaths
 
 ResultT = TypeVar("ResultT")
@@ -125,10 +124,6 @@ PlantName = Annotated[
         "as corrected.json, a CSV or Parquet file of simulated pressures, or module:function.",
     ),
 ]
-TrustFmu = Annotated[
-    bool,
-    typer.Option("--in-process", help="Run the machine code of a --plant that is an FMU."),
-]
 Workers = Annotated[
     int,
     typer.Option(min=0, help="Number of processes; 0 uses this one, with all cores."),
@@ -147,15 +142,6 @@ RecordingsDir = Annotated[
         metavar="DIR", help="Folder of the public recordings; VENTBENCH_RECORDINGS by default."
     ),
 ]
-
-
-def simulator_of(plant: str, in_process: bool) -> str | Fmu:
-    """Return what ``--plant`` names; an FMU is opened only where its code is trusted."""
-    if not in_process or not plant.lower().endswith(".fmu"):
-        return plant
-    from ventbench.plants.fmu import Fmu
-
-    return Fmu(plant)
 
 
 def recordings_folder(given: Path | None) -> Path:
@@ -202,7 +188,8 @@ def table_of(
     table, kept = Table(title=title, caption=caption), set(left)
     for place, name in enumerate(columns):
         justify = "left" if place == 0 or name in kept else "right"
-        table.add_column(name, justify=justify, no_wrap=no_wrap)
+        overflow = "ellipsis" if no_wrap else "fold"
+        table.add_column(name, justify=justify, no_wrap=no_wrap, overflow=overflow)
     for row in rows:
         table.add_row(*row)
     return table

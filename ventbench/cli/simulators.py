@@ -1,4 +1,4 @@
-"""``ventbench lungs``, ``coverage``, ``simulate``, ``open-loop``, ``fmu``, ``view``, ``report``.
+"""``ventbench lungs``, ``coverage``, ``simulate``, ``open-loop``, ``view``, ``report``.
 
 What simulators are and answer, and pictures of the runs that were scored on them.
 """
@@ -18,11 +18,9 @@ from ventbench.cli.options import (
     JsonFile,
     Pad,
     PlantName,
-    TrustFmu,
     bar,
     known_lungs,
     read_recording,
-    simulator_of,
     table_of,
     told,
 )
@@ -127,7 +125,6 @@ def simulate(
         ),
     ] = None,
     plant: PlantName = "frozen",
-    in_process: TrustFmu = False,
 ) -> None:
     """Simulate the pressures for a file of valve commands, as CSV.
 
@@ -138,11 +135,10 @@ def simulate(
     """
     from ventbench import recordings, simulation
 
-    chosen = simulator_of(plant, in_process)
     with open(controls, encoding="utf-8-sig", errors="replace") as file:
         many = "breath_id" in file.readline().replace('"', "").strip().split(",")
     if many:
-        done = simulation.simulate_breaths(controls, lung=lung, simulator=chosen, start=start)
+        done = simulation.simulate_breaths(controls, lung=lung, simulator=plant, start=start)
         if out is None:
             typer.echo(done.to_frame().to_csv(index=False), nl=False)
         else:
@@ -150,7 +146,7 @@ def simulate(
         return
     if lung is None:
         raise InputError("--lung is needed: the file names no lung; give one such as R20C50")
-    text = simulation.simulate(controls, lung=lung, simulator=chosen, start=start).to_csv()
+    text = simulation.simulate(controls, lung=lung, simulator=plant, start=start).to_csv()
     if out is None:
         typer.echo(text, nl=False)
     else:
@@ -162,7 +158,6 @@ def open_loop(
         Path, typer.Argument(help="CSV, CSV.GZ or Parquet file in the public schema.")
     ],
     plant: PlantName = "frozen",
-    in_process: TrustFmu = False,
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
@@ -186,8 +181,7 @@ def open_loop(
             "simulator with"
         )
     with bar(f"simulating {len(breaths)} breaths") as simulating:
-        chosen = simulator_of(plant, in_process)
-        result = open_loop_report.open_loop(breaths, chosen, progress=simulating)
+        result = open_loop_report.open_loop(breaths, plant, progress=simulating)
     console = told(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
     for line in result.remarks():
@@ -206,23 +200,6 @@ def _open_loop_table(result: dict[str, Any]) -> Any:
     title = f"Open-loop MAE of the {result['plant']} simulators, cmH2O"
     columns = ("lung", "n", "mean", "median", "held-out", "95 %", "median")
     return table_of(title, columns, rows, no_wrap=True)
-
-
-def fmu(
-    lung: Annotated[str, typer.Option(help="Lung, such as R20C50.", autocompletion=known_lungs)],
-    out: Annotated[Path, typer.Option(metavar="FILE.fmu", help="File to write.")],
-    plant: PlantName = "frozen",
-) -> None:
-    """Write a lung as an FMU for co-simulation in another program (FMI 3.0).
-
-    It runs where Python can import ventbench.
-
-    Example: `ventbench fmu --lung R20C50 --out R20C50.fmu`
-    """
-    from ventbench.plants.catalog import load_simulators
-    from ventbench.plants.fmu import export
-
-    typer.echo(f"wrote {export(load_simulators(plant).plant(lung), out, lung=lung)}")
 
 
 Runs = Annotated[
@@ -295,4 +272,4 @@ def report(
     typer.echo(f"wrote {pages.write_report(out or runs[0] / 'report.html', loaded, scores)}")
 
 
-COMMANDS = (lungs, coverage, simulate, open_loop, fmu, view, report)
+COMMANDS = (lungs, coverage, simulate, open_loop, view, report)

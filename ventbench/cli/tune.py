@@ -141,8 +141,6 @@ def pid(
         Path,
         typer.Option(metavar="DIR", callback=claim_out, help="Folder for table, plot and result."),
     ] = Path("runs/pid"),
-    workers: Workers = 0,
-    scheduler: Scheduler = None,
     plant: PlantName = "frozen",
     draws: Annotated[
         int,
@@ -163,8 +161,7 @@ def pid(
 
     P, I and D each take the values 0, 0.1, ..., 0.9, 1, 2, ..., 10 %/cmH2O. On the frozen
     simulators a lung has all its rigs but the held-out one. The 100 best without noise also run on
-    draws that are for tuning alone, and the best there win. Ctrl-C keeps the finished parts; the
-    same command continues.
+    draws that are for tuning alone, and the best there win.
 
     Example: `ventbench tune pid --all --out runs/pid`
     """
@@ -184,9 +181,8 @@ def pid(
             written = [RESULT]
         else:
             grid, result = tune_pid(
-                names, out, draws=draws, workers=workers, scheduler=scheduler, each=not robust,
-                simulator=plant, progress=progress,
-            )  # fmt: skip
+                names, out, draws=draws, each=not robust, simulator=plant, progress=progress
+            )
             written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
     console = told(result, json)
     console.print(_table(result))

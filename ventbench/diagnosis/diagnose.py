@@ -117,7 +117,7 @@ def diagnose(
             simulated pressures of these breaths, cmH2O, ``(n, T)``, or a Python function of one
             breath's commands, ``f(u_in, u_out, dt, *, R, C, initial_pressure)``, that returns the
             pressures, cmH2O, ``(T,)``, or a class with ``step``, in plain Python or NumPy; see
-            :mod:`~ventbench.plants.python_simulator`.
+            :mod:`~ventbench.plants.simulators`.
         lung: use only the breaths of this label.
         patient: True if the lung is a patient's or an active simulator's, so that somebody may
             breathe; False for a test lung, which makes no effort.

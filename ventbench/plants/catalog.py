@@ -6,15 +6,14 @@ What is given                         What it stands for
 ``frozen`` (or ``hybrid``)            the official simulators
 ``physics``                           R-C lungs at their labels
 ``two_balloon``, ...                  another family of ``plant_files.FAMILIES`` at the labels
-``FILE.json``, ``FILE.npz``           plants of some lungs, such as a ``corrected.json``
+``FILE.json``                         plants of some lungs, such as a ``corrected.json``
 ``FOLDER``                            what ``ventbench train simulator`` wrote
-``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
+``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths
 ``module:name``                       a function or class in plain Python, or a plant; or a mapping
-an ``Fmu``                            an FMU that is trusted; see :mod:`~ventbench.plants.fmu`
 a plant                               that plant for every lung
 a mapping                             plants, functions or classes by lung id
 a function, class or object           a simulator in plain Python or NumPy; see
-                                      :mod:`~ventbench.plants.python_simulator`
+                                      :mod:`~ventbench.plants.simulators`
 an array                              simulated pressures of given breaths
 ====================================  ============================================================
 """
@@ -35,26 +34,22 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench import recordings
 from ventbench.base import files, precision
-from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
-from ventbench.plants.fmu import Fmu
-from ventbench.plants.plant_files import FAMILIES, load_plants, origin
-from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
-from ventbench.plants.simulators import Simulators
+from ventbench.plants.plant_files import FAMILIES, load_plants
+from ventbench.plants.simulators import PythonSimulator, Simulators, is_jax_plant, python_simulator
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.read import read_simulated
+from ventbench.recordings.read import COLUMNS, read_simulated, simulated_pressures
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNGS, Lung, lung
 
 
 class Stepping(Protocol):
-    """A simulator in plain Python that runs sample by sample; see ``python_simulator``."""
+    """A simulator in plain Python that runs sample by sample; see ``simulators``."""
 
     @property
     def step(self) -> Callable[..., Any]:
@@ -109,22 +104,12 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
             return _python_by_lung(given, "the given simulators")
         digest = _leaves_sha256(given)
         return _plants(dict(given), "the given plants", _about("plants", digest), digest)
-    if isinstance(given, Fmu):
-        return _of_function(given, given.path.name, given.sha256)
     if _is_python(given):
         name = getattr(given, "__qualname__", type(given).__name__)
         return _of_function(given, name)
     if isinstance(given, Plant):
         return _single(given, type(given).__name__, _leaves_sha256(given))
     return _of_array(given, breaths)
-
-
-def load_simulated(path: str | Path, breaths: Breaths) -> Simulators:
-    """Simulated pressures in a table; see :func:`~ventbench.recordings.read.read_simulated`."""
-    digest, name = files.sha256(Path(path)) if Path(path).is_file() else None, Path(path).name
-    pressures = read_simulated(path, breaths)
-    about: dict[str, Any] = {"kind": "pressures", "file": name, "sha256": digest}
-    return _of_pressures(breaths, pressures, name, about, digest)
 
 
 def _is_python(value: Any) -> bool:
@@ -182,12 +167,11 @@ def _by_text(text: str) -> Simulators:
     if path.is_file():
         name = path.name.lower()
         if name.endswith((".csv", ".csv.gz", ".parquet")):
-            return _pressures_file(path)
+            return _of_table(read_simulated(path), path.name, str(path), files.sha256(path))
         if name.endswith(".fmu"):
             raise InputError(
-                f"{path} holds machine code, which runs with all your rights. If you trust it, "
-                "simulate, open-loop and diagnose take it with --in-process, and functions of "
-                "Python as ventbench.plants.fmu.Fmu(path); a closed loop needs states to set back"
+                f"{path} is an FMU, whose machine code nothing here runs; give --plant module:name "
+                "of an object that steps it with fmpy, as docs/own_rig.md shows"
             )
         return _plant_file(path)
     module, colon, attribute = text.partition(":")
@@ -195,7 +179,7 @@ def _by_text(text: str) -> Simulators:
         return _imported(module, attribute)
     raise InputError(
         f"--plant {text!r}: there is no such file, nor a simulator of that name; choose "
-        f"{', '.join(names())}, a file of plants (.json, .npz), a CSV or Parquet file of simulated "
+        f"{', '.join(names())}, a file of plants (.json), a CSV or Parquet file of simulated "
         "pressures, or module:function"
     )
 
@@ -290,7 +274,8 @@ def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
 def _plant_file(path: Path) -> Simulators:
     digest = files.sha256(path)
     about = _about("file", digest, file=path.name)
-    return replace(_plants(load_plants(path), path.name, about, digest), origin=origin(path))
+    plants, origin = load_plants(path)
+    return replace(_plants(plants, path.name, about, digest), origin=origin)
 
 
 def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:
@@ -327,13 +312,6 @@ def _imported(module: str, attribute: str) -> Simulators:
     )
 
 
-def _pressures_file(path: Path) -> Simulators:
-    breaths = recordings.load(path, pad=True)
-    digest = files.sha256(path)
-    about = _about("pressures", digest, file=path.name)
-    return _of_pressures(breaths, breaths.pressure, path.name, about, digest)
-
-
 def _of_array(given: Any, breaths: Breaths | None) -> Simulators:
     try:
         pressures = np.asarray(given, float)
@@ -344,17 +322,15 @@ def _of_array(given: Any, breaths: Breaths | None) -> Simulators:
         raise InputError(
             f"an array of simulated pressures, shape {pressures.shape}, needs {wanted}"
         )
-    return _of_pressures(breaths, pressures, "the given pressures", {"kind": "pressures"}, None)
+    columns = {name: getattr(breaths, name) for name in ("breath_id", "R", "C")}
+    table = {name: np.repeat(x, breaths.valid.sum(axis=1)) for name, x in columns.items()}
+    table |= {"u_in": breaths.u_in[breaths.valid], COLUMNS[0]: pressures[breaths.valid]}
+    return _of_table(table, "the given pressures", "the given pressures")
 
 
-def _of_pressures(
-    breaths: Breaths, pressures: Floats, name: str, about: Mapping[str, Any], sha256: str | None
+def _of_table(
+    table: Mapping[str, np.ndarray], name: str, file: str, sha256: str | None = None
 ) -> Simulators:
-    table = {}
-    for i, number in enumerate(breaths.breath_id.tolist()):
-        samples = breaths.valid[i]
-        if not np.all(np.isfinite(pressures[i, samples])):
-            raise InputError(f"{name}: breath {number} has a blank pressure; simulate every sample")
-        label = Lung(float(breaths.R[i]), float(breaths.C[i]))
-        table[number] = (label, breaths.u_in[i, samples], pressures[i, samples])
-    return Simulators("pressures", name, about, sha256=sha256, _table=table)
+    about = _about("pressures", sha256, **({} if sha256 is None else {"file": name}))
+    answers = partial(simulated_pressures, table, file, sha256=sha256)
+    return Simulators("pressures", name, about, sha256=sha256, _answers=answers)

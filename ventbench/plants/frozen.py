@@ -226,7 +226,7 @@ def load(path: Path | None = None) -> Frozen:
         raise InputError(f"{folder() / ROLES} is damaged or changed: restore it")
     path = path or folder()
     manifest = _manifest(path)
-    members = load_plant(_checked(path, MEMBERS, manifest), as_array=np.asarray)
+    members = load_plant(_checked(path, MEMBERS, manifest))
     with np.load(_checked(path, SEEN, manifest), allow_pickle=False) as arrays:
         if "commands" not in arrays:
             raise InputError(

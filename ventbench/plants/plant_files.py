@@ -1,4 +1,4 @@
-"""Families of plants, one line each, and their files: JSON, or one ``.npz`` of arrays by path.
+"""Families of plants, one line each; plants by lung as JSON, a stack of them as ``.npz``.
 
 A family is known to files, ``--plant`` and the contract tests. Never pickle: a file can only name
 the plant types of :data:`FAMILIES`, by their class names. Numbers have full precision: what is read
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ventbench.base import files
@@ -34,9 +33,7 @@ from ventbench.task.lungs import Lung, lung
 class PlantFamily:
     """One kind of plant."""
 
-    #: class of the plants; files name it by the class's name, so that a class that is renamed needs
-    #: a line in :data:`RENAMED`.
-    plant: type
+    plant: type  #: class of the plants; files name it by the class's name.
     #: makes the plant of a lung at its label, if labels are all it needs. The family then has a
     #: name for ``--plant`` and goes through the contract tests of physics plants.
     for_lung: Callable[[Lung], Plant] | None = None
@@ -53,9 +50,6 @@ FAMILIES: dict[str, PlantFamily] = {
     "hybrid": PlantFamily(Hybrid),
     "learned": PlantFamily(Learned, parts=(Boundary, MLP)),
 }
-
-#: Today's class name by the name that older files have.
-RENAMED: dict[str, str] = {}
 
 #: Names of fields in plant files, by class and field, where they differ from the attribute's.
 FIELDS_IN_FILES: dict[str, dict[str, str]] = {
@@ -74,7 +68,7 @@ def stored_type(name: str) -> type:
         for family in FAMILIES.values()
         for kind in (family.plant, *family.parts)
     }
-    return types[RENAMED.get(name, name)]
+    return types[name]
 
 
 FORMAT = "ventbench-plants-1"
@@ -85,77 +79,50 @@ _STRUCTURE = "structure"
 def save_plants(
     path: Path, plants: Mapping[str, Plant], about: Mapping[str, Any] | None = None
 ) -> None:
-    """Write plants by lung id in one step, as JSON or, if the path ends so, as ``.npz``.
+    """Write plants by lung id as JSON in one step.
 
     ``about`` are JSON values that say where they come from.
 
     Raises:
-        ValueError: if a parameter of a JSON file is not finite.
+        ValueError: if a parameter is not finite.
         TypeError: if a plant has a part that no file can hold.
     """
     arrays: dict[str, np.ndarray] = {}
     lungs = {name: _encode(plant, name, arrays) for name, plant in plants.items()}
-    head = {"format": FORMAT, "about": dict(about or {}), "lungs": lungs}
-    if Path(path).suffix == ".npz":
-        _write_npz(path, head, arrays)
-        return
     stored = {
         name: {"dtype": str(array.dtype), "shape": list(array.shape), "values": array.tolist()}
         for name, array in arrays.items()
     }
+    head = {"format": FORMAT, "about": dict(about or {}), "lungs": lungs}
     files.write_json(path, {**head, "arrays": stored})
 
 
-def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict[str, Plant]:
+def load_plants(path: Path) -> tuple[dict[str, Plant], dict[str, Any]]:
     """Read what :func:`save_plants` wrote.
 
-    ``as_array`` makes the leaves; those of numpy take the precision in force where they are used.
-
     Returns:
-        Plants by the id of their lung, in the order of the file.
+        Plants by the id of their lung, in the order of the file, with NumPy leaves, which take the
+        precision in force where they are used; and what the file says of their making.
 
     Raises:
         InputError: if the file is not such a file, or names an unknown type of plant.
         OSError: if it cannot be read.
     """
     try:
-        head, arrays = _content(path)
+        head = json.loads(Path(path).read_bytes())
         if not isinstance(head, dict) or head.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
         if not head["lungs"]:
             raise ValueError("it holds no lung")
-        if "arrays" in head:
-            arrays = {name: _array(value) for name, value in head["arrays"].items()}
-        return {
-            lung(name).id: _decode(node, arrays, as_array) for name, node in head["lungs"].items()
-        }
+        arrays = {name: _array(value) for name, value in head["arrays"].items()}
+        plants = {lung(name).id: _decode(node, arrays) for name, node in head["lungs"].items()}
+        return plants, dict(head.get("about", {}))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         why = "it is no text" if isinstance(error, UnicodeDecodeError) else error
         raise InputError(
             f"{path} is not a file of plants ({why}); give a corrected.json that "
             "`ventbench diagnose` wrote"
         ) from error
-
-
-def origin(path: Path) -> dict[str, Any]:
-    """What a file of :func:`save_plants` says of the making of its plants; empty if nothing.
-
-    Raises:
-        OSError: if the file cannot be read.
-    """
-    try:
-        about = _content(path)[0]["about"]
-    except (KeyError, TypeError, ValueError):
-        return {}
-    return dict(about) if isinstance(about, dict) else {}
-
-
-def _content(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
-    """Structure, and the arrays that stand beside it in an ``.npz``."""
-    if Path(path).suffix != ".npz":
-        return json.loads(Path(path).read_bytes()), {}
-    with np.load(path, allow_pickle=False) as npz:
-        return json.loads(str(npz[_STRUCTURE])), dict(npz)
 
 
 def save_plant(path: Path, plant: Any) -> None:
@@ -165,14 +132,13 @@ def save_plant(path: Path, plant: Any) -> None:
         TypeError: if it has a part that no file can hold.
     """
     arrays: dict[str, np.ndarray] = {}
-    _write_npz(path, _encode(plant, "", arrays), arrays)
+    structure = np.array(json.dumps(_encode(plant, "", arrays), sort_keys=True))
+    content: dict[str, Any] = {**arrays, _STRUCTURE: structure}
+    files.write_atomically(path, lambda file: np.savez(file, **content))
 
 
-def load_plant(path: Path, as_array: Callable[[Any], Any] = jnp.asarray) -> Any:
-    """Read what :func:`save_plant` wrote.
-
-    ``as_array`` makes the leaves; the default gives them the precision that is in force,
-    ``numpy.asarray`` that of the file.
+def load_plant(path: Path) -> Any:
+    """Read what :func:`save_plant` wrote, with NumPy leaves of the precision of the file.
 
     Raises:
         InputError: if the file is not a plant file, or names an unknown type of plant.
@@ -180,17 +146,9 @@ def load_plant(path: Path, as_array: Callable[[Any], Any] = jnp.asarray) -> Any:
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return _decode(json.loads(str(arrays[_STRUCTURE])), arrays, as_array)
+            return _decode(json.loads(str(arrays[_STRUCTURE])), arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a plant file of ventbench: {error!r}") from error
-
-
-def _write_npz(path: Path, structure: Any, arrays: dict[str, np.ndarray]) -> None:
-    content: dict[str, Any] = {
-        **arrays,
-        _STRUCTURE: np.array(json.dumps(structure, sort_keys=True)),
-    }
-    files.write_atomically(path, lambda file: np.savez(file, **content))
 
 
 def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
@@ -212,17 +170,17 @@ def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     raise TypeError(f"{path}: a {type(value).__name__} cannot be stored in a plant file")
 
 
-def _decode(node: dict[str, Any], arrays: Any, as_array: Callable[[Any], Any]) -> Any:
+def _decode(node: dict[str, Any], arrays: Any) -> Any:
     if "type" in node:
         kind = stored_type(node["type"])
         in_file = FIELDS_IN_FILES.get(kind.__name__, {})
         attributes = {name: attribute for attribute, name in in_file.items()}
-        children = {name: _decode(x, arrays, as_array) for name, x in node["fields"].items()}
+        children = {name: _decode(x, arrays) for name, x in node["fields"].items()}
         return kind(**{str(attributes.get(name, name)): x for name, x in children.items()})
     if "tuple" in node:
-        return tuple(_decode(child, arrays, as_array) for child in node["tuple"])
+        return tuple(_decode(child, arrays) for child in node["tuple"])
     if "array" in node:
-        return as_array(arrays[node["array"]])
+        return np.asarray(arrays[node["array"]])
     return node["value"]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,38 +31,48 @@ if TYPE_CHECKING:
 #: Names of the column of simulated pressures, in the order in which they are looked for.
 COLUMNS = ("simulated", "simulated_pressure", "pressure_simulated", "pressure")
 
+#: Commands of a table may differ from the recorded ones by rounding, %.
+_SAME_COMMAND = 0.05
+
 #: Names of the column of times.
 _TIMES = ("time_step", "time")
 
 
-def read_simulated(path: str | os.PathLike[str], breaths: Breaths) -> Floats:
-    """Read simulated pressures of recorded breaths.
+def simulated_pressures(
+    table: Mapping[str, np.ndarray], name: str, breaths: Breaths, *, sha256: str | None = None
+) -> Floats:
+    """Simulated pressures of recorded breaths.
 
-    The table has ``breath_id`` and a column of :data:`COLUMNS` (``simulated`` if recorded pressures
-    stand beside it), and may have ``time_step``. Rows of a breath are in time order. If a breath
-    has another number of rows than the recording, its pressures are interpolated at the recorded
-    times; commands never are.
+    Rows of a breath are in time order. If it has another number of them than the recording, its
+    pressures are interpolated at the recorded times; commands never are.
 
     Args:
-        path: CSV, gzipped CSV or Parquet.
+        table: columns by name: ``breath_id`` and one of :data:`COLUMNS` (``simulated`` if recorded
+            pressures stand beside it). It may have ``time_step``; ``R``, ``C`` and ``u_in`` must be
+            those of the recording.
+        name: what messages call the table.
         breaths: n recorded breaths of T samples.
+        sha256: hash of the table's file, by which it is known from that of the recording.
 
     Returns:
         cmH2O, ``(n, T)``; padding repeats the last value.
 
     Raises:
-        InputError: if a column or a breath is missing, or the rows do not cover a breath.
+        InputError: if a column or a breath is missing, the rows do not cover a breath, or they are
+            those of another lung or command.
     """
-    table, file = _table(Path(path)), Path(path).name
-    names = [name for name in COLUMNS if name in table]
+    names = [column for column in COLUMNS if column in table]
     if "breath_id" not in table or not names:
         raise InputError(
-            f"{file}: columns breath_id and {COLUMNS[0]} are needed; it has {', '.join(table)}"
+            f"{name}: columns breath_id and {COLUMNS[0]} are needed; it has {', '.join(table)}"
         )
     column = names[0]
-    values = _numbers(table[column], file, column)
-    times = next((_numbers(table[name], file, name) for name in _TIMES if name in table), None)
-    ids = _numbers(table["breath_id"], file, "breath_id")
+    if column == COLUMNS[-1] and sha256 is not None and sha256 == breaths.sha256:
+        raise InputError(f"{name} is the recording itself; it has no column {COLUMNS[0]}")
+    values = _numbers(table[column], name, column)
+    times = next((_numbers(table[key], name, key) for key in _TIMES if key in table), None)
+    given = {key: _numbers(table[key], name, key) for key in ("R", "C", "u_in") if key in table}
+    ids = _numbers(table["breath_id"], name, "breath_id")
     order = np.argsort(ids, kind="stable")
     starts = np.searchsorted(ids[order], breaths.breath_id)
     ends = np.searchsorted(ids[order], breaths.breath_id, side="right")
@@ -70,19 +81,34 @@ def read_simulated(path: str | os.PathLike[str], breaths: Breaths) -> Floats:
         rows = order[starts[i] : ends[i]]
         wanted = breaths.time[i, breaths.valid[i]]
         if len(rows) == 0:
-            raise InputError(f"{file} has no breath {number} of the recording")
+            raise InputError(f"{name} has no breath {number} of the recording")
         own, at = values[rows], None if times is None else times[rows] - times[rows][0]
         if not np.all(np.isfinite(own)):
             raise InputError(
-                f"{file}: breath {number} has a blank or infinite {column}; simulate every sample"
+                f"{name}: breath {number} has a blank or infinite {column}; simulate every sample"
             )
+        for key in set(given) - {"u_in"}:
+            if given[key][rows[0]] != getattr(breaths, key)[i]:
+                raise InputError(
+                    f"{name}: breath {number} is of {key} {given[key][rows[0]]:g}, in the "
+                    f"recording of lung {breaths.lung_ids[i]}"
+                )
         if len(rows) != len(wanted):
             if at is None:
                 raise InputError(
-                    f"{file}: breath {number} has {len(rows)} rows, the recording {len(wanted)}; "
+                    f"{name}: breath {number} has {len(rows)} rows, the recording {len(wanted)}; "
                     "simulate the recorded samples, or add a column time_step, s"
                 )
-            own = _at_times(own, at, wanted, file, number)
+            own = _at_times(own, at, wanted, name, number)
+        elif "u_in" in given:
+            command = given["u_in"][rows]
+            apart = np.abs(command - breaths.u_in[i, breaths.valid[i]])
+            if np.nanmax(apart, initial=0.0) > _SAME_COMMAND:
+                k = int(np.nanargmax(apart))
+                raise InputError(
+                    f"{name}: breath {number} has another command than the recording, u_in "
+                    f"{command[k]:g} at sample {k + 1}; simulate the recorded commands"
+                )
         answers[i, : len(wanted)], answers[i, len(wanted) :] = own, own[-1]
     return answers
 
@@ -101,8 +127,12 @@ def _at_times(
     return np.interp(wanted, at, values)
 
 
-def _table(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a table by name."""
+def read_simulated(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a table of simulated pressures by name, of CSV, gzipped CSV or Parquet.
+
+    Raises:
+        InputError: if it cannot be read.
+    """
     import pyarrow as pa
     from pyarrow import csv, parquet
 
@@ -111,8 +141,6 @@ def _table(path: Path) -> dict[str, np.ndarray]:
             table = parquet.read_table(path)
         else:
             table = csv.read_csv(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file of simulated pressures") from None
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{path}: it cannot be read: {str(error).splitlines()[0]}") from None
     return {name: table.column(name).to_numpy() for name in dict.fromkeys(table.column_names)}

@@ -21,7 +21,7 @@ class RecordingReport:
     """The result of `check`."""
 
     file: str  #: the path as the caller wrote it.
-    #: `csv`, `csv.gz`, `parquet` or `xlsx`, or None if the file cannot be read.
+    #: `csv`, `csv.gz` or `parquet`, or None if the file cannot be read.
     kind: str | None = None
     sha256: str | None = None  #: SHA-256 of the file, hex, or None if it cannot be read to its end.
     problems: tuple[RecordingProblem, ...] = ()  #: the first problems, in file order.

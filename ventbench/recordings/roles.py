@@ -1,8 +1,8 @@
 """Whether columns are what they are called: roles against the physics of a ventilated lung.
 
-Every figure is one number a breath, so that a file of any size is judged block by block. The sign
-of the flow needs no valve: over whole breaths a ventilator does work on a passive lung, so that
-pressure and flow correlate; where they do the opposite, flow is counted from the patient.
+Every figure is one number a breath. The sign of the flow needs no valve: over whole breaths a
+ventilator does work on a passive lung, so that pressure and flow correlate; where they do the
+opposite, flow is counted from the patient.
 """
 
 from __future__ import annotations

@@ -170,7 +170,7 @@ def _text(value: np.generic) -> str:
 
 
 #: Formats of files, and a table in memory.
-Kind = Literal["csv", "csv.gz", "parquet", "xlsx", "table"]
+Kind = Literal["csv", "csv.gz", "parquet", "table"]
 
 
 @dataclass(frozen=True)
@@ -257,8 +257,8 @@ def check_header(file: str, names: Sequence[str], line: int | None) -> tuple[Rec
 def _advice(names: Sequence[str], missing: Sequence[str]) -> str:
     if set(names) >= _RESPIRAWORKS:
         return (
-            "This is a RespiraWorks file, of another ventilator and with other columns: read it "
-            "with ventbench.mechanics.load_respiraworks."
+            "This is a RespiraWorks file: `ventbench mechanics` takes it, and `ventbench data "
+            "import --select run=... --select test=...` brings a run into the schema."
         )
     if len(names) == 1 and any(mark in names[0] for mark in ";\t|"):
         return "The columns must be separated by commas; `ventbench data import` reads others."

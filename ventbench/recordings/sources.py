@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from ventbench.base.errors import InputTypeError, require
+from ventbench.base.errors import InputTypeError
 from ventbench.base.files import sha256
 from ventbench.recordings.schema import (
     COLUMNS,
@@ -141,12 +141,10 @@ def _header(file: str, kind: Kind) -> tuple[str, ...]:
     return tuple(next(csv.reader([text])))
 
 
-#: A cell that is sound, as regular expressions; the parser accepts the same ones.
-_BLANK = "|".join([text for text in BLANKS if text]) + "|"
+#: A number that is sound, as the parser takes it; whole ones fit 64 bits.
 _DECIMAL = r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-_FLOAT = rf"[ \t]*[+-]?(?:{_DECIMAL}|(?i:nan|inf|infinity))[ \t]*|{_BLANK}"
-_WHOLE = rf"[ \t]*-?[0-9]{{1,18}}[ \t]*|{_BLANK}"
-_LARGEST = (1 << 63) - 1
+_NUMBER = re.compile(rf"[ \t]*[+-]?(?:{_DECIMAL}|(?i:nan|inf|infinity))[ \t]*")
+_WHOLE = re.compile(r"[ \t]*(-?[0-9]{1,19})[ \t]*")
 
 
 def data_lines(file: str, kind: Kind) -> Iterator[tuple[int, bytes]]:
@@ -178,29 +176,16 @@ def text_problems(
     file: str, kind: Kind, names: Sequence[str]
 ) -> tuple[list[RecordingProblem], int]:
     """Cells that are not numbers and rows of too few or too many cells: the first, and how many."""
-    sound = re.compile(",".join(map(_pattern, names)).encode())
-    cell_patterns = {name: re.compile(_pattern(name)) for name in names if name in COLUMNS}
     problems: list[RecordingProblem] = []
     total = 0
     for number, text in data_lines(file, kind):
-        if sound.fullmatch(text):
-            continue
-        in_line = _in_line(file, number, text, names, cell_patterns)
+        in_line = _in_line(file, number, text, names)
         total += len(in_line)
         problems += in_line[: SHOWN - len(problems)]
     return problems, total
 
 
-def _pattern(name: str) -> str:
-    if name not in COLUMNS:
-        return '[^,"]*'
-    return f"(?:{_WHOLE if COLUMNS[name].whole else _FLOAT})"
-
-
-def _in_line(
-    file: str, number: int, text: bytes, names: Sequence[str],
-    patterns: dict[str, re.Pattern[str]],
-) -> list[RecordingProblem]:  # fmt: skip
+def _in_line(file: str, number: int, text: bytes, names: Sequence[str]) -> list[RecordingProblem]:
     cells = _cells(text)
     if cells is None:
         return [RecordingProblem(file, "the line is not CSV", "Fix the row.", number)]
@@ -209,7 +194,7 @@ def _in_line(
         return [RecordingProblem(file, what, "Fix the row.", number)]
     problems = []
     for name, cell in zip(names, cells, strict=True):
-        if name in patterns and not (patterns[name].fullmatch(cell) or _fits(cell, name)):
+        if name in COLUMNS and not _is_sound(cell, COLUMNS[name].whole):
             kind = "a whole number" if COLUMNS[name].whole else "a number"
             value = cell if len(cell) <= 40 else cell[:37] + "..."
             what, advice = f"{value!r} is not {kind}", "Fix the cell."
@@ -222,20 +207,20 @@ def _in_line(
     return problems
 
 
+def _is_sound(cell: str, whole: bool) -> bool:
+    if cell in BLANKS:
+        return True
+    if not whole:
+        return _NUMBER.fullmatch(cell) is not None
+    match = _WHOLE.fullmatch(cell)
+    return match is not None and -(1 << 63) <= int(match[1]) < 1 << 63
+
+
 def _cells(text: bytes) -> list[str] | None:
     try:
         return next(csv.reader([text.decode("utf-8", "backslashreplace")]))
     except csv.Error:
         return None
-
-
-def _fits(cell: str, name: str) -> bool:
-    """Whether an integer of 19 digits fits 64 bits."""
-    plain = cell.strip(" \t")
-    digits = plain.removeprefix("-")
-    if not (COLUMNS[name].whole and digits.isascii() and digits.isdigit() and len(digits) == 19):
-        return False
-    return -_LARGEST - 1 <= int(plain) <= _LARGEST
 
 
 def open_bytes(path: str | os.PathLike[str], kind: Kind) -> IO[bytes]:
@@ -247,7 +232,7 @@ def open_bytes(path: str | os.PathLike[str], kind: Kind) -> IO[bytes]:
 
 @dataclass
 class ParquetSource(Source):
-    """A Parquet file, a spreadsheet, or a table in memory."""
+    """A Parquet file, or a table in memory."""
 
     kind: Kind = "parquet"
     table: pa.Table | None = None  #: the table in memory; None for Parquet.
@@ -326,12 +311,10 @@ def open_source(path: str | os.PathLike[str] | pd.DataFrame) -> Source:
     if not isinstance(path, str | os.PathLike):
         return _table_source(path)
     kind = kind_of(path)
-    if kind == "xlsx":
-        return _spreadsheet_source(str(path))
     return ParquetSource(str(path)) if kind == "parquet" else CsvSource(str(path), kind)
 
 
-def _table_source(frame: object, file: str = _TABLE, kind: Kind = "table") -> ParquetSource:
+def _table_source(frame: object) -> ParquetSource:
     import pandas as pd
     import pyarrow as pa
 
@@ -344,29 +327,14 @@ def _table_source(frame: object, file: str = _TABLE, kind: Kind = "table") -> Pa
         table = pa.Table.from_pandas(named, preserve_index=False)
     except (pa.ArrowException, ValueError) as error:
         what = f"the table cannot be read ({str(error).splitlines()[0]})"
-        raise fail(file, what, "Write numbers in every column.") from None
-    return ParquetSource(file, kind, table)
-
-
-def _spreadsheet_source(file: str) -> ParquetSource:
-    """First sheet of a workbook; its rows count from the header."""
-    import zipfile
-
-    import pandas as pd
-
-    require("openpyxl", extra="excel", what="spreadsheets")
-    try:
-        frame = pd.read_excel(file)
-    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
-        what = f"the spreadsheet cannot be read ({str(error).splitlines()[0]})"
-        raise fail(file, what, "Save it again, or as CSV.") from None
-    return _table_source(frame, file, "xlsx")
+        raise fail(_TABLE, what, "Write numbers in every column.") from None
+    return ParquetSource(_TABLE, "table", table)
 
 
 def locate(source: Source, rows: Collection[int]) -> Mapping[int, Place]:
     """Find data rows (0 for the first) in a file: CSV lines and cells, or Parquet rows from 1."""
     if isinstance(source, ParquetSource):
-        return {row: (row + 1 + (source.kind == "xlsx"), {}) for row in rows}
+        return {row: (row + 1, {}) for row in rows}
     return locate_rows(source.file, source.kind, source.names, rows)
 
 
@@ -396,14 +364,13 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
         raise fail(name, "this is not a Parquet file", advice)
     if first.startswith(b"\x1f\x8b"):
         return "csv.gz"
-    if first.startswith(b"PK\x03\x04") and name.endswith(".xlsx"):
-        return "xlsx"
+    spreadsheet = first == b"PK\x03\x04" and name.endswith(".xlsx")
+    if spreadsheet or first in (b"MATL", b"\x89HDF"):
+        what = {b"MATL": "MATLAB", b"\x89HDF": "HDF5 (MATLAB 7.3)"}.get(first, "spreadsheet")
+        advice = "Bring it into the schema with `ventbench data import`."
+        raise fail(name, f"this is a {what} file", advice)
     if first.startswith(b"PK\x03\x04"):
         raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
     if first.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise fail(name, "this is UTF-16 text", "Save the file as UTF-8.")
-    if first in (b"MATL", b"\x89HDF"):
-        what = "MATLAB" if first == b"MATL" else "HDF5 (MATLAB 7.3)"
-        advice = "Bring it into the schema with `ventbench data import`."
-        raise fail(name, f"this is a {what} file", advice)
     return "csv"

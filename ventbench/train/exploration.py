@@ -84,17 +84,9 @@ def draw_disturbances(
     )
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Pressures at which exploring is interrupted."""
-
-    #: the valve closes while the measured pressure is above ``min(60, PIP + 15)`` cmH2O or this,
-    #: cmH2O.
-    ease: float = protocol.SAFETY_PRESSURE
-    #: pressure above which the expiratory valve opens for the rest of the inspiration, as it does
-    #: where a pressure is not a number, cmH2O.
-    vent: float = protocol.SAFETY_PRESSURE
-    vented: int = 3  #: breaths that ended so, after which exploring stops.
+#: Pressure above which the expiratory valve opens for the rest of the inspiration, as it does where
+#: a pressure is not a number, cmH2O; and breaths that ended so, after which exploring stops.
+_VENT, _VENTED_BREATHS = protocol.SAFETY_PRESSURE, 3
 
 
 class VentilatorInterface(Protocol):
@@ -153,9 +145,8 @@ def explore(
     *,
     seed: int = 0,
     ranges: ExplorationRanges | None = None,
-    limits: Limits | None = None,
+    ease: float = protocol.SAFETY_PRESSURE,
     pips: tuple[float, ...] = protocol.PIPS,
-    peep: float = protocol.PEEP,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Breaths:
     """Explore a ventilator; the PIPs take turns.
@@ -166,13 +157,13 @@ def explore(
         breaths: number of breaths.
         seed: seed of all disturbances, which are the same for the same seed and width.
         ranges: the paper's for that lung if not given.
-        limits: see :class:`Limits`.
+        ease: the valve closes while the measured pressure is above ``min(60, PIP + 15)`` or this,
+            cmH2O.
         pips: cmH2O.
-        peep: cmH2O.
         progress: called with how many breaths are done, and how many were asked for.
 
     Returns:
-        Whole breaths; fewer than asked for, with a note, where the limits ended it.
+        Whole breaths; fewer than asked for, with a note, where too many were vented.
 
     Raises:
         InputError: if there are no ranges for the lung, or not one breath was asked for.
@@ -181,14 +172,14 @@ def explore(
         raise InputError(f"no ranges to explore {lung_id} in; they exist for {', '.join(RANGES)}")
     if breaths < 1:
         raise InputError(f"{breaths} breaths to explore: ask for one at least")
-    setting, ranges, limits = parse_lung(lung_id), ranges or RANGES[lung_id], limits or Limits()
+    setting, ranges = parse_lung(lung_id), ranges or RANGES[lung_id]
     random = np.random.default_rng(seed)
     columns: list[tuple[Floats, Floats, Floats]] = []
     done = vented = 0
-    while done < breaths and vented < limits.vented:
+    while done < breaths and vented < _VENTED_BREATHS:
         pip = np.array([pips[(done + k) % len(pips)] for k in range(ventilator.width)])
         added = draw_disturbances(random, ranges, ventilator.width)
-        made = _breaths(ventilator, pip, peep, ranges, limits, added)
+        made = _breaths(ventilator, pip, ranges, ease, added)
         columns.append(made)
         done += ventilator.width
         progress(min(done, breaths), breaths)
@@ -200,27 +191,26 @@ def explore(
     made = make_breaths(
         np.arange(n) + 1, np.full(n, setting.R), np.full(n, setting.C), time, u_in, u_out, pressure
     )
-    if vented < limits.vented:
+    if vented < _VENTED_BREATHS:
         return made
-    note = f"exploring stopped: {vented} breaths were vented, above {limits.vent:g} cmH2O"
+    note = f"exploring stopped: {vented} breaths were vented, above {_VENT:g} cmH2O"
     return replace(made, notes=(note,))
 
 
 def _breaths(
     ventilator: VentilatorInterface,
     pip: Floats,
-    peep: float,
     ranges: ExplorationRanges,
-    limits: Limits,
+    ease: float,
     added: Disturbance,
 ) -> tuple[Floats, Floats, Floats]:
     """One breath on each lung of the ventilator: u_in, u_out and pressure, ``(width, steps)``."""
-    ease = np.minimum(safety_limit(pip), limits.ease)
+    gate = np.minimum(safety_limit(pip), ease)
     vented = np.zeros(ventilator.width, bool)
     before = integral = derivative = np.zeros(ventilator.width)
     a = ventilator.dt / (ventilator.dt + TIME_CONSTANT)
     P, I, D = ranges.gains  # noqa: E741
-    pressure, rows = ventilator.start(peep), []
+    pressure, rows = ventilator.start(protocol.PEEP), []
     for step in range(protocol.BREATH_STEPS):
         if step < protocol.INSPIRATION_STEPS:
             # A sensor that gives no number must not poison the averages; it vents, see below.
@@ -230,8 +220,8 @@ def _breaths(
             before = error
             wanted = P * error + I * integral + D * derivative + added.at(step * ventilator.dt)
             # "Not below" instead of "above", so that a sensor that gives no number is unsafe.
-            vented |= ~(pressure <= limits.vent)
-            closed = vented | ~(pressure <= ease)
+            vented |= ~(pressure <= _VENT)
+            closed = vented | ~(pressure <= gate)
             u_in = np.where(closed, 0.0, np.clip(wanted, 0.0, protocol.U_MAX))
             u_out = vented.astype(float)
         else:

@@ -1,8 +1,7 @@
 """The exhaustive search for PID gains: every PID of the paper's grid on every lung and PIP.
 
 Without noise each breath of a run is the same, as each begins at rest and the PID starts anew, so
-one inspiration stands for all. The search is dealt out in parts, which run in this process, in
-others or on a cluster; a finished part is never computed twice.
+one inspiration stands for all.
 
 The best of the grid then run on draws for tuning, whose noise a high gain amplifies, and the least
 mean error wins: the gains of the entries ``pid_best`` and ``pid_robust``.
@@ -12,9 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import shutil
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ventbench.base import files, precision
 from ventbench.base.arrays import Floats
-from ventbench.base.errors import InputError
-from ventbench.base.executor import InProcess, executor, in_order
-from ventbench.base.resume import ARRAY, WorkFolder, fingerprint, kept_results
 from ventbench.controllers.pid import PID
 from ventbench.plants.catalog import Given
 from ventbench.plants.rigs import Rigs, load_rigs
@@ -60,8 +54,8 @@ TUNING = "tuning"
 TUNING_SEED = hashlib.sha256(b"ventbench, draws for tuning").digest()
 
 
-#: Files of a search in its folder.
-TABLE, RESULT, PARTS = "grid.parquet", "best.json", "parts"
+#: Files of a result in its folder.
+TABLE, RESULT = "grid.parquet", "best.json"
 
 #: Called with the number of trajectories done, and of all.
 Progress = Callable[[int, int], None]
@@ -163,66 +157,6 @@ class PIDGrid:
         files.write_atomically(path, lambda file: table.to_parquet(file, index=False))
 
 
-def search(
-    plants: Mapping[str, Plant],
-    *,
-    settings: Mapping[str, Any],
-    folder: Path | None = None,
-    gains: Floats | None = None,
-    pool: Executor | None = None,
-    part: int = BATCH,
-    progress: Progress | None = None,
-    errors_of: Callable[[Plant, Floats], NDArray[np.float32]] | None = None,
-) -> PIDGrid:
-    """Run the grid of gains on plants without noise.
-
-    Args:
-        plants: one plant a lung, by its id.
-        settings: JSON values that identify the plants.
-        folder: folder in which finished parts are kept, so that an interrupted search continues;
-            nowhere if not given.
-        gains: P, I and D, shape ``(G, 3)``; the paper's if not given.
-        pool: executor that computes the parts; this process if not given.
-        part: gains of a part.
-        progress: see :data:`Progress`.
-        errors_of: computes a part: errors of gains on one plant, shape ``(g, N)``; by
-            :func:`errors` if not given.
-
-    Raises:
-        InputError: if the folder holds parts of another search, or a worker died.
-    """
-    grid = paper_gains() if gains is None else gains
-    firsts = range(0, len(grid), part)
-    total = len(plants) * len(grid) * len(protocol.PIPS)
-    about = {"simulators": dict(settings), "gains": fingerprint(grid), "part": part}
-    work = None if folder is None else WorkFolder(folder, about)
-    finished: dict[str, NDArray[np.float32]] = {}
-    jobs: dict[str, tuple[Any, Floats]] = {}
-    for lung, plant in plants.items():
-        plain = jax.tree.map(np.asarray, plant)
-        jobs |= {f"{lung}-{first}": (plain, grid[first : first + part]) for first in firsts}
-    done, report = 0, progress or (lambda done, total: None)
-    report(done, total)
-    compute = errors_of or _part_errors
-    for name, error in kept_results(work, pool or InProcess(), compute, jobs, ARRAY):
-        shape = (len(jobs[name][1]), len(protocol.PIPS))
-        if error.shape != shape or error.dtype != np.float32:
-            path = name if work is None else work.path(name, ARRAY)
-            raise InputError(f"{path} holds {error.dtype} {error.shape}, not float32 {shape}")
-        finished[name] = error
-        done += error.size
-        report(done, total)
-    error = np.stack(
-        [np.concatenate([finished[f"{lung}-{first}"] for first in firsts]) for lung in plants]
-    )
-    return PIDGrid(tuple(plants), protocol.PIPS, grid, error)
-
-
-def _part_errors(plant: Plant, gains: Floats) -> NDArray[np.float32]:
-    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], plant)
-    return errors(stacked, gains)[0]
-
-
 @jax.jit
 def _pressures(plant: Plant, gains: Array, cells: Scenario) -> Array:
     def run(gains: Array) -> Array:
@@ -237,15 +171,16 @@ def _nominal_plants(rigs: Rigs, lung: int) -> Plant:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[at], rigs.plants)
 
 
-def _nominal_grid(rigs: Rigs, lungs: Sequence[int], gains: Floats, **options: Any) -> PIDGrid:
-    """Mean error without noise over the rigs of some lungs, member 0; see :func:`search`."""
-    plants = {rigs.lungs[at].id: _nominal_plants(rigs, at) for at in lungs}
-    settings = dict(rigs.about) | {"rigs": rigs.sessions}
-    return search(plants, settings=settings, gains=gains, errors_of=_mean_errors, **options)
-
-
-def _mean_errors(plants: Plant, gains: Floats) -> NDArray[np.float32]:
-    return errors(plants, gains).mean(axis=0, dtype=np.float64).astype(np.float32)
+def _nominal_grid(rigs: Rigs, lungs: Sequence[int], gains: Floats, progress: Progress) -> PIDGrid:
+    """Mean error without noise over the rigs of some lungs, member 0."""
+    each = len(gains) * len(protocol.PIPS)
+    found: list[Floats] = []
+    progress(0, len(lungs) * each)
+    for lung in lungs:
+        found.append(errors(_nominal_plants(rigs, lung), gains).mean(axis=0, dtype=np.float64))
+        progress(len(found) * each, len(lungs) * each)
+    names = tuple(rigs.lungs[lung].id for lung in lungs)
+    return PIDGrid(names, protocol.PIPS, gains, np.stack(found).astype(np.float32))
 
 
 def drawn_errors(
@@ -286,8 +221,6 @@ def tune_pid(
     *,
     gains: ArrayLike | None = None,
     draws: int = draw_tables.COUNT,
-    workers: int = 0,
-    scheduler: str | None = None,
     each: bool = True,
     single: bool | None = None,
     simulator: Given = "frozen",
@@ -301,14 +234,11 @@ def tune_pid(
 
     Args:
         lungs: ids; all lungs of the simulators if not given.
-        out: folder for ``grid.parquet``, the whole grid, and ``best.json``, the result; parts of an
-            interrupted search lie there too, and the same call continues from them. Nothing is
+        out: folder for ``grid.parquet``, the whole grid, and ``best.json``, the result. Nothing is
             written if not given.
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
         draws: number of draws for tuning that decide among the :data:`FINALISTS` best; 0 to decide
             without noise, as in the paper.
-        workers: processes; 0 for this one alone, which uses all cores.
-        scheduler: address of a Dask scheduler instead, such as ``tcp://host:8786``.
         each: put the best gains of each lung into the result.
         single: put the best gains for all lungs together into the result; if not given, where there
             are several lungs.
@@ -321,8 +251,7 @@ def tune_pid(
         their errors without weights, on the draws without the first step if there are any.
 
     Raises:
-        InputError: if a lung or a simulator is unknown, ``out`` holds an unfinished search with
-            other settings, or a worker died.
+        InputError: if a lung or a simulator is unknown.
 
     Examples:
         >>> from ventbench import tune_pid
@@ -336,32 +265,22 @@ def tune_pid(
     where = [trained_on.names.index(name) for name in names]
     weights, single = trained_on.weights[where], len(names) > 1 if single is None else single
     rigs = load_rigs(simulator).of_training
-    parts = None if out is None else Path(out) / PARTS
     count = FINALISTS if draws else 1
-    with executor(workers, scheduler) as pool:
-        grid = _nominal_grid(
-            rigs,
-            where,
-            paper_gains() if gains is None else np.asarray(gains, float),
-            folder=parts,
-            pool=pool,
-            progress=progress,
-        )
-        weighted = np.einsum("lgp,lp->lg", grid.error.astype(float), weights)
-        common = np.argsort(weighted.sum(axis=0), kind="stable")[: count if single else 0]
-        own = np.argsort(weighted, axis=1, kind="stable")[:, : count if each else 0]
-        lists = [np.concatenate([row, common]) for row in own]
-        if draws:
-            drawn = rigs.draws(draws, seed=TUNING_SEED, name=TUNING)
-            jobs = [
-                (rigs, drawn, lung, grid.gains[some])
-                for lung, some in zip(where, lists, strict=True)
-            ]
-            found = in_order(pool, drawn_errors, jobs)
-        else:
-            found = [
-                error[some] for error, some in zip(grid.error.astype(float), lists, strict=True)
-            ]
+    tried = paper_gains() if gains is None else np.asarray(gains, float)
+    grid = _nominal_grid(rigs, where, tried, progress or (lambda done, total: None))
+    nominal = grid.error.astype(float)
+    weighted = np.einsum("lgp,lp->lg", nominal, weights)
+    common = np.argsort(weighted.sum(axis=0), kind="stable")[: count if single else 0]
+    own = np.argsort(weighted, axis=1, kind="stable")[:, : count if each else 0]
+    lists = [np.concatenate([row, common]) for row in own]
+    if draws:
+        drawn = rigs.draws(draws, seed=TUNING_SEED, name=TUNING)
+        found = [
+            drawn_errors(rigs, drawn, lung, tried[some])
+            for lung, some in zip(where, lists, strict=True)
+        ]
+    else:
+        found = [error[some] for error, some in zip(nominal, lists, strict=True)]
     result: dict[str, Any] = {
         "trajectories": int(grid.error.size),
         "pips": list(grid.pips),
@@ -386,5 +305,4 @@ def tune_pid(
     if out is not None:
         grid.save(Path(out) / TABLE)
         files.write_json(Path(out) / RESULT, result)
-        shutil.rmtree(Path(out) / PARTS)
     return grid, result

@@ -285,7 +285,6 @@ def fit(
     progress: FitProgress | None = None,
     keep: bool = False,
     weights: ArrayLike | None = None,
-    start: Residual | None = None,
 ) -> Residual:
     """Train the correction of a PID on one lung, or on several at once.
 
@@ -303,8 +302,6 @@ def fit(
         progress: called after every ``CHUNK`` updates.
         keep: leave the checkpoint, so that a finished training is read from it.
         weights: weight of each lung's error at each PIP, shape ``(lungs, P)``; 1 if not given.
-        start: trained controller with the same gains and windows to go on from; a new network if
-            not given.
 
     Returns:
         The controller, float32.
@@ -328,15 +325,11 @@ def fit(
         limit=config.limit,
     )
     controller = untrained(start_key, like, config.widths)
-    if start is not None:
-        layers = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start.layers)
-        controller = controller.replace(layers=layers)  # type: ignore[attr-defined]
     adam = optimiser(config.updates, config.learning_rate, config.weight_decay)
     carry: Any = (controller.layers, adam.init(controller.layers))
     settings = {
         "config": dataclasses.asdict(config), "gains": list(gains), "seed": seed,
         "simulators": fingerprint(plants), "weights": fingerprint(weights),
-        "start": None if start is None else fingerprint(start.layers),
     }  # fmt: skip
     stored = Checkpoint(checkpoint, settings)
     carry = run_chunks(

@@ -23,8 +23,7 @@ from ventbench.plants.stacking import stack
 from ventbench.task.lungs import LUNGS
 from ventbench.train.rl import episodes
 from ventbench.train.rl import train as parallel
-from ventbench.train.rl.dqn import DQN
-from ventbench.train.rl.ppo import PPO, PolicyGradient
+from ventbench.train.rl.learners import DQN, PPO, PolicyGradient
 
 PG = PolicyGradient(breaths=6, iterations=160, widths=(8,), learning_rate=1e-2)
 SMALL_PPO = PPO(breaths=12, iterations=4, widths=(8,), epochs=2, minibatches=2)
@@ -66,11 +65,12 @@ def lungs(index: int) -> Any:
     return jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), made)
 
 
-WALK = RandomWalk()
+WALK: Any = RandomWalk()
 
 
 @pytest.mark.slow
-def test_same_seed_same_bits_and_resuming_changes_nothing(tmp_path):
+def test_same_seed_same_bits_and_resuming_changes_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel, "SAVE_SECONDS", 0.0)
     whole = parallel.train(WALK, lungs(0), (0, 1), chunk=2, file=tmp_path / "a.npz")
 
     def stop(share, error):
@@ -79,9 +79,7 @@ def test_same_seed_same_bits_and_resuming_changes_nothing(tmp_path):
 
     file = tmp_path / "b.npz"
     with pytest.raises(KeyboardInterrupt):
-        parallel.train(
-            WALK, lungs(0), (0, 1), chunk=2, file=file, progress=stop, save_seconds=0.0
-        )  # fmt: skip
+        parallel.train(WALK, lungs(0), (0, 1), chunk=2, file=file, progress=stop)
     again = parallel.train(WALK, lungs(0), (0, 1), chunk=2, file=file)
     for leaf, other in zip(
         jax.tree.leaves(whole.policies), jax.tree.leaves(again.policies), strict=True

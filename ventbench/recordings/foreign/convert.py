@@ -16,30 +16,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Floats, Ints
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, arranged
-from ventbench.recordings.foreign.breath_onsets import (
+from ventbench.recordings.foreign.formats import read_table
+from ventbench.recordings.foreign.layouts import (
     LAYOUTS,
     ROLES,
     USUAL,
+    Conversion,
     Layout,
+    conversion,
     expiratory_valve,
     find_breaths,
+    in_file_unit,
     recognise,
+    stem,
 )
-from ventbench.recordings.foreign.formats import read_table
 from ventbench.recordings.foreign.tables import Table
-from ventbench.recordings.foreign.units import Conversion, conversion, in_file_unit, stem
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung
 
 #: Roles with units.
 _MEASURED = ("time", "pressure", "flow", "volume", "u_in")
-
-#: Rows of the preview.
-_PREVIEW = 5
 
 #: Flow, mL/s, and volume, mL, below which another unit is likely; pressure, cmH2O, from which it
 #: is absolute.
@@ -58,7 +58,11 @@ class Imported:
     columns: Mapping[str, str]  #: role of each column of the file that is used.
     understood: tuple[str, ...]  #: what was understood, a sentence each.
     warnings: tuple[str, ...]  #: what may be wrong, a sentence each.
-    preview: str  #: the first rows as they are written.
+
+    @property
+    def preview(self) -> str:
+        """The first rows as they are written."""
+        return self.breaths.to_frame().head(5).to_string(index=False)
 
     def __repr__(self) -> str:
         """Breaths and columns."""
@@ -86,7 +90,7 @@ class Imported:
 
 
 def import_recording(
-    path: str | Path, *, columns: Mapping[str, str] | None = None,
+    path: str | Path | Table, *, columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None, layout: str | None = None, lung: str | None = None,
     rate: float | None = None, split_breaths: bool = False, invert: Iterable[str] = (),
     offsets: Mapping[str, float] | None = None, select: Mapping[str, str] | None = None,
@@ -95,8 +99,8 @@ def import_recording(
     """Read a recording of another laboratory.
 
     Args:
-        path: text with any separator (also gzipped), a spreadsheet, Parquet, MATLAB, EDF, BDF, the
-            header (.hea) of a WFDB record, or PIRDS as JSON.
+        path: text with any separator (also gzipped), a spreadsheet, Parquet, MATLAB, EDF, BDF, or
+            the header (.hea) of a WFDB record; or what has been read of one.
         columns: role of each column, ``{"Paw": "pressure"}``; the roles are ``time``,
             ``pressure``, ``flow``, ``volume``, ``u_in``, ``u_out``, ``R``, ``C``, ``breath``,
             ``group`` (a breath ends where it changes), ``target`` (inspiration is where it is
@@ -125,7 +129,9 @@ def import_recording(
         ...     "lab.csv", columns={"Paw": "pressure"}, units={"flow": "L/min"}, lung="R20C50"
         ... )  # doctest: +SKIP
     """
-    table = read_table(path, separator=separator, decimal=decimal)
+    table = path
+    if not isinstance(table, Table):
+        table = read_table(table, separator=separator, decimal=decimal)
     table, selected = _selected(table, dict(select or {}))
     known = _layout(layout, table)
     roles = _roles(table, dict(columns or {}), known)
@@ -201,7 +207,7 @@ def import_recording(
     pieces, left = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
     notes += left
     warnings += _suspicious(samples, changes)
-    breaths = _breaths(str(path), pieces, time, samples, R, C, notes)
+    breaths = _breaths(table.file, pieces, time, samples, R, C, notes)
     few = few_breaths(len(breaths))
     found = check_roles(breaths)
     if found and found[0].level == "refused":
@@ -209,7 +215,38 @@ def import_recording(
     warnings += [str(finding) for finding in found]
     notes += [few] if few is not None else []
     used = {name: role for name, role in roles.items() if role != "unused"}
-    return Imported(breaths, changes, used, tuple(notes), tuple(warnings), _preview(breaths))
+    return Imported(breaths, changes, used, tuple(notes), tuple(warnings))
+
+
+def import_runs(path: str | Path) -> dict[str, Breaths]:
+    """Read each recording of a Parquet file whose layout tells several apart.
+
+    Errors are those of :func:`import_recording`.
+
+    Returns:
+        Breaths by the values of the columns that do, in the order of the file: of RespiraWorks by
+        run and test, ``"2020-07-31-UFlow-Performance 4"``. Nothing of any other file.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        layout = recognise(tuple(parquet.read_schema(path).names))
+    except (pa.ArrowException, OSError):
+        return {}
+    groups = [name for name, role in layout.columns.items() if role == "group"] if layout else []
+    if not groups:
+        return {}
+    table = read_table(path)
+    cells = (
+        [f"{value:g}" if isinstance(value, float) else value for value in column]
+        for column in (table.columns[name].tolist() for name in groups)
+    )
+    keys = np.array([" ".join(row) for row in zip(*cells, strict=True)])
+    return {
+        key: import_recording(_rows(table, keys == key)).breaths
+        for key in dict.fromkeys(keys.tolist())
+    }
 
 
 def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
@@ -227,10 +264,13 @@ def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
         raise InputError(f"{table.file}: no row has {asked}")
     if keep.all():
         return table, []
+    return _rows(table, keep), [f"{int(keep.sum())} of {len(keep)} rows were selected."]
+
+
+def _rows(table: Table, keep: Bools) -> Table:
     columns = {name: values[keep] for name, values in table.columns.items()}
     lines = None if table.lines is None else table.lines[keep]
-    note = f"{int(keep.sum())} of {len(keep)} rows were selected."
-    return replace(table, columns=columns, lines=lines), [note]
+    return replace(table, columns=columns, lines=lines)
 
 
 def _same(cell: Any, value: str) -> bool:
@@ -507,18 +547,3 @@ def _breaths(
         lengths, np.concatenate(parts), columns, breath_id=np.arange(1, len(pieces) + 1),
         R=R[first].astype(float), C=C[first].astype(float), source=source, notes=tuple(notes),
     )  # fmt: skip
-
-
-def _preview(breaths: Breaths) -> str:
-    """The first rows as text."""
-    names = ["time_step", "u_in", "u_out", "pressure"]
-    columns = [breaths.time, breaths.u_in, breaths.u_out, breaths.pressure]
-    for name in ("flow", "volume"):
-        values = getattr(breaths, name)
-        if values is not None:
-            names.append(name)
-            columns.append(values)
-    lines = ["  ".join(f"{name:>9}" for name in names)]
-    for k in range(min(_PREVIEW, breaths.time.shape[1])):
-        lines.append("  ".join(f"{float(column[0, k]):>9.4g}" for column in columns))
-    return "\n".join(lines)

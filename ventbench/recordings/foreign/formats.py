@@ -1,12 +1,10 @@
 """Tables of numbers from files of every kind: recognised by their first bytes, read by a library.
 
-Parquet (pyarrow), MATLAB (scipy, pymatreader), EDF and BDF (pyedflib), WFDB (wfdb), and PIRDS, the
-Public Invention Respiratory Data Standard, version 0.3, as JSON. Nothing is resampled.
+Parquet (pyarrow), MATLAB (scipy), EDF and BDF (pyedflib), and WFDB (wfdb). Nothing is resampled.
 """
 
 from __future__ import annotations
 
-import json
 import re
 import warnings
 from collections import Counter
@@ -18,21 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError, require
-from ventbench.recordings.foreign.breath_onsets import USUAL
+from ventbench.recordings.foreign.layouts import USUAL, spelled, stem, unit_of
 from ventbench.recordings.foreign.tables import RATES, Table, read_spreadsheet, read_text
-from ventbench.recordings.foreign.units import spelled, stem, unit_of
-
-#: Roles of PIRDS types, and what their integers are divided by to be cmH2O, L/min and mL; relative
-#: pressure before absolute.
-_PIRDS = (
-    ("pressure", "D", 10.0),
-    ("pressure", "P", 10.0),
-    ("flow", "F", 1000.0),
-    ("volume", "V", 1.0),
-)
-
-#: Places of PIRDS sensors, the nearer to the patient first.
-_PLACES = "AIDE"
 
 
 def read_table(
@@ -40,8 +25,8 @@ def read_table(
 ) -> Table:
     """Read a table; the separator and the decimal mark of text are found out if None.
 
-    The file is text (also gzipped), a spreadsheet (.xlsx), Parquet, MATLAB, EDF, BDF, the header
-    (.hea) of a WFDB record, or PIRDS as JSON.
+    The file is text (also gzipped), a spreadsheet (.xlsx), Parquet, MATLAB, EDF, BDF, or the header
+    (.hea) of a WFDB record.
 
     Raises:
         InputError: if the file cannot be read, or holds no table of numbers.
@@ -58,12 +43,10 @@ def read_table(
         return _parquet(file)
     if first.startswith(b"MATLAB 5.0"):
         return _matlab(file)
-    if first.startswith(b"MATLAB 7.3"):
-        return _matlab_hdf5(file)
-    if first.startswith(b"\x89HDF"):
+    if first.startswith((b"MATLAB 7.3", b"\x89HDF")):
         raise InputError(
-            f"{file} is HDF5 without MATLAB's header (a log of PyTables?); save it with "
-            "`save(..., '-v7')` in MATLAB, or export the table as CSV"
+            f"{file} is HDF5 (MATLAB 7.3, a log of PyTables?); save it with `save(..., '-v7')` in "
+            "MATLAB, or export the table as CSV"
         )
     if first.startswith((b"0       ", b"\xffBIOSEMI")):
         return _edf(file)
@@ -71,8 +54,6 @@ def read_table(
         return _wfdb(file)
     if first.startswith(b"PK\x03\x04"):
         return read_spreadsheet(file)
-    if first.lstrip()[:1] in (b"{", b"[") and b'"event"' in first:
-        return _pirds(file)
     return read_text(file, separator, decimal)
 
 
@@ -109,21 +90,6 @@ def _matlab(file: str) -> Table:
         content = loadmat(file, simplify_cells=True)
     except (ValueError, NotImplementedError, OSError, TypeError) as error:
         raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
-    return _variables(file, content)
-
-
-def _matlab_hdf5(file: str) -> Table:
-    """MATLAB 7.3, which is HDF5 behind a header."""
-    require("pymatreader", "h5py", extra="formats", what="MATLAB 7.3 files")
-    from pymatreader import read_mat
-
-    try:
-        content = read_mat(file)
-    except (ValueError, NotImplementedError, OSError, TypeError, KeyError) as error:
-        raise InputError(
-            f"{file} cannot be read as a MATLAB 7.3 file ({error}); save it with "
-            "`save(..., '-v7')` in MATLAB"
-        ) from None
     return _variables(file, content)
 
 
@@ -250,48 +216,3 @@ def _wfdb(file: str) -> Table:
     return _channels(
         file, "WFDB", record.sig_name or (), record.units or (), rates, record.e_p_signal or ()
     )
-
-
-def _pirds(file: str) -> Table:
-    """A JSON list of events, or an event a line; sensors are aligned by their milliseconds."""
-    text = Path(file).read_text(encoding="utf-8", errors="replace")
-    try:
-        events = json.loads(text)
-    except json.JSONDecodeError:
-        events = []
-        for k, line in enumerate(text.splitlines()):
-            if line.strip(" \t,[]"):
-                try:
-                    events.append(json.loads(line.strip(" \t,")))
-                except json.JSONDecodeError as error:
-                    raise InputError(
-                        f"{file}, line {k + 1} is no JSON event ({error.msg})"
-                    ) from None
-    events = events if isinstance(events, list) else [events]
-    sensors: dict[tuple[str, str, int], dict[float, float]] = {}
-    for k, event in enumerate(events):
-        try:
-            if event["event"] == "M":
-                key = (str(event["type"]), str(event["loc"]), int(event["num"]))
-                sensors.setdefault(key, {})[float(event["ms"])] = float(event["val"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{file}, event {k + 1} is no PIRDS event ({type(error).__name__}: {error}); a "
-                "measurement has event, type, loc, num, ms and val"
-            ) from None
-    chosen: dict[str, tuple[tuple[str, str, int], float]] = {}
-    for role, kind, scale in _PIRDS:
-        sensing = [key for key in sensors if key[0] == kind and key[1] in _PLACES]
-        if sensing and role not in chosen:
-            chosen[role] = min(sensing, key=lambda key: (_PLACES.index(key[1]), key[2])), scale
-    if "pressure" not in chosen:
-        raise InputError(f"{file}: no measurement of type D or P, which are pressures")
-    times = np.array(sorted(sensors[chosen["pressure"][0]]))
-    columns = {"time": times} | {
-        role: np.array([sensors[key].get(ms, np.nan) for ms in times]) / scale
-        for role, (key, scale) in chosen.items()
-    }
-    which = ", ".join(f"{role} {t} of {loc}{num}" for role, ((t, loc, num), _) in chosen.items())
-    units = {"time": "ms", "pressure": "cmH2O", "flow": "L/min", "volume": "mL"}
-    units = {name: units[name] for name in columns}
-    return Table(file, columns, units, None, None, (f"PIRDS, {len(events)} events: {which}.",))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError, require
-from ventbench.recordings.foreign.units import UNITS, is_unit, spelled, unit_of
+from ventbench.recordings.foreign.layouts import UNITS, is_unit, spelled, unit_of
 
 #: Lines that decide on separator, decimal mark and header, and of those, the ones that are split.
 _LOOKED_AT = 400

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import flax.struct
 import jax
@@ -36,35 +36,10 @@ from ventbench.train.plants import (
     plants_to_train_on,
 )
 from ventbench.train.rl import episodes
-from ventbench.train.rl.dqn import DQN
-from ventbench.train.rl.ppo import PPO, PolicyGradient
+from ventbench.train.rl.learners import DQN, PPO, PolicyGradient
 
-
-class Learner(Protocol):
-    """Settings of a way of learning: hashable, static in ``jit``; its methods are pure."""
-
-    @property
-    def breaths(self) -> int:
-        """Episodes in an iteration."""
-        ...
-
-    @property
-    def iterations(self) -> int:
-        """Iterations of a training."""
-        ...
-
-    def init(self, key: Array) -> Any:
-        """State at the start."""
-        ...
-
-    def iterate(self, state: Any, plants: episodes.Lungs) -> Any:
-        """State one iteration later."""
-        ...
-
-    def policy(self, state: Any) -> Any:
-        """The policy learned so far, as a pure controller."""
-        ...
-
+#: Settings of a way of learning: hashable, static in ``jit``; their methods are pure.
+Method = PolicyGradient | PPO | DQN
 
 #: Cells on each lung by which the best policy of a training is chosen, and the seed they come from.
 VALIDATION_CELLS, VALIDATION_SEED = 48, 2021
@@ -123,7 +98,7 @@ def fresh_error(lungs: episodes.Lungs, policy: Any) -> Array:
 
 
 @partial(jax.jit, static_argnames=("method", "count"))
-def _advance(method: Learner, runs: _Run, plants: episodes.Lungs, count: int) -> tuple[_Run, Array]:
+def _advance(method: Method, runs: _Run, plants: episodes.Lungs, count: int) -> tuple[_Run, Array]:
     """``count`` iterations of each run, then both errors, shape ``(R, 2)``."""
 
     def advance(run: _Run, plant: episodes.Lungs) -> tuple[_Run, Array]:
@@ -142,18 +117,18 @@ def _advance(method: Learner, runs: _Run, plants: episodes.Lungs, count: int) ->
 
 
 def _start(
-    method: Learner, seeds: Sequence[int], plants: episodes.Lungs
+    method: Method, seeds: Sequence[int], plants: episodes.Lungs
 ) -> tuple[_Run, NDArray[np.float32]]:
     numbers = jnp.asarray(np.asarray(seeds, np.uint32))
     keys = jax.vmap(jax.random.key)(numbers)
     states = jax.vmap(method.init)(keys)
-    best = jax.vmap(method.policy)(states)
+    best = jax.vmap(method.policy)(states)  # type: ignore[arg-type]
     errors = np.asarray(jax.jit(jax.vmap(nominal_error))(plants, best))
     return _Run(states, best, jnp.full(len(seeds), jnp.inf)), errors
 
 
 def train(
-    method: Learner,
+    method: Method,
     plants: episodes.Lungs,
     seeds: Sequence[int],
     *,
@@ -161,7 +136,6 @@ def train(
     about: str = "",
     file: Path | None = None,
     progress: RunsProgress | None = None,
-    save_seconds: float = SAVE_SECONDS,
 ) -> TrainedPolicies:
     """Train R policies side by side.
 
@@ -169,14 +143,14 @@ def train(
     training goes on as if it had not been.
 
     Args:
-        method: the recipe, common to all.
+        method: the recipe, common to all: ``breaths`` in each of ``iterations``; the states by
+            ``init(key)`` and ``iterate(state, plants)``, and the ``policy(state)`` learned so far.
         plants: lungs of each run, an axis ``(R, ...)`` in front of all leaves; taken in float32.
         seeds: one for each run.
         chunk: iterations between two points of the curves.
         about: text that tells one training from another, such as the simulators' hash.
         file: checkpoint that is resumed from and written to; kept at the end.
         progress: see :data:`RunsProgress`.
-        save_seconds: least time between two checkpoints, s.
 
     Raises:
         InputError: if the checkpoint belongs to another training.
@@ -192,7 +166,7 @@ def train(
         carry: Any = (runs, curves, seconds, compiling)
         settings = {
             "method": type(method).__name__,
-            "recipe": asdict(method),  # type: ignore[call-overload]
+            "recipe": asdict(method),
             "seeds": list(map(int, seeds)),
             "chunk": chunk,
             "about": about,
@@ -213,7 +187,7 @@ def train(
             seconds[done] = seconds[done - 1] + now - before
             if not np.isfinite(curves[:, done]).all():
                 raise FloatingPointError(f"training diverged before point {done} of {points}")
-            if now - saved > save_seconds or done == points:
+            if now - saved > SAVE_SECONDS or done == points:
                 stored.save((runs, curves, seconds, compiling), done)
                 saved = time.perf_counter()
             if progress is not None:
@@ -234,8 +208,6 @@ METHODS = ("policy-gradient", "ppo", "dqn")
 
 #: Iterations between two points of a learning curve.
 CHUNKS = {"policy-gradient": 10, "ppo": 10, "dqn": 50}
-
-Method = PolicyGradient | PPO | DQN
 
 _ONE_LUNG: dict[str, Method] = {"policy-gradient": PolicyGradient(), "ppo": PPO(), "dqn": DQN()}
 _ALL_LUNGS: dict[str, Method] = {

@@ -1,7 +1,8 @@
-"""Two ways to improve a correction: through the simulator's derivatives, and PPO without them.
+"""Ways to learn a correction: through the simulator's derivatives, and PPO and DQN without them.
 
 The policy gradient differentiates the error of whole breaths; proximal policy optimisation samples
-commands from a Gaussian around the network's output.
+commands from a Gaussian around the network's output; DQN learns values of discrete corrections from
+a replay buffer by double Q-learning.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ import optax
 from jax import Array
 
 from ventbench.controllers import rl_policy
-from ventbench.controllers.rl_policy import SCALE, GaussianPolicy, Parameters, TanhNetwork
+from ventbench.controllers.rl_policy import (
+    CHOICES,
+    SCALE,
+    GaussianPolicy,
+    GreedyPolicy,
+    Parameters,
+    TanhNetwork,
+)
 from ventbench.train.rl import episodes
 
 
@@ -198,3 +206,136 @@ class PPO:
         wanted = part.value + part.advantage
         critic = jnp.mean((self._value(parameters, part.features) - wanted) ** 2)
         return policy + 0.5 * critic
+
+
+@flax.struct.dataclass
+class Replay:
+    """Steps to learn from, the oldest overwritten first; N of them."""
+
+    features: Array  #: features before the choice, ``(N, features)``.
+    choice: Array  #: index into the corrections, ``(N,)``.
+    reward: Array  #: the next reward, ``(N,)``.
+    discount: Array  #: discount of what follows it; 0 where the breath ends, ``(N,)``.
+    following: Array  #: features then, ``(N, features)``.
+
+
+@flax.struct.dataclass
+class DQNState:
+    """One training: both networks, optimiser, replay, key, iteration."""
+
+    online: Parameters
+    target: Parameters
+    optimiser: Any
+    replay: Replay
+    key: Array
+    iteration: Array
+
+
+@dataclass(frozen=True)
+class DQN:
+    """Settings; one iteration is some breaths into the replay, then some updates."""
+
+    breaths: int = 24  #: breaths of an iteration, three an episode.
+    iterations: int = 2400  #: iterations of a training, over which the learning rate falls to zero.
+    learning_rate: float = 3e-3  #: initial learning rate of Adam.
+    widths: tuple[int, ...] = (64, 64)  #: hidden layers of the network.
+    updates: int = 8  #: updates of an iteration.
+    batch: int = 256  #: steps of an update.
+    memory: int = 2400  #: breaths that the replay holds.
+    discount: float = 0.95  #: factor of a reward one step later.
+    #: share by which the target network moves to the online network at each update.
+    follow: float = 0.01
+    #: share of random choices, at the start and at the end.
+    explore: tuple[float, float] = (1.0, 0.05)
+    explored: float = 0.4  #: share of the training after which exploration has reached its end.
+
+    @property
+    def network(self) -> TanhNetwork:
+        """One output for each choice."""
+        return TanhNetwork(self.widths, len(CHOICES), first=0.01)
+
+    @property
+    def _optimiser(self) -> optax.GradientTransformation:
+        schedule = optax.cosine_decay_schedule(self.learning_rate, self.iterations * self.updates)
+        return optax.chain(optax.clip_by_global_norm(10.0), optax.adam(schedule))
+
+    def init(self, key: Array) -> DQNState:
+        """Return the state at the start of a training."""
+        network_key, key = jax.random.split(key)
+        parameters = rl_policy.init_parameters(self.network, network_key)
+        size = self.memory * episodes.STEPS
+        seen, zero = jnp.zeros((size, rl_policy.FEATURES)), jnp.zeros((size,))
+        replay = Replay(seen, jnp.zeros((size,), jnp.int32), zero, zero, seen)
+        iteration = jnp.zeros((), jnp.int32)
+        optimiser = self._optimiser.init(parameters)
+        return DQNState(parameters, parameters, optimiser, replay, key, iteration)
+
+    def iterate(self, state: DQNState, plants: episodes.Lungs) -> DQNState:
+        """Collect breaths on lungs and learn from the replay."""
+        collect_key, learn_key, key = jax.random.split(state.key, 3)
+        new = self._collect(state, plants, collect_key)
+        count = self.breaths * episodes.STEPS
+        first = state.iteration % (self.memory // self.breaths) * count
+        replay = jax.tree.map(
+            lambda old, some: jax.lax.dynamic_update_slice_in_dim(old, some, first, 0),
+            state.replay,
+            new,
+        )
+        known = jnp.minimum((state.iteration + 1) * count, self.memory * episodes.STEPS)
+
+        def update(carry: Any, key: Array) -> tuple[Any, None]:
+            rows = jax.random.randint(key, (self.batch,), 0, known)
+            return self._update(carry, jax.tree.map(lambda x: x[rows], replay)), None
+
+        carry = (state.online, state.target, state.optimiser)
+        keys = jax.random.split(learn_key, self.updates)
+        (online, target, optimiser), _ = jax.lax.scan(update, carry, keys)
+        return DQNState(online, target, optimiser, replay, key, state.iteration + 1)
+
+    def policy(self, state: DQNState) -> GreedyPolicy:
+        """Policy so far: the choices of the target network, the smoother of the two."""
+        return GreedyPolicy(state.target, self.network)
+
+    def _values(self, parameters: Any, x: Array) -> Array:
+        return self.network.apply(parameters, x)  # type: ignore[return-value]
+
+    def _collect(self, state: DQNState, plants: episodes.Lungs, key: Array) -> Replay:
+        cells_key, roll_key = jax.random.split(key)
+        drawn = episodes.of_iteration(cells_key, plants, self.breaths, state.iteration)
+        start, end = self.explore
+        progress = jnp.minimum(state.iteration / (self.explored * self.iterations), 1.0)
+        share = start + (end - start) * progress
+
+        def act(key: Array, x: Array, base: Array) -> tuple[Array, Array]:
+            whether, which = jax.random.split(key)
+            greedy = jnp.argmax(self._values(state.online, x), axis=-1)
+            random = jax.random.randint(which, greedy.shape, 0, len(CHOICES))
+            explore = jax.random.uniform(whether, greedy.shape) < share
+            choice = jnp.where(explore, random, greedy)
+            return base + jnp.asarray(CHOICES, base.dtype)[choice], choice
+
+        x, choice, rewards = episodes.roll(drawn, act, roll_key)
+        following = jnp.arange(episodes.STEPS) + 1
+        discount = jnp.where(following < episodes.STEPS, self.discount, 0.0)
+        replay = Replay(
+            x,
+            choice.astype(jnp.int32),
+            rewards,
+            jnp.broadcast_to(discount[:, None], rewards.shape),
+            x[jnp.minimum(following, episodes.STEPS - 1)],
+        )
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), replay)
+
+    def _update(self, carry: Any, part: Replay) -> Any:
+        online, target, optimiser = carry
+        after = [self._values(p, part.following) for p in (online, target)]
+        wanted = episodes.double_q_target(part.reward, part.discount, *after)
+
+        def loss(parameters: Parameters) -> Array:
+            values = self._values(parameters, part.features)
+            chosen = jnp.take_along_axis(values, part.choice[:, None], axis=-1)[:, 0]
+            return jnp.mean(optax.huber_loss(chosen, wanted))
+
+        updates, optimiser = self._optimiser.update(jax.grad(loss)(online), optimiser, online)
+        online = optax.apply_updates(online, updates)
+        return online, optax.incremental_update(online, target, self.follow), optimiser

@@ -44,8 +44,8 @@ Method = PolicyGradient | PPO | DQN
 #: Cells on each lung by which the best policy of a training is chosen, and the seed they come from.
 VALIDATION_CELLS, VALIDATION_SEED = 48, 2021
 
-#: At least this many seconds lie between two checkpoints: what an interruption may cost.
-SAVE_SECONDS = 5.0
+#: Time between two checkpoints: at least so many seconds, and so many times as long as one takes.
+SAVE_SECONDS, SAVE_SHARE = 5.0, 20.0
 
 #: Called with the share that is done and the lowest error of each run, cmH2O, shape ``(R,)``.
 RunsProgress = Callable[[float, NDArray[np.float32]], None]
@@ -178,6 +178,7 @@ def train(
         if done < points:  # once for nothing, so that no point's time contains the compiling
             jax.block_until_ready(_advance(method, runs, plants, chunk))
         saved = now = time.perf_counter()
+        pause = SAVE_SECONDS
         compiling = compiling + (now - began)
         while done < points:
             runs, errors = _advance(method, runs, plants, chunk)
@@ -187,9 +188,10 @@ def train(
             seconds[done] = seconds[done - 1] + now - before
             if not np.isfinite(curves[:, done]).all():
                 raise FloatingPointError(f"training diverged before point {done} of {points}")
-            if now - saved > SAVE_SECONDS or done == points:
+            if now - saved > pause or done == points:
                 stored.save((runs, curves, seconds, compiling), done)
                 saved = time.perf_counter()
+                pause = max(SAVE_SECONDS, SAVE_SHARE * (saved - now))
             if progress is not None:
                 progress(done / points, np.asarray(runs.error))
         return TrainedPolicies(

@@ -415,7 +415,8 @@ def train_residual(
                     checkpoint=_checkpoint(out, name, seed),
                     progress=lambda *how_far, about_it=about_it: progress(about_it, how_far),
                 )  # fmt: skip
-                fresh.append(float(_fresh(episodes.Lungs(plants, weights), each[seed][name])))
+                lungs_of = episodes.Lungs(plants, jnp.asarray(weights))
+                fresh.append(float(_fresh(lungs_of, each[seed][name])))
         chosen = seeds[int(np.argmin(fresh))]
         controllers[name] = each[chosen][name]
         about[name] = {

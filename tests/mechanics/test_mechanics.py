@@ -139,7 +139,7 @@ def test_a_wrong_label_is_found(label, truth):
     assert not found.match.label_matches
     assert found.match.label == f"R{label[0]:g}C{label[1]:g}"
     assert found.match.settings[0] == f"R{truth[0]:g}C{truth[1]:g}"
-    assert len(found.settings) == 1
+    assert len(found.match.settings) == 1
     assert found.match.source == "pressure and flow"
 
 

@@ -61,4 +61,4 @@ def test_another_label_is_refused(public_recordings):
         wrong = np.full(len(breaths), other[breaths.R[0]])
         (found,) = mechanics.identify(replace(breaths, R=wrong))
         assert not found.match.label_matches
-        assert found.settings[0].id == breaths.lung_ids[0]
+        assert found.match.settings[0] == breaths.lung_ids[0]

@@ -2,7 +2,8 @@
 
 In each breath of a stressed run the physics of that breath is known, and its commands are the best
 that :mod:`ventbench.task.attainable` finds. So nobody has a lower stress score on these cells, but
-by what the search has missed. ``--draws`` of the development draws, one PIP of each lung and draw.
+by what the search has missed: rounding of commands has no derivative. ``--draws`` of the
+development draws, one PIP of each lung and draw.
 
 Usage:
 

@@ -56,7 +56,7 @@ NOT_REPRODUCED = (
     (
         "section 6",
         "720 trials of hyper-parameters for PPO and 180 for DQN",
-        "their settings and results are not published; docs/reinforcement.md lists the trials here",
+        "their settings and results are not published",
     ),
     (
         "sections 5 and 6",

@@ -62,8 +62,13 @@ def test_train(method, steps, tmp_path):
         about = json.loads((folder / "training.json").read_text())
         # As `ventbench.score` has it of this PID on the reference rig.
         assert about["networks"]["R20C50"]["error_pid"] == pytest.approx(3.443, abs=2e-3)
-        assert sorted(path.name for path in folder.iterdir()) == ["training.json", "weights.npz"]
+        seeds = [f"weights-{seed}.npz" for seed in range(2)]
+        assert {path.name for path in folder.iterdir()} == {"training.json", "weights.npz", *seeds}
         written.append((folder / "weights.npz").read_bytes())
+        best = about["networks"]["R20C50"]["seed"]
+        assert [(folder / name).read_bytes() == written[-1] for name in seeds] == [
+            seed == best for seed in range(2)
+        ]
         with np.load(folder / "weights.npz") as arrays:
             assert set(arrays) == {f"R20C50.{kind}{k}" for kind in "wb" for k in range(3)}
     assert written[0] == written[1]

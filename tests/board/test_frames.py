@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -46,11 +47,11 @@ def test_seeds_stand_beside_the_entry_that_the_round_scored(leaderboard: Path) -
     path = leaderboard / "rounds/r1/result.json"
     result = canonical.parse(path.read_bytes(), "result")
     key = "pid_best (performance)"
-    before = frames.load_board(leaderboard).set_index(["name", "track"])
+    before: Any = frames.load_board(leaderboard).set_index(["name", "track"])
     result["records"] = {key: before.loc[("pid_best", "performance"), "record"]}
     result["seeds"] = {key: [60.0, 62.0, 61.0, 63.0, 90.0]}
     path.write_bytes(canonical.canonical(result))
-    board = frames.load_board(leaderboard)
+    board: Any = frames.load_board(leaderboard)
     told = board[board["seeds"].notna()]
     assert told[["name", "track"]].values.tolist() == [["pid_best", "performance"]]
     low, middle, high = told[["seeds_low", "seeds", "seeds_high"]].to_numpy()[0]
@@ -58,7 +59,8 @@ def test_seeds_stand_beside_the_entry_that_the_round_scored(leaderboard: Path) -
     assert 60.0 <= low < middle < high <= 90.0
     result["records"][key] = "0" * 64
     path.write_bytes(canonical.canonical(result))
-    assert frames.load_board(leaderboard)["seeds"].isna().all()
+    board = frames.load_board(leaderboard)
+    assert board["seeds"].isna().all()
 
 
 def test_cells_are_those_of_the_records(full: Path) -> None:

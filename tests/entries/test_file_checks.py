@@ -7,7 +7,14 @@ import zipfile
 import numpy as np
 import pytest
 
-from ventbench.entries.folder import MAX_BYTES, check_files, weights_problems
+from ventbench.entries.errors import SubmissionError
+from ventbench.entries.folder import (
+    MAX_BYTES,
+    MAX_SEEDS,
+    check_files,
+    open_submission,
+    weights_problems,
+)
 
 
 def files(folder):
@@ -77,6 +84,16 @@ def test_too_many_files(demo):
     for k in range(1000):
         (demo / f"f{k}.txt").touch()
     assert files(demo)["the folder"] == "has more than 1000 files"
+
+
+def test_too_many_seeds(demo):
+    for seed in range(MAX_SEEDS + 1):
+        assert files(demo) == {}
+        (demo / "seeds" / f"{seed}").mkdir(parents=True)
+        (demo / "seeds" / f"{seed}" / "note.txt").write_text("other weights")
+    assert files(demo) == {"seeds": "has 11 folders; at most 10 seeds are scored"}
+    with pytest.raises(SubmissionError, match="more than 10 folders in seeds"):
+        open_submission(str(demo))
 
 
 def test_a_file_called_almost_right(demo):

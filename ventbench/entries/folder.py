@@ -261,6 +261,9 @@ def check_files(folder: Path) -> list[Finding]:
         else:
             findings.append(_irregular(name, status.st_mode))
     findings += _size(sizes)
+    if len(seeds(folder)) > MAX_SEEDS:
+        what = f"has {len(seeds(folder))} folders; at most {MAX_SEEDS} seeds are scored"
+        findings.append(_problem(SEEDS, what, "leave some out"))
     for first, second in collisions(sizes):
         what = f"differs from {first} only in upper and lower case"
         findings.append(_problem(second, what, "rename one of them"))

@@ -1,4 +1,4 @@
-"""A comparison with a paper as plain data: sections with tables and charts, as Markdown or JSON."""
+"""A comparison with a paper as plain data: sections with tables, as Markdown or JSON."""
 
 from __future__ import annotations
 
@@ -36,27 +36,6 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Line:
-    """A line of a chart."""
-
-    name: str  #: what it shows.
-    x: tuple[float, ...]  #: positions, increasing.
-    y: tuple[float, ...]  #: values; NaN where there is none.
-    dashed: bool = False  #: whether it is what others are compared with, such as a target.
-
-
-@dataclass(frozen=True)
-class Chart:
-    """Lines over one axis."""
-
-    title: str  #: what is shown.
-    x_label: str  #: with unit.
-    y_label: str  #: with unit.
-    lines: tuple[Line, ...]  #: the lines.
-    logarithmic: bool = False  #: whether the x axis is.
-
-
-@dataclass(frozen=True)
 class Section:
     """One table, figure or claim of the paper beside ours."""
 
@@ -68,7 +47,6 @@ class Section:
     finding: str  #: what came out here, in a sentence or two.
     source: str  #: how the figures here were made.
     tables: tuple[Table, ...] = ()  #: tables.
-    charts: tuple[Chart, ...] = ()  #: charts.
 
 
 @dataclass(frozen=True)
@@ -77,20 +55,10 @@ class Reproduction:
 
     about: Mapping[str, Any]  #: simulators, protocol and versions that the figures belong to.
     sections: tuple[Section, ...]  #: in the order of the paper's argument.
-    #: place in the paper, what stands there, and why it is not reproduced.
-    not_reproduced: tuple[tuple[str, str, str], ...]
 
     def to_json(self) -> dict[str, Any]:
         """JSON values, null where a number is missing."""
-        plain = {
-            "about": dict(self.about),
-            "sections": [dataclasses.asdict(section) for section in self.sections],
-            "not_reproduced": [
-                {"place": place, "what": what, "why": why}
-                for place, what, why in self.not_reproduced
-            ],
-        }
-        return json_values(plain)
+        return json_values(dataclasses.asdict(self))
 
     def summary(self) -> Table:
         """A row a section: place, claim, verdict and finding."""
@@ -110,8 +78,7 @@ class Reproduction:
             parts += [f"Paper: {section.claim}", f"Here (**{section.verdict}**): {section.finding}"]
             for table in section.tables:
                 parts += [f"{table.caption}:", _markdown(table)]
-        missing = Table("", ("paper", "what", "why not here"), self.not_reproduced)
-        return "\n\n".join([*parts, "## Not reproduced", _markdown(missing)]) + "\n"
+        return "\n\n".join(parts) + "\n"
 
 
 def _markdown(table: Table) -> str:

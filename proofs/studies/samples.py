@@ -34,9 +34,6 @@ CUT = 0.25
 #: How close to its final score counts as having reached it.
 CLOSE = 0.02
 
-#: Points of a stored curve.
-STORED_POINTS = 40
-
 
 def interquartile_mean(values: ArrayLike) -> Floats:
     """Mean of what is left after cutting a quarter at each end; over the first axis.
@@ -117,18 +114,8 @@ class SampleStudy:
         return pd.DataFrame([self._row(curve) for curve in self.curves])
 
     def stored(self) -> dict[str, Any]:
-        """JSON values for the paper's page: the table, and a few points of each curve.
-
-        The points are evenly apart in logarithms.
-        """
-        seeds, lines = len(self.curves[0].scores), {}
-        for curve in self.curves:
-            last = max(len(curve.episodes) - 1, 1)
-            at = np.unique(np.geomspace(1, last, STORED_POINTS).round().astype(int))
-            lines[curve.method] = {
-                "episodes": curve.episodes[at].tolist(),
-                "score": np.round(curve.middle[at], 4).tolist(),
-            }
+        """JSON values for the paper's page."""
+        seeds = len(self.curves[0].scores)
         return {
             "about": {
                 "command": f"python -m proofs study samples --seeds {seeds}", "simulators": 1,
@@ -136,7 +123,6 @@ class SampleStudy:
             "lung": self.lung,
             "seeds": seeds,
             "methods": files.json_values(self.summary().to_dict("records")),
-            "curves": lines,
         }  # fmt: skip
 
     def _row(self, curve: LearningCurve) -> dict[str, object]:
@@ -193,7 +179,6 @@ def sample_efficiency(
     out: Path,
     *,
     share: float = 1.0,
-    simulators: frozen.Frozen | None = None,
     progress: Progress = lambda *_: None,
 ) -> SampleStudy:
     """Train by every method with every seed; finished trainings are read from ``out``.
@@ -206,13 +191,12 @@ def sample_efficiency(
         seeds: one for each training of a method.
         out: folder of the checkpoints, ``samples.csv`` and ``summary.csv``.
         share: share of the full length of each training.
-        simulators: what is ventilated; the frozen simulators if not given.
         progress: see :data:`Progress`.
 
     Raises:
         InputError: if ``out`` holds another study.
     """
-    simulators = simulators or frozen.load()
+    simulators = frozen.load()
     at = LUNG_IDS.index(lung.id)
     single = jax.tree.map(lambda leaf: leaf[at : at + 1], simulators.plants)
     lungs = jax.tree.map(

@@ -112,7 +112,8 @@ def record(
     base = case.base or draw_base(case.lung_R, case.lung_C, rng)
     time = sampling_times(case.breaths, case.samples, case.jitter, rng)
     command = RecordingController(case, time, rng, share).command
-    return _run(case, base, time, expiratory(time), command, np.arange(len(time)), rng, steps)
+    u_out = (time >= INSPIRATION).astype(np.int8)
+    return _run(case, base, time, u_out, command, np.arange(len(time)), rng, steps)
 
 
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:
@@ -237,11 +238,6 @@ class RecordingController:
         inspired = np.where(measured > _HIGHEST, 0.0, inspired)
         risen = -np.expm1(-np.maximum(t - 1.5, 0.0) * 5.0)
         return np.where(t < INSPIRATION, inspired, self._bias * np.where(self._soft, risen, 1.0))
-
-
-def expiratory(time: Floats) -> NDArray[np.int8]:
-    """Command of the expiratory valve, ``(n, T)``: 0 in inspiration, 1 (open) after it."""
-    return (time >= INSPIRATION).astype(np.int8)
 
 
 def _steady_command(case: Case, pressure: float | Floats) -> float | Floats:

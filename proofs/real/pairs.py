@@ -26,6 +26,7 @@ from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import Mechanics, identify
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.foreign import import_runs
+from ventbench.task.lungs import lung
 
 Split = Literal["development", "sealed"]
 
@@ -98,12 +99,8 @@ def load(folder: Path) -> Material:
     return Material(runs, drives)
 
 
-def pairs(material: Material) -> list[Pair]:
+def pairs(material: Material) -> Iterator[Pair]:
     """All pairs, in a fixed order."""
-    return list(_pairs(material))
-
-
-def _pairs(material: Material) -> Iterator[Pair]:
     names = list(material.runs)
     label = {name: material.runs[name].lung_ids[0] for name in names}
     for name in names:
@@ -130,8 +127,6 @@ def _pairs(material: Material) -> Iterator[Pair]:
 
 def changed(first: str, second: str) -> str:
     """What of R and C differs between two labels, in words."""
-    from ventbench.task.lungs import lung
-
     a, b = lung(first), lung(second)
     parts = [
         f"{name} {x:g} -> {y:g}" for name, x, y in (("R", a.R, b.R), ("C", a.C, b.C)) if x != y

@@ -57,7 +57,6 @@ class Part:
     """One diagnosis of the proof."""
 
     name: str  #: name of its folder.
-    title: str  #: title in words.
     lungs: tuple[str, ...]  #: lungs whose breaths it uses.
     #: returns the setting, given the breaths of the lungs and the folder of the proof; or the
     #: reason why there is none.
@@ -103,14 +102,13 @@ def _injected(breaths: Breaths, out: Path) -> Setting:
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
-        Part("rc", "R-C lungs at their labels", LUNG_IDS, _rc),
-        Part("two_balloon", "the paper's two-balloon lungs at their labels", LUNG_IDS,
-             _two_balloon),
-        Part("removed", "the corrected R-C lungs, a mechanism removed", FEW, _removed, "rc"),
-        Part("injected", "the frozen simulators, recordings with a sensor lag", FEW, _injected),
-        Part("frozen", "the frozen simulators, recordings as they are", FEW, _frozen),
+        Part("rc", LUNG_IDS, _rc),
+        Part("two_balloon", LUNG_IDS, _two_balloon),
+        Part("removed", FEW, _removed, "rc"),
+        Part("injected", FEW, _injected),
+        Part("frozen", FEW, _frozen),
     )
-}  # fmt: skip
+}
 
 
 def slower_sensor(breaths: Breaths, tau: float) -> Breaths:

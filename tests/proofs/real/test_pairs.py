@@ -48,7 +48,7 @@ def material() -> Material:
 
 
 def test_pairs_know_their_truth_and_their_half(material):
-    listed = pairs.pairs(material)
+    listed = list(pairs.pairs(material))
     assert len({pair.name for pair in listed}) == len(listed)
     halves = [pair.split for pair in listed]
     assert {"development", "sealed"} == set(halves)

@@ -131,7 +131,6 @@ def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -
     chosen = {
         name: tuple(grid.gains[int(np.argmin(np.where(among, error, np.inf)))].tolist())
         for name, among in kinds.items()
-        if np.any(among)
     }
     with precision.float64():
         plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[at], float), official.plants)

@@ -61,10 +61,6 @@ def reproduce_paper(
 
     Raises:
         InputError: if a recording is malformed.
-
-    Examples:
-        >>> page, _ = reproduce_paper()  # doctest: +SKIP
-        >>> print(page)  # doctest: +SKIP
     """
     official = frozen.load()
     kept = load_stored()

@@ -25,9 +25,11 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]  #: cells, a row as long as ``columns``.
     digits: int = 3  #: decimals of the numbers.
 
-    def texts(self) -> list[list[str]]:
-        """Rows as they are shown."""
-        return [[self._text(cell) for cell in row] for row in self.rows]
+    def to_markdown(self) -> str:
+        """The table as it is shown."""
+        rows = [[self._text(cell) for cell in row] for row in self.rows]
+        texts = [self.columns, ["---"] * len(self.columns), *rows]
+        return "\n".join(f"| {' | '.join(row)} |" for row in texts)
 
     def _text(self, cell: Cell) -> str:
         if cell is None:
@@ -72,15 +74,10 @@ class Reproduction:
         """The comparison as a page of documentation."""
         about = ", ".join(f"{name} {value}" for name, value in self.about.items())
         parts = ["# The paper, reproduced", f"Figures of: {about}.", "## Claims"]
-        parts.append(_markdown(self.summary()))
+        parts.append(self.summary().to_markdown())
         for section in self.sections:
             parts += [f"## {section.title}", f"*{section.place}; {section.source}*"]
             parts += [f"Paper: {section.claim}", f"Here (**{section.verdict}**): {section.finding}"]
             for table in section.tables:
-                parts += [f"{table.caption}:", _markdown(table)]
+                parts += [f"{table.caption}:", table.to_markdown()]
         return "\n\n".join(parts) + "\n"
-
-
-def _markdown(table: Table) -> str:
-    texts = [list(table.columns), ["---"] * len(table.columns), *table.texts()]
-    return "\n".join(f"| {' | '.join(row)} |" for row in texts)

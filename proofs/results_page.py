@@ -194,7 +194,7 @@ def proof_section(proof: Proof) -> str:
 
 
 def pairs_section(report: str, *, half: str) -> str:
-    """Tables of :func:`~proofs.real.comparisons.report` for a half of the pairs as Markdown."""
+    """Tables of :func:`~proofs.real.pairs.report` for a half of the pairs as Markdown."""
     option = " --sealed" if half == "sealed" else ""
     return (
         f"```sh\npython -m proofs pairs --recordings DIR --out runs/pairs{option}\n```\n\n"

@@ -107,7 +107,7 @@ def pairs(
 
     Example: `python -m proofs pairs --recordings recordings --out runs/pairs`
     """
-    from proofs.real import comparisons as work
+    from proofs.real import pairs as work
     from proofs.results_page import pairs_section, write_section
     from ventbench.base import compilation
 

@@ -17,7 +17,7 @@ import numpy as np
 
 import ventbench
 from proofs import code_version
-from proofs.real.parts import PARTS, Part, Setting, by_names_alone, has_unnamed
+from proofs.real.parts import PARTS, Part, Setting, by_names_alone
 from ventbench import recordings
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -163,11 +163,11 @@ def _finished(folder: Path, key: dict[str, Any]) -> dict[str, Any] | None:
 
 def _mae_by_names_alone(diagnosis: Diagnosis) -> float | None:
     """Held-out MAE of the corrected simulator without nonparametric components, cmH2O."""
-    if not any(has_unnamed(plant) for plant in diagnosis.plants.values()):
+    plants = {lung: by_names_alone(plant) for lung, plant in diagnosis.plants.items()}
+    if all(plants[lung] is plant for lung, plant in diagnosis.plants.items()):
         error = diagnosis.open_loop.after.mae
     else:
         held_out: Breaths = diagnosis.traces.breaths.select(diagnosis.traces.held_out)
-        plants = {lung: by_names_alone(plant) for lung, plant in diagnosis.plants.items()}
         inspiration = held_out.inspiratory & (held_out.time > 0)
         simulated = load_simulators(plants).pressures(held_out)
         error = open_loop_error(held_out.pressure, simulated, inspiration).mae

@@ -84,6 +84,4 @@ def generator(name: str) -> Generator:
 
 def generator_of(case: Case) -> Generator:
     """Return the generator of a case."""
-    if isinstance(case, faults.FaultsCase):
-        return FAULTS
-    return STRANGER if isinstance(case, stranger.StrangerCase) else FIRST
+    return GENERATORS[getattr(case, "generator", "first")]

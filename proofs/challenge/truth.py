@@ -76,8 +76,8 @@ def _terms(case: Case, effect: Effect) -> tuple[frozenset[str], frozenset[str]]:
             # It comes with a circuit's compliance, which may be named or not; alone below the
             # detection limit.
             beside = {"circuit_compliance"}
-    elif not isinstance(case, FaultsCase):
-        right = _OUTSIDE.get(effect.name, right)
+    elif not (isinstance(case, FaultsCase) or EFFECTS[effect.name].inside):
+        right = _OUTSIDE[effect.name]
     return frozenset(right), frozenset(beside)
 
 
@@ -109,19 +109,18 @@ def true_values(case: Case) -> dict[str, float]:
         paths = {f"{e.name}.{key}": v for e in case.effects for key, v in e.parameters.items()}
         return {path: value for path, value in paths.items() if path in PARAMETERS}
     values: dict[str, float] = {}
+    if not isinstance(case, stranger.StrangerCase):
+        for effect in filter(has_library_form, case.effects):
+            values |= _values_of(effect, ratio)
+        return values
     for effect in case.effects:
-        if isinstance(case, stranger.StrangerCase):
-            same = effect.form == stranger.SAME
-        else:
-            same = has_library_form(effect)
-        if same and effect.name == "circuit_compliance" and isinstance(case, stranger.StrangerCase):
+        if effect.name == "circuit_compliance":
             # The circuit that every rig of this generator has adds to the drawn one.
             whole = effect.parameters["compliance"] + case.dead_space
             effect = replace(effect, parameters={"compliance": whole})
-        if same:
+        if effect.form == stranger.SAME:
             values |= _values_of(effect, ratio)
-    if isinstance(case, stranger.StrangerCase):
-        _refer_to_zero_pressure(values, case)
+    _refer_to_zero_pressure(values, case)
     return values
 
 

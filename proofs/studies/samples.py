@@ -26,7 +26,7 @@ from ventbench.task.metrics import bootstrap
 from ventbench.train import pid_grid
 from ventbench.train.rl import episodes
 from ventbench.train.rl.learners import PolicyGradient
-from ventbench.train.rl.train import METHODS, Method, TrainedPolicies, method_for, train
+from ventbench.train.rl.train import METHODS, Method, method_for, train
 
 #: Share of the values that the interquartile mean cuts off at each end.
 CUT = 0.25
@@ -216,17 +216,15 @@ def sample_efficiency(
             file=out / f"{name}.npz",
             progress=lambda done, error, name=name: progress(name, done, float(error.mean())),
         )
-        curves.append(_curve(name, trained))
+        seconds, scores = trained.seconds, trained.curves.astype(float)
+        curves.append(
+            LearningCurve(name, trained.episodes, seconds, trained.compile_seconds, scores)
+        )
     grid = pid_grid.errors(single, pid_grid.paper_gains())[0].mean(axis=-1)
     study = SampleStudy(lung.id, tuple(curves), float(curves[0].scores[0, 0]), float(grid.min()))
     files.write_text(out / "samples.csv", study.points().to_csv(index=False))
     files.write_text(out / "summary.csv", study.summary().to_csv(index=False))
     return study
-
-
-def _curve(name: str, trained: TrainedPolicies) -> LearningCurve:
-    scores = trained.curves.astype(float)
-    return LearningCurve(name, trained.episodes, trained.seconds, trained.compile_seconds, scores)
 
 
 #: What the curves are called in the picture.

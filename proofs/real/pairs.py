@@ -366,6 +366,5 @@ def as_dict(answers: list[Answered]) -> dict[str, Any]:
     """JSON values."""
     return {
         "answers": [asdict(entry) for entry in answers],
-        "report": report(answers),
         "ventbench": ventbench.__version__,
     }

@@ -244,9 +244,8 @@ def _wanted_is_named(name: str, parts: Mapping[str, Mapping[str, Any]]) -> Claim
     part = parts[name]
     wanted = part["wanted"]
     mechanism = named(part["mechanisms"], wanted)
-    value = f"not named; named: {_names(part['mechanisms'])}"
-    if mechanism:
-        value = _in_words(mechanism)
+    missed = f"not named; named: {_names(part['mechanisms'])}"
+    value = _in_words(mechanism) if mechanism else missed
     if name == "injected" and "frozen" in parts:
         # What the same simulators lack on the same breaths before anything was injected.
         control = named(parts["frozen"]["mechanisms"], wanted)

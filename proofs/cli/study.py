@@ -24,12 +24,10 @@ app = typer.Typer(
     name="study", help="Compare training methods, and variants of a design.", no_args_is_help=True
 )
 
-
 Only = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME", help="Only this variant and the base; may be repeated."),
 ]
-
 
 Store = Annotated[
     Path | None,

@@ -62,19 +62,12 @@ class Reproduction:
         """JSON values, null where a number is missing."""
         return json_values(dataclasses.asdict(self))
 
-    def summary(self) -> Table:
-        """A row a section: place, claim, verdict and finding."""
-        rows = tuple(
-            (section.place, section.claim, section.verdict, section.finding)
-            for section in self.sections
-        )
-        return Table("The paper's claims", ("paper", "claim", "here", "figures here"), rows)
-
     def to_markdown(self) -> str:
         """The comparison as a page of documentation."""
         about = ", ".join(f"{name} {value}" for name, value in self.about.items())
         parts = ["# The paper, reproduced", f"Figures of: {about}.", "## Claims"]
-        parts.append(self.summary().to_markdown())
+        claims = tuple((s.place, s.claim, s.verdict, s.finding) for s in self.sections)
+        parts.append(Table("", ("paper", "claim", "here", "figures here"), claims).to_markdown())
         for section in self.sections:
             parts += [f"## {section.title}", f"*{section.place}; {section.source}*"]
             parts += [f"Paper: {section.claim}", f"Here (**{section.verdict}**): {section.finding}"]

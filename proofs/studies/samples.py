@@ -28,9 +28,6 @@ from ventbench.train.rl import episodes
 from ventbench.train.rl.learners import PolicyGradient
 from ventbench.train.rl.train import METHODS, Method, method_for, train
 
-#: Share of the values that the interquartile mean cuts off at each end.
-CUT = 0.25
-
 #: How close to its final score counts as having reached it.
 CLOSE = 0.02
 
@@ -41,7 +38,7 @@ def interquartile_mean(values: ArrayLike) -> Floats:
     Args:
         values: shape ``(n, ...)``; ``floor(n / 4)`` values are cut at each end.
     """
-    return trim_mean(np.asarray(values, float), CUT, axis=0)
+    return trim_mean(np.asarray(values, float), 0.25, axis=0)
 
 
 def band(values: ArrayLike) -> tuple[Floats, Floats]:

@@ -268,7 +268,7 @@ def test_draws_and_diagnosers_are_scored_together(answered, tmp_path):
     done = CliRunner().invoke(app, ["challenge", "board", *own])
     assert done.exit_code == 0
     text = page.read_text()
-    assert re.search(r"\n\| unsure \| \S+ \| 3 \|", text)
-    assert re.search(r"\n\| sees_nothing \| \S+ \| 1 \|", text)
+    assert re.search(r"\n\| `first` \| unsure \| \S+ \| 3 \|", text)
+    assert re.search(r"\n\| `first` \| sees_nothing \| \S+ \| 1 \|", text)
     assert "`sees_nothing` minus the other, case by case" in text
     assert f"| `{SECRET}` | `{answered.commitment.read_text().strip()}` |" in text

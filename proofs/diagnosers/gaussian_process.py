@@ -104,4 +104,4 @@ class _Process:
 
     def _likelihood(self, z: Floats) -> float:
         root = Covariance.from_cholesky(cholesky(self._covariance(z), lower=True))
-        return float(multivariate_normal.logpdf(self._y, cov=root))
+        return float(multivariate_normal.logpdf(self._y, cov=root))  # type: ignore[arg-type]

@@ -47,13 +47,12 @@ def write_section(path: Path, name: str, text: str) -> None:
 
 
 def challenge_section(result: Judged) -> str:
-    """Figures of a challenge, of one or more draws, as Markdown, with how they come to be."""
+    """Figures of a diagnoser on one or more draws as Markdown."""
     versions = ", ".join(result.versions) or "unknown"
     answered = ", ".join(f"{draw.answered} of {draw.total}" for draw in result.draws)
     lines = [
-        *_commands({result.generator: result.draws}, [result.diagnoser], "reveal"),
-        "",
-        f"Diagnoser `{result.diagnoser}`, code {versions}, answered {answered}:",
+        f"Diagnoser `{result.diagnoser}`, code {versions}, answered {answered} of "
+        f"`{result.generator}`:",
         "",
         "| figure | measured | cases | goal |",
         "|---|---|---|---|",
@@ -90,30 +89,21 @@ def _wrong_answers(result: Judged) -> list[str]:
     ]  # fmt: skip
 
 
-def _commands(
-    tables: Mapping[str, Sequence[Draw]], diagnosers: Sequence[str], last: str
-) -> list[str]:
+def _commands(tables: Mapping[str, Sequence[Draw]], diagnosers: Sequence[str]) -> list[str]:
     """Commands that make, answer and judge draws, and what was committed."""
-    make, answer, folders, seeds, drawn = [], [], [], [], []
+    call, make, folders, seeds, drawn = "python -m proofs challenge", [], [], [], []
     for source, draws in tables.items():
         for k, draw in enumerate(draws, start=1):
-            where = f"runs/{source}{k if k > 1 else ''}"
-            folders.append(where)
+            folders.append(f"runs/{source}{k if k > 1 else ''}")
             seeds.append(f"--seed={draw.seed}")
-            make.append(
-                f"python -m proofs challenge make --generator {source} {seeds[-1]} "
-                f"--cases {draw.total} --out {where}"
-            )
-            answer.append(f"python -m proofs challenge answer {where} --diagnoser {diagnosers[0]}")
+            given = f"--generator {source} {seeds[-1]} --cases {draw.total} --out {folders[-1]}"
+            make.append(f"{call} make {given}")
             drawn.append(f"| `{source}` | `{draw.seed}` | `{draw.commitment}` |")
-    if len(diagnosers) > 1:
-        one = "python -m proofs challenge answer $where --diagnoser $who"
-        each = f"for who in {' '.join(diagnosers)}; do {one}; done"
-        answer = [f"for where in {' '.join(folders)}; do {each}; done"]
-    who = f"--diagnoser {diagnosers[0]} " if last == "reveal" else ""
-    end = f"python -m proofs challenge {last} {' '.join(folders)} {who}{' '.join(seeds)}"
+    each = f"for who in {' '.join(diagnosers)}; do {call} answer $where --diagnoser $who; done"
+    answer = f"for where in {' '.join(folders)}; do {each}; done"
+    end = f"{call} board {' '.join(folders)} {' '.join(seeds)}"
     head = ["| world | seed | commitment |", "|---|---|---|"]
-    return ["```sh", *make, *answer, end, "```", "", *head, *drawn]
+    return ["```sh", *make, answer, end, "```", "", *head, *drawn]
 
 
 #: Figures of the board, and their heads.
@@ -135,7 +125,7 @@ def board_section(result: Board) -> str:
     every = [row for rows in result.tables.values() for row in rows]
     names = list(dict.fromkeys(row.diagnoser for row in every))
     drawn = {generator: rows[0].draws for generator, rows in result.tables.items()}
-    lines = _commands(drawn, names, "board")
+    lines = _commands(drawn, names)
     lines += ["", f"The last two columns are `{result.against}` minus the other, case by case."]
     heads = ["world", "diagnoser", "code", "cases", *_BOARD.values()]
     heads += [f"less: {what}" for what in _PAIRED]
@@ -193,8 +183,8 @@ def proof_section(proof: Proof) -> str:
     return "\n".join(lines)
 
 
-def pairs_section(report: str, *, half: str) -> str:
-    """Tables of :func:`~proofs.real.comparisons.report` for a half of the pairs as Markdown."""
+def pairs_section(report: str, half: str) -> str:
+    """Tables of :func:`~proofs.real.pairs.report` for a half of the pairs as Markdown."""
     option = " --sealed" if half == "sealed" else ""
     return (
         f"```sh\npython -m proofs pairs --recordings DIR --out runs/pairs{option}\n```\n\n"

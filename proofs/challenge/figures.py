@@ -60,13 +60,9 @@ def _goal(least: float | None, most: float | None) -> str:
     return f">= {least:.0%}" if most is None else f"{least:.0%} to {most:.0%}"
 
 
-def statistic(what: str, values: Sequence[float], of: Callable, most: float | None) -> Figure:
-    """Statistic ``of`` the values, with its upper limit."""
-    goal = "" if most is None else f"<= {most:g}"
-    if len(values) == 0:
-        return Figure(what, None, goal, 0, None, None)
-    value = float(of(np.asarray(values)))
-    return Figure(what, value, goal, len(values), None, None if most is None else value <= most)
+def largest(what: str, values: Sequence[float]) -> Figure:
+    """The largest value, which has no interval."""
+    return Figure(what, max(values, default=None), "", len(values), None, None)
 
 
 def mean(
@@ -142,8 +138,8 @@ def scores(cases: Sequence[JudgedCase]) -> list[Figure]:
         mean("withheld expirations, error, cmH2O", [c.expiration for c in cases]),
         *_parameters(cases),
         mean("processor seconds, mean", [c.seconds for c in cases]),
-        statistic("processor seconds, longest", [c.seconds for c in cases], np.max, None),
-        statistic("memory, MiB, most", [c.peak for c in cases], np.max, None),
+        largest("processor seconds, longest", [c.seconds for c in cases]),
+        largest("memory, MiB, most", [c.peak for c in cases]),
     ]  # fmt: skip
 
 
@@ -182,7 +178,7 @@ def by_kind(cases: Sequence[JudgedCase]) -> list[Figure]:
         share("four: terms found",
               (bool(c.answered & effect.terms) for c in four for effect in c.truth if effect.seen),
               least=0.90),
-        statistic("four: spurious names a case", [len(c.false) for c in four], np.mean, 0.25),
+        mean("four: spurious names a case", [len(c.false) for c in four], most=0.25),
         share("masked: right name and nothing else", (c.right for c in masked)),
         share("masked: a wrong name", (bool(c.false) for c in masked)),
     ]  # fmt: skip
@@ -193,7 +189,8 @@ def _parameters(cases: Sequence[JudgedCase]) -> list[Figure]:
     named = [estimate for estimate in every if "." in estimate.path]
     lungs = [estimate for estimate in every if "." not in estimate.path]
     return [
-        statistic("parameters: median relative error", [e.error for e in named], np.median, 0.10),
+        mean("parameters: median relative error", [e.error for e in named], most=0.10,
+             of=lambda errors: np.median(errors, axis=1)),
         share("parameters: 95 % intervals that hold the truth", (e.covered for e in named),
               least=0.92, most=0.98),
         share("R and C, nothing missing: intervals that hold the truth",

@@ -164,11 +164,11 @@ def judge(
     belief = sum(hypotheses[terms] for terms in right)
     others = [p for terms, p in hypotheses.items() if terms not in right]
     allowed = frozenset().union(*(effect.terms | effect.beside for effect in truth))
-    by_term = _marginals(hypotheses)
     wrong = {
-        term: p for term, p in by_term.items()
-        if term not in allowed and not term.startswith(UNKNOWN)
-    }  # fmt: skip
+        term: sum(p for terms, p in hypotheses.items() if term in terms)
+        for term in sorted(frozenset().union(*hypotheses) - allowed)
+        if not term.startswith(UNKNOWN)
+    }
     places = frozenset().union(*(effect.places for effect in truth))
     errors = _errors(breaths, withheld, answer)
     return JudgedCase(
@@ -193,15 +193,6 @@ def judge(
         peak=given["peak_mib"],
         problem=problem,
     )
-
-
-def _marginals(hypotheses: dict[frozenset[str], float]) -> dict[str, float]:
-    """Probability of each term: that of all hypotheses that have it."""
-    found: dict[str, float] = {}
-    for terms, probability in hypotheses.items():
-        for term in terms:
-            found[term] = found.get(term, 0.0) + probability
-    return found
 
 
 def _estimates(

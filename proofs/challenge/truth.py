@@ -13,20 +13,19 @@ import numpy as np
 from hardware_eval.emulation.cases import EFFECTS, NOMINAL_GAIN, Case, Effect
 from proofs.challenge.detectability import LIMIT
 from proofs.challenge.faults.effects import FaultsCase
-from proofs.challenge.generators import in_library
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger import effects as stranger
 from proofs.challenge.vocabulary import PARAMETERS, TERMS, UNKNOWN, place_of
 
 #: Terms that are right for an effect that the first generator's library does not have.
-_OUTSIDE: dict[str, tuple[str, ...]] = {
-    "volume_resistance": (f"{UNKNOWN}airway",),
-    "cardiogenic": (f"{UNKNOWN}muscles",),
-    "pulsating_supply": (f"{UNKNOWN}supply", "supply_ripple"),
-    "direction_resistance": (f"{UNKNOWN}airway",),
-    "second_compartment": (f"{UNKNOWN}lung", "viscoelasticity"),
-    "sensor_nonlinearity": (f"{UNKNOWN}pressure_sensor", "sensor_curve"),
-    "expiratory_valve_orifice": (f"{UNKNOWN}expiratory_valve",),
+_OUTSIDE: dict[str, set[str]] = {
+    "volume_resistance": {f"{UNKNOWN}airway"},
+    "cardiogenic": {f"{UNKNOWN}muscles"},
+    "pulsating_supply": {f"{UNKNOWN}supply", "supply_ripple"},
+    "direction_resistance": {f"{UNKNOWN}airway"},
+    "second_compartment": {f"{UNKNOWN}lung", "viscoelasticity"},
+    "sensor_nonlinearity": {f"{UNKNOWN}pressure_sensor", "sensor_curve"},
+    "expiratory_valve_orifice": {f"{UNKNOWN}expiratory_valve"},
 }
 
 #: Power of (true gain / nominal gain) by which a parameter's value changes when a fit assumes the
@@ -68,20 +67,18 @@ def concealed(drawn: DrawnCase, nats: Iterable[float]) -> tuple[Concealed, ...]:
 
 
 def _terms(case: Case, effect: Effect) -> tuple[frozenset[str], frozenset[str]]:
-    beside: frozenset[str] = frozenset()
-    if isinstance(case, FaultsCase):
-        return frozenset({effect.name}), beside
-    if in_library(case, effect.name):
-        if isinstance(case, stranger.StrangerCase) and effect.name == "inertance":
-            # It comes with a circuit's compliance, which may be named or not; alone below the
-            # detection limit.
-            beside = frozenset({"circuit_compliance"})
-        return frozenset({effect.name}), beside
+    right, beside = {effect.name}, set()
     if isinstance(case, stranger.StrangerCase):
         family = stranger.EFFECTS[effect.name]
-        names = {name for name in family.names if name in TERMS}
-        return frozenset(names | {UNKNOWN + place for place in family.places}), beside
-    return frozenset(_OUTSIDE[effect.name]), beside
+        if not family.inside:
+            right = {*TERMS.intersection(family.names), *(UNKNOWN + at for at in family.places)}
+        elif effect.name == "inertance":
+            # It comes with a circuit's compliance, which may be named or not; alone below the
+            # detection limit.
+            beside = {"circuit_compliance"}
+    elif not (isinstance(case, FaultsCase) or EFFECTS[effect.name].inside):
+        right = _OUTSIDE[effect.name]
+    return frozenset(right), frozenset(beside)
 
 
 def is_right(terms: frozenset[str], truth: tuple[Concealed, ...]) -> bool:
@@ -112,19 +109,18 @@ def true_values(case: Case) -> dict[str, float]:
         paths = {f"{e.name}.{key}": v for e in case.effects for key, v in e.parameters.items()}
         return {path: value for path, value in paths.items() if path in PARAMETERS}
     values: dict[str, float] = {}
+    if not isinstance(case, stranger.StrangerCase):
+        for effect in filter(has_library_form, case.effects):
+            values |= _values_of(effect, ratio)
+        return values
     for effect in case.effects:
-        if isinstance(case, stranger.StrangerCase):
-            same = effect.form == stranger.SAME
-        else:
-            same = has_library_form(effect)
-        if same and effect.name == "circuit_compliance" and isinstance(case, stranger.StrangerCase):
+        if effect.name == "circuit_compliance":
             # The circuit that every rig of this generator has adds to the drawn one.
             whole = effect.parameters["compliance"] + case.dead_space
             effect = replace(effect, parameters={"compliance": whole})
-        if same:
+        if effect.form == stranger.SAME:
             values |= _values_of(effect, ratio)
-    if isinstance(case, stranger.StrangerCase):
-        _refer_to_zero_pressure(values, case)
+    _refer_to_zero_pressure(values, case)
     return values
 
 

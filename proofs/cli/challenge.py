@@ -122,7 +122,6 @@ def reveal(
     seed: Seeds,
     diagnoser: Diagnoser = "ventbench",
     json: JsonFile = None,
-    page: ResultsPage = None,
 ) -> None:
     """Open the seal, check all hashes, and judge a diagnoser by the withheld pressures and effects.
 
@@ -130,14 +129,11 @@ def reveal(
 
     Example: `python -m proofs challenge reveal runs/challenge --seed "$SECRET" --json scores.json`
     """
-    _one_seed_each(folders, seed)
-
-    from proofs.challenge.folder import ChallengeFolder
     from proofs.challenge.reveal import reveal as work
     from proofs.results_page import challenge_section
 
-    result = work([ChallengeFolder(folder) for folder in folders], seed, diagnoser)
-    _told(result, json, page, f"challenge {result.generator}", challenge_section(result))
+    result = work(_draws(folders, seed), seed, diagnoser)
+    _told(result, challenge_section(result), json)
     if any(figure.met is False for figure in result.figures):
         raise typer.Exit(1)
 
@@ -158,14 +154,11 @@ def board(
 
     Example: `python -m proofs challenge board runs/challenge --seed "$SECRET"`
     """
-    _one_seed_each(folders, seed)
-
-    from proofs.challenge.folder import ChallengeFolder
     from proofs.challenge.reveal import board as work
     from proofs.results_page import board_section
 
-    result = work([ChallengeFolder(folder) for folder in folders], seed, against)
-    _told(result, json, page, "board of diagnosers", board_section(result))
+    result = work(_draws(folders, seed), seed, against)
+    _told(result, board_section(result), json, page)
 
 
 @app.command()
@@ -232,22 +225,25 @@ def round_(
         own = rounds.draw(own, content)
     with bars() as tell:
         result = rounds.play(own, jobs=jobs, tell=tell)
-    _told(result, json, page, "board of diagnosers", board_section(result))
+    _told(result, board_section(result), json, page)
 
 
-def _told(result: Any, json: Path | None, page: Path | None, name: str, text: str) -> None:
+def _told(result: Any, text: str, json: Path | None, page: Path | None = None) -> None:
     from proofs.results_page import write_section
 
     emit(result.as_dict(), json)
     if page is not None:
-        write_section(page, name, text)
+        write_section(page, "board of diagnosers", text)
     if str(json) != "-":
         typer.echo(text)
 
 
-def _one_seed_each(folders: list[Path], seed: list[str]) -> None:
+def _draws(folders: list[Path], seed: list[str]) -> Any:
+    from proofs.challenge.folder import ChallengeFolder
+
     if len(seed) != len(folders):
         raise typer.BadParameter(
             f"{len(folders)} folders and {len(seed)} seeds were given; give --seed once a folder",
             param_hint="--seed",
         )
+    return [ChallengeFolder(folder) for folder in folders]

@@ -14,13 +14,6 @@ from ventbench.cli.options import JsonFile, RecordingsDir, Workers, bar, emit
 def paper(
     recordings: RecordingsDir = None,
     workers: Workers = 0,
-    page: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Write the page, with charts.")
-    ] = None,
-    markdown: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write the page as Markdown."),
-    ] = None,
     store: Annotated[
         Path | None,
         typer.Option(
@@ -30,13 +23,13 @@ def paper(
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Set each table and figure of the paper that needs no hardware beside ours.
+    """Set each table and figure of the paper that needs no hardware beside ours, as Markdown.
 
     The grid of PIDs and the bundled entries run on the frozen simulators; what takes minutes is
     read from stored results. With --recordings the errors by horizon are measured again; `study
     --store` renews the others.
 
-    Example: `python -m proofs paper --html paper.html --json paper.json`
+    Example: `python -m proofs paper --json paper.json`
     """
     from proofs.paper.paper import reproduce_paper
 
@@ -46,18 +39,6 @@ def paper(
             progress=lambda what, share: progress(share, text=what),
         )  # fmt: skip
     emit(result.to_json(), json)
-    text = result.to_markdown()
-    typer.echo(text, err=str(json) == "-")
-    written = []
-    if page is not None:
-        from proofs.paper.page import write_reproduction
-
-        written.append(write_reproduction(page, result))
-    if markdown is not None:
-        files.write_text(markdown, text)
-        written.append(markdown)
+    typer.echo(result.to_markdown(), err=str(json) == "-")
     if store is not None:
         files.write_json(store, stored)
-        written.append(store)
-    for path in written:
-        typer.echo(f"wrote {path}", err=str(json) == "-")

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from proofs.cli import ResultsPage
-from ventbench.base import files
 from ventbench.base.errors import require
 from ventbench.cli.options import (
     JsonFile,
@@ -107,7 +106,7 @@ def pairs(
 
     Example: `python -m proofs pairs --recordings recordings --out runs/pairs`
     """
-    from proofs.real import comparisons as work
+    from proofs.real import pairs as work
     from proofs.results_page import pairs_section, write_section
     from ventbench.base import compilation
 
@@ -115,10 +114,9 @@ def pairs(
     compilation.keep()
     with bar("comparing") as progress:
         answers = work.run(folder, out, sealed=sealed, kinds=kind or (), progress=progress)
-    text = work.report(answers)
-    files.write_text(out / ("sealed.md" if sealed else "development.md"), text + "\n")
+    half = "sealed" if sealed else "development"
+    text = pairs_section(work.report(answers), half)
     if page is not None:
-        half = "sealed" if sealed else "development"
-        write_section(page, f"real pairs {half}", pairs_section(text, half=half))
+        write_section(page, f"real pairs {half}", text)
     emit(work.as_dict(answers), json)
     typer.echo(text, err=str(json) == "-")

@@ -9,7 +9,6 @@ import typer
 
 from ventbench.base import files
 from ventbench.base.errors import InputError, require
-from ventbench.base.files import json_values
 from ventbench.cli.options import (
     JsonFile,
     RecordingsDir,
@@ -18,7 +17,6 @@ from ventbench.cli.options import (
     bars,
     claim_out,
     recordings_folder,
-    table_of,
     told,
 )
 
@@ -26,12 +24,10 @@ app = typer.Typer(
     name="study", help="Compare training methods, and variants of a design.", no_args_is_help=True
 )
 
-
 Only = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME", help="Only this variant and the base; may be repeated."),
 ]
-
 
 Store = Annotated[
     Path | None,
@@ -78,29 +74,12 @@ def samples(
     files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
     _keep(store, samples=result.stored())
     table = result.summary()
-    _tell({"lung": result.lung, "methods": _plain(table)}, _summary(result, table), out, json)
-
-
-def _plain(table: Any) -> list[dict[str, Any]]:
-    # What is not reached is NaN in the table and null in JSON.
-    return json_values(table.to_dict("records"))
-
-
-def _summary(result: Any, frame: Any) -> Any:
-    # The file has more columns, and longer names for them.
-    heads = {
-        "method": "method",
-        "final": "final",
-        "episodes": "breaths",
-        "at_100_episodes": "at 100",
-        "episodes_to_best_pid": "to best PID",
-        "episodes_to_2_percent": "to 2 %",
-        "seconds_to_2_percent": "s to 2 %",
-    }
-    rows = [["-" if row[k] is None else str(row[k]) for k in heads] for row in _plain(frame)]
-    caption = f"The corrected PID: {result.start:.3f}; best PID of the grid: {result.best_pid:.3f}."
-    title = f"{result.lung}: nominal score, cmH2O, and experience"
-    return table_of(title, heads.values(), rows, caption=caption)
+    title = (
+        f"{result.lung}: nominal score, cmH2O, and breaths of experience; the corrected PID has "
+        f"{result.start:.3f}, the best of the grid {result.best_pid:.3f}"
+    )
+    values = {"lung": result.lung, "methods": table.to_dict("records")}
+    _tell(values, title, table.set_index("method").T, out, json)
 
 
 @app.command()
@@ -130,8 +109,7 @@ def controllers(
     from ventbench.train.residual import ResidualConfig
 
     config = ResidualConfig(updates=updates)
-    known = work.variants(config)
-    _check(only, known)
+    _check(only, work.variants(config))
     with bar("controllers") as progress:
         runs = work.compare(
             frozen.load(), out, range(seeds), config=config, only=only,
@@ -140,19 +118,10 @@ def controllers(
         )  # fmt: skip
     _keep(store, controllers=work.stored(runs, config))
     table = work.summary(runs)
-    meanings = {name: variant.meaning for name, variant in known.items()}
-    rows = [
-        (
-            str(row["variant"]), meanings[str(row["variant"])],
-            *(f"{row[x]:.3f}" for x in work.FIGURES),
-            f"{row['nominal_change_low']:+.3f}..{row['nominal_change_high']:+.3f}",
-        )
-        for row in table.to_dict("records")
-    ]  # fmt: skip
-    heads = ("variant", "what", *work.FIGURES, "difference to base")
-    title = "Mean |pressure - target|, cmH2O, averaged over seeds"
+    title = "Mean |pressure - target|, cmH2O, averaged over seeds, and difference to the base"
     values = {"updates": updates, "variants": table.to_dict("records")}
-    _tell(values, table_of(title, heads, rows, left=["what"]), out, json)
+    shown = ["variant", *work.FIGURES, "nominal_change_low", "nominal_change_high"]
+    _tell(values, title, table[shown].set_index("variant"), out, json)
 
 
 @app.command()
@@ -185,16 +154,9 @@ def networks(
         )  # fmt: skip
     _keep(store, networks=work.stored(breaths))
     table = work.summary(breaths)
-    rows = [
-        (
-            str(row["variant"]), f"{row['mean']:.3f}", f"{row['median']:.3f}",
-            f"{row['change']:+.3f}", f"{row['low95']:+.3f}..{row['high95']:+.3f}",
-        )
-        for row in table.to_dict("records")
-    ]  # fmt: skip
-    heads = ("variant", "mean", "median", "difference to base", "95 %, paired by breath")
-    shown = table_of("Held-out open-loop MAE, cmH2O", heads, rows)
-    _tell({"variants": table.to_dict("records")}, shown, out, json)
+    title = "Held-out open-loop MAE, cmH2O, and its change from the base, paired by breath"
+    values = {"variants": table.to_dict("records")}
+    _tell(values, title, table.set_index("variant"), out, json)
 
 
 def _check(only: list[str] | None, known: dict[str, Any]) -> None:
@@ -214,7 +176,8 @@ def _keep(store: Path | None, **section: Any) -> None:
         files.write_json(store, kept | section)
 
 
-def _tell(values: Any, shown: Any, out: Path, json: Path | None) -> None:
-    console = told(values, json)
-    console.print(shown)
-    console.print(f"wrote {out}", soft_wrap=True)
+def _tell(values: Any, title: str, table: Any, out: Path, json: Path | None) -> None:
+    # What is not reached is NaN in a table and null in JSON.
+    console = told(files.json_values(values), json)
+    text = table.to_string(na_rep="-", float_format="{:.3f}".format)
+    console.print(f"{title}\n\n{text}\n\nwrote {out}", soft_wrap=True)

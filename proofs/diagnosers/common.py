@@ -80,17 +80,14 @@ def see(folder: Path) -> Seen:
     return Seen(question, breaths, np.isin(breaths.breath_id, question["withheld"]))
 
 
+def estimated(value: float, low: float, high: float) -> dict[str, float]:
+    """A parameter and its 95 % interval, as an answer has them."""
+    return {"value": float(value), "low": float(min(low, value)), "high": float(max(high, value))}
+
+
 def intervals(fitted: Fit, paths: Iterable[str]) -> dict[str, dict[str, float]]:
-    """Estimates of free parameters with their 95 % intervals, as an answer has them."""
-    found = {}
-    for path in paths:
-        value, (low, high) = float(fitted.value(path)[0]), fitted.ci95(path)[0]
-        found[path] = {
-            "value": value,
-            "low": min(float(low), value),
-            "high": max(float(high), value),
-        }
-    return found
+    """Estimates of free parameters with their 95 % intervals."""
+    return {path: estimated(fitted.value(path)[0], *fitted.ci95(path)[0]) for path in paths}
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,4 +151,4 @@ def strength(name: str, multiple: float) -> dict[str, dict[str, float]]:
     """Estimate of a strength as a multiple of the mild one, without an interval of its own."""
     about = mechanism(name).description.strength
     value = about.neutral + multiple * (about.mild - about.neutral)
-    return {f"{name}.{about.name}": {"value": value, "low": value, "high": value}}
+    return {f"{name}.{about.name}": estimated(value, value, value)}

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import softmax
 
 from proofs.diagnosers.common import (
     Seen,
@@ -51,21 +52,17 @@ def diagnose(folder: Path) -> dict[str, Any]:
     regions = _regions(seen, model)
     guilty, noise = _energy(model, regions)
     names = list(model.effects)
-    number = np.broadcast_to(np.arange(len(model.weight))[:, None], model.weight.shape)
-    counted, held = model.weight > 0, number % 3 == 2
+    counted, held = model.weight > 0, (np.arange(len(model.weight)) % 3 == 2)[:, None]
     base = [*model.refit, np.ones_like(model.pressure)]
 
-    def solve(chosen: tuple[str, ...], rows: NDArray[np.bool_]) -> Floats:
-        columns = [*base, *(model.effects[name] for name in chosen)]
-        x = np.stack([column[rows] for column in columns], axis=1)
-        return np.asarray(np.linalg.lstsq(x, model.residual[rows], rcond=None)[0], float)
-
-    def corrected(chosen: tuple[str, ...], weights: Floats) -> Floats:
-        columns = [*base, *(model.effects[name] for name in chosen)]
-        return sum(w * column for w, column in zip(weights, columns, strict=True))  # type: ignore[return-value]
+    def correction(chosen: tuple[str, ...], rows: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """Multiples of chosen terms, fitted to some samples, and the change of all pressures."""
+        x = np.stack([*base, *(model.effects[name] for name in chosen)], axis=-1)
+        weights = np.asarray(np.linalg.lstsq(x[rows], model.residual[rows], rcond=None)[0], float)
+        return weights[len(base) :], x @ weights
 
     def left(chosen: tuple[str, ...]) -> float:
-        change = corrected(chosen, solve(chosen, counted & ~held))
+        change = correction(chosen, counted & ~held)[1]
         return float(np.sum((model.residual - change)[counted & held] ** 2))
 
     sets = [(), *((name,) for name in names), *combinations(names, 2)]
@@ -77,31 +74,25 @@ def diagnose(folder: Path) -> dict[str, Any]:
         best = single
     if best and not _gains(before, energies[best], freedom):
         best = ()
-    total = np.array([energies[c] for c in energies])
-    nats = -0.5 * freedom * np.log(np.maximum(total, 1e-9)) - 3.0 * np.array(
-        [len(c) for c in energies]
-    )
-    weights = np.exp((nats - nats.max()) / _COOLED) * np.array(
-        [c == best or len(c) <= 1 for c in energies]
-    )
-    weights = 0.3 * weights / weights.sum()
+    told = [c for c in energies if c == best or len(c) <= 1]
+    nats = [-0.5 * freedom * np.log(max(energies[c], 1e-9)) - 3.0 * len(c) for c in told]
+    weights = 0.3 * softmax(np.array(nats) / _COOLED)
     hypotheses = [
         {"terms": sorted(c), "probability": w + 0.6 * (c == best)}
-        for c, w in zip(energies, weights.tolist(), strict=True)
+        for c, w in zip(told, weights.tolist(), strict=True)
         if w > 1e-4 or c == best
     ]
     rest = 1.0 - sum(h["probability"] for h in hypotheses)
     hypotheses.append({"terms": ["unknown:airway"], "probability": rest})
-    found = solve(best, counted)
-    predicted = model.pressure + corrected(best, found)
+    multiples, change = correction(best, counted)
     parameters: dict[str, Any] = intervals(fitted, ("R", "C"))
-    for name, multiple in zip(best, found[len(base) :], strict=True):
+    for name, multiple in zip(best, multiples, strict=True):
         parameters |= strength(name, float(multiple))
     vocabulary = seen.question["vocabulary"]["names"]
     known = {f"{n}.{key}" for n, about in vocabulary.items() for key in about["parameters"]}
     return {
         "hypotheses": hypotheses,
-        "pressures": seen.pressures(predicted[seen.apart]),
+        "pressures": seen.pressures((model.pressure + change)[seen.apart]),
         "parameters": {k: v for k, v in parameters.items() if k in known | {"R", "C"}},
         "active": _active(seen, np.isin(regions, list(guilty))) if best or guilty else {},
         "notes": {"noise": noise},
@@ -135,15 +126,13 @@ def _energy(model: Templates, regions: NDArray[np.int64]) -> tuple[set[int], flo
     order = sorted(cells, key=lambda r: float(np.mean(cells[r] ** 2)))
     clean = np.concatenate([cells[r] for r in order[: max(1, round(_CLEAN * len(order)))]])
     variance, size = float(np.mean(clean**2)), len(clean) / _CORRELATED
-    values = []
-    for r in order:
-        ratio = float(np.mean(cells[r] ** 2)) / max(variance, 1e-12)
-        values.append(float(stats.f.sf(ratio, len(cells[r]) / _CORRELATED, size)))
-    p = np.array(values)  # Benjamini and Hochberg
-    rank = np.argsort(p)
-    below = np.flatnonzero(p[rank] <= _RATE * np.arange(1, len(p) + 1) / len(p))
-    count = 0 if not below.size else int(below[-1]) + 1
-    return {order[i] for i in rank[:count]}, float(np.sqrt(variance))
+    p = [
+        stats.f.sf(np.mean(cells[r] ** 2) / max(variance, 1e-12), len(cells[r]) / _CORRELATED, size)
+        for r in order
+    ]
+    adjusted = stats.false_discovery_control(p)  # Benjamini and Hochberg
+    guilty = {r for r, value in zip(order, adjusted, strict=True) if value <= _RATE}
+    return guilty, float(np.sqrt(variance))
 
 
 def _active(seen: Seen, flags: NDArray[np.bool_]) -> dict[str, list[list[float]]]:

@@ -49,9 +49,9 @@ def diagnose(folder: Path) -> dict[str, Any]:
     x = np.stack([term.ravel() for term in terms.values()], axis=1)
     scale = np.maximum(x.std(axis=0), 1e-9)
     x, y = x / scale, model.residual.ravel()
-    number = np.broadcast_to(np.arange(len(model.weight))[:, None], model.weight.shape).ravel()
     counted = model.weight.ravel() > 0
-    train, test = counted & (number % 3 != 2), counted & (number % 3 == 2)
+    held = np.repeat(np.arange(len(model.weight)) % 3 == 2, model.weight.shape[1])
+    train, test = counted & ~held, counted & held
 
     def sparse(threshold: float, rows: NDArray[np.bool_]) -> Floats:
         return thresholded_least_squares(x[rows], y[rows], threshold)

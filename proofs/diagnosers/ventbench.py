@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import ventbench
-from proofs.diagnosers.common import see
+from proofs.diagnosers.common import estimated, see
 from ventbench.physics.catalogue import basis_terms, mechanism
 
 #: Public places of the diagnosis's places.
@@ -141,12 +141,10 @@ def _by_place(slot: Mapping[str, Any]) -> dict[str, float]:
 
 def _parameters(found: Any, names: dict[str, Any]) -> dict[str, dict[str, float]]:
     """Estimates that the vocabulary has, where both ends of the interval are known."""
-    values = {
-        f"{missing.name}.{key}": (estimate.value, *estimate.ci95)
-        for missing in found.mechanisms
-        for key, estimate in missing.parameters.items()
-    }
+    values: dict[str, tuple[float, float, float]] = {}
     for missing in found.mechanisms:
+        for key, estimate in missing.parameters.items():
+            values[f"{missing.name}.{key}"] = (estimate.value, *estimate.ci95)
         if missing.breaths is not None:
             values[f"{missing.name}.breath"] = missing.breaths
     for match in found.lungs[:1]:
@@ -161,12 +159,7 @@ def _parameters(found: Any, names: dict[str, Any]) -> dict[str, dict[str, float]
         values["saturation.level"] = (found.saturated[0],) * 3
     known = {f"{name}.{key}" for name, about in names.items() for key in about["parameters"]}
     return {
-        path: {
-            "value": float(v),
-            "low": min(float(low), float(v)),
-            "high": max(float(high), float(v)),
-        }
-        for path, (v, low, high) in values.items()
-        if path in known | {"R", "C"}
-        and all(x is not None and np.isfinite(x) for x in (v, low, high))
+        path: estimated(*triple)
+        for path, triple in values.items()
+        if path in known | {"R", "C"} and all(x is not None and np.isfinite(x) for x in triple)
     }

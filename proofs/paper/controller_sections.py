@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from proofs.paper import published
-from proofs.paper.report import Cell, Chart, Line, Section, Table, Verdict
+from proofs.paper.report import Cell, Section, Table, Verdict
 from ventbench.base import precision
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.controllers.pid import PID
 from ventbench.plants import frozen
 from ventbench.plants.rigs import Rigs
-from ventbench.task import environment, protocol, rollouts, waveform
+from ventbench.task import environment, protocol, rollouts
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import score as metric
 from ventbench.train import pid_grid
@@ -131,21 +131,17 @@ def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -
     chosen = {
         name: tuple(grid.gains[int(np.argmin(np.where(among, error, np.inf)))].tolist())
         for name, among in kinds.items()
-        if np.any(among)
     }
     with precision.float64():
         plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[at], float), official.plants)
         controllers = PID(*(jnp.asarray(column) for column in zip(*chosen.values(), strict=True)))
         cells = environment.nominal_scenario(np.full(len(chosen), EXAMPLE_PIP))
-        inspired, expired = rollouts.closed_loop(plant, controllers, cells, whole=True)
-        assert expired is not None
-        breaths = np.concatenate([inspired.pressure, expired.pressure], axis=-1)
-    runs = {name: breaths[k].reshape(-1) for k, name in enumerate(chosen)}
-    runs["residual"] = residual[at, pip]
-    rows = []
+        inspired, _ = rollouts.closed_loop(plant, controllers, cells)
+        breaths = dict(zip(chosen, np.asarray(inspired.pressure[:, -1]), strict=True))
     last = protocol.BREATH_STEPS * (protocol.BREATHS - 1)
-    for name, run in runs.items():
-        breath = run[last : last + protocol.INSPIRATION_STEPS]
+    breaths["residual"] = residual[at, pip, last : last + protocol.INSPIRATION_STEPS]
+    rows = []
+    for name, breath in breaths.items():
         rows.append(
             (
                 name,
@@ -160,10 +156,6 @@ def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -
     faster = all(not ours[3] > row[3] for row in others if np.isfinite(row[3]))
     nearer = all(ours[2] < row[2] for row in others)
     verdict: Verdict = "agrees" if faster and nearer else "in part" if nearer else "differs"
-    steps = np.arange(protocol.BREATH_STEPS)
-    time = tuple((steps * protocol.DT).tolist())
-    target = tuple(np.asarray(waveform.target(steps, EXAMPLE_PIP), float).tolist())
-    lines = tuple(Line(name, time, tuple(run[last:].tolist())) for name, run in runs.items())
     return Section(
         "example", "Trajectories of one breath", "figures 2, 4 and 9",
         "The trained controller rises fast and stays near the target; P-only, I-only and PID rise "
@@ -178,12 +170,6 @@ def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -
                 "Third breath: error, cmH2O; rise from 10 to 90 %, s; overshoot, cmH2O; swings "
                 "around the target",
                 ("controller", "P, I, D", "error", "rise", "overshoot", "swings"), tuple(rows), 2,
-            ),
-        ),
-        (
-            Chart(
-                f"{EXAMPLE} at PIP {EXAMPLE_PIP:g} cmH2O", "time in the breath, s",
-                "pressure, cmH2O", (Line("target", time, target, dashed=True), *lines),
             ),
         ),
     )  # fmt: skip
@@ -334,14 +320,6 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
             "times fewer than PPO and DQN."
         )
     close = short["final"] <= 1.02 * min(row["final"] for row in methods.values())
-    lines = tuple(
-        Line(name, tuple(curve["episodes"]), tuple(curve["score"]))
-        for name, curve in samples["curves"].items()
-    )
-    chart = Chart(
-        f"{samples['lung']}: score without noise against experience", "breaths", "cmH2O", lines,
-        logarithmic=True,
-    )  # fmt: skip
     return Section(
         "samples", "Breaths of experience", "figure 11, contribution 4, conclusion 3",
         "The policy gradient converges in about 100 episodes, PPO and DQN in tens of thousands.",
@@ -362,7 +340,6 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
                 rows,
             ),
         ),
-        (chart,),
     )  # fmt: skip
 
 

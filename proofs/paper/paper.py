@@ -9,13 +9,12 @@ minutes or needs recordings is read from ``proofs/paper/stored.json``, where ear
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import ventbench
 from proofs.paper import controller_sections as controllers
-from proofs.paper import published
 from proofs.paper import simulator_sections as simulators
 from proofs.paper.report import Reproduction
 from proofs.studies.networks import MEASURED
@@ -48,18 +47,13 @@ def reproduce_paper(
     *,
     recordings: Path | str | None = None,
     workers: int = 0,
-    gains: Floats | None = None,
-    stored: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> tuple[Reproduction, dict[str, Any]]:
     """Set the paper's tables, figures and claims beside ours.
 
     Args:
         recordings: folder of the public recordings: errors by horizon are measured again.
         workers: processes for entries; 0 for this one alone.
-        gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given. They must
-            contain those of the paper's table.
-        stored: results of minutes; those of ``proofs/paper/stored.json`` if not given.
         progress: see :data:`Progress`.
 
     Returns:
@@ -67,29 +61,23 @@ def reproduce_paper(
 
     Raises:
         InputError: if a recording is malformed.
-
-    Examples:
-        >>> page, _ = reproduce_paper()  # doctest: +SKIP
-        >>> print(page)  # doctest: +SKIP
     """
-    tell = progress or (lambda what, share: None)
     official = frozen.load()
-    kept = dict(load_stored() if stored is None else stored)
+    kept = load_stored()
     if recordings is not None:
-        tell("errors by horizon", 0.0)
-        kept["horizon"] = simulators.measure_horizon(Path(recordings) / MEASURED)
-    tell("PID grid", 0.1)
-    tried = pid_grid.paper_gains() if gains is None else gains
-    error = pid_grid.errors(official.plants, tried)
-    grid = pid_grid.PIDGrid(LUNG_IDS, protocol.PIPS, tried, error)
+        progress("errors by horizon", 0.0)
+        kept["horizon"] = simulators.measure_horizon(Path(recordings) / MEASURED, kept["horizon"])
+    progress("PID grid", 0.1)
+    gains = pid_grid.paper_gains()
+    error = pid_grid.errors(official.plants, gains)
+    grid = pid_grid.PIDGrid(LUNG_IDS, protocol.PIPS, gains, error)
     with executor(workers) as pool:
-        jobs = dict(ENTRIES)
         scored: dict[str, tuple[Floats, Floats]] = {}
-        for name, result in results(pool, _scored, jobs):
+        for name, result in results(pool, _scored, ENTRIES):
             scored[name] = result
-            tell(f"{name} scored", 0.4 + 0.4 * len(scored) / len(jobs))
+            progress(f"{name} scored", 0.4 + 0.4 * len(scored) / len(ENTRIES))
     errors = {name: result[0] for name, result in scored.items()}
-    tell("exploration and examples", 0.9)
+    progress("exploration and examples", 0.9)
     sections = (
         simulators.simulators(official, kept["horizon"]),
         simulators.by_horizon(kept["horizon"]),
@@ -106,11 +94,8 @@ def reproduce_paper(
         controllers.sample_efficiency(kept["samples"]),
         controllers.stability(kept["samples"]),
     )
-    about = {
-        "ventbench": ventbench.__version__,
-        "simulators": official.manifest_sha256[:12],
-    }
-    return Reproduction(about, sections, published.NOT_REPRODUCED), kept
+    about = {"ventbench": ventbench.__version__, "simulators": official.manifest_sha256[:12]}
+    return Reproduction(about, sections), kept
 
 
 def load_stored(path: Path | None = None) -> dict[str, Any]:

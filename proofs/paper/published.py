@@ -31,36 +31,3 @@ TRAJECTORIES = 2400
 
 #: Trials with other hyper-parameters (section 6).
 TRIALS = {"PPO": 720, "DQN": 180}
-
-#: What needs the authors' hardware or gives no numbers, and why it is not reproduced here.
-NOT_REPRODUCED = (
-    ("figure 1", "drawing of the respiratory circuit", "a drawing, nothing to measure"),
-    ("figure 3", "the cluster of ten ventilators", "a photograph of hardware"),
-    (
-        "figures 7 and 8, on the lung",
-        "trained controller and best PID on the physical test lung",
-        "needs the ventilator and the QuickLung; here both run on simulators that were learned "
-        "from recordings of them. `ventbench-hardware run` does it where there is a rig",
-    ),
-    (
-        "table 2, on the lung",
-        "grid search over PIDs on the physical test lung",
-        "needs 14,400 runs of the rig; here the same grid runs on the simulators",
-    ),
-    (
-        "table 1, on the lung",
-        "exploratory breaths recorded on the physical test lung",
-        "the authors' training recordings are not public; the public ones are fewer and from many "
-        "rigs",
-    ),
-    (
-        "section 6",
-        "720 trials of hyper-parameters for PPO and 180 for DQN",
-        "their settings and results are not published",
-    ),
-    (
-        "sections 5 and 6",
-        "values of lambda; robustness to hyper-parameters",
-        "no values are given; `ventbench train residual --lambda X` regularises",
-    ),
-)

@@ -1,4 +1,4 @@
-"""A comparison with a paper as plain data: sections with tables and charts, as Markdown or JSON."""
+"""A comparison with a paper as plain data: sections with tables, as Markdown or JSON."""
 
 from __future__ import annotations
 
@@ -25,35 +25,16 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]  #: cells, a row as long as ``columns``.
     digits: int = 3  #: decimals of the numbers.
 
-    def texts(self) -> list[list[str]]:
-        """Rows as they are shown."""
-        return [[self._text(cell) for cell in row] for row in self.rows]
+    def to_markdown(self) -> str:
+        """The table as it is shown."""
+        rows = [[self._text(cell) for cell in row] for row in self.rows]
+        texts = [self.columns, ["---"] * len(self.columns), *rows]
+        return "\n".join(f"| {' | '.join(row)} |" for row in texts)
 
     def _text(self, cell: Cell) -> str:
         if cell is None:
             return "-"
         return cell if isinstance(cell, str) else f"{cell:.{self.digits}f}"
-
-
-@dataclass(frozen=True)
-class Line:
-    """A line of a chart."""
-
-    name: str  #: what it shows.
-    x: tuple[float, ...]  #: positions, increasing.
-    y: tuple[float, ...]  #: values; NaN where there is none.
-    dashed: bool = False  #: whether it is what others are compared with, such as a target.
-
-
-@dataclass(frozen=True)
-class Chart:
-    """Lines over one axis."""
-
-    title: str  #: what is shown.
-    x_label: str  #: with unit.
-    y_label: str  #: with unit.
-    lines: tuple[Line, ...]  #: the lines.
-    logarithmic: bool = False  #: whether the x axis is.
 
 
 @dataclass(frozen=True)
@@ -68,7 +49,6 @@ class Section:
     finding: str  #: what came out here, in a sentence or two.
     source: str  #: how the figures here were made.
     tables: tuple[Table, ...] = ()  #: tables.
-    charts: tuple[Chart, ...] = ()  #: charts.
 
 
 @dataclass(frozen=True)
@@ -77,43 +57,20 @@ class Reproduction:
 
     about: Mapping[str, Any]  #: simulators, protocol and versions that the figures belong to.
     sections: tuple[Section, ...]  #: in the order of the paper's argument.
-    #: place in the paper, what stands there, and why it is not reproduced.
-    not_reproduced: tuple[tuple[str, str, str], ...]
 
     def to_json(self) -> dict[str, Any]:
         """JSON values, null where a number is missing."""
-        plain = {
-            "about": dict(self.about),
-            "sections": [dataclasses.asdict(section) for section in self.sections],
-            "not_reproduced": [
-                {"place": place, "what": what, "why": why}
-                for place, what, why in self.not_reproduced
-            ],
-        }
-        return json_values(plain)
-
-    def summary(self) -> Table:
-        """A row a section: place, claim, verdict and finding."""
-        rows = tuple(
-            (section.place, section.claim, section.verdict, section.finding)
-            for section in self.sections
-        )
-        return Table("The paper's claims", ("paper", "claim", "here", "figures here"), rows)
+        return json_values(dataclasses.asdict(self))
 
     def to_markdown(self) -> str:
         """The comparison as a page of documentation."""
         about = ", ".join(f"{name} {value}" for name, value in self.about.items())
         parts = ["# The paper, reproduced", f"Figures of: {about}.", "## Claims"]
-        parts.append(_markdown(self.summary()))
+        claims = tuple((s.place, s.claim, s.verdict, s.finding) for s in self.sections)
+        parts.append(Table("", ("paper", "claim", "here", "figures here"), claims).to_markdown())
         for section in self.sections:
             parts += [f"## {section.title}", f"*{section.place}; {section.source}*"]
             parts += [f"Paper: {section.claim}", f"Here (**{section.verdict}**): {section.finding}"]
             for table in section.tables:
-                parts += [f"{table.caption}:", _markdown(table)]
-        missing = Table("", ("paper", "what", "why not here"), self.not_reproduced)
-        return "\n\n".join([*parts, "## Not reproduced", _markdown(missing)]) + "\n"
-
-
-def _markdown(table: Table) -> str:
-    texts = [list(table.columns), ["---"] * len(table.columns), *table.texts()]
-    return "\n".join(f"| {' | '.join(row)} |" for row in texts)
+                parts += [f"{table.caption}:", table.to_markdown()]
+        return "\n\n".join(parts) + "\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proofs.paper import published
-from proofs.paper.report import Cell, Chart, Line, Section, Table, Verdict
+from proofs.paper.report import Cell, Section, Table, Verdict
 from ventbench.base import files, precision
 from ventbench.base.arrays import Floats
 from ventbench.plants import frozen
@@ -28,15 +27,10 @@ from ventbench.train.exploration import RANGES, SimulatedVentilator, explore
 
 AnyFloats = NDArray[np.floating]
 
-#: Kinds of simulators whose error is shown by horizon, as tables name them.
-KINDS = {
-    "hybrid": "hybrid (official)",
-    "network": "network (the paper's kind)",
-    "single_compartment": "R-C lung",
-    "two_balloon": "two balloons",
-}
+#: Kinds of simulators whose error is measured.
+KINDS = ("hybrid", "network", "single_compartment", "two_balloon")
 
-#: The lung of the paper's figure of open-loop distance and of its figure of exploration.
+#: The lung of the paper's figure of exploration.
 SHOWN = "R5C50"
 
 #: Steps after the start at which errors by horizon are tabulated.
@@ -51,15 +45,16 @@ BREATHS = 64
 _MEANS = ("mae", "median_mae")
 
 
-def measure_horizon(recording: Path) -> dict[str, Any]:
+def measure_horizon(recording: Path, stored: Mapping[str, Any]) -> dict[str, Any]:
     """Open-loop errors of every kind of simulator on measured breaths, by horizon, as JSON values.
 
     Hybrids are judged by the member of their ensemble that has not seen the breath; the physics
-    knows no more than the label. Errors of the paper's networks, which are not among the
-    simulators, are the stored ones.
+    knows no more than the label.
 
     Args:
         recording: file of measured breaths in the public schema.
+        stored: an earlier result, whose errors of the paper's networks stay: they are not among the
+            simulators.
 
     Raises:
         InputError: if it is missing or malformed.
@@ -67,15 +62,13 @@ def measure_horizon(recording: Path) -> dict[str, Any]:
     breaths = load(recording)
     breaths = breaths.select(np.flatnonzero(np.isin(breaths.lung_ids, LUNG_IDS)))
     official = frozen.load()
-    stored = json.loads(Path(__file__).with_name("stored.json").read_text("utf-8"))
-    networks = stored["horizon"]["lungs"]
     judged = {
         "hybrid": official.cross_fitted,
         "single_compartment": partial(nominal_plants, single_compartment),
         "two_balloon": partial(nominal_plants, two_balloon),
     }
     lungs: dict[str, Any] = {
-        name: {"breaths": len(index), "network": networks[name]["network"]}
+        name: {"breaths": len(index), "network": stored["lungs"][name]["network"]}
         for name, index in breaths.by_lung_index.items()
     }
     for kind, plants_for in judged.items():
@@ -150,12 +143,6 @@ def by_horizon(horizon: Mapping[str, Any]) -> Section:
         for name, about in lungs.items()
     }
     flat = [name for name, value in growth.items() if value <= GROWTH]
-    shown = lungs[SHOWN]
-
-    def line(kind: str, title: str) -> Line:
-        curve = shown[kind]["by_step"]
-        return Line(title, tuple(float(k + 1) for k in range(len(curve))), tuple(curve))
-
     verdict: Verdict = "agrees" if len(flat) == len(lungs) else "in part" if flat else "differs"
     return Section(
         "horizon", "Error by horizon", "figure 5, table 5",
@@ -168,12 +155,6 @@ def by_horizon(horizon: Mapping[str, Any]) -> Section:
             Table(
                 "Hybrid: open-loop distance (sum over steps) and error after n steps, cmH2O",
                 ("lung", "distance", *(f"step {k}" for k in HORIZONS)), tuple(rows), 2,
-            ),
-        ),
-        (
-            Chart(
-                f"{SHOWN}: open-loop error by horizon", "steps after the start", "cmH2O",
-                tuple(line(kind, title) for kind, title in KINDS.items()),
             ),
         ),
     )  # fmt: skip
@@ -275,10 +256,5 @@ def exploration(official: frozen.Frozen) -> Section:
         f"computed: {BREATHS} breaths of {SHOWN}, with the paper's ranges of that lung",
         (
             Table(f"Exploration of {SHOWN}", ("quantity", "value"), rows),
-            Table(
-                "Settings of all lungs, the paper's (appendix C.1)",
-                ("lung", *(field.replace("_", " ") for field in ranges.__dataclass_fields__)),
-                tuple((name, *map(str, vars(own).values())) for name, own in RANGES.items()),
-            ),
         ),
     )  # fmt: skip

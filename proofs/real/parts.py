@@ -57,7 +57,6 @@ class Part:
     """One diagnosis of the proof."""
 
     name: str  #: name of its folder.
-    title: str  #: title in words.
     lungs: tuple[str, ...]  #: lungs whose breaths it uses.
     #: returns the setting, given the breaths of the lungs and the folder of the proof; or the
     #: reason why there is none.
@@ -103,14 +102,13 @@ def _injected(breaths: Breaths, out: Path) -> Setting:
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
-        Part("rc", "R-C lungs at their labels", LUNG_IDS, _rc),
-        Part("two_balloon", "the paper's two-balloon lungs at their labels", LUNG_IDS,
-             _two_balloon),
-        Part("removed", "the corrected R-C lungs, a mechanism removed", FEW, _removed, "rc"),
-        Part("injected", "the frozen simulators, recordings with a sensor lag", FEW, _injected),
-        Part("frozen", "the frozen simulators, recordings as they are", FEW, _frozen),
+        Part("rc", LUNG_IDS, _rc),
+        Part("two_balloon", LUNG_IDS, _two_balloon),
+        Part("removed", FEW, _removed, "rc"),
+        Part("injected", FEW, _injected),
+        Part("frozen", FEW, _frozen),
     )
-}  # fmt: skip
+}
 
 
 def slower_sensor(breaths: Breaths, tau: float) -> Breaths:
@@ -177,25 +175,22 @@ def without(plant: Physics, names: Collection[str]) -> Physics:
 
 
 def by_names_alone(plant: Plant) -> Plant:
-    """Return a corrected plant without the correction by nonparametric components.
+    """Return a corrected plant without the correction by nonparametric components, if it has any.
 
     Components that the given simulator has itself keep its values.
     """
+    physics = plant.with_mechanisms if isinstance(plant, Corrected) else plant
+    if not isinstance(physics, Physics) or not any(
+        _owner(path) in basis_terms() for path in physics.names
+    ):
+        return plant
     if not isinstance(plant, Corrected):
-        return without(plant, basis_terms()) if isinstance(plant, Physics) else plant
+        return without(physics, basis_terms())
     wanted, own = plant.with_mechanisms, plant.without_mechanisms
     coefficients = [path for path in (*wanted.names, *own.names) if _owner(path) in basis_terms()]
     with precision.float64():
         named_only = wanted.having(**{path: own.get(path) for path in coefficients})
     return dataclasses.replace(plant, with_mechanisms=named_only)
-
-
-def has_unnamed(plant: Plant) -> bool:
-    """Whether a corrected plant has nonparametric components."""
-    physics = plant.with_mechanisms if isinstance(plant, Corrected) else plant
-    return isinstance(physics, Physics) and any(
-        _owner(path) in basis_terms() for path in physics.names
-    )
 
 
 def _owner(path: str) -> str:

@@ -9,6 +9,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 import ventbench
 from proofs import code_version
-from proofs.real.parts import PARTS, Part, Setting, by_names_alone, has_unnamed
+from proofs.real.parts import PARTS, Part, Setting, by_names_alone
 from ventbench import recordings
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -80,7 +81,7 @@ class Proof:
 
 
 def prove(
-    folder: Path, out: Path, only: Collection[str] = (), progress: Progress | None = None
+    folder: Path, out: Path, only: Collection[str] = (), progress: Progress = lambda *_: None
 ) -> Proof:
     """Run the parts that are not finished, and write ``proof.json`` of all that are.
 
@@ -128,15 +129,10 @@ def prove(
     return proof
 
 
-def _run(
-    part: Part, setting: Setting, key: dict[str, Any], out: Path, progress: Progress | None
-) -> None:
-    def tell(step: str, share: float) -> None:
-        if progress is not None:
-            progress(part.name, step, share)
-
+def _run(part: Part, setting: Setting, key: dict[str, Any], out: Path, progress: Progress) -> None:
     diagnosis = diagnose(
-        setting.breaths, simulator=setting.plant, rigs=setting.rigs, progress=tell,
+        setting.breaths, simulator=setting.plant, rigs=setting.rigs,
+        progress=partial(progress, part.name),
         patient=False,  # the ventilator was connected to a test lung
     )  # fmt: skip
     diagnosis = dataclasses.replace(diagnosis, simulator=setting.plant_name)
@@ -147,8 +143,6 @@ def _run(
         out / DONE,
         {
             "key": key,
-            "title": part.title,
-            "breaths": len(setting.breaths),
             "wanted": setting.wanted,
             "code": code_version(),
             "mae_by_names_alone": _mae_by_names_alone(diagnosis),
@@ -169,11 +163,11 @@ def _finished(folder: Path, key: dict[str, Any]) -> dict[str, Any] | None:
 
 def _mae_by_names_alone(diagnosis: Diagnosis) -> float | None:
     """Held-out MAE of the corrected simulator without nonparametric components, cmH2O."""
-    if not any(has_unnamed(plant) for plant in diagnosis.plants.values()):
+    plants = {lung: by_names_alone(plant) for lung, plant in diagnosis.plants.items()}
+    if all(plants[lung] is plant for lung, plant in diagnosis.plants.items()):
         error = diagnosis.open_loop.after.mae
     else:
         held_out: Breaths = diagnosis.traces.breaths.select(diagnosis.traces.held_out)
-        plants = {lung: by_names_alone(plant) for lung, plant in diagnosis.plants.items()}
         inspiration = held_out.inspiratory & (held_out.time > 0)
         simulated = load_simulators(plants).pressures(held_out)
         error = open_loop_error(held_out.pressure, simulated, inspiration).mae
@@ -183,34 +177,25 @@ def _mae_by_names_alone(diagnosis: Diagnosis) -> float | None:
 def figures(diagnosis: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[str, Any]:
     """JSON values of a finished part; errors in cmH2O, on breaths that no fit has seen.
 
+    The part's ``diagnosis.json`` has everything else.
+
     Args:
         diagnosis: content of its ``diagnosis.json``.
         summary: content of its ``part.json``.
     """
     loop = diagnosis["open_loop"]
-    stages = {name: loop[name] for name in ("before", "refit", "after")}
     mechanisms = diagnosis["mechanisms"]
     named_alone = summary["mae_by_names_alone"] if mechanisms else None
-    wanted = summary["wanted"]
     return {
-        "title": summary["title"],
-        "lungs": summary["key"]["lungs"],
-        "breaths": summary["breaths"],
         "held_out": len(loop["held_out_breaths"]),
-        "mae": {name: stage["mae"] for name, stage in stages.items()},
-        "rmse": {name: stage["rmse"] for name, stage in stages.items()},
+        "mae": {name: loop[name]["mae"] for name in ("before", "refit", "after")},
         "mae_by_names_alone": summary["mae_by_names_alone"],
         "cut_percent": cut(loop["before"]["mae"], named_alone),
-        "noise_floor": loop["noise_floor"],
         "groups": loop["groups"],
-        "verdict": diagnosis["verdict"],
         "mechanisms": mechanisms,
         "slot": diagnosis["slot"],
-        "misfitting_labels": [lung for lung in diagnosis["lungs"] if not lung["label_matches"]],
-        "wanted": wanted,
-        "found": None if wanted is None else named(mechanisms, wanted) is not None,
+        "wanted": summary["wanted"],
         "about": summary["key"]["about"],
-        "seconds": diagnosis["seconds"],
         "code": summary.get("code"),
     }
 
@@ -259,9 +244,8 @@ def _wanted_is_named(name: str, parts: Mapping[str, Mapping[str, Any]]) -> Claim
     part = parts[name]
     wanted = part["wanted"]
     mechanism = named(part["mechanisms"], wanted)
-    value = f"not named; named: {_names(part['mechanisms'])}"
-    if mechanism:
-        value = _in_words(mechanism)
+    missed = f"not named; named: {_names(part['mechanisms'])}"
+    value = _in_words(mechanism) if mechanism else missed
     if name == "injected" and "frozen" in parts:
         # What the same simulators lack on the same breaths before anything was injected.
         control = named(parts["frozen"]["mechanisms"], wanted)

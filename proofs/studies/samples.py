@@ -26,16 +26,10 @@ from ventbench.task.metrics import bootstrap
 from ventbench.train import pid_grid
 from ventbench.train.rl import episodes
 from ventbench.train.rl.learners import PolicyGradient
-from ventbench.train.rl.train import METHODS, Method, TrainedPolicies, method_for, train
-
-#: Share of the values that the interquartile mean cuts off at each end.
-CUT = 0.25
+from ventbench.train.rl.train import METHODS, Method, method_for, train
 
 #: How close to its final score counts as having reached it.
 CLOSE = 0.02
-
-#: Points of a stored curve.
-STORED_POINTS = 40
 
 
 def interquartile_mean(values: ArrayLike) -> Floats:
@@ -44,7 +38,7 @@ def interquartile_mean(values: ArrayLike) -> Floats:
     Args:
         values: shape ``(n, ...)``; ``floor(n / 4)`` values are cut at each end.
     """
-    return trim_mean(np.asarray(values, float), CUT, axis=0)
+    return trim_mean(np.asarray(values, float), 0.25, axis=0)
 
 
 def band(values: ArrayLike) -> tuple[Floats, Floats]:
@@ -117,18 +111,8 @@ class SampleStudy:
         return pd.DataFrame([self._row(curve) for curve in self.curves])
 
     def stored(self) -> dict[str, Any]:
-        """JSON values for the paper's page: the table, and a few points of each curve.
-
-        The points are evenly apart in logarithms.
-        """
-        seeds, lines = len(self.curves[0].scores), {}
-        for curve in self.curves:
-            last = max(len(curve.episodes) - 1, 1)
-            at = np.unique(np.geomspace(1, last, STORED_POINTS).round().astype(int))
-            lines[curve.method] = {
-                "episodes": curve.episodes[at].tolist(),
-                "score": np.round(curve.middle[at], 4).tolist(),
-            }
+        """JSON values for the paper's page."""
+        seeds = len(self.curves[0].scores)
         return {
             "about": {
                 "command": f"python -m proofs study samples --seeds {seeds}", "simulators": 1,
@@ -136,7 +120,6 @@ class SampleStudy:
             "lung": self.lung,
             "seeds": seeds,
             "methods": files.json_values(self.summary().to_dict("records")),
-            "curves": lines,
         }  # fmt: skip
 
     def _row(self, curve: LearningCurve) -> dict[str, object]:
@@ -193,7 +176,6 @@ def sample_efficiency(
     out: Path,
     *,
     share: float = 1.0,
-    simulators: frozen.Frozen | None = None,
     progress: Progress = lambda *_: None,
 ) -> SampleStudy:
     """Train by every method with every seed; finished trainings are read from ``out``.
@@ -206,13 +188,12 @@ def sample_efficiency(
         seeds: one for each training of a method.
         out: folder of the checkpoints, ``samples.csv`` and ``summary.csv``.
         share: share of the full length of each training.
-        simulators: what is ventilated; the frozen simulators if not given.
         progress: see :data:`Progress`.
 
     Raises:
         InputError: if ``out`` holds another study.
     """
-    simulators = simulators or frozen.load()
+    simulators = frozen.load()
     at = LUNG_IDS.index(lung.id)
     single = jax.tree.map(lambda leaf: leaf[at : at + 1], simulators.plants)
     lungs = jax.tree.map(
@@ -232,17 +213,15 @@ def sample_efficiency(
             file=out / f"{name}.npz",
             progress=lambda done, error, name=name: progress(name, done, float(error.mean())),
         )
-        curves.append(_curve(name, trained))
+        seconds, scores = trained.seconds, trained.curves.astype(float)
+        curves.append(
+            LearningCurve(name, trained.episodes, seconds, trained.compile_seconds, scores)
+        )
     grid = pid_grid.errors(single, pid_grid.paper_gains())[0].mean(axis=-1)
     study = SampleStudy(lung.id, tuple(curves), float(curves[0].scores[0, 0]), float(grid.min()))
     files.write_text(out / "samples.csv", study.points().to_csv(index=False))
     files.write_text(out / "summary.csv", study.summary().to_csv(index=False))
     return study
-
-
-def _curve(name: str, trained: TrainedPolicies) -> LearningCurve:
-    scores = trained.curves.astype(float)
-    return LearningCurve(name, trained.episodes, trained.seconds, trained.compile_seconds, scores)
 
 
 #: What the curves are called in the picture.

@@ -37,9 +37,7 @@ def test_a_section_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
     assert (tmp_path / "fresh.md").read_text().startswith("<!-- proof -->")
 
 
-def test_a_challenge_tells_its_seed_its_commitment_and_its_code(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_challenge_tells_its_code_and_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     leak = Effect("leak", "strong", "library", {"conductance": 20.0})
     right = judged("single", [leak], answer((1.0, "leak")))
     wrong = judged("single", [leak], answer((0.9, "unknown:lung valve_lag"), (0.1, "")), worth=0.1)
@@ -55,15 +53,7 @@ def test_a_challenge_tells_its_seed_its_commitment_and_its_code(
     )
     monkeypatch.setattr(reveal, "by_kind", lambda cases: (*by_kind(cases), *more))
     text = challenge_section(result)
-    make = "python -m proofs challenge make --generator stranger"
-    assert f"{make} --seed=words --cases 40 --out runs/stranger\n" in text
-    assert f"{make} --seed=-more --cases 8 --out runs/stranger2\n" in text
-    both = "runs/stranger runs/stranger2 --seed=words --seed=-more"
-    folders, seeds = both.split(" --seed", 1)
-    told = f"python -m proofs challenge reveal {folders} --diagnoser refit --seed{seeds}"
-    assert told + "\n" in text
-    assert "Diagnoser `refit`, code 1a2b3c, answered 1 of 40, 1 of 8:\n" in text
-    assert "| `stranger` | `words` | `abc123` |\n| `stranger` | `-more` | `def456` |" in text
+    assert "Diagnoser `refit`, code 1a2b3c, answered 1 of 40, 1 of 8 of `stranger`:\n" in text
     assert "Answers that are not right (1 of 2):" in text
     told = "unknown:lung + valve_lag | strong leak (below the detection limit)"
     assert f"| {told} |" in text
@@ -76,16 +66,19 @@ def test_the_board_has_a_column_and_a_difference_for_each() -> None:
     leak = Effect("leak", "strong", "library", {"conductance": 20.0})
     ours = {(0, str(k)): judged("single", [leak], answer((1.0, "leak"))) for k in range(5)}
     other = {(0, str(k)): judged("single", [leak], answer((1.0, ""))) for k in range(3)}
-    draws = (Draw("words", "abc123", 5, 5),)
+    draws = (Draw("words", "abc123", 5, 5), Draw("-more", "def456", 8, 0))
     rows = (Judged("ours", "faults", draws, ours), Judged("flat", "faults", draws, other))
     text = board_section(Board("ours", {"faults": rows}))
     assert "\n| `faults` | ours | – | 5 | 0 (0..0) | 1 (1..1) |" in text
     assert "\n| `faults` | flat | – | 3 | 6.91 (6.91..6.91) | 0 (0..0) |" in text
     assert text.endswith(" | -6.91 (-6.91..-6.91) | -1 (-1..-1) |")
     assert text.count("| ours |") == 1
-    assert "| `faults` | `words` | `abc123` |" in text
-    assert "for where in runs/faults; do for who in ours flat; do python -m proofs" in text
-    assert text.count("challenge board runs/faults --seed=words\n") == 1
+    assert "| `faults` | `words` | `abc123` |\n| `faults` | `-more` | `def456` |" in text
+    make, both = "python -m proofs challenge make --generator faults", "runs/faults runs/faults2"
+    assert f"{make} --seed=words --cases 5 --out runs/faults\n" in text
+    assert f"{make} --seed=-more --cases 8 --out runs/faults2\n" in text
+    assert f"for where in {both}; do for who in ours flat; do python -m proofs" in text
+    assert text.count(f"challenge board {both} --seed=words --seed=-more\n") == 1
 
 
 def test_the_proof_is_told_part_by_part_and_lung_by_lung() -> None:

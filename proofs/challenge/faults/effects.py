@@ -15,13 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, EffectFamily, Strength
-from proofs.challenge.questions import DrawnCase, Kind, drawn
+from proofs.challenge.questions import Kind
 from ventbench.task.lungs import Lung
 
 
@@ -93,12 +92,8 @@ _LUNGS = tuple(Lung(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0)
 _SAMPLING = ((0.03, 84), (0.025, 100), (0.0333, 76))
 
 
-def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
-    """See :func:`proofs.challenge.questions.drawn`."""
-    return drawn(SHARES, _of_kind, kind, count, rng)
-
-
-def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[FaultsCase]:
+def of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[FaultsCase]:
+    """Draw cases of a kind."""
     every = tuple(FAULTS)
     rounds = count // len(every) + 1
     names = [every[i] for _ in range(rounds) for i in rng.permutation(len(every))]

@@ -7,8 +7,9 @@ jumps, because gas has mass or because the circuit stores none.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Base
 from proofs.challenge.first.instruments import EffectsByName, Floats, solve_falling
@@ -66,27 +67,24 @@ class Disturbances:
             x = np.clip((t - self._onset) / self._effort.parameters["duration"], 0.0, 1.0)
             pull = self._amplitude * _effort_shape(x, self._effort.form)
         if self._heart:
-            amplitude, rate, phase = self._heart
-            pull = pull + amplitude * np.sin(rate * t + phase)
+            pull = pull + self._heart(t)
         return pull
 
     def pulsed(self, flow: Floats, t: Floats) -> Floats:
         """Flow of the valve with the supply's pulsation, L/s, ``(n,)``."""
-        if not self._pulse:
-            return flow
-        amplitude, rate, phase = self._pulse
-        return flow * (1.0 + amplitude * np.sin(rate * t + phase))
+        return flow * (1.0 + self._pulse(t)) if self._pulse else flow
 
 
 def _oscillation(
     effects: EffectsByName, name: str, began: Floats, phase: float
-) -> tuple[float, float, NDArray[np.float64]] | None:
-    """Amplitude, angular frequency in rad/s, and phase of each breath; None without the effect."""
-    oscillation = effects.get(name)
-    if oscillation is None:
+) -> Callable[[Floats], Floats] | None:
+    """A sine of the time in each breath, s, that goes on between breaths; None without it."""
+    if name not in effects:
         return None
-    rate = 2.0 * np.pi * oscillation.parameters["frequency"]
-    return oscillation.parameters["amplitude"], rate, rate * began + phase
+    given = effects[name].parameters
+    rate = 2.0 * np.pi * given["frequency"]
+    phases = rate * began + phase
+    return lambda t: given["amplitude"] * np.sin(rate * t + phases)
 
 
 def _effort_shape(x: Floats, form: str) -> Floats:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from hardware_eval.emulation.cases import (
     draw_grid,
     rotate,
 )
-from proofs.challenge.questions import CLASSES, DrawnCase, Kind, drawn
+from proofs.challenge.questions import Kind
 from ventbench.task.lungs import LUNGS, Lung
 
 #: Share of each kind in a challenge of all kinds.
@@ -35,16 +34,18 @@ SHARES: dict[Kind, float] = {
 #: Effects that the library does not have, in alphabetical order.
 OUTSIDE: tuple[str, ...] = tuple(sorted(name for name, e in EFFECTS.items() if not e.inside))
 
+#: Classes of effects that the pressure of a single lung may not tell apart.
+CLASSES: tuple[frozenset[str], ...] = (
+    frozenset({"valve_lag", "sensor_lag", "circuit_compliance"}),
+    frozenset({"leak", "valve_dead_band", "command_rounding", "viscoelasticity"}),
+)
+
 #: Never combined with other effects, among which they are below the detection limit.
 _SINGLE_ONLY = ("inertance", "command_rounding")
 
 
-def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
-    """See :func:`proofs.challenge.questions.drawn`."""
-    return drawn(SHARES, _of_kind, kind, count, rng)
-
-
-def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[Case]:
+def of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[Case]:
+    """Draw cases of a kind."""
     if kind in ("null", "pair", "four"):
         for lung in rotate(list(LUNGS), count, rng):
             if kind == "null":

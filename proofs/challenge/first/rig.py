@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, draw_base
 from proofs.challenge.first.circuit import READING, Circuit, Disturbances
 from proofs.challenge.first.instruments import Floats, Sensor, Valve
-from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.breaths import Breaths, make_breaths
 
 #: Means of the sampling interval that a breath may have, s.
 INTERVALS = (0.0319, 0.0340)
@@ -112,7 +112,8 @@ def record(
     base = case.base or draw_base(case.lung_R, case.lung_C, rng)
     time = sampling_times(case.breaths, case.samples, case.jitter, rng)
     command = RecordingController(case, time, rng, share).command
-    return _run(case, base, time, expiratory(time), command, np.arange(len(time)), rng, steps)
+    u_out = (time >= INSPIRATION).astype(np.int8)
+    return _run(case, base, time, u_out, command, np.arange(len(time)), rng, steps)
 
 
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:
@@ -167,12 +168,10 @@ def _run(
         for s in range(k * steps, (k + 1) * steps):
             flow = asked[rows, grid.command[:, s]]
             state = circuit.step(state, lengths[:, s], flow, grid.opened[:, s], grid.nodes[:, s])
-    return Breaths(
-        breath_id=number + 1,
-        R=np.full(n, case.lung_R), C=np.full(n, case.lung_C),
-        time=time, dt=np.diff(time, axis=1, append=2 * time[:, -1:] - time[:, -2:-1]),
-        u_in=u_in, u_out=u_out.astype(np.int8), pressure=np.round(pressure, 6),
-        valid=np.ones((n, samples), bool), time_inferred=np.zeros(n, bool),
+    return make_breaths(
+        # A replay may ask for a breath several times, and takes the pressures alone.
+        number[0] + 1 + np.arange(n), np.full(n, case.lung_R), np.full(n, case.lung_C), time, u_in,
+        u_out, np.round(pressure, 6),
     )  # fmt: skip
 
 
@@ -237,11 +236,6 @@ class RecordingController:
         inspired = np.where(measured > _HIGHEST, 0.0, inspired)
         risen = -np.expm1(-np.maximum(t - 1.5, 0.0) * 5.0)
         return np.where(t < INSPIRATION, inspired, self._bias * np.where(self._soft, risen, 1.0))
-
-
-def expiratory(time: Floats) -> NDArray[np.int8]:
-    """Command of the expiratory valve, ``(n, T)``: 0 in inspiration, 1 (open) after it."""
-    return (time >= INSPIRATION).astype(np.int8)
 
 
 def _steady_command(case: Case, pressure: float | Floats) -> float | Floats:

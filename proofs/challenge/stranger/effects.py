@@ -17,12 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, EffectFamily, Strength
-from proofs.challenge.questions import DrawnCase, Kind, drawn
+from proofs.challenge.questions import Kind
 from ventbench.task.lungs import Lung
 
 #: Form of an effect whose parameter means the same as the library's of that name.
@@ -154,12 +153,8 @@ _GROSS, _FACTOR = 0.08, (1.5, 1.8)
 _SAMPLING = ((0.0319, 80), (0.0340, 80), (0.0250, 100))
 
 
-def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
-    """See :func:`proofs.challenge.questions.drawn`."""
-    return drawn(SHARES, _of_kind, kind, count, rng)
-
-
-def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[StrangerCase]:
+def of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[StrangerCase]:
+    """Draw cases of a kind."""
     lungs = [SETTINGS[i] for _ in range(count // 9 + 1) for i in rng.permutation(9)]
     pool = OUTSIDE if kind == "outside" else INSIDE
     names = [pool[i] for _ in range(count // len(pool) + 1) for i in rng.permutation(len(pool))]

@@ -163,17 +163,13 @@ def _run(
     at_sample = _events(sampled, count)
     at_valve, at_opening = _events(reaches, count), _events(late_opening, count)
     acting, out_now, out_before = np.zeros(n), np.zeros(n), np.zeros(n)
-    remembers = "valve_hysteresis" in effects
     for i in range(count + 1):
         for column, breaths in at_sample.get(i, ()):
             due = np.zeros(n, bool)
             due[breaths] = True
             seen, wanted = command(column, rig.shown(), due)
             pressure[due, column], u_in[due, column] = seen[due], wanted[due]
-            opening_now = (
-                _with_memory(rig, wanted, due) if remembers else rig.steady_command(wanted)
-            )
-            asked[due, column] = opening_now[due]
+            asked[due, column] = rig.steady_command(wanted, due)[due]
             out_now[due] = u_out[due, column]
         for column, breaths in at_valve.get(i, ()):
             acting[breaths] = gains[breaths] * asked[breaths, column]
@@ -192,16 +188,6 @@ def _events(at: NDArray[np.int64], count: int) -> dict[int, list[tuple[int, NDAr
                 breaths = np.flatnonzero(at[:, column] == step)
                 events.setdefault(int(step), []).append((column, breaths))
     return events
-
-
-def _with_memory(rig: Rig, wanted: Floats, these: NDArray[np.bool_]) -> Floats:
-    """Opening of all breaths; those that are not sampled now keep their hysteresis."""
-    held, before = rig.held.copy(), np.broadcast_to(rig.speed_of_command, wanted.shape).copy()
-    rig.speed_of_command = before
-    opening = rig.steady_command(wanted)
-    rig.held = np.where(these, rig.held, held)
-    rig.speed_of_command = np.where(these, rig.speed_of_command, before)
-    return opening
 
 
 def _explored(case: StrangerCase, rng: np.random.Generator, time: Floats, share: float) -> Floats:

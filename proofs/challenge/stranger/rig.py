@@ -78,15 +78,16 @@ class Rig:
         self.q = np.zeros(n)
         self.v, self.v2 = self._volumes(self.p - self.rest)  # beyond those at PEEP
         self.stress = np.zeros(n)
-        self.held = np.zeros(n)  # hysteresis
+        self.held = np.zeros(n)  # hysteresis, and the command before, whose travel it follows
+        self.command = np.zeros(n)
         self.valve = np.zeros(n)
         self.speed = np.zeros(n)
         self.deficit = np.zeros(n)
         self.outlet = np.zeros(n)
         self.reading, self.filter = self.p.copy(), self.p.copy()
 
-    def steady_command(self, u: Floats) -> Floats:
-        """Opening of the inspiratory valve that commands ask for, %; hysteresis remembers."""
+    def steady_command(self, u: Floats, due: NDArray[np.bool_]) -> Floats:
+        """Opening of the inspiratory valve that commands ask for, %; the due breaths move on."""
         effects = self.effects
         if "command_rounding" in effects:
             u = np.floor(u + 1e-9)
@@ -100,14 +101,15 @@ class Rig:
         if (play := effects.get("valve_hysteresis")) is not None:
             half = 0.5 * play.parameters["width"]
             if play.form == "backlash":
-                self.held = np.clip(self.held, u - half, u + half)
-                u = np.maximum(self.held, 0.0)
+                held = np.clip(self.held, u - half, u + half)
+                opening = np.maximum(held, 0.0)
             else:  # Bouc-Wen: the play approaches its width exponentially with the travel
-                travel = u - self.speed_of_command
+                travel = u - self.command
                 full = np.sign(travel) * half
-                self.held = full + (self.held - full) * np.exp(-np.abs(travel) / half)
-                self.speed_of_command = u
-                u = np.maximum(u - self.held, 0.0)
+                held = full + (self.held - full) * np.exp(-np.abs(travel) / half)
+                opening = np.maximum(u - held, 0.0)
+            self.held, self.command = np.where(due, held, self.held), np.where(due, u, self.command)
+            u = opening
         if (curve := effects.get("valve_curve")) is not None:
             loss, x = curve.parameters["loss"], u / 100.0
             if curve.form == "rational saturation":
@@ -120,9 +122,6 @@ class Rig:
             else:
                 u = 100.0 * ((1.0 - loss) * x + loss * np.sqrt(x))
         return u
-
-    #: Command of the step before, for hysteresis that follows the travel.
-    speed_of_command: Floats | float = 0.0
 
     def advance(self, opening: Floats, out: Floats, time: float, h: float) -> None:
         """Advance by one step.

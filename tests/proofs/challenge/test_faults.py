@@ -10,9 +10,10 @@ import pytest
 
 from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.detectability import LIMIT, log_likelihood_loss
-from proofs.challenge.faults.effects import FAULTS, PARTIAL, SHARES, FaultsCase, draw
+from proofs.challenge.faults.effects import FAULTS, PARTIAL, SHARES, FaultsCase
 from proofs.challenge.faults.laboratory import active, record, replay
 from proofs.challenge.folder import decode_answers, encode_answers
+from proofs.challenge.generators import FAULTS as GENERATOR
 from proofs.challenge.truth import true_values
 from proofs.challenge.vocabulary import PARAMETERS, VOCABULARY
 from ventbench.base.errors import InputError
@@ -112,7 +113,7 @@ def test_where_a_fault_acts_that_is_everywhere_has_no_flags():
 
 
 def test_names_and_parameters_are_those_of_the_vocabulary():
-    drawn = draw("all", 80, np.random.default_rng(0))
+    drawn = GENERATOR.draw("all", 80, np.random.default_rng(0))
     assert {d.kind for d in drawn} == set(SHARES)
     names = {e.name for d in drawn for e in d.case.effects}
     assert names == set(FAULTS) <= set(VOCABULARY)
@@ -124,7 +125,7 @@ def test_names_and_parameters_are_those_of_the_vocabulary():
     text = encode_answers("s", drawn, [[30.0] * len(d.case.effects) for d in drawn])
     assert [d for d, _ in decode_answers(text)] == drawn
     with pytest.raises(InputError, match="no kind outside"):
-        draw("outside", 3, np.random.default_rng(0))
+        GENERATOR.draw("outside", 3, np.random.default_rng(0))
 
 
 def test_a_faint_fault_is_below_detection_and_a_strong_one_above():

@@ -5,13 +5,13 @@ import hashlib
 import pytest
 
 from hardware_eval.emulation.cases import commitment, encrypt, random_generator, unseal
-from proofs.challenge.first.plan import draw
 from proofs.challenge.folder import decode_answers, encode_answers
+from proofs.challenge.generators import FIRST
 from ventbench.base.errors import InputError
 
 
 def answers(secret="s"):
-    drawn = draw("all", 12, random_generator(secret, "plan"))
+    drawn = FIRST.draw("all", 12, random_generator(secret, "plan"))
     return drawn, encode_answers(secret, drawn, [[30.0] * len(d.case.effects) for d in drawn])
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hardware_eval.emulation.cases import LIBRARY
-from proofs.challenge.first.plan import CLASSES, OUTSIDE, draw
+from proofs.challenge.first.plan import CLASSES, OUTSIDE
+from proofs.challenge.generators import FIRST
 from proofs.challenge.questions import Kind
 from proofs.challenge.truth import has_library_form
 from ventbench.base.errors import InputError
@@ -16,7 +17,7 @@ from ventbench.physics import library
 
 
 def drawn(kind, count, seed=0):
-    return draw(kind, count, np.random.default_rng(seed))
+    return FIRST.draw(kind, count, np.random.default_rng(seed))
 
 
 def test_effects_inside_the_library_have_its_names():

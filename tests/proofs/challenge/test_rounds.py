@@ -257,18 +257,18 @@ def test_draws_and_diagnosers_are_scored_together(answered, tmp_path):
     assert [case["draw"] for case in together.as_dict()["cases"]] == [0, 0, 1]
     folders, seeds = (str(answered.path), str(other.path)), ("--seed", SECRET)
     page = tmp_path / "page.md"
-    arguments = [*folders, *seeds, "--seed", "other words", "--page", str(page)]
+    arguments = [*folders, *seeds, "--seed", "other words"]
     done = CliRunner().invoke(app, ["challenge", "reveal", *arguments, "--diagnoser", "unsure"])
     assert done.exit_code in (0, 1)
-    assert "answered 2 of 2, 1 of 2:" in page.read_text()
+    assert "answered 2 of 2, 1 of 2 of `first`:" in done.stdout
     missing = CliRunner().invoke(app, ["challenge", "reveal", *folders, *seeds])
     assert missing.exit_code == 2
     assert "2 folders and 1 seeds" in missing.output
-    page.unlink()
-    done = CliRunner().invoke(app, ["challenge", "board", *arguments, "--against", "sees_nothing"])
+    own = [*arguments, "--against", "sees_nothing", "--page", str(page)]
+    done = CliRunner().invoke(app, ["challenge", "board", *own])
     assert done.exit_code == 0
     text = page.read_text()
-    assert re.search(r"\n\| unsure \| \S+ \| 3 \|", text)
-    assert re.search(r"\n\| sees_nothing \| \S+ \| 1 \|", text)
+    assert re.search(r"\n\| `first` \| unsure \| \S+ \| 3 \|", text)
+    assert re.search(r"\n\| `first` \| sees_nothing \| \S+ \| 1 \|", text)
     assert "`sees_nothing` minus the other, case by case" in text
     assert f"| `{SECRET}` | `{answered.commitment.read_text().strip()}` |" in text

@@ -12,10 +12,11 @@ from scipy.integrate import solve_ivp
 
 from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.folder import ChallengeFolder
+from proofs.challenge.generators import STRANGER
 from proofs.challenge.make import make
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger import effects as stranger
-from proofs.challenge.stranger.effects import SAME, StrangerCase, draw
+from proofs.challenge.stranger.effects import SAME, StrangerCase
 from proofs.challenge.stranger.laboratory import record, replay
 from proofs.challenge.stranger.rig import Rig
 from proofs.challenge.truth import concealed, is_right, true_values
@@ -155,7 +156,7 @@ def test_every_effect_acts_and_a_strong_one_more():
 
 
 def test_cases_cover_the_laboratory():
-    cases = draw("all", 120, np.random.default_rng(0))
+    cases = STRANGER.draw("all", 120, np.random.default_rng(0))
     assert set(Counter(drawn.kind for drawn in cases)) == set(stranger.SHARES)
     lungs = Counter(drawn.case.lung for drawn in cases)
     assert len(lungs) == 9
@@ -170,7 +171,7 @@ def test_cases_cover_the_laboratory():
         names = {effect.name for effect in drawn.case.effects}
         assert len(names) == {"pair": 2, "four": 4, "null": 0}.get(drawn.kind, 1)
     with pytest.raises(InputError, match="no kind form"):
-        draw("form", 9, np.random.default_rng(0))
+        STRANGER.draw("form", 9, np.random.default_rng(0))
 
 
 def test_a_recording_has_the_nuisances_of_its_case():
@@ -235,7 +236,7 @@ def test_a_challenge_of_strangers_keeps_its_seal(tmp_path, monkeypatch):
     lag = Effect("sensor_lag", "strong", SAME, {"tau": 0.1})
 
     def few(kind, count, rng):
-        drawn = draw("single", 2, rng)
+        drawn = STRANGER.draw("single", 2, rng)
         return [replace(d, case=replace(small, effects=e)) for d, e in zip(drawn, ((), (lag,)))]  # noqa: B905
 
     from proofs.challenge import generators

@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from proofs.real import comparisons, pairs
-from proofs.real.comparisons import Answered, with_leak
-from proofs.real.pairs import Material, Pair, changed
+from proofs.real import pairs
+from proofs.real.pairs import Answered, Material, Pair, changed, with_leak
 from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import identify
 from ventbench.recordings.breaths import Breaths, make_breaths
@@ -48,7 +47,7 @@ def material() -> Material:
 
 
 def test_pairs_know_their_truth_and_their_half(material):
-    listed = pairs.pairs(material)
+    listed = list(pairs.pairs(material))
     assert len({pair.name for pair in listed}) == len(listed)
     halves = [pair.split for pair in listed]
     assert {"development", "sealed"} == set(halves)
@@ -66,7 +65,7 @@ def answered(material: Material, kind: str, **fields: str) -> Answered:
         for pair in pairs.pairs(material)
         if pair.kind == kind and all(getattr(pair, k) == v for k, v in fields.items())
     ]
-    return comparisons.answer(found[0], material)
+    return pairs.answer(found[0], material)
 
 
 def test_lungs_are_told_apart_and_a_wrong_label_is_seen(material):
@@ -96,29 +95,29 @@ def test_an_added_leak_is_exact(material):
 
 
 def test_answers_are_kept_and_the_seal_is_broken_once(material, tmp_path, monkeypatch):
-    monkeypatch.setattr(comparisons, "load", lambda folder: material)
+    monkeypatch.setattr(pairs, "load", lambda folder: material)
     calls = []
-    counted = comparisons.answer
+    counted = pairs.answer
 
     def answer(pair, own):
         calls.append(pair.name)
         return counted(pair, own)
 
-    monkeypatch.setattr(comparisons, "answer", answer)
-    first = comparisons.run(tmp_path, tmp_path / "out", kinds=("label", "drive"))
-    again = comparisons.run(tmp_path, tmp_path / "out", kinds=("label", "drive"))
+    monkeypatch.setattr(pairs, "answer", answer)
+    first = pairs.run(tmp_path, tmp_path / "out", kinds=("label", "drive"))
+    again = pairs.run(tmp_path, tmp_path / "out", kinds=("label", "drive"))
     assert again == first
     assert len(calls) == len(first)
     assert all(entry.pair.split == "development" for entry in first)
-    sealed = comparisons.run(tmp_path, tmp_path / "out", sealed=True, kinds=("label",))
+    sealed = pairs.run(tmp_path, tmp_path / "out", sealed=True, kinds=("label",))
     assert all(entry.pair.split == "sealed" for entry in sealed)
     opened = json.loads((tmp_path / "out" / "opened.json").read_text())
     assert list(opened) == ["label"]
-    monkeypatch.setattr(comparisons.ventbench, "__version__", "99.0")
+    monkeypatch.setattr(pairs.ventbench, "__version__", "99.0")
     with pytest.raises(InputError, match="can be opened once"):
-        comparisons.run(tmp_path, tmp_path / "out", sealed=True, kinds=("label",))
+        pairs.run(tmp_path, tmp_path / "out", sealed=True, kinds=("label",))
     with pytest.raises(InputError, match="no kind 'magic'"):
-        comparisons.run(tmp_path, tmp_path / "out", kinds=("magic",))
+        pairs.run(tmp_path, tmp_path / "out", kinds=("magic",))
 
 
 def test_the_report_counts():
@@ -126,7 +125,7 @@ def test_the_report_counts():
         pair = Pair(f"{kind} {right} {strength}", kind, "", "a", "b", strength)
         return Answered(pair, "", right, **more)
 
-    text = comparisons.report(
+    text = pairs.report(
         [
             made("label", True),
             made("label", False),
@@ -142,12 +141,12 @@ def test_a_rival_that_grows_counts_as_of_its_class(material):
     lung = material.mechanics("day#1")
     term = next(iter(lung.terms), None)
     if term is None:
-        term = comparisons.Term("circuit_compliance", {}, 9.0, 1.0, ())
+        term = pairs.Term("circuit_compliance", {}, 9.0, 1.0, ())
     from ventbench.mechanics.labels import Estimate
 
     small = replace(term, parameters={"c": Estimate(1.0, "", (0.8, 1.2))})
     large = replace(term, parameters={"c": Estimate(2.0, "", (1.8, 2.2))})
-    assert comparisons._has_grown(large, small)
-    assert comparisons._has_grown(small, None)
-    assert not comparisons._has_grown(small, large)
-    assert not comparisons._has_grown(None, small)
+    assert pairs._has_grown(large, small)
+    assert pairs._has_grown(small, None)
+    assert not pairs._has_grown(small, large)
+    assert not pairs._has_grown(None, small)

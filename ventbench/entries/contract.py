@@ -201,14 +201,15 @@ LONGEST_S = 450.0
 _PLACE = re.compile(r"([\w./-]+\.py) line (\d+) ")
 _ADVICE = {
     "construct": "Controller() is called without arguments",
-    "reset": "reset(task) gets track, lung (None on the robustness track), dt, inspiration_steps",
-    "act": "act(observation) must answer whatever the sensors and the clock say",
+    "reset": "reset(self, task) gets track, lung (None for robustness), dt, inspiration_steps",
+    "act": "act(self, observation) must answer whatever the sensors and the clock say",
     "type": "return one int or float, for example with float(u_in)",
     "value": "look for a division by zero, an overflow or a logarithm",
     "timeout": "answer within milliseconds; train before submitting",
     "memory": "keep to 512 MiB beyond Python and its packages",
 }
 _IMPORT_ADVICE = "it must be possible to import it with what the sandbox has"
+_CLASS_ADVICE = "write a class Controller with reset(self, task) and act(self, observation)"
 _OTHER_ADVICE = "see the limits of the sandbox in docs/submitting.md"
 _TO_RUN: tuple[Group, ...] = ("run", "repeat", "time")
 
@@ -291,9 +292,10 @@ def _ran(
         timed_answers = run_all(submission, [timed_run], runner, clock, count)
     except SubmissionError as error:
         # Each begins with the label.
-        texts = [problem.removeprefix(f"{name}: ") for problem in error.problems]
-        problems = [_placed("run", text, _IMPORT_ADVICE) for text in texts]
-        return _report(name, [*findings, *problems], left_out=_TO_RUN[1:], sandbox=sandbox)
+        for problem in str(error).split("\n"):
+            advice = _IMPORT_ADVICE if "while it was imported" in problem else _CLASS_ADVICE
+            findings.append(_placed("run", problem.removeprefix(f"{name}: "), advice))
+        return _report(name, findings, left_out=_TO_RUN[1:], sandbox=sandbox)
     findings += _failure_findings(runs, answers) or _failure_findings([timed_run], timed_answers)
     findings += _clipping_notes(answers.commands[: len(plain_runs)])
     repeats = (0, len(plain_runs))

@@ -53,9 +53,3 @@ def test_shapes_must_pair():
         open_loop.distance(np.zeros((2, 5)), np.zeros((2, 6)))
     with pytest.raises(ValueError, match="do not pair"):
         open_loop.distance(1.0, 1.0)
-
-
-def test_commands_are_counted_in_ranges_of_ten():
-    counts = open_loop.command_counts([[0.0, 9.99], [10.0, 100.0]])
-    assert counts.tolist() == [2, 1, 0, 0, 0, 0, 0, 0, 0, 1]
-    assert len(open_loop.EDGES) == len(counts) + 1

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -74,10 +78,47 @@ def by_horizon(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None
 #: Edges of the ranges in which recorded commands are counted, %; 100 belongs to the last range.
 EDGES = tuple(float(edge) for edge in range(0, 101, 10))
 
+#: Ranges with fewer recorded samples than this are sparse.
+SPARSE_BELOW = 20
+
 #: Command above which the valve of the recordings is hardly known, %.
 WIDE_OPEN = 70.0
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """Commands of an entry on one lung, and the recordings of it."""
+
+    wide_open: float  #: share of commands at or above :data:`WIDE_OPEN`, 0..1.
+    #: share of commands in ranges with fewer than :data:`SPARSE_BELOW` recorded samples.
+    sparse: float
+    recorded_wide_open: int  #: recorded samples of the lung at or above :data:`WIDE_OPEN`.
+    recorded: int  #: all its recorded samples.
 
 
 def command_counts(u_in: ArrayLike) -> Ints:
     """Count commands, %, of any shape in the ranges of :data:`EDGES`; shape ``(10,)``."""
     return np.histogram(np.asarray(u_in, float), bins=EDGES)[0].astype(np.int64)
+
+
+def extrapolation(u_in: ArrayLike, recorded: ArrayLike) -> Extrapolation:
+    """Compare commands on one lung, %, with :func:`command_counts` of its recordings, ``(10,)``."""
+    commands, counts = np.asarray(u_in, float), np.asarray(recorded, np.int64)
+    used = command_counts(commands)
+    wide = np.asarray(EDGES[:-1]) >= WIDE_OPEN
+    return Extrapolation(
+        wide_open=float(np.mean(commands >= WIDE_OPEN)),
+        sparse=float(used[counts < SPARSE_BELOW].sum() / max(used.sum(), 1)),
+        recorded_wide_open=int(counts[wide].sum()),
+        recorded=int(counts.sum()),
+    )
+
+
+def by_lung(
+    u_in: Mapping[str, ArrayLike], lungs: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Extrapolation]:
+    """Compare commands, %, by lung id, with what ``ventbench.plants.frozen.Frozen.lungs`` says."""
+    return {
+        name: extrapolation(commands, lungs[name]["recorded_commands"])
+        for name, commands in u_in.items()
+    }

@@ -55,7 +55,7 @@ def test_the_picture_has_a_row_a_lung_and_one_for_all(whole):
     pytest.importorskip("matplotlib", reason="the extra ventbench[view] is missing")
     from matplotlib.image import imread
 
-    from ventbench.pages.gain_map import gain_map_png
+    from ventbench.pages.report import gain_map_png
 
     pictures = [
         gain_map_png(whole),

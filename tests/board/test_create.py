@@ -69,7 +69,8 @@ def test_replay_agrees_with_the_scorer(drafts, scores) -> None:
 
 
 def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: TextbookRigs) -> None:
-    from ventbench.entries.cells import as_float64, replay
+    from ventbench.entries.cells import as_float64
+    from ventbench.entries.scoring import replay
     from ventbench.plants.stacking import take
 
     pressures = []

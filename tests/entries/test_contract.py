@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries import contract
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.contract import STEPS
-from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import check_files, open_submission
 from ventbench.entries.review import check_sources
-from ventbench.entries.runner import InProcessRunner
+from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.sandbox.pipes import Allowance
 from ventbench.sandbox.runner import SandboxRunner
 
@@ -366,7 +366,6 @@ def test_everything_at_once(demo):
     assert all(finding.advice for finding in report.problems)
     text = "\n".join(report.lines())
     assert "9 problems; not ready to submit" in text
-    assert "did you mean Controler?" in text
     assert "'pop' is not one of pid, residual, ppo, dqn, other; did you mean ppo?" in text
 
 

@@ -14,9 +14,9 @@ from safetensors.numpy import save_file
 from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.entries import contract
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
 from ventbench.entries.manifest import FAMILIES
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scaffold import contents, create, initial_weights
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs

@@ -14,15 +14,15 @@ from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.entries import cells
-from ventbench.entries.errors import Failure, SubmissionError
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol, score
 from ventbench.physics import mechanism, physics
 from ventbench.plants.plant_files import save_plants
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
+from ventbench.sandbox.child.cell import Failure, SubmissionError
 from ventbench.task import draws, environment, protocol, rollouts, waveform
 from ventbench.task.interfaces import Task
 from ventbench.task.lungs import LUNG_IDS, LUNGS, lung

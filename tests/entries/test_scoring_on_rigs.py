@@ -9,8 +9,8 @@ import pytest
 
 from ventbench.base import precision
 from ventbench.controllers.pid import PID
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission, submission_of
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
 from ventbench.plants.rigs import load_rigs, rigs_of

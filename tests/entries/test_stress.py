@@ -18,16 +18,15 @@ from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
-from ventbench.entries.cells import Cells, ProtocolRun, protocol_of
-from ventbench.entries.errors import SubmissionError
+from ventbench.entries.cells import Cells, InProcessRunner, ProtocolRun, protocol_of
 from ventbench.entries.folder import open_submission, submission_of
 from ventbench.entries.result import Score
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.runs import Runs
 from ventbench.entries.scoring import run_protocol, runs_of
 from ventbench.plants import frozen
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.rigs import load_rigs, rigs_of
+from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.task import environment, protocol, rollouts
 from ventbench.task.interfaces import Task
 from ventbench.task.metrics.score import run_error

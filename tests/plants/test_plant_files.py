@@ -14,7 +14,7 @@ from ventbench.base import files as whole_files
 from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.cli import app
-from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.cells import InProcessRunner
 from ventbench.physics import physics
 from ventbench.plants import frozen, plant_files
 from ventbench.plants.corrected import Corrected

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 
 from ventbench.base import precision
-from ventbench.entries.errors import SubmissionError
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.sandbox import runner as runner_module
-from ventbench.sandbox.child.cell import ROW
+from ventbench.sandbox.child.cell import ROW, SubmissionError
 from ventbench.sandbox.pipes import Allowance, SandboxError
 from ventbench.sandbox.runner import SandboxRunner, layers
 from ventbench.task import protocol

@@ -23,8 +23,8 @@ from ventbench.controllers.residual import (
     save_weights,
     untrained,
 )
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment

@@ -26,9 +26,8 @@ import numpy as np
 from ventbench.base import precision
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.entries.cells import PlantError, step_through
+from ventbench.entries.cells import PlantError, Runner, runner_of, step_through
 from ventbench.entries.folder import Submission, as_submission
-from ventbench.entries.runner import Runner, runner_of
 from ventbench.entries.runs import number
 from ventbench.entries.scoring import enter
 from ventbench.physics.catalogue import parameter

@@ -25,9 +25,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ventbench.entries.errors import Finding
 from ventbench.entries.folder import CONTROLLER, MAX_BYTES, check_files
-from ventbench.entries.manifest import check_manifest
+from ventbench.entries.manifest import Finding, check_manifest
 from ventbench.sandbox.child.cell import source_text
 from ventbench.sandbox.child.sources import Import, imports, module_files, sources
 from ventbench.sandbox.pipes import OPTIONAL

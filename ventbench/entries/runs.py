@@ -18,7 +18,7 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.entries.errors import Failure
+from ventbench.sandbox.child.cell import Failure
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics.bootstrap import resampled_scores

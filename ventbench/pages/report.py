@@ -1,4 +1,4 @@
-"""Files that show runs, an HTML report without script or network and the viewer's; maps of gains."""
+"""Files that show runs, an HTML report without script or network and the viewer's; maps of gain."""
 
 from __future__ import annotations
 

@@ -169,11 +169,9 @@ def open_loop(
     )
 
 
-def errors(
-    plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] | None = None
-) -> Floats:
+def errors(plants_for: PlantsFor, breaths: Breaths) -> Floats:
     """Open-loop MAE of each breath by some plants; see :func:`mean_errors`."""
-    return mean_errors(open_loop_breaths(plants_for, breaths, progress), breaths)
+    return mean_errors(open_loop_breaths(plants_for, breaths), breaths)
 
 
 def mean_errors(simulated: Floats, breaths: Breaths) -> Floats:

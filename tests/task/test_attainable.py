@@ -68,12 +68,3 @@ def test_a_second_optimiser_finds_nothing_better():
     assert np.all(found.error < second + 1e-3)
     assert np.mean(second - found.error) < 0.1  # and it is no straw man
     assert np.all(found.error > found.lower - 1e-9)
-
-
-def test_progress_is_told():
-    plants, cells = lungs_and_cells()
-    few = jax.tree.map(lambda x: x[:2], (plants, cells))
-    seen = []
-    attainable.attainable(*few, starts=(1,), iterations=3, progress=lambda *x: seen.append(x))
-    assert seen[0] == (0, 3)
-    assert all(total == 3 for _, total in seen)

@@ -353,8 +353,7 @@ def _resampled(record: Record, values: Floats) -> Floats:
 
 
 def _interval(values: Floats, means: Floats) -> Interval:
-    low, high = np.quantile(means, (0.025, 0.975))
-    return Interval(float(np.mean(values)), float(low), float(high))
+    return Interval(float(np.mean(values)), *bootstrap.limits(means))
 
 
 def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:

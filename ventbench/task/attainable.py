@@ -23,7 +23,7 @@ own, half of them random.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -64,8 +64,6 @@ ACCEPTED, GOOD = 0.1, 0.7
 
 #: Cells whose derivatives are computed together: bounds memory.
 BATCH = 64
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,32 +114,25 @@ def _in_batches(function: Any, plants: Plant, cells: Scenario, u_in: Floats) -> 
 
 
 def attainable(
-    plants: Plant, cells: Scenario, *, starts: Sequence[int | Floats] = STARTS,
-    iterations: int = ITERATIONS, progress: Progress | None = None,
-) -> Attainable:  # fmt: skip
+    plants: Plant, cells: Scenario, *, starts: Sequence[int | Floats] = STARTS
+) -> Attainable:
     """Bound the least error of cells from above and below; see the module.
 
     Args:
         plants: leaves ``(n, ...)``.
         cells: batch shape ``(n,)``; their noise is not used.
         starts: see :data:`STARTS`; or commands to start at, %, shape ``(n, COMMANDS)``.
-        iterations: most linear programs of a cell and start.
-        progress: called with the number of programs solved, and of all at most.
     """
     # One breath of noise is as good as any: none is used.
     cells = cells.replace(noise=np.zeros((*np.shape(cells.pip), 1, 1)))  # type: ignore[attr-defined]
     n, pip = np.shape(cells.pip)[0], np.asarray(cells.pip)[:, None]
     best, witness = np.full(n, np.inf), np.zeros((n, COMMANDS))
-    total = len(starts) * iterations
     with precision.float64():
-        for turn, start in enumerate(starts):
+        for start in starts:
             if isinstance(start, int):
                 start = np.where(np.arange(COMMANDS) < start, protocol.U_MAX, HOLD)
             u_in = np.broadcast_to(start, (n, COMMANDS)).astype(float)
-            error = _descend(
-                plants, cells, pip, u_in, iterations,
-                lambda k, turn=turn: progress and progress(turn * iterations + k, total),
-            )  # fmt: skip
+            error = _descend(plants, cells, pip, u_in)
             better = error < best - 1e-12
             best, witness = np.where(better, error, best), np.where(better[:, None], u_in, witness)
         miss = pip - pressures(plants, cells, witness)
@@ -155,10 +146,7 @@ def attainable(
     return Attainable(best, lower, gains, witness)
 
 
-def _descend(
-    plants: Plant, cells: Scenario, pip: Floats, u_in: Floats, iterations: int,
-    progress: Callable[[int], object],
-) -> Floats:  # fmt: skip
+def _descend(plants: Plant, cells: Scenario, pip: Floats, u_in: Floats) -> Floats:
     """Improve commands in place; returns their errors, cmH2O, shape ``(n,)``."""
     n = len(u_in)
     miss = pip - pressures(plants, cells, u_in)
@@ -166,8 +154,7 @@ def _descend(
     radius, live, programs = np.full(n, FIRST_RADIUS), np.arange(n), LinearPrograms(COMMANDS)
     slopes = np.zeros((n, COMMANDS, COMMANDS))
     stale = np.ones(n, bool)
-    for k in range(iterations):
-        progress(k)
+    for _ in range(ITERATIONS):
         anew = live[stale[live]]
         if len(anew):
             some, cell = jax.tree.map(lambda x, i=anew: np.asarray(x)[i], (plants, cells))

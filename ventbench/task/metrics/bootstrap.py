@@ -73,8 +73,8 @@ def resampled_means(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int 
 def summary(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int = SEED) -> Summary:
     """Summarise values over breaths or draws, of any unit and shape; options as of the means.
 
-    The interval is the percentile bootstrap: 2.5 % and 97.5 % quantiles of
-    :func:`resampled_means`. NaN is a missing value, infinity is one like others.
+    The interval is that of :func:`resampled_means`. NaN is a missing value, infinity is one like
+    others.
     """
     values = np.ravel(np.asarray(values, float))
     values = values[~np.isnan(values)]
@@ -84,8 +84,13 @@ def summary(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int = SEED) 
     if count == 1 or not np.all(np.isfinite(values)):
         return Summary(mean, median, (np.nan, np.nan), count)
     means = resampled_means(values, resamples=resamples, seed=seed)
+    return Summary(mean, median, limits(means), count)
+
+
+def limits(means: Floats) -> tuple[float, float]:
+    """95 % interval of resampled means: their 2.5 % and 97.5 % quantiles."""
     low, high = np.quantile(means, (0.025, 0.975))
-    return Summary(mean, median, (float(low), float(high)), count)
+    return float(low), float(high)
 
 
 def resampled_scores(

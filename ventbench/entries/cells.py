@@ -116,19 +116,20 @@ def protocol_of(
     pips = tuple(float(pip) for pip in pips)
     if draws < 0 or stress < 0:
         raise InputError(f"{min(draws, stress)} draws: there cannot be fewer than none")
-    every = drawn
+    stressed = None
+    if stress:
+        names = {stressor(name).name for name in stressors}
+        chosen = tuple(c for c in conditions() if not names or set(c.stressors) <= names)
+        every = rigs.draws(draw_tables.COUNT) if drawn is None else drawn
+        ranked = every.only(np.flatnonzero(every.ranked)).first(stress)
+        stressed = _under_stress(rigs, ranked, chosen)
     if drawn is None and draws:
         drawn = rigs.draws(draws, pips)
-    if stress:
-        every = rigs.draws(draw_tables.COUNT) if every is None else every
-        whole = every.only(np.flatnonzero(every.ranked)).first(stress)
     if pips == protocol.PIPS:
         about = None if drawn is None else drawn.about()
         reference = reference_of(rigs.about, about, reference)
-    return Protocol(
-        rigs, pips, drawn, _nominal_and_drawn(rigs, drawn, pips),
-        _under_stress(rigs, whole, chosen_conditions(stressors)) if stress else None, reference,
-    )  # fmt: skip
+    nominal = _nominal_and_drawn(rigs, drawn, pips)
+    return Protocol(rigs, pips, drawn, nominal, stressed, reference)
 
 
 def _nominal_and_drawn(rigs: Rigs, drawn: Draws | None, pips: tuple[float, ...]) -> Cells:
@@ -159,16 +160,6 @@ def _under_stress(rigs: Rigs, drawn: Draws, chosen: tuple[Condition, ...]) -> Ce
     nominal = np.asarray(protocol.PIPS)[columns][:, :, None]
     every = np.arange(1, n + 1)
     return Cells(rigs.lungs, chosen, plants, scenario, nominal, every, drawn.rig, drawn.member)
-
-
-def chosen_conditions(stressors: Sequence[str]) -> tuple[Condition, ...]:
-    """All conditions, or no stressor and those of some stressors alone.
-
-    Raises:
-        InputError: if there is no such stressor.
-    """
-    names = {stressor(name).name for name in stressors}
-    return tuple(c for c in conditions() if not names or set(c.stressors) <= names)
 
 
 class ControllerSession(Interface):

@@ -181,16 +181,12 @@ def review(folder: Path) -> list[Finding]:
     notes = []
     for path in sources(folder):
         name = path.relative_to(folder).as_posix()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                text = source_text(path.read_bytes())
-                tree = ast.parse(text, name)
-        except (SyntaxError, ValueError, RecursionError, MemoryError, OSError):
+        tree = _parsed(path, name)
+        if isinstance(tree, Finding):
             continue  # check_sources says so
         notes += [
             Finding("source", name, what, _ADVICE, line, problem=False)
-            for line, what in _characters(text)
+            for line, what in _characters(source_text(path.read_bytes()))
         ]
         seen = set()
         for node in ast.walk(tree):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import open_loop_report
+from ventbench import simulation
 from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
 from ventbench.plants.stacking import open_loop_breaths
@@ -70,7 +70,7 @@ def mean_errors(pooled, breaths, sessions):
     def of(part):
         return plants(pooled, groups_of(part, sessions, RECORDED_LUNGS))
 
-    return open_loop_report.errors(of, breaths)
+    return simulation.open_loop_errors(of, breaths)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from ventbench.base.errors import InputError
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
 from ventbench import gym_env  # noqa: E402
-from ventbench.base import precision  # noqa: E402
+from ventbench.base import compilation  # noqa: E402
 from ventbench.plants import frozen  # noqa: E402
 from ventbench.task import environment, protocol, rollouts  # noqa: E402
 from ventbench.task.lungs import LUNG_IDS  # noqa: E402
@@ -48,7 +48,7 @@ def test_registered_by_name():
 
 def scripted(actions, plant, cell):
     """Score of commands by the scan of the benchmark."""
-    with precision.float32():
+    with compilation.float32():
         plant, cell = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (plant, cell))
         u_in = jnp.asarray(50.0 + 50.0 * actions)
         run, _ = rollouts.closed_loop(plant, Script(u_in), cell)
@@ -87,7 +87,7 @@ def test_hidden_deviations_are_those_of_the_scored_draws():
     """An episode with noise, replayed by the scan from the cell that nobody is shown."""
     lungs = task.load_lungs(rigs="training")
     assert jax.tree.leaves(lungs.plants)[0].shape[0] > 6, "members of several rigs"
-    with precision.float32():
+    with compilation.float32():
         state, _ = task.reset(jax.random.key(3), lungs, 5, 20.0)
         plant, cell = state.episode.plant, state.episode.cell
         step, actions = jax.jit(task.step), np.linspace(-0.9, -0.5, 102).astype(np.float32)

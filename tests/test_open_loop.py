@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from proofs.studies.networks import MEASURED
 from ventbench import simulation
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.cli import app
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment

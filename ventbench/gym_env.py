@@ -28,7 +28,7 @@ from gymnasium.vector.utils import batch_space
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.plants.catalog import Given
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
@@ -176,7 +176,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         self._pips = pips if pip is None else np.full(num_envs, pip, np.float32)
         self._turn = len(chosen)
         self._rigs, self._noise = environment.load_lungs(simulator, rigs=rigs), noise
-        with precision.float32():
+        with compilation.float32():
             state, _ = jax.eval_shape(environment.reset, jax.random.key(0), self._rigs)
         self._layouts = _Layout.of(state.episode), _Layout.of(state.progress)
         self._count = STEPS + 1
@@ -189,7 +189,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         # PIPs change lungs from episode to episode.
         shift = int(self.np_random.integers(len(protocol.PIPS))) * self._turn
         number = np.uint32(self.np_random.integers(2**32))
-        with precision.float32():
+        with compilation.float32():
             self._episodes, self._progress, pip, seen = _reset(
                 number, self._rigs, self._lung, np.roll(self._pips, shift), vary=self._noise
             )
@@ -220,7 +220,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         if not np.isfinite(values.sum()):
             at = int(np.argmin(np.isfinite(values.reshape(self.num_envs))))
             raise InputError(f"action {at} is {values[at, 0]}; it must be a number from -1 to 1")
-        with precision.float32():
+        with compilation.float32():
             self._progress, self._steps, seen, reward, self.pressure, error = _step(
                 self._episodes, self._progress, self._steps, values, layouts=self._layouts
             )

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from proofs.studies.networks import Progress, Tell, finish
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.base.resume import WorkFolder
 from ventbench.board.replay import spread
@@ -182,7 +182,7 @@ def _trained(
         if tell is not None:
             tell(done / total)
 
-    with precision.float32():
+    with compilation.float32():
         controller = fit(
             jax.tree.map(np.asarray, simulators.ensemble), gains, config=config, seed=seed,
             checkpoint=checkpoint, progress=told, keep=True,
@@ -217,7 +217,7 @@ def score_controllers(
         cmH2O; whether all runs were safe.
     """
     errors, requested, safe = [], [], True
-    with precision.float64():
+    with compilation.float64():
         rigs = Rigs(LUNGS, simulators.plants)
         _, every = rigs.cells(rigs.draws(draws, pips) if draws else None, pips)
         for index, controller in enumerate(controllers):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.controllers.rl_policy import (
     CHOICES,
     GaussianPolicy,
@@ -62,7 +62,7 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
     shutil.copytree(HERE / name, folder, ignore=shutil.ignore_patterns("__pycache__"))
     made = make(name)
     save_weights(folder / "weights.npz", made)
-    with precision.float64():
+    with compilation.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
         rigs = Rigs(LUNGS, plants)
         found = run_protocol(

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.controllers.pid import PID
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission, submission_of
@@ -39,7 +39,7 @@ def result(rigs):
 
 def compiled(rigs, draws):
     """Errors and requested commands of the same PID in one scan."""
-    with precision.float64():
+    with compilation.float64():
         plants, cells = rigs.cells(rigs.draws(draws, PIPS), PIPS)
         plants, cells = jax.tree.map(jax.numpy.asarray, (plants, cells))
 

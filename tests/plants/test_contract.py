@@ -22,7 +22,7 @@ from hypothesis.extra import numpy as hnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.entries import scoring
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission

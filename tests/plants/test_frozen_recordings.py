@@ -10,7 +10,7 @@ import pytest
 
 from proofs.studies.networks import MEASURED, RECONSTRUCTED
 from ventbench import simulation
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.plants import frozen
 from ventbench.plants.frozen import BY_NONE
 from ventbench.plants.single_compartment import single_compartment

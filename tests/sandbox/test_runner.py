@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
 from ventbench.entries.scoring import run_protocol
@@ -38,7 +38,7 @@ def started(submission, lungs=(None,), **options):
 
 
 def test_scores_are_those_of_the_plain_process():
-    with precision.float64():
+    with compilation.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
     for name in ("pid_best", "pid_robust"):
         submission = open_submission(name)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.entries.folder import Submission
@@ -402,7 +402,7 @@ def step_through(
     changing: bool = False,
     count: Callable[[], object] = lambda: None,
 ) -> ProtocolRun:
-    """Run a submission on every lung and cell. Call it within ``precision.float64()``.
+    """Run a submission on every lung and cell. Call it within ``compilation.float64()``.
 
     Args:
         plants: from :func:`as_float64`, L lungs; leaves may have the cells' batch shape too,
@@ -430,7 +430,7 @@ def step_through(
     has_volume = loop.signals.volume is not None
     # Cells go on by themselves: what one takes, no other one waits for.
     given, ready = np.zeros(cells, np.int64), np.arange(cells)
-    with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
+    with compilation.float32():  # a submission that uses JAX finds it as it is elsewhere
         session = runner.start(submission, each)
     try:
         while (given < total).any():
@@ -440,7 +440,7 @@ def step_through(
             if has_volume:
                 volume[ready, given[ready]] = _of_cells(loop.signals.volume, batch)[ready]
             start = time.perf_counter()
-            with precision.float32():
+            with compilation.float32():
                 session.ask(ready, rows[ready])
                 ready, commands = session.answers()
             seconds.append((time.perf_counter() - start) / max(1, len(ready)))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.entries.cells import (
@@ -157,7 +157,7 @@ def run_protocol(
         reference=reference,
     )  # fmt: skip
     count = _counted(progress, 1 + stress)
-    with precision.float64():
+    with compilation.float64():
         run = run_cells(what.cells, runner, submission, tasks, count)
         under_stress = None
         if what.stressed is not None:
@@ -334,7 +334,7 @@ def transfer(
         places.append(every + [every[0]] * (most - len(every)))
     rig, member = np.moveaxis(np.array(places), -1, 0)
     pips = np.broadcast_to(np.array(protocol.PIPS), (*rig.shape, len(protocol.PIPS)))
-    with precision.float64():
+    with compilation.float64():
         plants = draws.plants_of(rigs.plants, rig, member)
         scenario, every = nominal_scenario(pips), np.zeros(most, np.int64)
         cells = Cells(rigs.lungs, (Condition(),), plants, scenario, pips, every, rig, member)

@@ -36,7 +36,7 @@ import optax
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
@@ -127,7 +127,7 @@ def attainable(
     cells = cells.replace(noise=np.zeros((*np.shape(cells.pip), 1, 1)))  # type: ignore[attr-defined]
     n, pip = np.shape(cells.pip)[0], np.asarray(cells.pip)[:, None]
     best, witness = np.full(n, np.inf), np.zeros((n, COMMANDS))
-    with precision.float64():
+    with compilation.float64():
         for start in starts:
             if isinstance(start, int):
                 start = np.where(np.arange(COMMANDS) < start, protocol.U_MAX, HOLD)
@@ -249,7 +249,7 @@ def second_optimum(plants: Plant, cells: Scenario, *, iterations: int = ADAM_ITE
         6.0 * uniforms(DEVELOPMENT_SEED, "second optimum", (RANDOM_STARTS, COMMANDS)) - 3.0
     )
     best = np.full(n, np.inf)
-    with precision.float64():
+    with compilation.float64():
         plants, cells = jax.tree.map(jnp.asarray, (plants, cells))
         for start in starts:
             free = jnp.broadcast_to(jnp.asarray(start), (n, COMMANDS))

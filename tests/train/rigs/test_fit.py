@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ventbench import simulation
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.plants.stacking import open_loop_breaths
 from ventbench.recordings import join
 from ventbench.task.lungs import RECORDED_LUNGS, lung

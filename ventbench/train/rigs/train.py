@@ -25,7 +25,7 @@ import tomli_w
 from scipy.special import ndtri
 
 from ventbench import simulation
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.resume import Format, WorkFolder
@@ -187,7 +187,7 @@ def train_rigs(
     scales, noise = Scales(), Noise()
     about = _provenance(data, listed, config, scales, noise)
     parts = WorkFolder(out / "parts", about)
-    with precision.float32():  # enough for a fit to noisy recordings, and twice as fast
+    with compilation.float32():  # enough for a fit to noisy recordings, and twice as fast
         problem = _arrange(data, table, listed, config, scales, noise)
         fits = _fits(problem, config, parts, report)
         manifest, members = _assess(problem, listed, fits, out)

@@ -79,7 +79,7 @@ def build(folder: Path, out: Path) -> Built:
     for name, text in [*built.items(), *((name, (folder / name).read_bytes()) for name in named)]:
         path = out / name
         if not path.is_file() or path.read_bytes() != text:
-            files.write_atomically(path, lambda file, text=text: file.write(text))
+            files.write_bytes(path, text)
             changed.append(name)
     for name in sorted(filter(canonical.BUILT.fullmatch, canonical.walk(out)[0])):
         if name not in built:

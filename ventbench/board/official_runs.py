@@ -410,7 +410,7 @@ def score(
         records[key] = path.stem
         tell("records", at + 1, len(runs))
     content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))
-    files.write_atomically(own.folder / RESULT, lambda file: file.write(content))
+    files.write_bytes(own.folder / RESULT, content)
     return rounds.load(leaderboard, name)
 
 

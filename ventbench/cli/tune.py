@@ -199,7 +199,7 @@ def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
     except InputError as error:
         typer.echo(f"no plot: {error}", err=True)
         return []
-    files.write_atomically(path, lambda file: file.write(picture))
+    files.write_bytes(path, picture)
     return [path.name]
 
 

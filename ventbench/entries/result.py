@@ -207,8 +207,8 @@ class Score:
         files.write_json(folder / "score.json", self.to_json())
         self.trajectories.save(folder / "trajectories.npz")
         if self.stressed is not None:
-            table = self.stressed.to_frame().to_csv(index=False, lineterminator="\n").encode()
-            files.write_atomically(folder / "stress.csv", lambda file: file.write(table))
+            table = self.stressed.to_frame().to_csv(index=False, lineterminator="\n")
+            files.write_text(folder / "stress.csv", table)
 
     def to_frame(self) -> pd.DataFrame:
         """Figures of all runs, one row each, stressed ones last.

@@ -37,7 +37,7 @@ def write_rerun(path: Path | str, runs: Sequence[Trajectories]) -> Path:
 
 
 def _write(path: Path | str, content: bytes) -> Path:
-    files.write_atomically(Path(path), lambda file: file.write(content))
+    files.write_bytes(Path(path), content)
     return Path(path)
 
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import highspy
@@ -236,8 +235,8 @@ RANDOM_STARTS, OPENED_STEPS = 4, (1, 3, 9, 20)
 ADAM_ITERATIONS, ADAM_RATE = 1500, 0.12
 
 
-def second_optimum(plants: Plant, cells: Scenario, *, iterations: int = ADAM_ITERATIONS) -> NDArray:
-    """Least error that Adam finds in n cells, in so many iterations of each start, cmH2O, ``(n,)``.
+def second_optimum(plants: Plant, cells: Scenario) -> NDArray:
+    """Least error that Adam finds in n cells, cmH2O, ``(n,)``.
 
     It is the mean of ``|p - PIP|`` over steps 2 to 34; noise of the cells is not used.
     """
@@ -253,7 +252,7 @@ def second_optimum(plants: Plant, cells: Scenario, *, iterations: int = ADAM_ITE
         plants, cells = jax.tree.map(jnp.asarray, (plants, cells))
         for start in starts:
             free = jnp.broadcast_to(jnp.asarray(start), (n, COMMANDS))
-            best = np.minimum(best, np.asarray(_search(plants, cells, free, iterations)))
+            best = np.minimum(best, np.asarray(_search(plants, cells, free)))
     return best
 
 
@@ -262,9 +261,9 @@ def _errors(plants: Plant, cells: Scenario, free: Array) -> Array:
     return jnp.mean(jnp.abs(pressure - cells.pip[:, None]), axis=-1)
 
 
-@partial(jax.jit, static_argnames="iterations")
-def _search(plants: Plant, cells: Scenario, start: Array, iterations: int) -> Array:
-    optimiser = optax.adam(optax.cosine_decay_schedule(ADAM_RATE, iterations))
+@jax.jit
+def _search(plants: Plant, cells: Scenario, start: Array) -> Array:
+    optimiser = optax.adam(optax.cosine_decay_schedule(ADAM_RATE, ADAM_ITERATIONS))
     gradient = jax.grad(lambda free: _errors(plants, cells, free).sum())
 
     def iterate(carry: tuple[Array, Any, Array], _: None) -> tuple[tuple[Array, Any, Array], None]:
@@ -274,5 +273,5 @@ def _search(plants: Plant, cells: Scenario, start: Array, iterations: int) -> Ar
         return (free, state, jnp.minimum(best, _errors(plants, cells, free))), None
 
     begun = (start, optimiser.init(start), _errors(plants, cells, start))
-    (_, _, best), _ = jax.lax.scan(iterate, begun, length=iterations)
+    (_, _, best), _ = jax.lax.scan(iterate, begun, length=ADAM_ITERATIONS)
     return best

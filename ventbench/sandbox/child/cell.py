@@ -230,8 +230,8 @@ def _checked(names: Mapping[str, Any], label: str) -> Callable[[], Any]:
     """The class among the names of a module."""
     controller = names.get(CLASS)
     if controller is None:
-        here = names["__name__"]
-        own = [k for k, v in names.items() if getattr(v, "__module__", "") == here]
+        here = names.get("__name__")
+        own = [x.__name__ for x in names.values() if isinstance(x, type) and x.__module__ == here]
         instead = f", but {', '.join(own[:3])}" if own else ""
         raise SubmissionError(f"{label}: {FILE} defines no class {CLASS}{instead}")
     if not callable(controller):

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.physics import library, parameter, paths
 from ventbench.physics.catalogue import basis_terms
 from ventbench.recordings import Breaths

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.files import write_json
 from ventbench.controllers.pid import PID
 from ventbench.gym_env import STEPS, VentilatorVector
@@ -45,7 +45,7 @@ def main() -> None:
     many = VentilatorVector(count)
     many.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1.0, 0.0, (count, 1)).astype(np.float32)
-    with precision.float32():
+    with compilation.float32():
         plant = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), take(frozen.load().plants, 4))
         cells = nominal_scenario(np.resize(protocol.PIPS, count))
         pid = PID(jnp.ones(count), jnp.ones(count))

@@ -28,7 +28,7 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-from ventbench.base import compilation, files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.entries.reference import published
 from ventbench.plants.rigs import load_rigs
@@ -123,7 +123,7 @@ def main() -> None:
     columns = [protocol.PIPS.index(pip) for pip in given.pips]
     scatter = np.exp(np.interp(QUANTILES, np.linspace(0, 1, len(GAIN_QUANTILES)), GAIN_QUANTILES))
     points: dict[str, list[Floats]] = {"gain": [], "lung": []}
-    with precision.float64():
+    with compilation.float64():
         plants, cells = rigs.cells(None, protocol.PIPS)
         plants = jax.tree.map(lambda leaf: np.asarray(leaf, float)[:, 0, 0], plants)
         cells = cells.replace(noise=np.zeros((*np.shape(cells.pip), 1, 1)))  # type: ignore[attr-defined]

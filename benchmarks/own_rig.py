@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ventbench import recordings
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.base.resume import WorkFolder
 from ventbench.controllers.pid import PID
@@ -108,7 +108,7 @@ def gains() -> Floats:
 
 def errors(controller: Controller, plant: Plant) -> tuple[float, Floats]:
     """Error without noise, cmH2O, and that of each of the 20 draws, shape ``(20,)``."""
-    with precision.float64():
+    with compilation.float64():
         plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), plant)
         controller = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
         out = []

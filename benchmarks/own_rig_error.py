@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri
 
-from ventbench.base import compilation, precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import Hybrid
@@ -352,10 +352,10 @@ def main() -> None:
     recordings = load_rig_recordings(options.recordings, folds=5, seed=0)
     simulators = frozen.load()
     if options.fits is None and not options.unseen:
-        with precision.float64():
+        with compilation.float64():
             report(recordings)
         return
-    with precision.float32():
+    with compilation.float32():
         chosen = judged(recordings, simulators)
         if options.unseen:
             plant = unseen_plants(recordings, simulators, chosen)

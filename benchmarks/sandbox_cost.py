@@ -13,8 +13,8 @@ import time
 
 import numpy as np
 
+from ventbench.entries.cells import InProcessRunner, Runner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner, Runner
 from ventbench.sandbox.child.cell import ROW
 from ventbench.sandbox.runner import SandboxRunner
 from ventbench.task import protocol

@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ventbench.base import compilation, files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Bools, Floats
 from ventbench.entries.cells import Cells, protocol_of
 from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE
@@ -59,7 +59,7 @@ def main() -> None:
     compilation.keep()
     cells = protocol_of(load_rigs(), draws=given.draws, stress=given.draws).stressed
     assert cells is not None
-    with precision.float64():
+    with compilation.float64():
         errors, survived = zip(*(best(cells, k) for k in range(given.draws)), strict=True)
     error, share = np.mean(errors, axis=(0, 2)), np.mean(survived, axis=(0, 2))
     names = [condition.id for condition in cells.conditions]

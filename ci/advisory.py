@@ -13,10 +13,10 @@ from ci import workflow
 from ci.take import PARENT, TakeError, changed_submissions, take
 from ventbench.base.text import number
 from ventbench.entries import contract
+from ventbench.entries.cells import Runner
 from ventbench.entries.folder import open_submission
 from ventbench.entries.manifest import MANIFEST
 from ventbench.entries.result import Score
-from ventbench.entries.runner import Runner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.task.draws import COUNT

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 from ci.git import Git, GitError, fetch
 from ventbench.base.errors import InputError
-from ventbench.entries.errors import printable
 from ventbench.entries.folder import MAX_BYTES, MAX_FILES, collisions, kind_problem, path_problem
 from ventbench.entries.manifest import NAME, NAME_RULE
+from ventbench.sandbox.child.cell import printable
 
 #: Folder of all submissions in the repository.
 PARENT = "submissions"

@@ -316,12 +316,12 @@ def compare(
     Example: `ventbench-hardware compare runs/hardware --out runs/mismatch`
     """
     from hardware_eval.results.replay import recorded_breaths, scored_plants
-    from ventbench.open_loop_report import mean_errors, summary
+    from ventbench.simulation import error_summary, mean_errors
 
     breaths = recorded_breaths(recorded, log)
     tested = scored_plants(plant, list(breaths.by_lung_index))
     error = mean_errors(tested.pressures(breaths), breaths)
-    lungs = {lung: summary("", error[index]) for lung, index in breaths.by_lung_index.items()}
+    lungs = {lung: error_summary("", error[index]) for lung, index in breaths.by_lung_index.items()}
     diagnoses = {}
     if diagnose:
         from ventbench.diagnosis.diagnose import diagnose as run_diagnosis

@@ -30,7 +30,7 @@ import numpy as np
 from jax import Array
 
 from hardware_eval.emulation.simulated import breath_begun
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.entries.scaffold import contents
@@ -168,7 +168,7 @@ def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
     if not pips or any(b <= a for a, b in itertools.pairwise(pips)):
         raise ValueError(f"PIPs {pips} cmH2O must rise")
     n = len(pips)
-    with precision.float64():
+    with compilation.float64():
         cells = env.nominal_scenario(np.asarray(pips))
         cells = cells.replace(noise=np.zeros((n, 1, 1)))  # type: ignore[attr-defined]
         wide = jax.tree.map(lambda leaf: np.asarray(leaf, float), plant)

@@ -15,7 +15,7 @@ from ventbench.base.errors import InputError
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
 from ventbench import gym_env  # noqa: E402
-from ventbench.base import precision  # noqa: E402
+from ventbench.base import compilation  # noqa: E402
 from ventbench.plants import frozen  # noqa: E402
 from ventbench.task import environment, protocol, rollouts  # noqa: E402
 from ventbench.task.lungs import LUNG_IDS  # noqa: E402
@@ -33,7 +33,7 @@ MANY = 12
 def test_the_checker_of_gymnasium_has_no_complaint():
     from gymnasium.utils.env_checker import check_env
 
-    made = gymnasium.make(NAME, render_mode="rgb_array")
+    made = gymnasium.make(NAME)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(made.unwrapped)
@@ -48,7 +48,7 @@ def test_registered_by_name():
 
 def scripted(actions, plant, cell):
     """Score of commands by the scan of the benchmark."""
-    with precision.float32():
+    with compilation.float32():
         plant, cell = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (plant, cell))
         u_in = jnp.asarray(50.0 + 50.0 * actions)
         run, _ = rollouts.closed_loop(plant, Script(u_in), cell)
@@ -56,7 +56,7 @@ def scripted(actions, plant, cell):
 
 
 def test_an_episode_scores_as_the_benchmark_does():
-    made = gym_env.Ventilator(lung="R20C50", pip=25.0, noise=False, render_mode="rgb_array")
+    made = gym_env.Ventilator(lung="R20C50", pip=25.0, noise=False)
     actions = np.random.default_rng(0).uniform(-1.0, -0.4, 102).astype(np.float32)
     seen, info = made.reset(seed=1)
     assert info["pip"] == 25.0
@@ -79,10 +79,6 @@ def test_an_episode_scores_as_the_benchmark_does():
     weight = plants_to_train_on().weights[LUNG_IDS.index("R20C50"), protocol.PIPS.index(25.0)]
     by_reward = (2 * 20.0 - 10.0 / weight * sum(rewards[34:])) / 68
     assert by_reward == pytest.approx(wanted, rel=1e-4)
-    picture = made.render()
-    assert picture is not None
-    assert picture.shape == (400, 640, 3)
-    assert picture.std() > 5.0, "something is drawn"
     with pytest.raises(InputError, match="call reset"):
         made.step(actions[:1])
 
@@ -91,7 +87,7 @@ def test_hidden_deviations_are_those_of_the_scored_draws():
     """An episode with noise, replayed by the scan from the cell that nobody is shown."""
     lungs = task.load_lungs(rigs="training")
     assert jax.tree.leaves(lungs.plants)[0].shape[0] > 6, "members of several rigs"
-    with precision.float32():
+    with compilation.float32():
         state, _ = task.reset(jax.random.key(3), lungs, 5, 20.0)
         plant, cell = state.episode.plant, state.episode.cell
         step, actions = jax.jit(task.step), np.linspace(-0.9, -0.5, 102).astype(np.float32)
@@ -121,7 +117,6 @@ def test_what_cannot_be_done_is_said():
         ({"lung": "R7C7"}, "R7C7 is not a lung of the simulators: R5C10"),
         ({"pip": 80.0}, "PIP 80 cmH2O"),
         ({"rigs": "all"}, "choose training or reference"),
-        ({"render_mode": "human"}, "choose 'rgb_array'"),
     ]
     for options, said in wrong:
         with pytest.raises(InputError, match=said):
@@ -132,7 +127,6 @@ def test_what_cannot_be_done_is_said():
     made.reset(seed=0)
     with pytest.raises(InputError, match="action 0 is nan"):
         made.step(np.array([np.nan], np.float32))
-    assert made.render() is None
 
 
 def test_many_at_once_are_each_alone():

@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from proofs.studies.networks import MEASURED
-from ventbench import open_loop_report
+from ventbench import simulation
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.cli import app
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
@@ -32,7 +32,7 @@ SAMPLES, INSPIRATORY = 40, 30
 
 
 def as_json(*arguments):
-    return open_loop_report.open_loop(*arguments).as_dict()
+    return simulation.open_loop(*arguments).as_dict()
 
 
 def answered(plants_for, lungs: list[str], seed: int = 0, noise: float = 0.3) -> Breaths:
@@ -66,7 +66,7 @@ def breaths(simulators):
 
 
 def test_the_error_is_the_one_that_was_put_in(breaths):
-    report = open_loop_report.open_loop(breaths)
+    report = simulation.open_loop(breaths)
     result = report.as_dict()
     assert list(result["lungs"]) == ["R5C20", "R20C50"]
     for one in result["lungs"].values():
@@ -85,7 +85,7 @@ def test_the_error_is_the_one_that_was_put_in(breaths):
 @pytest.mark.parametrize("kind", ["frozen", "hybrid", "physics"])
 def test_each_kind_is_what_it_says(simulators, breaths, kind):
     kinds: dict[str, Any] = {"physics": single_compartments}
-    error = open_loop_report.errors(kinds.get(kind, simulators.for_breaths), breaths)
+    error = simulation.open_loop_errors(kinds.get(kind, simulators.for_breaths), breaths)
     result = as_json(breaths, kind)
     assert result["plant"] == kind
     assert result["simulators"] == simulators.about()
@@ -101,7 +101,7 @@ def test_breaths_without_a_first_pressure_are_not_judged(breaths):
     pressure = breaths.pressure.copy()
     pressure[1, 0] = np.nan
     pressure[5, 1:INSPIRATORY] = np.nan
-    report = open_loop_report.open_loop(replace(breaths, pressure=pressure))
+    report = simulation.open_loop(replace(breaths, pressure=pressure))
     result = report.as_dict()
     assert result["not_judged"] == [2, 6]
     assert [one["breaths"] for one in result["lungs"].values()] == [2, 2]
@@ -110,7 +110,7 @@ def test_breaths_without_a_first_pressure_are_not_judged(breaths):
 
 def test_progress_counts_every_simulated_breath(breaths):
     told = []
-    open_loop_report.open_loop(breaths, progress=lambda *counts: told.append(counts))
+    simulation.open_loop(breaths, progress=lambda *counts: told.append(counts))
     assert told == [(6, 12), (12, 12)]
 
 
@@ -190,7 +190,7 @@ def test_errors_on_training_breaths_exported_again_are_not_printed_as_held_out(p
     breaths = breaths.select(breaths.by_lung_index["R5C20"][:6])
     u_in, pressure = np.round(breaths.u_in, 2), np.round(breaths.pressure, 2)
     pressure[2, 7] = np.nan
-    report = open_loop_report.open_loop(replace(breaths, u_in=u_in, pressure=pressure))
+    report = simulation.open_loop(replace(breaths, u_in=u_in, pressure=pressure))
     result = report.as_dict()
     assert result["lungs"]["R5C20"]["official_held_out_breaths"] == 0
     assert result["perhaps_copies"] == [int(breaths.breath_id[2])]

@@ -17,7 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 import ventbench
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.cli import app, options
 from ventbench.plants import frozen
@@ -165,7 +165,7 @@ def test_simulate_answers_commands_with_the_official_pressures(commands, tmp_pat
     assert list(found) == ["time_step", "u_in", "u_out", "pressure"]
     np.testing.assert_allclose(found["time_step"], 0.033 * np.arange(60), atol=1e-6)
     (given,), plant = read_controls(commands), take(frozen.load().plants, LUNG_IDS.index(name))
-    with precision.float64():
+    with compilation.float64():
         row = [jnp.asarray(x)[None] for x in (given.u_in, given.u_out, given.dt)]
         wanted = open_loop(plant, jnp.asarray([6.0]), *row)[0]
     np.testing.assert_allclose(found["pressure"], wanted, atol=1e-6)

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.task.lungs import LUNGS, Lung
@@ -21,7 +21,7 @@ class Textbook:
     for_breaths = cross_fitted = None
 
     def __init__(self) -> None:
-        with precision.float64():
+        with compilation.float64():
             # Numpy leaves, as the frozen ones have: they take the precision of their user.
             self.plants = jax.tree.map(np.asarray, _lungs(1.0))
             members = [_lungs(factor) for factor in (1.0, 0.97, 1.04)]

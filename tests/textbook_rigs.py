@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import (
     SingleCompartment,
@@ -61,7 +61,7 @@ class TextbookRigs:
     population = None
 
     def __init__(self) -> None:
-        with precision.float64():
+        with compilation.float64():
             members = [_sessions(factor) for factor in (1.0, 0.96)]
             self.sessions_plants: OffsetLung = jax.tree.map(np.asarray, stack(members))
 

@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from ventbench.diagnosis.result import Diagnosis as Diagnosis
     from ventbench.entries.result import Score as Score
     from ventbench.entries.scoring import score as score
-    from ventbench.open_loop_report import OpenLoopReport as OpenLoopReport
-    from ventbench.open_loop_report import open_loop as open_loop
     from ventbench.plants.catalog import load_simulators as load_simulators
     from ventbench.plants.simulators import Simulators as Simulators
     from ventbench.recordings import Breaths as Breaths
     from ventbench.recordings import load as load_recording  # noqa: F401
     from ventbench.recordings.foreign import import_recording as import_recording
+    from ventbench.simulation import OpenLoopReport as OpenLoopReport
     from ventbench.simulation import Simulation as Simulation
+    from ventbench.simulation import open_loop as open_loop
     from ventbench.simulation import simulate as simulate
     from ventbench.simulation import simulate_breaths as simulate_breaths
     from ventbench.task.interfaces import Controller as Controller
@@ -66,7 +66,7 @@ _SOURCES = {
     "LUNGS": ("task.lungs", "LUNGS"),
     "Lung": ("task.lungs", "Lung"),
     "Observation": ("task.interfaces", "Observation"),
-    "OpenLoopReport": ("open_loop_report", "OpenLoopReport"),
+    "OpenLoopReport": ("simulation", "OpenLoopReport"),
     "Plant": ("task.interfaces", "Plant"),
     "Score": ("entries.result", "Score"),
     "Simulation": ("simulation", "Simulation"),
@@ -80,7 +80,7 @@ _SOURCES = {
     "load_board": ("board.frames", "load_board"),
     "load_recording": ("recordings", "load"),
     "load_simulators": ("plants.catalog", "load_simulators"),
-    "open_loop": ("open_loop_report", "open_loop"),
+    "open_loop": ("simulation", "open_loop"),
     "rollout": ("trajectories", "rollout"),
     "score": ("entries.scoring", "score"),
     "simulate": ("simulation", "simulate"),

@@ -28,7 +28,7 @@ from gymnasium.vector.utils import batch_space
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.plants.catalog import Given
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
@@ -135,7 +135,6 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         noise: deviations and sensor noise drawn anew from the distributions of the scored draws;
             else nominal breaths on the reference rig.
         simulator: see :func:`ventbench.load_simulators`.
-        render_mode: must be None; one :class:`Ventilator` draws.
 
     Raises:
         InputError: if there is no such lung, the PIP is outside 5..60 cmH2O, or E is below 1.
@@ -154,15 +153,12 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         rigs: Literal["training", "reference"] = "training",
         noise: bool = True,
         simulator: Given = "frozen",
-        render_mode: str | None = None,
     ):
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}; it must be at least 1")
-        if render_mode is not None:
-            raise InputError("many at once draw nothing; leave render_mode out")
         if pip is not None and not protocol.PEEP < pip <= protocol.SAFETY_PRESSURE:
             raise InputError(f"PIP {pip:g} cmH2O is outside of 5..60 cmH2O")
-        self.num_envs, self.render_mode = num_envs, None
+        self.num_envs = num_envs
         self.single_action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         limit = np.full(environment.OBSERVATION, 5.0, np.float32)
         self.single_observation_space = spaces.Box(-limit, limit, dtype=np.float32)
@@ -180,7 +176,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         self._pips = pips if pip is None else np.full(num_envs, pip, np.float32)
         self._turn = len(chosen)
         self._rigs, self._noise = environment.load_lungs(simulator, rigs=rigs), noise
-        with precision.float32():
+        with compilation.float32():
             state, _ = jax.eval_shape(environment.reset, jax.random.key(0), self._rigs)
         self._layouts = _Layout.of(state.episode), _Layout.of(state.progress)
         self._count = STEPS + 1
@@ -193,7 +189,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         # PIPs change lungs from episode to episode.
         shift = int(self.np_random.integers(len(protocol.PIPS))) * self._turn
         number = np.uint32(self.np_random.integers(2**32))
-        with precision.float32():
+        with compilation.float32():
             self._episodes, self._progress, pip, seen = _reset(
                 number, self._rigs, self._lung, np.roll(self._pips, shift), vary=self._noise
             )
@@ -224,7 +220,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         if not np.isfinite(values.sum()):
             at = int(np.argmin(np.isfinite(values.reshape(self.num_envs))))
             raise InputError(f"action {at} is {values[at, 0]}; it must be a number from -1 to 1")
-        with precision.float32():
+        with compilation.float32():
             self._progress, self._steps, seen, reward, self.pressure, error = _step(
                 self._episodes, self._progress, self._steps, values, layouts=self._layouts
             )
@@ -238,7 +234,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
 
 
 class Ventilator(gymnasium.Env[Floats, Floats]):
-    """One ventilator of :class:`VentilatorVector`, which draws what it does.
+    """One ventilator of :class:`VentilatorVector`.
 
     ``info`` holds ``lung``, ``pip``, the true airway ``pressure``, cmH2O, and at the end ``error``.
 
@@ -248,13 +244,12 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         rigs: as of :class:`VentilatorVector`.
         noise: as of :class:`VentilatorVector`.
         simulator: see :func:`ventbench.load_simulators`.
-        render_mode: ``"rgb_array"`` for :meth:`render`, which needs the extra ``ventbench[view]``.
 
     Raises:
-        InputError: if there is no such lung or render mode, or the PIP is outside 5..60 cmH2O.
+        InputError: if there is no such lung, or the PIP is outside 5..60 cmH2O.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 33}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
     def __init__(
         self,
@@ -263,19 +258,13 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         rigs: Literal["training", "reference"] = "training",
         noise: bool = True,
         simulator: Given = "frozen",
-        render_mode: str | None = None,
     ):
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise InputError(f"render_mode is {render_mode!r}; choose 'rgb_array' or None")
-        if render_mode is not None:
-            require("matplotlib")
         self._one = VentilatorVector(1, lung, pip, rigs, noise, simulator)
         self._any = () if lung is not None else self._one.lungs
-        self._fixed, self.render_mode = pip is not None, render_mode
+        self._fixed = pip is not None
         self.action_space = self._one.single_action_space
         self.observation_space = self._one.single_observation_space
         self._info: dict[str, Any] = {}
-        self._seen: list[tuple[float, float, float]] = []
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -290,7 +279,6 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
             one._pips = draw.choice(np.asarray(protocol.PIPS, np.float32), 1)
         seen, info = one.reset(seed=int(draw.integers(2**31)))
         self._info = {"lung": str(info["lung"][0]), "pip": float(info["pip"][0])}
-        self._seen = []
         return seen[0], {**self._info, "pressure": 40.0 * float(seen[0, 0])}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
@@ -303,32 +291,9 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
             raise InputError("no episode is under way: call reset() first")
         seen, reward, ended, _, last = self._one.step(np.asarray(action, np.float32).reshape(1, 1))
         info = {**self._info, "pressure": float(np.asarray(self._one.pressure)[0])}
-        u_in = 50.0 + 50.0 * float(np.ravel(action)[0])
-        self._seen.append((info["pressure"], 40.0 * float(seen[0, 1]), u_in))
         if ended[0]:
             info["error"] = float(last["error"][0])
         return seen[0], float(reward[0]), bool(ended[0]), False, info
-
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """Draw pressure, target and command of the episode so far, RGB, shape ``(400, 640, 3)``."""
-        if self.render_mode is None:
-            return None
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(6.4, 4.0), dpi=100, layout="constrained")
-        upper, lower = figure.subplots(2, 1, sharex=True)
-        pressure, target, u_in = np.array(self._seen or [(np.nan,) * 3]).T
-        steps = np.arange(1, len(pressure) + 1)
-        upper.plot(steps, target, color="black", lw=1.0)
-        upper.plot(steps, pressure, color="#1f5aa6")
-        lower.step(steps, np.clip(u_in, 0.0, protocol.U_MAX), color="#1f5aa6", where="post")
-        upper.set(ylabel="pressure, cmH2O", ylim=(0.0, protocol.SAFETY_PRESSURE))
-        lower.set(ylabel="u_in, %", xlabel="command", xlim=(0, STEPS), ylim=(0.0, 100.0))
-        upper.set_title("{lung}, PIP {pip:.1f} cmH2O".format(**self._info), fontsize="medium")
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def register() -> None:

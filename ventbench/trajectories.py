@@ -164,7 +164,7 @@ def rollout(
     import jax
     import jax.numpy as jnp
 
-    from ventbench.base import precision
+    from ventbench.base import compilation
     from ventbench.plants.catalog import load_simulators
     from ventbench.task import environment, rollouts
 
@@ -178,7 +178,7 @@ def rollout(
     names = [entry.id for entry in simulators.lungs] if lungs is None else list(lungs)
     cells = tuple(float(pip) for pip in pips)
     plants = [simulators.plant(name) for name in names]
-    with precision.float64():
+    with compilation.float64():
         nominal = environment.nominal_scenario(np.asarray(cells))
 
         def run(plant: Plant) -> tuple[Floats, Floats]:

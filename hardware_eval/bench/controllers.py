@@ -30,7 +30,7 @@ class LiveController(Protocol):
         """Ask for the next command.
 
         Args:
-            row: the observation, as :func:`ventbench.entries.runner.pack` lays it out.
+            row: the observation, as :func:`ventbench.entries.cells.pack` lays it out.
             budget: time for the answer, s.
 
         Returns:
@@ -54,7 +54,7 @@ class SubmissionController:
     """A submission in its process, asked by a thread so that the loop need not wait for it.
 
     Args:
-        runner: as in scoring; see :class:`ventbench.entries.runner.Runner`.
+        runner: as in scoring; see :class:`ventbench.entries.cells.Runner`.
         submission: whose code runs.
         task: what the controller is told.
         real_time: whether ``budget`` holds; else answers are waited for.

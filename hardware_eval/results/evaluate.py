@@ -33,9 +33,9 @@ from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
 from ventbench.board import record
 from ventbench.board.record import HardwareRecord
-from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import Submission, open_submission
 from ventbench.recordings.breaths import write
+from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 
@@ -217,7 +217,7 @@ def make_runner(sandbox: bool) -> Any:
 
         # A run lasts 9 s and the loop does not wait; a controller silent for 2 s has failed.
         return SandboxRunner(allowance=Allowance(patience_s=2.0, total_s=120.0))
-    from ventbench.entries.runner import InProcessRunner
+    from ventbench.entries.cells import InProcessRunner
 
     return InProcessRunner()
 

@@ -14,7 +14,7 @@ from scipy import stats
 
 from proofs.paper import published
 from proofs.paper.report import Cell, Section, Table, Verdict
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.controllers.pid import PID
@@ -132,7 +132,7 @@ def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -
         name: tuple(grid.gains[int(np.argmin(np.where(among, error, np.inf)))].tolist())
         for name, among in kinds.items()
     }
-    with precision.float64():
+    with compilation.float64():
         plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[at], float), official.plants)
         controllers = PID(*(jnp.asarray(column) for column in zip(*chosen.values(), strict=True)))
         cells = environment.nominal_scenario(np.full(len(chosen), EXAMPLE_PIP))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from proofs.paper import published
 from proofs.paper.report import Cell, Section, Table, Verdict
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
@@ -220,7 +220,7 @@ def boundary(networks: Mapping[str, Any]) -> Section:
 def exploration(official: frozen.Frozen) -> Section:
     """Exploratory breaths on a simulator (the paper's figure 6 and table 1)."""
     index = LUNG_IDS.index(SHOWN)
-    with precision.float32():
+    with compilation.float32():
         plant = jax.tree.map(
             lambda leaf: jnp.asarray(leaf, jnp.float32), take(official.plants, index)
         )

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
@@ -70,7 +70,7 @@ def _rc(breaths: Breaths, out: Path) -> Setting:
 
 
 def _two_balloon(breaths: Breaths, out: Path) -> Setting:
-    with precision.float64():
+    with compilation.float64():
         plants = {lung.id: jax.tree.map(np.asarray, two_balloon(lung)) for lung in LUNGS}
     return Setting(breaths, plants, "two-balloon")
 
@@ -168,7 +168,7 @@ def most_important(mechanisms: Sequence[Mapping[str, Any]]) -> str | None:
 
 def without(plant: Physics, names: Collection[str]) -> Physics:
     """Return the plant with the parameters of these mechanisms at their neutral values."""
-    with precision.float64():
+    with compilation.float64():
         return plant.having(
             **{path: parameter(path).neutral for path in plant.names if _owner(path) in names}
         )
@@ -188,7 +188,7 @@ def by_names_alone(plant: Plant) -> Plant:
         return without(physics, basis_terms())
     wanted, own = plant.with_mechanisms, plant.without_mechanisms
     coefficients = [path for path in (*wanted.names, *own.names) if _owner(path) in basis_terms()]
-    with precision.float64():
+    with compilation.float64():
         named_only = wanted.having(**{path: own.get(path) for path in coefficients})
     return dataclasses.replace(plant, with_mechanisms=named_only)
 

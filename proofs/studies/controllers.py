@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from proofs.studies.networks import Progress, Tell, finish
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.base.resume import WorkFolder
 from ventbench.board.replay import spread
@@ -182,7 +182,7 @@ def _trained(
         if tell is not None:
             tell(done / total)
 
-    with precision.float32():
+    with compilation.float32():
         controller = fit(
             jax.tree.map(np.asarray, simulators.ensemble), gains, config=config, seed=seed,
             checkpoint=checkpoint, progress=told, keep=True,
@@ -205,7 +205,7 @@ def score_controller(
         Errors, cmH2O, ``(6, 1 + draws, 6)``, the nominal ones first; the exploitation index, cmH2O.
     """
     errors, requested = [], []
-    with precision.float64():
+    with compilation.float64():
         rigs, pips = Rigs(LUNGS, simulators.plants), protocol.PIPS
         _, every = rigs.cells(rigs.draws(draws, pips) if draws else None, pips)
         wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from ventbench import open_loop_report
+from ventbench import simulation
 from ventbench.base import files
 from ventbench.base.executor import InProcess, executor
 from ventbench.base.resume import WorkFolder, kept_results
@@ -205,7 +205,7 @@ def _errors(nets: Any, breaths: Breaths, fold: np.ndarray) -> np.ndarray:
         member = np.array([of[int(k)] for k in some.breath_id])
         return VmappedPlant(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), nets))
 
-    return open_loop_report.errors(plants_for, breaths)
+    return simulation.open_loop_errors(plants_for, breaths)
 
 
 #: Called with what is trained and the share of all that is done.

@@ -17,13 +17,13 @@ from ventbench.board import build, canonical, create, record, rounds, store
 from ventbench.board.record import Record
 from ventbench.board.replay import Replayed, ReplayPlants, replay
 from ventbench.entries import reference as references
-from ventbench.entries.errors import Failure
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission, resolve
 from ventbench.entries.result import Score
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.runs import CellFailure, Runs
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
+from ventbench.sandbox.child.cell import Failure
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS

@@ -133,27 +133,3 @@ def test_who_follows_an_earlier_entry_is_found():
 def test_entries_without_commands_follow_nobody_but_each_other():
     zero, some = np.zeros((5, 34)), np.ones((5, 34))
     assert comparison.sources([some, zero]) == [None, None]
-
-
-def test_agreement_is_kendalls_tau():
-    random = np.random.default_rng(6)
-    cells = np.arange(5.0)[:, None, None, None] + 0.0 * random.standard_normal((5, DRAWS, 6, 6))
-    cells[:, :, 2] *= -1.0  # one lung has the opposite order
-    made = comparison.agreement(cells, FIXED, [f"L{k}" for k in range(6)], range(10, 40, 5))
-    assert made["lung"] == pytest.approx({f"L{k}": (-1.0 if k == 2 else 1.0) for k in range(6)})
-    assert list(made["PIP"].values()) == pytest.approx([1.0] * 6)
-    assert sum(tau < 0 for tau in made["rig"].values()) == SIZES[2]
-
-
-def test_profile_and_interquartile_mean():
-    random = np.random.default_rng(8)
-    cells = random.gamma(2.0, 20.0, (DRAWS, 6, 6))
-    shares = comparison.profile(cells)
-    for threshold, share in zip(comparison.THRESHOLDS, shares, strict=True):
-        assert share == pytest.approx(np.mean(cells <= threshold))
-    value, low, high = comparison.interquartile_mean(cells, FIXED)
-    assert value == pytest.approx(stats.trim_mean(cells.ravel(), 0.25))
-    assert low < value < high
-    outlier = cells.copy()
-    outlier[0, 0, 0] = 1e6
-    assert comparison.interquartile_mean(outlier, FIXED)[0] == pytest.approx(value, abs=0.3)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.errors import InputError
 from ventbench.board import create, gate, record, schema, store
 from ventbench.board.record import Record
@@ -69,11 +69,12 @@ def test_replay_agrees_with_the_scorer(drafts, scores) -> None:
 
 
 def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: TextbookRigs) -> None:
-    from ventbench.entries.cells import as_float64, replay
+    from ventbench.entries.cells import as_float64
+    from ventbench.entries.scoring import replay
     from ventbench.plants.stacking import take
 
     pressures = []
-    with precision.float64():
+    with compilation.float64():
         for member in range(2):
             plants = as_float64(take(simulators.ensemble, member), 6)
             plants = jax.tree.map(lambda leaf: leaf[:, None], plants)

@@ -14,7 +14,7 @@ from ventbench.base.errors import InputError
 from ventbench.board import official_runs, store
 from ventbench.board.verify import verify
 from ventbench.cli import app
-from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.cells import InProcessRunner
 from ventbench.plants import frozen
 
 from ..textbook_rigs import TextbookRigs

@@ -20,7 +20,7 @@ from ventbench.board import (
     verify,
 )
 from ventbench.board.replay import differences, replay
-from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.runs import DRAWS, Runs, pip_columns
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol

@@ -24,8 +24,8 @@ from ventbench.board.rounds import Request
 from ventbench.board.verify import verify
 from ventbench.cli import app
 from ventbench.entries import reference as references
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import as_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import load_rigs
 from ventbench.task import draws as draw_tables

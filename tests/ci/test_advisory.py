@@ -8,7 +8,7 @@ import pytest
 import ventbench
 from ci import advisory
 from ventbench.base.text import number
-from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.cells import InProcessRunner
 from ventbench.plants.rigs import load_rigs
 from ventbench.sandbox.runner import SandboxRunner
 

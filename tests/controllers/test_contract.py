@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from jax import Array
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.controllers import residual, rl_policy
 from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment

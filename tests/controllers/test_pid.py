@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.controllers.pid import PID
 from ventbench.task.interfaces import Controller, Observation
 from ventbench.task.rollouts import Script
@@ -39,7 +39,7 @@ def stepped(controller, pressures, target, dt, shape=()):
 @pytest.mark.parametrize("gains", [(2.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 0.0, 4.0), (2, 3, 4)])
 def test_against_plain_loop(gains):
     pressures = np.random.default_rng(0).uniform(5, 25, size=(3, 34))
-    with precision.float64():
+    with compilation.float64():
         found = stepped(PID(*gains), pressures, 20.0, 0.03)
     p, i, d = gains
     expected = plain(p, i, d, pressures, 20.0, 0.03)
@@ -48,7 +48,7 @@ def test_against_plain_loop(gains):
 
 def test_constant_error_in_closed_form():
     a = 0.03 / 0.53
-    with precision.float64():
+    with compilation.float64():
         integral = stepped(PID(0.0, 1.0, 0.0), np.full((1, 34), 10.0), 20.0, 0.03)
     np.testing.assert_allclose(integral, 10 * (1 - (1 - a) ** np.arange(1, 35)), rtol=1e-12)
 
@@ -56,7 +56,7 @@ def test_constant_error_in_closed_form():
 def test_batched_gains():
     pressures = np.random.default_rng(1).uniform(5, 25, size=(2, 5))
     gains = np.random.default_rng(2).uniform(0, 5, size=(3, 4))
-    with precision.float64():
+    with compilation.float64():
         found = stepped(PID(*jnp.asarray(gains)), pressures, 20.0, 0.03, (4,))
         for k in range(4):
             single = stepped(PID(*gains[:, k]), pressures, 20.0, 0.03)

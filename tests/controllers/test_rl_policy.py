@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.controllers.rl_policy import (
     CHOICES,
     GaussianPolicy,
@@ -19,8 +19,8 @@ from ventbench.controllers.rl_policy import (
     init_parameters,
     save_weights,
 )
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
@@ -62,7 +62,7 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
     shutil.copytree(HERE / name, folder, ignore=shutil.ignore_patterns("__pycache__"))
     made = make(name)
     save_weights(folder / "weights.npz", made)
-    with precision.float64():
+    with compilation.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
         rigs = Rigs(LUNGS, plants)
         found = run_protocol(

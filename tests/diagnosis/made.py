@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.diagnosis.findings import (
     BreathRequest,
     MissingMechanism,
@@ -104,7 +104,7 @@ def diagnosis(n: int = 40) -> Diagnosis:
         kinds = {"before": before, "refit": refit, "after": after}
         return {name: distance(simulated, part) for name, simulated in kinds.items()}
 
-    with precision.float64():
+    with compilation.float64():
         plant = physics(about, {"valve_delay": {"delay": 0.041}}).having(R=22.1, C=47.4)
     u_in, u_out, _, dt = commands(3, 70, 5)
     return Diagnosis(

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.diagnosis import corrected as module
 from ventbench.diagnosis.corrected import choose, correct, fit_open_loop
 from ventbench.diagnosis.evaluator import make_evaluator
@@ -36,7 +36,7 @@ def breaths() -> Breaths:
 
 
 def plants(**base: float) -> dict[str, Plant]:
-    with precision.float64():
+    with compilation.float64():
         return {small.LABEL: physics(lung(small.LABEL), {}).having(**base)}
 
 

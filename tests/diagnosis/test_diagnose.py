@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.diagnosis.diagnose import _Comparison, diagnose
 from ventbench.diagnosis.result import Diagnosis
@@ -39,7 +39,7 @@ def found(breaths) -> Diagnosis:
 
 def turbulent(quadratic: float) -> dict[str, Plant]:
     """A user's plant that is the rig, more or less."""
-    with precision.float64():
+    with compilation.float64():
         plant = physics(lung(small.LABEL), {NAME: {"quadratic": quadratic}})
         return {small.LABEL: plant.having(R=small.RIG.R, C=small.RIG.C, PEEP=small.RIG.peep)}
 

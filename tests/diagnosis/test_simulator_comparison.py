@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.evaluator import fit_with_noise
@@ -167,7 +167,7 @@ def test_a_simulator_is_described_by_the_recordings_mechanisms_that_it_needs():
 @pytest.mark.slow  # three conclusions
 def test_what_recording_and_simulator_share_is_no_mismatch():
     effect = small.made(small.effect(NAME, quadratic=10.0))
-    with precision.float64():
+    with compilation.float64():
         plant = physics(lung(small.LABEL), {}).having(
             R=small.RIG.R, C=small.RIG.C, PEEP=small.RIG.peep
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.entries.scaffold import create
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.stacking import stack
@@ -16,7 +16,7 @@ from ..conftest import MANIFEST as MANIFEST
 @pytest.fixture(scope="session")
 def plants() -> SingleCompartment:
     """The six lungs, float64, stacked."""
-    with precision.float64():
+    with compilation.float64():
         return stack([single_compartment(lung) for lung in LUNGS])
 
 

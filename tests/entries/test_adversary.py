@@ -13,13 +13,12 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries.adversary import EDGE, RIG, _Bench, adversary
-from ventbench.entries.cells import PlantError, ProtocolRun
-from ventbench.entries.errors import Failure
+from ventbench.entries.cells import InProcessRunner, PlantError, ProtocolRun
 from ventbench.entries.folder import as_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.physics.parameters import VALVE_GAIN
 from ventbench.plants.population import NAMES, to_vector
 from ventbench.plants.rigs import load_rigs
+from ventbench.sandbox.child.cell import Failure
 from ventbench.task.stressors import STRESSORS, stressor
 
 #: R, C, PIP and what is safe there, cmH2O.

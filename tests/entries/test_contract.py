@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries import contract
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.contract import STEPS
-from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import check_files, open_submission
 from ventbench.entries.review import check_sources
-from ventbench.entries.runner import InProcessRunner
+from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.sandbox.pipes import Allowance
 from ventbench.sandbox.runner import SandboxRunner
 
@@ -26,6 +26,10 @@ from .conftest import MANIFEST
 
 #: No machine is so busy that one of these is met.
 PATIENT = Allowance(start_patience_s=300.0, patience_s=300.0, total_s=600.0)
+
+
+RESET = "    def reset(self, task): pass\n"
+ACT = "    def act(self, observation): return 1.0\n"
 
 
 def ticking(act_s=1e-4):
@@ -174,9 +178,6 @@ def test_a_seed_is_enough(check):
 
 
 def test_an_import_that_fails(check):
-    report = check("import helper\n" + "class Controller: pass", helper="1 / 0\n")
-    # The class is empty, but what is read comes first.
-    assert {finding.group for finding in report.problems} == {"source"}
     report = check(
         """
         import helper
@@ -190,6 +191,42 @@ def test_an_import_that_fails(check):
     assert (finding.file, finding.line) == ("helper.py", 2)
     assert "ZeroDivisionError while it was imported" in finding.what
     assert report.left_out == ("repeat", "time")
+
+
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
+@pytest.mark.parametrize(
+    ("body", "said", "advice"),
+    [
+        (f"{RESET}    def act(self): return 1\n", "raised TypeError at step 1", "act(self, obs"),
+        (f"{RESET}    def act(self, o, *, b): return 1\n", "raised TypeError at", "act(self, obs"),
+        (f"{RESET}    async def act(self, o): return 1\n", "act returned a coroutine", "float("),
+        (f"{RESET}    def act(self, o): yield 1\n", "act returned a generator", "float("),
+        (f"{RESET}    def act(self, o): 1.0\n", "act returned None; it must", "float("),
+        (f"    def reset(self): pass\n{ACT}", "raised TypeError in reset", "reset(self, task)"),
+        (f"    def __init__(self, n): pass\n{RESET}{ACT}", "raised TypeError in Controller()",
+         "Controller() is called without arguments"),
+        (ACT, "class Controller in controller.py has no method reset(task)", "reset(self, task)"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_the_class_are_named_with_what_to_do(check, body, said, advice):
+    finding = only(check(f"class Controller:\n{body}"), "run")
+    assert finding.file == "controller.py"
+    assert finding.what.startswith(said)
+    assert advice in finding.advice
+
+
+def test_every_method_that_is_missing_is_named(check):
+    apart = check("class Controller: pass", apart=True)
+    assert [finding.what.partition(" has ")[2] for finding in apart.problems] == [
+        "no method reset(task)",
+        "no method act(observation)",
+    ]
+
+
+def test_a_class_of_another_name_is_named(check):
+    finding = only(check(f"from pathlib import Path\nclass Controler:\n{RESET}{ACT}"), "run")
+    assert finding.what == "defines no class Controller, but Controler"
+    assert finding.advice == contract._CLASS_ADVICE
 
 
 def test_a_class_that_comes_from_elsewhere_is_asked_in_the_run(check):
@@ -325,12 +362,10 @@ def test_everything_at_once(demo):
         ("submission.toml", 5, "manifest"),
         ("network.py", 1, "source"),
         ("network.py", 2, "source"),
-        ("controller.py", 2, "source"),
     }
     assert all(finding.advice for finding in report.problems)
     text = "\n".join(report.lines())
-    assert "10 problems; not ready to submit" in text
-    assert "did you mean Controler?" in text
+    assert "9 problems; not ready to submit" in text
     assert "'pop' is not one of pid, residual, ppo, dqn, other; did you mean ppo?" in text
 
 

@@ -7,7 +7,6 @@ import zipfile
 import numpy as np
 import pytest
 
-from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import (
     MAX_BYTES,
     MAX_SEEDS,
@@ -15,6 +14,7 @@ from ventbench.entries.folder import (
     open_submission,
     weights_problems,
 )
+from ventbench.sandbox.child.cell import SubmissionError
 
 
 def files(folder):

@@ -5,8 +5,8 @@ import pytest
 
 from ventbench.base import files
 from ventbench.entries import folder
-from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import bundled, open_submission, resolve
+from ventbench.sandbox.child.cell import SubmissionError
 
 
 def test_bundled_by_name_and_by_path(monkeypatch):

@@ -2,8 +2,8 @@ import re
 
 import pytest
 
-from ventbench.entries.errors import SubmissionError
 from ventbench.entries.manifest import Training, check_manifest, read_manifest
+from ventbench.sandbox.child.cell import SubmissionError
 
 from .conftest import MANIFEST
 

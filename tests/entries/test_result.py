@@ -139,7 +139,7 @@ def test_it_shows_itself(textbook, official):
 def test_failures_are_shown_and_escaped(plants):
     class Fails(Pretender):
         def start(self, submission, tasks):
-            from ventbench.entries.errors import Failure
+            from ventbench.sandbox.child.cell import Failure
 
             self.failures = {k: Failure("act", "<b>raised</b>") for k in range(6)}
             return self

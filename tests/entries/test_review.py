@@ -1,6 +1,6 @@
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.contract import check
 from ventbench.entries.review import check_sources, review
-from ventbench.entries.runner import InProcessRunner
 
 SOURCE = """\
 import gc, math

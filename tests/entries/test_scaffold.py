@@ -11,12 +11,12 @@ import pytest
 from flax import linen as nn
 from safetensors.numpy import save_file
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.entries import contract
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
 from ventbench.entries.manifest import FAMILIES
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scaffold import contents, create, initial_weights
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
@@ -28,11 +28,11 @@ NETWORKS = ("residual", "ppo", "dqn")
 
 @pytest.fixture(scope="module")
 def one_lung():
-    from ventbench.base import precision
+    from ventbench.base import compilation
     from ventbench.plants.single_compartment import single_compartment
     from ventbench.plants.stacking import stack
 
-    with precision.float64():
+    with compilation.float64():
         return stack([single_compartment(LUNGS[0])])
 
 
@@ -189,7 +189,7 @@ def trained(library: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
         network = nn.Sequential([nn.Dense(16), nn.relu, nn.Dense(16), nn.relu, nn.Dense(1)])
         tree = {f"layers_{2 * k}": {"kernel": w, "bias": b} for k, (w, b) in enumerate(weights)}
         arrays = {f"params.{name}.{key}": x for name, d in tree.items() for key, x in d.items()}
-        with precision.float64():
+        with compilation.float64():
             actions = np.asarray(network.apply({"params": tree}, seen))
         return arrays | {"check.input": seen, "check.output": actions}, actions
     names = ["mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2", "action_net"]

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.entries import cells
-from ventbench.entries.errors import Failure, SubmissionError
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol, score
 from ventbench.physics import mechanism, physics
 from ventbench.plants.plant_files import save_plants
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
+from ventbench.sandbox.child.cell import Failure, SubmissionError
 from ventbench.task import draws, environment, protocol, rollouts, waveform
 from ventbench.task.interfaces import Task
 from ventbench.task.lungs import LUNG_IDS, LUNGS, lung
@@ -41,7 +41,7 @@ GAINS = {
 def pure_errors(plants, cells, gains):
     """Errors of the pure PID in one scan, shape ``(L, ...)``; cells of all or of each lung."""
     errors = []
-    with precision.float64():
+    with compilation.float64():
         for i, gain in enumerate(gains):
             own = cells if cells.pip.ndim == 1 else jax.tree.map(lambda x, i=i: x[i], cells)
             found, _ = rollouts.closed_loop(take(plants, i), PID(*gain), own)
@@ -57,14 +57,14 @@ def best(plants):
 
 
 def test_nominal_is_that_of_the_pure_pid(plants, best):
-    with precision.float64():
+    with compilation.float64():
         cells = environment.nominal_scenario(np.array(protocol.PIPS))
     expected = pure_errors(plants, cells, GAINS.values())
     np.testing.assert_allclose(best.nominal, expected, rtol=0, atol=1e-9)
 
 
 def test_draws_are_those_of_the_pure_pid(plants, best):
-    with precision.float64():
+    with compilation.float64():
         cells = Rigs(LUNGS, plants).draws(20).cells
     expected = np.moveaxis(pure_errors(plants, cells, GAINS.values()), 0, 1)
     np.testing.assert_allclose(best.drawn, expected, rtol=0, atol=1e-9)
@@ -78,7 +78,7 @@ def test_robust_pid(plants):
             track=track,
             runner=InProcessRunner(),
         )
-        with precision.float64():
+        with compilation.float64():
             cells = environment.nominal_scenario(np.array(protocol.PIPS))
         expected = pure_errors(plants, cells, [(10.0, 2.0, 9.0)] * 6)
         np.testing.assert_allclose(found.nominal, expected, rtol=0, atol=1e-9)
@@ -140,7 +140,7 @@ def test_trajectories(best, plants):
     scored = (phase < 34) & (np.arange(300) >= 100)
     error = np.abs(found.pressure - found.target)[..., scored].mean(axis=-1)
     np.testing.assert_allclose(error, result.nominal, rtol=0, atol=1e-9)
-    with precision.float64():
+    with compilation.float64():
         cells = environment.nominal_scenario(np.array(protocol.PIPS))
         pid = PID(*GAINS["R20C20"])
         inspired, expired = rollouts.closed_loop(take(plants, 4), pid, cells, whole=True)
@@ -437,7 +437,7 @@ def test_nothing_is_left_on_the_search_path(plants):
 
 @pytest.fixture(scope="module")
 def two_lungs():
-    with precision.float64():
+    with compilation.float64():
         return {lung.id: single_compartment(lung) for lung in LUNGS[:2]}
 
 

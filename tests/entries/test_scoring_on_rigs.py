@@ -7,10 +7,10 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.controllers.pid import PID
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission, submission_of
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
 from ventbench.plants.rigs import load_rigs, rigs_of
@@ -39,7 +39,7 @@ def result(rigs):
 
 def compiled(rigs, draws):
     """Errors and requested commands of the same PID in one scan."""
-    with precision.float64():
+    with compilation.float64():
         plants, cells = rigs.cells(rigs.draws(draws, PIPS), PIPS)
         plants, cells = jax.tree.map(jax.numpy.asarray, (plants, cells))
 

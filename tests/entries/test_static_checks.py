@@ -77,67 +77,6 @@ def test_only_what_the_controller_imports_must_be_there(demo):
     assert sources(demo, GOOD) == []
 
 
-ACT = "    def act(self, observation): return 1.0\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("x = 1\n", "defines no class Controller"),
-        ("class MyController: pass\n", "defines no class Controller; did you mean MyController?"),
-        ("class Controller:\n" + ACT, "class Controller has no method reset"),
-        ("class Controller:\n" + RESET, "class Controller has no method act"),
-        (
-            f"class Controller:\n{RESET}    def act(self): return 1\n",
-            "act cannot be called as act(",
-        ),
-        (f"class Controller:\n{RESET}    def act(self, a, b): return 1\n", "act cannot be called"),
-        (
-            f"class Controller:\n{RESET}    def act(self, a, *, b): return 1\n",
-            "act cannot be called",
-        ),
-        (f"class Controller:\n{RESET}    async def act(self, o): return 1\n", "act is async"),
-        (f"class Controller:\n{RESET}    def act(self, o): yield 1\n", "act is a generator"),
-        (f"class Controller:\n{RESET}    def act(self, o): 1.0\n", "act returns nothing"),
-        (f"class Controller:\n    def reset(self): pass\n{ACT}", "reset cannot be called"),
-        (f"class Controller:\n    def __init__(self, n): pass\n{RESET}{ACT}", "Controller() needs"),
-    ],
-)
-def test_the_class_and_its_methods(demo, text, said):
-    (finding,) = sources(demo, text)
-    assert finding.what.startswith(said)
-    assert finding.problem
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "from network import *\n",
-        "from other import Mine as Controller\n",
-        "Controller = type('Controller', (), {})\n",
-        "if True:\n    class Controller: pass\n",
-        "class Base: pass\nclass Controller(Base): pass\n",
-        f"class Controller:\n{RESET}    def act(self, o, gain=1, *more): return 1\n",
-        f"class Controller:\n{RESET}    @staticmethod\n    def act(o): return 1\n",
-        f"class Controller:\n{RESET}    def f(self, o): return 1\n    act = f\n",
-        f"class Controller:\n    def __init__(self, n=1): pass\n{RESET}{ACT}",
-        f"class Controller:\n{RESET}    def act(self, o):\n        raise NotImplementedError\n",
-    ],
-)
-def test_what_only_a_run_can_tell_is_left_to_it(demo, text):
-    assert sources(demo, text, other="") == []
-
-
-def test_inner_functions_are_their_own(demo):
-    text = (
-        f"class Controller:\n{RESET}    def act(self, o):\n        def f(): return 1\n        f()\n"
-    )
-    (finding,) = sources(demo, text)
-    assert finding.what == "act returns nothing"
-    inner = "        def f(): yield 1\n        return next(f())\n"
-    assert sources(demo, f"class Controller:\n{RESET}    def act(self, o):\n{inner}") == []
-
-
 @pytest.mark.parametrize(
     "text",
     [

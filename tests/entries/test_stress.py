@@ -14,20 +14,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
-from ventbench.entries.cells import Cells, ProtocolRun, protocol_of
-from ventbench.entries.errors import SubmissionError
+from ventbench.entries.cells import Cells, InProcessRunner, ProtocolRun, protocol_of
 from ventbench.entries.folder import open_submission, submission_of
 from ventbench.entries.result import Score
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.runs import Runs
 from ventbench.entries.scoring import run_protocol, runs_of
 from ventbench.plants import frozen
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.rigs import load_rigs, rigs_of
+from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.task import environment, protocol, rollouts
 from ventbench.task.interfaces import Task
 from ventbench.task.metrics.score import run_error
@@ -122,7 +121,7 @@ def test_draws_cover_every_pip_on_every_lung_and_are_those_of_the_protocol() -> 
 
 @pytest.mark.slow
 def test_the_scan_and_the_steps_give_the_same_score(runs: Runs, cells: Cells) -> None:
-    with precision.float64():
+    with compilation.float64():
         plants, scenario = cells.stressed(0)
         gains = PID(jnp.asarray(2.0), jnp.asarray(4.0), jnp.asarray(0.0))
         run = scanned(plants, gains, scenario)
@@ -140,7 +139,7 @@ def test_every_condition_is_finite_and_differs_from_none() -> None:
     cells = protocol_of(load_rigs(), stress=1).stressed
     assert cells is not None
     every = cells.conditions
-    with precision.float64():
+    with compilation.float64():
         plants, scenario = cells.stressed(0)
         gains = PID(*(jnp.asarray(gain) for gain in (6.0, 6.0, 0.3)))
         run = scanned(plants, gains, scenario)
@@ -300,7 +299,7 @@ def _of(runs: Runs, name: str) -> int:
 
 def test_nothing_is_changed_without_a_stressor(runs: Runs, cells: Cells) -> None:
     """The same commands on the scored rig alone give the same pressures."""
-    with precision.float64():
+    with compilation.float64():
         plant, scenario = jax.tree.map(
             lambda leaf: jnp.asarray(np.asarray(leaf)[:, :, 0], float),
             (cells.plants, cells.scenario),
@@ -321,7 +320,7 @@ def test_it_is_the_rule_of_the_corrected_simulator(cells: Cells) -> None:
     leaks = [
         k for k, condition in enumerate(cells.conditions) if "sensor_low" not in condition.stressors
     ]
-    with precision.float64():
+    with compilation.float64():
         leaky = tuple(cells.conditions[k] for k in leaks)
         plants, scenario = dataclasses.replace(cells, conditions=leaky).stressed(0)
         # Of breath 2, in which the tube comes off.

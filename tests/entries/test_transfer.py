@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import GROUPS, by_group, run_protocol, transfer
 from ventbench.plants.rigs import load_rigs
 

@@ -12,8 +12,8 @@ from hardware_eval.demo import error_on
 from hardware_eval.emulation.simulated import SimulatedHal
 from hardware_eval.planned import PlannedController, plan_controller
 from ventbench.controllers.pid import TIME_CONSTANT
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.physics.model import physics
 from ventbench.task.interfaces import Plant, Task
 from ventbench.task.lungs import lung

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.task import environment, lungs, protocol, rollouts, waveform
@@ -30,7 +30,7 @@ SHAPE = (len(lungs.LUNGS), len(protocol.PIPS), protocol.BREATHS * protocol.BREAT
 def simulate(name: str, gains: Mapping[str, tuple[float, float]]) -> Trajectories:
     pressure, u_in = np.empty(SHAPE), np.empty(SHAPE)
     for i, lung in enumerate(lungs.LUNGS):
-        with precision.float64():
+        with compilation.float64():
             cells = environment.nominal_scenario(protocol.PIPS)
             inspired, expired = rollouts.closed_loop(
                 single_compartment(lung), PID(*gains[lung.id]), cells, whole=True

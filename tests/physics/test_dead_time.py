@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.physics.dead_time import window_weights
 
 POINTS = 20_000

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.physics.catalogue import events, intermittent, library
 from ventbench.physics.model import Physics, physics
 from ventbench.task.lungs import Lung
@@ -20,7 +20,7 @@ STEPS = 40
 
 
 def _pressure(plant: Physics, command: float) -> np.ndarray:
-    with precision.float64():
+    with compilation.float64():
         u_in = jnp.full((1, STEPS), command)
         dt = jnp.full((1, STEPS), 0.03)
         return np.asarray(open_loop(plant, jnp.array([5.0]), u_in, 0.0 * u_in, dt))[0]
@@ -38,7 +38,7 @@ def _with(**values: float) -> Physics:
         for name, event in events().items()
         for p in event.description.parameters
     }
-    with precision.float64():
+    with compilation.float64():
         return physics(Lung(20.0, 20.0)).having(**off).having(**values)
 
 
@@ -85,7 +85,7 @@ def test_a_ripple_and_water_swing_as_formulas_say() -> None:
 
 
 def test_off_they_change_nothing(plain: np.ndarray) -> None:
-    with precision.float64():
+    with compilation.float64():
         without = physics(Lung(20.0, 20.0))
     np.testing.assert_allclose(plain, _pressure(without, 12.0), rtol=0, atol=1e-9)
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ci.generated_tables import mechanisms
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.physics import library, mechanism, parameter, paths, physics, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.physics import library, parameter, paths, physics, resolution
 from ventbench.plants.plant_files import load_plant, save_plant
@@ -38,7 +38,7 @@ def commands(seed=0, top=100.0):
 @pytest.mark.parametrize("lung", LUNGS, ids=str)
 def test_base_is_the_textbook_lung(lung):
     """Solved there in closed form. Here the expiratory valve lets gas out only."""
-    with precision.float64():
+    with compilation.float64():
         start = jnp.full(N, 6.0)
         mine = open_loop(physics(lung), start, *commands(top=20.0))
         textbook = open_loop(single_compartment(lung), start, *commands(top=20.0))
@@ -46,7 +46,7 @@ def test_base_is_the_textbook_lung(lung):
 
 
 def test_nothing_enters_through_the_expiratory_valve():
-    with precision.float64():
+    with compilation.float64():
         plant = physics(Lung(20.0, 20.0))
         start, zero = jnp.full(N, 4.0), jnp.zeros((N, T))
         state, _ = plant.init(start, jnp.full(N, 9.0))
@@ -72,7 +72,7 @@ def test_stable_at_any_parameter_in_range(data):
         between = item.coordinate(item.low) * (1 - share) + item.coordinate(item.high) * share
         values[name] = float(np.clip(item.physical(between), item.low, item.high))
     dt = data.draw(st.sampled_from([0.002, 0.03, 0.1]))
-    with precision.float64():
+    with compilation.float64():
         plant = physics(Lung(1.0, 1.0)).having(**values)
         u_in, u_out, _ = commands(data.draw(st.integers(0, 99)))
         p = np.asarray(_RUN(plant, jnp.full(N, 5.0), u_in, u_out, jnp.full((N, T), dt)))
@@ -87,7 +87,7 @@ def test_stable_at_any_parameter_in_range(data):
 @pytest.mark.slow
 def test_gradients_are_finite_and_not_zero():
     """By every parameter, at neutral strengths and at mild ones."""
-    with precision.float64():
+    with compilation.float64():
         start, c = jnp.full(N, 5.0), commands(top=30.0)
         c = (c[0] + 0.4, *c[1:])
 
@@ -107,7 +107,7 @@ def test_gradients_are_finite_and_not_zero():
 
 def test_single_precision_agrees():
     found = []
-    for context in (precision.float32, precision.float64):
+    for context in (compilation.float32, compilation.float64):
         with context():
             u_in, u_out, dt = (jnp.asarray(np.asarray(x), float) for x in commands(top=30.0))
             found.append(np.asarray(open_loop(everything(), jnp.full(N, 5.0), u_in, u_out, dt)))
@@ -118,7 +118,7 @@ def test_single_precision_agrees():
 @pytest.mark.slow
 def test_half_the_interval_gives_the_same():
     """Commands held for two samples each, with all mechanisms that look at flows, not at edges."""
-    with precision.float64():
+    with compilation.float64():
         u_in, u_out, dt = commands(top=20.0)
         whole = open_loop(everything(), jnp.full(N, 5.0), u_in, u_out, dt)
         twice = [jnp.repeat(x, 2, axis=1) for x in (u_in, u_out, dt / 2)]
@@ -131,7 +131,7 @@ def test_half_the_interval_gives_the_same():
 
 @pytest.mark.slow
 def test_stacks_and_variations():
-    with precision.float64():
+    with compilation.float64():
         stacked = everything().having(R=np.array([5.0, 20.0, 20.0, 50.0]))
         found = open_loop(stacked, jnp.full(N, 5.0), *commands(top=20.0))
         one = open_loop(everything(Lung(50.0, 20.0)), jnp.full(N, 5.0), *commands(top=20.0))
@@ -146,7 +146,7 @@ def test_stacks_and_variations():
 
 def test_end_expiratory_pressure():
     """An explicit one counts most, then the parameter, then the start."""
-    with precision.float64():
+    with compilation.float64():
         plant, start = physics(LUNGS[0], PEEP=7.0), jnp.asarray(5.0)
         assert float(plant.init(start)[0].peep) == 7.0
         assert float(plant.init(start, jnp.asarray(3.0))[0].peep) == 3.0
@@ -154,7 +154,7 @@ def test_end_expiratory_pressure():
 
 
 def test_file_round_trip(tmp_path):
-    with precision.float64():
+    with compilation.float64():
         plant = everything()
         save_plant(tmp_path / "plant.npz", plant)
         loaded = load_plant(tmp_path / "plant.npz")

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.diagnosis.evaluator import make_evaluator
 from ventbench.diagnosis.evidence import search
 from ventbench.diagnosis.hypothesis import all_parameter_paths

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.physics import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
 from ventbench.physics.characteristics import characteristic

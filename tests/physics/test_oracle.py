@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.physics import library, physics
 from ventbench.task.lungs import Lung
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators, names
@@ -92,7 +92,7 @@ def test_a_folder_is_official_only_if_its_manifest_is(tmp_path):
 
 
 def test_plants_by_lung_from_a_mapping_and_a_file(breaths, tmp_path):
-    with precision.float64():
+    with compilation.float64():
         plants = {name: single_compartment(lung(name)) for name in ("R20C50", "R5C10")}
     given = load_simulators(plants)
     assert given.sha256 == load_simulators(dict(plants)).sha256

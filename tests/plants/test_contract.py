@@ -22,10 +22,10 @@ from hypothesis.extra import numpy as hnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.entries import scoring
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators

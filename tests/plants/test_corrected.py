@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.corrected import Corrected

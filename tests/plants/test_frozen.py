@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from ventbench.base import files
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.plants import frozen
 from ventbench.plants.frozen import BY_ALL, seen
 from ventbench.task.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS

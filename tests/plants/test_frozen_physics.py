@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import ArrayLike
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import PLAYS, RELIEF, RELIEF_ROOM, Hybrid
 from ventbench.task import protocol, waveform

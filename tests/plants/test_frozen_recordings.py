@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from proofs.studies.networks import MEASURED, RECONSTRUCTED
-from ventbench import open_loop_report
-from ventbench.base.precision import float64
+from ventbench import simulation
+from ventbench.base.compilation import float64
 from ventbench.plants import frozen
 from ventbench.plants.frozen import BY_NONE
 from ventbench.plants.single_compartment import single_compartment
@@ -89,13 +89,13 @@ def test_reconstructed_breaths_have_been_seen_by_all(official, reconstructed):
 
 
 def test_the_errors_of_the_manifest_are_reproduced(official, measured):
-    error = open_loop_report.errors(official.cross_fitted, measured)
+    error = simulation.open_loop_errors(official.cross_fitted, measured)
     at = official.sessions.assign(measured)
     for lung, about in official.lungs().items():
         index = measured.by_lung_index[lung]
         figures = {
-            **open_loop_report.summary("held_out_", error[index]),
-            **open_loop_report.summary("own_rig_", error[index[np.isin(at[index], about["rigs"])]]),
+            **simulation.error_summary("held_out_", error[index]),
+            **simulation.error_summary("own_rig_", error[index[np.isin(at[index], about["rigs"])]]),
         }
         agree(figures, {name: about[name] for name in figures}, 1e-6)
 
@@ -104,5 +104,5 @@ def test_the_hybrid_is_better_than_physics_from_labels(official, measured):
     """On breaths that its judge has not seen, over the six lungs."""
     scored = measured.select(np.flatnonzero(np.isin(measured.lung_ids, LUNG_IDS)))
     finders = (official.cross_fitted, single_compartments, two_balloons)
-    hybrid, rc, balloons = (open_loop_report.errors(x, scored).mean() for x in finders)
+    hybrid, rc, balloons = (simulation.open_loop_errors(x, scored).mean() for x in finders)
     assert 1.5 * hybrid < min(rc, balloons)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.plants.hybrid import (
     DIRECTION_WIDTH,
     ELASTIC_KNOTS,

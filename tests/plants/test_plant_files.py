@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from ventbench.base import compilation
 from ventbench.base import files as whole_files
-from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.cli import app
-from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.cells import InProcessRunner
 from ventbench.physics import physics
 from ventbench.plants import frozen, plant_files
 from ventbench.plants.corrected import Corrected
@@ -111,7 +111,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 def late(lung_id: str, **base: float):
-    with precision.float64():
+    with compilation.float64():
         return physics(lung(lung_id), {"valve_delay": {"delay": 1.0 / 24.0}}, **base)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.plants import frozen, population
 from ventbench.plants.population import FLOW, NAMES, from_vector, to_vector
@@ -29,7 +29,7 @@ def official():
 
 def test_numbers_of_a_rig_give_it_back(official):
     for xp in (np, jnp):
-        with precision.float64():
+        with compilation.float64():
             back = from_vector(to_vector(official.members), xp)
         for name, leaf in vars(official.members).items():
             np.testing.assert_allclose(getattr(back, name), leaf, rtol=1e-9, atol=1e-12)
@@ -80,7 +80,7 @@ def test_drawn_rigs_are_lungs_of_their_label_and_rise_with_the_command(official)
         resistance = np.median(rigs.R + FLOW * rigs.K2)
         assert resistance == pytest.approx(np.median(fitted), rel=0.25)
         three = jax.tree.map(lambda x: np.tile(x[:3], (5,) + (1,) * (x.ndim - 1)), rigs)
-        with precision.float64():
+        with compilation.float64():
             zeros, dt = np.zeros((15, steps)), np.full((15, steps), protocol.DT)
             arrays = jax.tree.map(jnp.asarray, (three, np.full(15, 5.0), u_in, zeros, dt))
             final = np.asarray(open_loop(*arrays))[:, -1].reshape(5, 3)

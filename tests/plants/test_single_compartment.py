@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.task.lungs import LUNGS, Lung
 
@@ -41,7 +41,7 @@ def test_against_solve_ivp(lung):
     u_in = rng.uniform(0, 20, size=60)
     u_out = (np.arange(60) % 20 >= 12).astype(float)
     dt = rng.uniform(0.02, 0.05, size=60)
-    with precision.float64():
+    with compilation.float64():
         plant = single_compartment(lung)
         (state, _), found = plant.init(jnp.asarray(6.0), jnp.asarray(5.0)), []
         for command in zip(u_in, u_out, dt, strict=True):
@@ -51,7 +51,7 @@ def test_against_solve_ivp(lung):
 
 
 def test_two_half_steps_are_a_whole_one():
-    with precision.float64():
+    with compilation.float64():
         plant = single_compartment(Lung(20, 50))
         for u_out in (0.0, 1.0):
             (start, _), u, out = plant.init(jnp.asarray(9.0)), jnp.asarray(7.0), jnp.asarray(u_out)
@@ -62,7 +62,7 @@ def test_two_half_steps_are_a_whole_one():
 
 
 def test_expiration_returns_to_peep():
-    with precision.float64():
+    with compilation.float64():
         plant = single_compartment(Lung(20, 50))
         state, _ = plant.init(jnp.asarray(40.0), jnp.asarray(5.0))
         for _ in range(1000):

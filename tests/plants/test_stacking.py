@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.physics import physics
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
@@ -93,12 +93,12 @@ def test_the_order_of_breaths_does_not_matter(make_recording):
 
 
 def late(lung_id: str, **base: float):
-    with precision.float64():
+    with compilation.float64():
         return physics(lung(lung_id), {"valve_delay": {"delay": 1.0 / 24.0}}, **base)
 
 
 def test_physics_with_other_mechanisms_are_stacked_and_stay_themselves() -> None:
-    with precision.float64():
+    with compilation.float64():
         leaking = physics(lung("R5C10"), {"leak": {"conductance": 8.0}})
         both = stack_heterogeneous([late("R20C50"), leaking])
         u_in = np.array([[30.0, 20.0, 0.0, 10.0, 0.0, 0.0]])

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.plants.two_balloon import BALLOON_PRESSURE, PEAK, two_balloon
 from ventbench.task.lungs import lung
 

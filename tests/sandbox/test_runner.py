@@ -10,16 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ventbench.base import precision
-from ventbench.entries.errors import SubmissionError
+from ventbench.base import compilation
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.sandbox import runner as runner_module
-from ventbench.sandbox.child.cell import ROW
+from ventbench.sandbox.child.cell import ROW, SubmissionError
 from ventbench.sandbox.pipes import Allowance, SandboxError
 from ventbench.sandbox.runner import SandboxRunner, layers
 from ventbench.task import protocol
@@ -39,7 +38,7 @@ def started(submission, lungs=(None,), **options):
 
 
 def test_scores_are_those_of_the_plain_process():
-    with precision.float64():
+    with compilation.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
     for name in ("pid_best", "pid_robust"):
         submission = open_submission(name)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.physics import cases
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.physics import library, parameter, paths, strength_path
 from ventbench.system_id import (
     START,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.physics import cases
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.physics import parameter, paths
 from ventbench.system_id import START, Predictor, make_data, parameter_values
 from ventbench.system_id import predictor as predictor_module

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.task import attainable
@@ -17,7 +17,7 @@ PIPS = (10.0, 20.0, 35.0)
 
 def lungs_and_cells(delay=0.0):
     """The six textbook lungs at three PIPs, as 18 cells."""
-    with precision.float64():
+    with compilation.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS for _ in PIPS])
         cells = nominal_scenario(np.tile(PIPS, len(LUNGS)))
         delays = np.full(len(LUNGS) * len(PIPS), delay)
@@ -53,7 +53,7 @@ def test_the_rise_by_hand(exact):
 def test_commands_attain_the_error_and_stay_in_range(exact):
     plants, cells, found = exact
     assert np.all((found.commands >= 0.0) & (found.commands <= 100.0))
-    with precision.float64():
+    with compilation.float64():
         pressure = attainable.pressures(plants, cells, found.commands)
     error = np.abs(pressure - cells.pip[:, None]).mean(axis=1)
     np.testing.assert_allclose(error, found.error, atol=1e-12)
@@ -68,12 +68,3 @@ def test_a_second_optimiser_finds_nothing_better():
     assert np.all(found.error < second + 1e-3)
     assert np.mean(second - found.error) < 0.1  # and it is no straw man
     assert np.all(found.error > found.lower - 1e-9)
-
-
-def test_progress_is_told():
-    plants, cells = lungs_and_cells()
-    few = jax.tree.map(lambda x: x[:2], (plants, cells))
-    seen = []
-    attainable.attainable(*few, starts=(1,), iterations=3, progress=lambda *x: seen.append(x))
-    assert seen[0] == (0, 3)
-    assert all(total == 3 for _, total in seen)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.task import environment as env
 from ventbench.task import protocol, waveform
@@ -13,7 +13,7 @@ from ventbench.task.lungs import Lung
 
 @pytest.fixture(autouse=True)
 def _float64():
-    with precision.float64():
+    with compilation.float64():
         yield
 
 

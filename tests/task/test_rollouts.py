@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
@@ -18,13 +18,13 @@ from ventbench.task.rollouts import Script
 
 @pytest.fixture
 def plants():
-    with precision.float64():
+    with compilation.float64():
         return stack([single_compartment(lung) for lung in LUNGS])
 
 
 @pytest.fixture
 def nominal():
-    with precision.float64():
+    with compilation.float64():
         return env.nominal_scenario(np.array(protocol.PIPS))
 
 
@@ -52,7 +52,7 @@ def looped(plant, controller, cells):
 
 def test_closed_loop_against_python_loop(plants):
     controller = PID(0.5, 5.0, 1.0)
-    with precision.float64():
+    with compilation.float64():
         drawn = draws.build([[0]], 1, n=2, pips=(10.0, 35.0))
         cells = jax.tree.map(lambda x: jnp.asarray(x[0]), drawn.cells)
         for k in (0, 5):
@@ -70,7 +70,7 @@ def test_closed_loop_against_python_loop(plants):
 
 
 def test_without_expirations(plants, nominal):
-    with precision.float64():
+    with compilation.float64():
         plant = take(plants, 0)
         short, none = rollouts.closed_loop(plant, PID(1.0, 5.0), nominal)
         whole, _ = rollouts.closed_loop(plant, PID(1.0, 5.0), nominal, whole=True)
@@ -79,7 +79,7 @@ def test_without_expirations(plants, nominal):
 
 
 def test_controller_state_lives_through_the_breaths(plants, nominal):
-    with precision.float64():
+    with compilation.float64():
         lines = jnp.broadcast_to(jnp.arange(102.0), (6, 102))
         found, _ = rollouts.closed_loop(take(plants, 0), Script(lines), nominal)
     np.testing.assert_array_equal(found.requested.reshape(6, 102), lines)
@@ -88,7 +88,7 @@ def test_controller_state_lives_through_the_breaths(plants, nominal):
 
 
 def test_vmap_over_lungs_is_each_lung(plants, nominal):
-    with precision.float64():
+    with compilation.float64():
         together, _ = jax.vmap(lambda p: rollouts.closed_loop(p, PID(1.0, 5.0), nominal))(plants)
         for k in range(6):
             alone, _ = rollouts.closed_loop(take(plants, k), PID(1.0, 5.0), nominal)
@@ -100,7 +100,7 @@ def test_gradient_with_respect_to_gains(plants, nominal):
         found, _ = rollouts.closed_loop(take(plants, 5), PID(*gains), nominal)
         return jnp.mean((found.pressure - nominal.pip[:, None, None]) ** 2)
 
-    with precision.float64():
+    with compilation.float64():
         gains = jnp.array([0.5, 3.0, 0.2])
         found = jax.grad(loss)(gains)
         for k in range(3):
@@ -110,7 +110,7 @@ def test_gradient_with_respect_to_gains(plants, nominal):
 
 
 def test_single_precision_is_close(plants, nominal):
-    with precision.float64():
+    with compilation.float64():
         double, _ = rollouts.closed_loop(take(plants, 4), PID(0.5, 5.0), nominal)
     to_single = jax.tree.map(lambda x: np.asarray(x, np.float32), (take(plants, 4), nominal))
     single, _ = rollouts.closed_loop(to_single[0], PID(0.5, 5.0), to_single[1])
@@ -121,7 +121,7 @@ def test_single_precision_is_close(plants, nominal):
 def test_compiles_once(plants, nominal):
     function: Any = rollouts.closed_loop
     function.clear_cache()
-    with precision.float64():
+    with compilation.float64():
         for k in range(3):
             function(take(plants, k), PID(jnp.asarray(float(k)), 5.0, 0.0), nominal)
     assert function._cache_size() == 1
@@ -133,7 +133,7 @@ def test_open_loop_against_python_loop(plants):
     u_out = (np.arange(50) > 30) * np.ones((4, 1))
     dt = rng.uniform(0.02, 0.05, size=(4, 50))
     start = rng.uniform(4, 8, size=4)
-    with precision.float64():
+    with compilation.float64():
         plant = take(plants, 3)
         found = rollouts.open_loop(plant, *map(jnp.asarray, (start, u_in, u_out, dt)))
         (state, _), expected = plant.init(jnp.asarray(start)), [start]
@@ -144,7 +144,7 @@ def test_open_loop_against_python_loop(plants):
 
 
 def test_open_loop_ignores_the_last_command(plants):
-    with precision.float64():
+    with compilation.float64():
         commands = jnp.ones((1, 5)), jnp.zeros((1, 5)), jnp.full((1, 5), 0.03)
         changed = (commands[0].at[0, -1].set(99.0), *commands[1:])
         plant, start = take(plants, 0), jnp.array([5.0])
@@ -161,5 +161,5 @@ def test_pure_controllers_see_what_submissions_see(plants, nominal):
             assert observation.time.shape == observation.pressure.shape == (6,)
             return super().step(state, observation)
 
-    with precision.float64():
+    with compilation.float64():
         looped(take(plants, 0), Spy(1.0, 5.0), nominal)

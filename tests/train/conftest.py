@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.plants.sessions import Sessions, find
 from ventbench.recordings import Breaths, make_breaths
 from ventbench.task.lungs import RECORDED_LUNGS, Lung

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
@@ -76,7 +76,7 @@ def ventilator(lung_id="R20C50", width=6, **options) -> SimulatedVentilator:
 def test_without_disturbance_it_is_the_pid():
     found = explore(ventilator(), "R20C50", 6, ranges=STILL)
     pid, state = PID(*STILL.gains), None
-    with precision.float64():
+    with compilation.float64():
         for step in range(INSPIRATION):
             pips = np.array(protocol.PIPS)
             seen = Observation(step * 0.03, 0.03, found.pressure[:, step], pips, None, None)

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
@@ -55,7 +55,7 @@ def test_the_picture_has_a_row_a_lung_and_one_for_all(whole):
     pytest.importorskip("matplotlib", reason="the extra ventbench[view] is missing")
     from matplotlib.image import imread
 
-    from ventbench.pages.gain_map import gain_map_png
+    from ventbench.pages.report import gain_map_png
 
     pictures = [
         gain_map_png(whole),
@@ -122,7 +122,7 @@ def test_the_papers_values():
 
 
 def test_an_error_is_that_of_the_scored_run():
-    with precision.float64():
+    with compilation.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS[:2]])
         gains = np.array([(0.0, 0.0, 0.0), (6.0, 6.0, 0.3), (10.0, 10.0, 10.0)])
         cells = nominal_scenario(np.array(protocol.PIPS))

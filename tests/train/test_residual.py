@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
@@ -23,8 +23,8 @@ from ventbench.controllers.residual import (
     save_weights,
     untrained,
 )
+from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
-from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
@@ -103,7 +103,7 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
     shutil.copytree(bundled, folder, ignore=shutil.ignore_patterns("__pycache__"))
     made = {name: controller(k, **fields) for k, name in enumerate(names)}
     save_weights(folder / "weights.npz", made)
-    with precision.float64():
+    with compilation.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS[:3]])
         pure = {
             name: jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), one)
@@ -143,7 +143,7 @@ def test_beyond_the_valve_only_the_way_back_has_a_derivative(u_in, gradient, exp
 
 def test_the_run_is_that_of_the_scorer():
     one = controller(5)
-    with precision.float64():
+    with compilation.float64():
         cells = draws.build([[0]], 1, n=1).cells
         cells = jax.tree.map(lambda x: jnp.asarray(x[0, 0]), cells).replace(quantum=jnp.zeros(6))
         plant = single_compartment(LUNGS[3])
@@ -156,7 +156,7 @@ def test_the_run_is_that_of_the_scorer():
 
 def test_the_gradient_is_that_of_finite_differences():
     """Where the valve never reaches an end, so that nothing is left out."""
-    with precision.float64():
+    with compilation.float64():
         one = controller(7, limit=3.0).replace(pid=PID(0.5, 1.0, 0.0))
         one = jax.tree.map(lambda x: jnp.asarray(x, float), one)
         plants = stack([single_compartment(LUNGS[5])])

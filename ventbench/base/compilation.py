@@ -1,4 +1,7 @@
-"""Compiled functions are kept from one run to the next, and what compiling leaves behind is not."""
+"""How JAX compiles: precision, functions kept from one run to the next, memory handed back.
+
+Scores are float64; training and grids may be float32. No global switch is ever flipped.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import ctypes
 import hashlib
 import os
 import platform
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,6 +18,24 @@ _COMPILED, _LONG = "/jax/core/compile/backend_compile_duration", 0.5
 
 #: Option of glibc's ``mallopt``: the most pools of memory.
 _ARENA_MAX = -8
+
+
+def float64() -> AbstractContextManager[None]:
+    """Context in which new JAX arrays and traces are 64-bit.
+
+    Functions jitted by ventbench may be called inside and outside: JAX keeps one compilation for
+    each.
+    """
+    import jax
+
+    return jax.enable_x64(True)
+
+
+def float32() -> AbstractContextManager[None]:
+    """Context in which new JAX arrays and traces are 32-bit, which is JAX's default."""
+    import jax
+
+    return jax.enable_x64(False)
 
 
 def folder() -> Path:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ventbench.base import files
 from ventbench.base.text import flatten
-from ventbench.board import canonical, comparison, frames, pages, ranking, store
+from ventbench.board import canonical, frames, pages, ranking, store
 from ventbench.board.frames import Line
 from ventbench.board.gate import Evidence
 from ventbench.board.ranking import BASELINES, Row, Track
@@ -79,7 +79,7 @@ def build(folder: Path, out: Path) -> Built:
     for name, text in [*built.items(), *((name, (folder / name).read_bytes()) for name in named)]:
         path = out / name
         if not path.is_file() or path.read_bytes() != text:
-            files.write_atomically(path, lambda file, text=text: file.write(text))
+            files.write_bytes(path, text)
             changed.append(name)
     for name in sorted(filter(canonical.BUILT.fullmatch, canonical.walk(out)[0])):
         if name not in built:
@@ -157,8 +157,6 @@ def _track(track: Track) -> dict[str, Any]:
                 "baseline": row.record.name == BASELINES[track.name],
                 "plot": pages.interval_plot(row, low, high),
                 "hardware": None if measured is None else pages.hardware_shown(measured),
-                "name": row.record.name,
-                "profile": pages.profile(row.record),
             }
         )
     return {
@@ -168,31 +166,7 @@ def _track(track: Track) -> dict[str, Any]:
         "about": track.title,
         "practice": track.round is None,
         "rows": rows,
-        "stability": _stability(track),
     }
-
-
-def _stability(track: Track) -> list[dict[str, str]]:
-    """How far the order by one rig, lung or PIP agrees with that by all runs."""
-    if len(track.ranked) < 2:
-        return []
-    records = [row.record for row in track.ranked]
-    ranked = records[0].headroom.ranked
-    cells = np.stack([record.headroom.normalised[1:][ranked] for record in records])
-    rig = records[0].headroom.session[:, ranked]
-    shown = []
-    for kind, taus in comparison.agreement(cells, rig, records[0].lungs, records[0].pips).items():
-        least = min(taus, key=lambda name: taus[name])
-        values = list(taus.values())
-        shown.append(
-            {
-                "kind": kind,
-                "median": pages.figure(float(np.median(values)), 2),
-                "least": pages.figure(taus[least], 2),
-                "where": least,
-            }
-        )
-    return shown
 
 
 def _aside(line: Line) -> dict[str, Any]:

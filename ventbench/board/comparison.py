@@ -1,4 +1,4 @@
-r"""Which entries are better beyond doubt, over all pairs at once, and how stable their order is.
+r"""Which entries are better beyond doubt, over all pairs at once.
 
 **Paired test.** Entries ran on the same draws. The difference of two of them on a lung is a mean
 over rigs; draws on one rig share it, so that the rig is what varies independently (the draw, where
@@ -21,10 +21,8 @@ and never against it; see :func:`sources`.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -42,13 +40,10 @@ POINTS, CMH2O = 1.0, 0.01
 #: bundled entries differ by 8 to 45 % in the middle run.
 DISTANCE, FOLLOWING = 0.05, 0.75
 
-#: Thresholds of performance profiles, points of the normalised score.
-THRESHOLDS = np.arange(0.0, 201.0, 5.0)
-
 # Runs by which entries are first compared.
 _FEW = 48
 
-#: Resamples and seed of the interval of the interquartile mean.
+#: Resamples and seed of the interval over seeds of a training.
 _RESAMPLES, _SEED = 400, 20210215
 
 # Below this standard error, replays on other machines round differently.
@@ -184,66 +179,8 @@ def _apart(own: Floats, other: Floats) -> Floats:
     return np.sqrt(np.maximum(1.0 - product**2 / (squares[0] * squares[1]), 0.0))
 
 
-def agreement(cells: Floats, rig: Ints, lungs: Sequence[str], pips: Sequence[float]) -> Mapping[
-    str, Mapping[str, float]
-]:  # fmt: skip
-    """Kendall's tau between the order by all runs and that by one rig, one lung or one PIP.
-
-    Of normalised scores of at least two entries, ``(N, K, L, P)``, on a rig of each lung and draw,
-    ``(L, K)``: for ``"rig"``, ``"lung"`` and ``"PIP"``, tau by name; NaN where all are equal.
-    """
-    means = cells.mean(axis=(1, 2, 3))
-
-    def tau(part: Floats) -> float:
-        result: Any = stats.kendalltau(means, part.reshape(len(means), -1).mean(axis=1))
-        return float(result.statistic)
-
-    return {
-        "rig": {
-            f"{lung}, rig {name}": tau(cells[:, rig[i] == name, i])
-            for i, lung in enumerate(lungs)
-            for name in np.unique(rig[i]).tolist()
-        },
-        "lung": {lung: tau(cells[:, :, i]) for i, lung in enumerate(lungs)},
-        "PIP": {f"{pip:g}": tau(cells[..., j]) for j, pip in enumerate(pips)},
-    }
-
-
-def profile(cells: Floats) -> Floats:
-    """Share of runs whose normalised score is at most each of :data:`THRESHOLDS`."""
-    return np.searchsorted(np.sort(cells.ravel()), THRESHOLDS, side="right") / cells.size
-
-
-def interquartile_mean(cells: Floats, rig: Ints) -> tuple[float, float, float]:
-    """Mean of the middle half of all runs (Agarwal et al. 2021), with its 95 % interval over rigs.
-
-    Of normalised scores of an entry, ``(K, L, P)``, on a rig of each lung and draw, ``(L, K)``.
-    """
-    flat = cells.ravel()
-    order = np.argsort(flat, kind="stable")
-    weights = _taken(tuple(map(tuple, rig.tolist())))
-    spread = np.repeat(weights.reshape(_RESAMPLES, -1), cells.shape[2], axis=1)[:, order]
-    upto = np.cumsum(spread, axis=1) / spread.sum(axis=1, keepdims=True)
-    inside = np.diff(np.clip(upto, 0.25, 0.75), axis=1, prepend=0.25)
-    low, high = np.quantile(2.0 * inside @ flat[order], (0.025, 0.975))
-    return float(stats.trim_mean(flat, 0.25)), float(low), float(high)
-
-
 def over_seeds(scores: Sequence[float]) -> tuple[float, float, float]:
     """Interquartile mean of the scores of seeds, with its 95 % bootstrap interval over seeds."""
     drawn = np.random.default_rng(_SEED).choice(np.sort(scores), (_RESAMPLES, len(scores)))
     low, high = np.quantile(stats.trim_mean(drawn, 0.25, axis=1), (0.025, 0.975))
     return float(stats.trim_mean(scores, 0.25)), float(low), float(high)
-
-
-@functools.lru_cache(maxsize=4)
-def _taken(rig: tuple[tuple[int, ...], ...]) -> Floats:
-    """How often resamples of the rigs of each lung take each draw, ``(_RESAMPLES, K, L)``."""
-    rng = np.random.default_rng(_SEED)
-    taken = []
-    for own in rig:
-        names, index = np.unique(own, return_inverse=True)
-        index = np.arange(len(own)) if len(names) < 2 else index
-        size = int(index.max()) + 1
-        taken.append(rng.multinomial(size, np.full(size, 1 / size), _RESAMPLES)[:, index])
-    return np.stack(taken, axis=-1).astype(float)

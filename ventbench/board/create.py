@@ -52,8 +52,8 @@ class Draft:
         """Write both files, each named by its hash; return the record's path."""
         commands = folder / f"{canonical.digest(self.commands)}{canonical.ACTIONS_SUFFIX}"
         path = folder / f"{canonical.digest(self.content)}{record.SUFFIX}"
-        files.write_atomically(commands, lambda file: file.write(self.commands))
-        files.write_atomically(path, lambda file: file.write(self.content))
+        files.write_bytes(commands, self.commands)
+        files.write_bytes(path, self.content)
         return path
 
 

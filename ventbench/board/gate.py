@@ -279,7 +279,7 @@ def sign(folder: Path, sha256: str, secret: str) -> Path:
     signature = private.sign(_message(sha256)).hex()
     content = canonical.canonical({"key": own.id, "record": sha256, "signature": signature})
     path = signature_path(folder, sha256)
-    files.write_atomically(path, lambda file: file.write(content))
+    files.write_bytes(path, content)
     return path
 
 

@@ -35,6 +35,7 @@ from ventbench.board.record import Record, RecordStress
 from ventbench.board.replay import ReplayPlants, draws_of, worst
 from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
 from ventbench.entries import reference as references
+from ventbench.entries.cells import Runner
 from ventbench.entries.folder import (
     SEEDS,
     Submission,
@@ -44,7 +45,6 @@ from ventbench.entries.folder import (
     seeds,
 )
 from ventbench.entries.reference import Reference
-from ventbench.entries.runner import Runner
 from ventbench.entries.runs import DRAWS, Runs
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
@@ -410,7 +410,7 @@ def score(
         records[key] = path.stem
         tell("records", at + 1, len(runs))
     content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))
-    files.write_atomically(own.folder / RESULT, lambda file: file.write(content))
+    files.write_bytes(own.folder / RESULT, content)
     return rounds.load(leaderboard, name)
 
 

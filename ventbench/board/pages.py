@@ -25,7 +25,6 @@ import numpy as np
 from ventbench import palette
 from ventbench.base.arrays import Floats
 from ventbench.base.text import number, page_templates, plain
-from ventbench.board import comparison
 from ventbench.board.ranking import HardwareRow, Interval, Row, StressRow
 from ventbench.task import protocol
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
@@ -402,15 +401,3 @@ def _stairs(heights: list[int]) -> str:
             before, run = height, 0
         run += STEP
     return "".join([*parts, f"h{run}"])
-
-
-def profile(record: Record) -> dict[str, str] | None:
-    """Performance profile of an entry: a path in a box of 200 by 40, and the share below 100."""
-    cells = record.headroom.normalised[1:][record.headroom.ranked]
-    if not np.isfinite(cells).all():
-        return None
-    shares = comparison.profile(cells)
-    points = zip(comparison.THRESHOLDS.tolist(), (40.0 * (1.0 - shares)).tolist(), strict=True)
-    path = "M" + "L".join(f"{x:g} {y:.1f}" for x, y in points)
-    below = float(shares[comparison.THRESHOLDS.tolist().index(100.0)])
-    return {"path": path, "below": f"{100 * below:.0f}"}

@@ -69,7 +69,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A score as mean over draws, and of the middle half of all runs, and differences to others.
+    """A score as mean over draws, and differences to others.
 
     There is none to the baseline for the track's PID itself or without one, and none to the entry
     above for the first.
@@ -78,7 +78,6 @@ class Comparison:
     score: Interval
     to_baseline: Interval | None
     to_above: Interval | None
-    middle: Interval
 
 
 @dataclass(frozen=True)
@@ -317,10 +316,7 @@ def _comparisons(records: Sequence[Record], base: int | None) -> list[Comparison
             to_baseline = _interval(own - values[base], means[i] - means[base])
         if i:
             to_above = _interval(own - values[i - 1], means[i] - means[i - 1])
-        rigs = records[i].headroom
-        cells, rig = rigs.normalised[1:][rigs.ranked], rigs.session[:, rigs.ranked]
-        middle = Interval(*comparison.interquartile_mean(cells, rig))
-        compared.append(Comparison(_interval(own, means[i]), to_baseline, to_above, middle))
+        compared.append(Comparison(_interval(own, means[i]), to_baseline, to_above))
     return compared
 
 
@@ -357,8 +353,7 @@ def _resampled(record: Record, values: Floats) -> Floats:
 
 
 def _interval(values: Floats, means: Floats) -> Interval:
-    low, high = np.quantile(means, (0.025, 0.975))
-    return Interval(float(np.mean(values)), float(low), float(high))
+    return Interval(float(np.mean(values)), *bootstrap.limits(means))
 
 
 def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:

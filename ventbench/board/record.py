@@ -372,9 +372,9 @@ def load(path: Path, *, strict: bool = True) -> AnyRecord:
     return from_bytes(path.read_bytes(), str(path), strict=strict)
 
 
-def withdrawal(withdraws: str, reason: str, now: datetime | None = None) -> bytes:
+def withdrawal(withdraws: str, reason: str) -> bytes:
     """Return the bytes of a record that takes another one, named by its SHA-256, back."""
-    about = {"format": schema.FORMAT, "kind": "withdrawal", "created": timestamp(now)}
+    about = {"format": schema.FORMAT, "kind": "withdrawal", "created": timestamp()}
     return canonical.canonical({**about, "withdraws": withdraws, "reason": reason})
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.board.record import Record
@@ -121,7 +121,7 @@ def pressures(
         requested: %, shape ``(N, L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``, nominal cells first.
         draws: K of them; None for nominal cells alone.
     """
-    with precision.float64():
+    with compilation.float64():
         plants, cells = rigs_of(simulators).cells(draws, pips)
         plants = as_float64(plants, requested.shape[1])
         return np.asarray(_pressures(plants, cells, jnp.asarray(requested)))
@@ -141,7 +141,7 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
     members, lungs = leaves[0].shape[:2]
     if members < 2:
         return np.full(requested.shape[:3], np.nan)
-    with precision.float64():
+    with compilation.float64():
         cells, _, _ = draw_tables.with_nominal(None, [0] * lungs, pips)
         plants = as_float64(simulators.ensemble, members)
         by_member = np.asarray(_members(plants, cells, jnp.asarray(requested[:, :, None])))
@@ -176,7 +176,7 @@ def replay(
     """
     if not requested:
         return
-    with precision.float64():
+    with compilation.float64():
         _, cells = rigs_of(simulators).cells(draws, pips)
     size = min(BATCH, len(requested))
     for first in range(0, len(requested), size):

@@ -255,7 +255,7 @@ def open_round(
     folder = leaderboard / ROUNDS / name
     if name == DEVELOPMENT or folder.exists():
         raise InputError(f"{folder} is there already, or its name is taken")
-    _write(folder / OPENED, tomli_w.dumps(values).encode())
+    files.write_bytes(folder / OPENED, tomli_w.dumps(values).encode())
     return load(leaderboard, name)
 
 
@@ -308,7 +308,7 @@ def freeze(
     if not entries:
         raise InputError(f"round {name}: no entry can be frozen; {left_out}")
     written = canonical.canonical(protocol_of(simulators))
-    _write(own.folder / PROTOCOL, written)
+    files.write_bytes(own.folder / PROTOCOL, written)
     frozen = {
         "round": files.sha256(own.folder / OPENED),
         "protocol": canonical.digest(written),
@@ -316,7 +316,7 @@ def freeze(
         "entries": entries,
         "left_out": left_out,
     }
-    _write(own.folder / FROZEN, tomli_w.dumps(frozen).encode())
+    files.write_bytes(own.folder / FROZEN, tomli_w.dumps(frozen).encode())
     return load(leaderboard, name)
 
 
@@ -348,7 +348,7 @@ def draw(leaderboard: Path, name: str, content: bytes, *, now: datetime | None =
         raise InputError(f"round {own.number} of the beacon is published at {due:%F %T} UTC")
     value = beacon.read(content, "the value of the beacon")
     beacon.check(value, own.opened.chain, own.number, "the value of the beacon")
-    _write(own.folder / BEACON, canonical.canonical(msgspec.structs.asdict(value)))
+    files.write_bytes(own.folder / BEACON, canonical.canonical(msgspec.structs.asdict(value)))
     return load(leaderboard, name)
 
 
@@ -407,10 +407,6 @@ def _toml(path: Path, kind: type[schema.TableT]) -> schema.TableT:
         if isinstance(when, datetime) and when.tzinfo is None:
             raise InputError(f"{path}, key {key}: has no time zone; times are UTC")
     return table
-
-
-def _write(path: Path, content: bytes) -> None:
-    files.write_atomically(path, lambda file: file.write(content))
 
 
 _RESULT = msgspec.json.Decoder(Result)

@@ -198,7 +198,7 @@ def add(
             known = store.evidence.rounds
             require_replay(added, content, simulators, str(path), known)
         kept = commands_path(added, folder / RECORDS)
-        files.write_atomically(kept, lambda file: file.write(content))
+        files.write_bytes(kept, content)
     _write(folder, added, path.read_bytes())
     return added
 
@@ -224,7 +224,7 @@ def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
 
 def _write(folder: Path, added: AnyRecord, content: bytes) -> None:
     path = folder / RECORDS / f"{added.sha256}{record.SUFFIX}"
-    files.write_atomically(path, lambda file: file.write(content))
+    files.write_bytes(path, content)
 
 
 def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:

@@ -20,7 +20,6 @@ from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.official_runs import STRESS_TOLERANCE, folders
 from ventbench.board.record import AnyRecord, Record
 from ventbench.board.replay import (
-    BATCH,
     Replayed,
     ReplayPlants,
     deviation,
@@ -67,7 +66,7 @@ class Report:
 
 
 def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Report:
-    """Verify a leaderboard; ``progress`` is called after each batch of records.
+    """Verify a leaderboard; ``progress`` is called after each record.
 
     Raises:
         InputError: if there is no leaderboard.
@@ -141,11 +140,7 @@ def _check_replay(
             continue
         own = leaderboard.evidence.rounds.get(header.draws.season)
         report.problems += _wrong_reference(group, own)
-        for first in range(0, len(group), BATCH):
-            batch = group[first : first + BATCH]
-            by_draw |= _replay_batch(leaderboard.folder, batch, simulators, drawn, report)
-            if progress is not None:
-                progress(min(first + BATCH, len(group)), len(group))
+        by_draw |= _replay_group(leaderboard.folder, group, simulators, drawn, report, progress)
     return by_draw
 
 
@@ -264,24 +259,20 @@ def _loaded(load: Load, report: Report) -> ReplayPlants | None:
         return None
 
 
-def _replay_batch(
-    folder: Path,
-    batch: Sequence[Record],
-    simulators: ReplayPlants,
-    drawn: Draws,
-    report: Report,
-) -> dict[str, Floats]:
+def _replay_group(
+    folder: Path, group: Sequence[Record], simulators: ReplayPlants, drawn: Draws,
+    report: Report, progress: Progress | None,
+) -> dict[str, Floats]:  # fmt: skip
+    """Replay records over the same draws; see :func:`_check_replay`."""
     sound, requested = [], []
     by_draw: dict[str, Floats] = {}
-    for score in batch:
+    for score in group:
         try:
             requested.append(store.load_commands(score, folder / RECORDS))
             sound.append(score)
         except (InputError, OSError) as error:
             report.problems.append(str(error))
-    if not sound:
-        return by_draw
-    runs = replay(simulators, sound[0].pips, requested, drawn)
+    runs = replay(simulators, group[0].pips, requested, drawn)
     for score, replayed in zip(sound, runs, strict=True):
         report.replayed += 1
         report.deviation = max(report.deviation, deviation(score, replayed))
@@ -291,6 +282,8 @@ def _replay_batch(
         own, failed = score.headroom, np.isnan(score.drawn)
         values = normalised(replayed.controllable, own.attainable, own.pid)[1:]
         by_draw[score.sha256] = np.where(failed, np.nan, values).mean(axis=2).T[:, own.ranked]
+        if progress is not None:
+            progress(len(by_draw), len(group))
     return by_draw
 
 

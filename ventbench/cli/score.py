@@ -367,8 +367,8 @@ def transfer(
     from rich.text import Text
 
     from ventbench.entries import scoring as transfers
+    from ventbench.entries.cells import runner_of
     from ventbench.entries.folder import open_submission
-    from ventbench.entries.runner import runner_of
     from ventbench.plants.rigs import load_rigs
 
     opened = [open_submission(name) for name in names]
@@ -450,7 +450,7 @@ def check(
     Example: `ventbench check submissions/mine --json check.json`
     """
     from ventbench.entries import contract
-    from ventbench.entries.runner import InProcessRunner
+    from ventbench.entries.cells import InProcessRunner
 
     runner = InProcessRunner() if in_process else None
     with bar(f"running {submission}") as running:

@@ -172,7 +172,7 @@ def open_loop(
     """
     import numpy as np
 
-    from ventbench import open_loop_report
+    from ventbench import simulation
 
     breaths = read_recording(recordings, clip=clip, pad=pad)
     if not np.isfinite(breaths.pressure).any():
@@ -181,7 +181,7 @@ def open_loop(
             "simulator with"
         )
     with bar(f"simulating {len(breaths)} breaths") as simulating:
-        result = open_loop_report.open_loop(breaths, plant, progress=simulating)
+        result = simulation.open_loop(breaths, plant, progress=simulating)
     console = told(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
     for line in result.remarks():

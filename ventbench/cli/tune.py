@@ -192,14 +192,14 @@ def pid(
 
 def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
     """Draw the picture if matplotlib is installed."""
-    from ventbench.pages.gain_map import gain_map_png
+    from ventbench.pages.report import gain_map_png
 
     try:
         picture = gain_map_png(grid, each=each, single=single)
     except InputError as error:
         typer.echo(f"no plot: {error}", err=True)
         return []
-    files.write_atomically(path, lambda file: file.write(picture))
+    files.write_bytes(path, picture)
     return [path.name]
 
 

@@ -23,12 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.entries.cells import PlantError, step_through
+from ventbench.entries.cells import PlantError, Runner, runner_of, step_through
 from ventbench.entries.folder import Submission, as_submission
-from ventbench.entries.runner import Runner, runner_of
 from ventbench.entries.runs import number
 from ventbench.entries.scoring import enter
 from ventbench.physics.catalogue import parameter
@@ -374,7 +373,7 @@ class _Bench:
             own = jax.tree.map(lambda leaf, k=k: leaf[:, k, None, None], every)
             conditions = [Condition(names, "strong", tuple(share)) for share in shares]
             each.append(stressed_plants(own, [lung], conditions))
-        with precision.float64():
+        with compilation.float64():
             plants: Any = jax.tree.map(
                 lambda *own: jnp.asarray(np.stack(own, 1).reshape(-1, *own[0].shape[1:]), float),
                 *each,

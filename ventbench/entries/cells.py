@@ -2,39 +2,41 @@
 
 A cell is a lung on one of its rigs, a PIP, deviations of ventilator and sensor, and a condition.
 All conditions share their cells, so that each stressed run has an unstressed twin. Between plants
-and controllers only numbers cross, and no cell waits for another.
+and controllers only numbers cross, and no cell waits for another: a runner starts one fresh
+controller for each cell, told its :class:`~ventbench.task.interfaces.Task`, and then answers
+batches of observations, :data:`~ventbench.sandbox.child.cell.ROW` floats each, with one float.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+from typing import Protocol as Interface
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.entries.errors import Failure
 from ventbench.entries.folder import Submission
 from ventbench.entries.reference import Reference, reference_of
-from ventbench.entries.runner import Runner, pack
 from ventbench.entries.runs import pip_columns
 from ventbench.plants.corrected import Stressed, stressed_plants
 from ventbench.plants.rigs import Rigs
+from ventbench.sandbox.child.cell import Cell, Failed, Failure, controller_class
+from ventbench.sandbox.pipes import Asked
 from ventbench.task import draws as draw_tables
 from ventbench.task import environment as env
-from ventbench.task import protocol, rollouts
+from ventbench.task import protocol
 from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario
-from ventbench.task.interfaces import Plant, PlantT, Task
+from ventbench.task.interfaces import Observation, Plant, PlantT, Task
 from ventbench.task.lungs import Lung
-from ventbench.task.rollouts import Script
 from ventbench.task.stressors import Condition, conditions, stressor
 
 
@@ -114,19 +116,20 @@ def protocol_of(
     pips = tuple(float(pip) for pip in pips)
     if draws < 0 or stress < 0:
         raise InputError(f"{min(draws, stress)} draws: there cannot be fewer than none")
-    every = drawn
+    stressed = None
+    if stress:
+        names = {stressor(name).name for name in stressors}
+        chosen = tuple(c for c in conditions() if not names or set(c.stressors) <= names)
+        every = rigs.draws(draw_tables.COUNT) if drawn is None else drawn
+        ranked = every.only(np.flatnonzero(every.ranked)).first(stress)
+        stressed = _under_stress(rigs, ranked, chosen)
     if drawn is None and draws:
         drawn = rigs.draws(draws, pips)
-    if stress:
-        every = rigs.draws(draw_tables.COUNT) if every is None else every
-        whole = every.only(np.flatnonzero(every.ranked)).first(stress)
     if pips == protocol.PIPS:
         about = None if drawn is None else drawn.about()
         reference = reference_of(rigs.about, about, reference)
-    return Protocol(
-        rigs, pips, drawn, _nominal_and_drawn(rigs, drawn, pips),
-        _under_stress(rigs, whole, chosen_conditions(stressors)) if stress else None, reference,
-    )  # fmt: skip
+    nominal = _nominal_and_drawn(rigs, drawn, pips)
+    return Protocol(rigs, pips, drawn, nominal, stressed, reference)
 
 
 def _nominal_and_drawn(rigs: Rigs, drawn: Draws | None, pips: tuple[float, ...]) -> Cells:
@@ -159,14 +162,151 @@ def _under_stress(rigs: Rigs, drawn: Draws, chosen: tuple[Condition, ...]) -> Ce
     return Cells(rigs.lungs, chosen, plants, scenario, nominal, every, drawn.rig, drawn.member)
 
 
-def chosen_conditions(stressors: Sequence[str]) -> tuple[Condition, ...]:
-    """All conditions, or no stressor and those of some stressors alone.
+class ControllerSession(Interface):
+    """Controllers of all cells of one submission, between start and close."""
+
+    @property
+    def failures(self) -> Mapping[int, Failure]:
+        """What went wrong up to now, by index of the cell; a failed cell stays failed."""
+        ...
+
+    def ask(self, cells: Ints, observations: Floats) -> None:
+        """Give some controllers, ``(n,)``, their next observations, ``(n, ROW)``; see :func:`pack`.
+
+        Each is asked by itself, once for each step of each inspiration, in order, after its answer.
+        """
+        ...
+
+    def answers(self) -> tuple[Ints, Floats]:
+        """Take the commands that have come, and wait for one if there is none.
+
+        Cells, shape ``(m,)``, and their ``u_in``, %: finite, 0 for a failed cell, not clipped.
+        """
+        ...
+
+    def act(self, observations: Floats) -> Floats:
+        """Ask every controller and wait for all, see :class:`ventbench.sandbox.pipes.Asked`."""
+        ...
+
+    def processor_time(self) -> float:
+        """Processor time that the controllers have had, s, as the system counts it."""
+        ...
+
+    def close(self) -> None:
+        """End all controllers; may be called more than once."""
+        ...
+
+
+class Runner(Interface):
+    """Starts sessions."""
+
+    @property
+    def sandbox(self) -> Mapping[str, Any] | None:
+        """Layers that keep a submission apart, for the record; None makes a result not official."""
+        ...
+
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
+        """Make and reset one fresh controller of a submission for each task, which is a cell's.
+
+        A controller that cannot be made or reset is a failure of its cell, found in the session.
+
+        Raises:
+            SubmissionError: if the code cannot be imported or lacks what it must have.
+        """
+        ...
+
+
+def pack(observation: Observation) -> Floats:
+    """Lay a batch of observations out as rows, batch axes flattened.
+
+    Fields of shape ``(...)``, ``targets_ahead`` ``(..., TARGETS_AHEAD)``; float64, shape
+    ``(cells, ROW)``, the fields in their order.
+    """
+    shape = np.shape(observation.pressure)
+    columns = [
+        np.broadcast_to(np.asarray(field, float), shape)[..., None]
+        if name != "targets_ahead"
+        else np.asarray(field, float)
+        for name, field in zip(Observation._fields, observation, strict=True)
+    ]
+    rows = np.concatenate(columns, axis=-1)
+    return rows.reshape(-1, rows.shape[-1])
+
+
+class InProcessSession(Asked):
+    """Controllers of all cells in this process; :class:`InProcessRunner` starts them."""
+
+    def __init__(self, submission: Submission, tasks: Sequence[Task]):
+        controller = submission.controller
+        source = None if controller is None else submission.label
+        if controller is None:
+            controller = controller_class(submission.folder, submission.label)
+        self.failures: dict[int, Failure] = {}
+        self._answers: dict[int, float] = {}
+        self._cells: dict[int, Cell] = {}
+        for index, task in enumerate(tasks):
+            try:
+                self._cells[index] = Cell(controller, task, submission.folder, source)
+            except Failed as failed:
+                self.failures[index] = failed.failure
+
+    def ask(self, cells: Ints, observations: Floats) -> None:
+        """Ask some controllers for their next command; see :class:`ControllerSession`."""
+        for index, row in zip(cells.tolist(), observations.tolist(), strict=True):
+            self._answers[index] = 0.0
+            if index in self._cells:
+                try:
+                    self._answers[index] = self._cells[index].act(row)
+                except Failed as failed:
+                    self.failures[index] = failed.failure
+                    del self._cells[index]
+
+    def answers(self) -> tuple[Ints, Floats]:
+        """Take the commands; see :class:`ControllerSession`."""
+        given, self._answers = self._answers, {}
+        return np.array(list(given), np.int64), np.array(list(given.values()))
+
+    def processor_time(self) -> float:
+        """Processor time of this process, s; see :class:`ControllerSession`."""
+        return time.process_time()
+
+    def close(self) -> None:
+        """Forget the controllers."""
+        self._cells.clear()
+
+
+class InProcessRunner:
+    """Runs controllers in this process, with all of its rights: for code that you trust.
+
+    Quick, and good for one's own development. Nothing stops a submission from reading the
+    simulators or keeping state from cell to cell, so results carry ``"sandbox": null`` and
+    ``"official": false``.
+    """
+
+    sandbox: Mapping[str, Any] | None = None
+
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
+        """Make and reset one fresh controller for each cell; see :class:`Runner`."""
+        return InProcessSession(submission, tasks)
+
+
+def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
+    """Choose how a submission runs: a folder in locked-down processes unless ``sandbox`` is False.
+
+    A class or function always runs in this process.
 
     Raises:
-        InputError: if there is no such stressor.
+        SandboxError: if this machine cannot run submissions apart.
     """
-    names = {stressor(name).name for name in stressors}
-    return tuple(c for c in conditions() if not names or set(c.stressors) <= names)
+    if not sandbox or submission.controller is not None:
+        return InProcessRunner()
+    from ventbench.sandbox.runner import SandboxRunner
+
+    return SandboxRunner()
+
+
+#: Series of a :class:`ProtocolRun`.
+_SERIES = ("pressure", "requested", "u_in", "volume")
 
 
 @dataclass(frozen=True)
@@ -262,7 +402,7 @@ def step_through(
     changing: bool = False,
     count: Callable[[], object] = lambda: None,
 ) -> ProtocolRun:
-    """Run a submission on every lung and cell. Call it within ``precision.float64()``.
+    """Run a submission on every lung and cell. Call it within ``compilation.float64()``.
 
     Args:
         plants: from :func:`as_float64`, L lungs; leaves may have the cells' batch shape too,
@@ -290,7 +430,7 @@ def step_through(
     has_volume = loop.signals.volume is not None
     # Cells go on by themselves: what one takes, no other one waits for.
     given, ready = np.zeros(cells, np.int64), np.arange(cells)
-    with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
+    with compilation.float32():  # a submission that uses JAX finds it as it is elsewhere
         session = runner.start(submission, each)
     try:
         while (given < total).any():
@@ -300,7 +440,7 @@ def step_through(
             if has_volume:
                 volume[ready, given[ready]] = _of_cells(loop.signals.volume, batch)[ready]
             start = time.perf_counter()
-            with precision.float32():
+            with compilation.float32():
                 session.ask(ready, rows[ready])
                 ready, commands = session.answers()
             seconds.append((time.perf_counter() - start) / max(1, len(ready)))
@@ -376,13 +516,10 @@ def run_cells(
             )
         )
 
-    def joined(name: str) -> Floats:
-        return np.stack([getattr(run, name) for run in runs], axis=2)
-
+    series = {name: np.stack([getattr(run, name) for run in runs], axis=2) for name in _SERIES}
     failures = {at: failure for run in runs for at, failure in run.failures.items()}
     seconds = np.concatenate([run.act_seconds for run in runs])
-    pressure, requested, u_in, volume = map(joined, ("pressure", "requested", "u_in", "volume"))
-    return ProtocolRun(pressure, requested, u_in, volume, failures, seconds)
+    return ProtocolRun(**series, failures=failures, act_seconds=seconds)
 
 
 def _reshaped(
@@ -390,23 +527,6 @@ def _reshaped(
     shape: Callable[[Floats], Floats],
     index: Callable[[tuple[int, ...]], tuple[int, ...]],
 ) -> ProtocolRun:
-    volume = None if run.volume is None else shape(run.volume)
+    series = {name: shape(x) for name in _SERIES if (x := getattr(run, name)) is not None}
     failures = {index(at): failure for at, failure in run.failures.items()}
-    pressure, requested, u_in = map(shape, (run.pressure, run.requested, run.u_in))
-    return ProtocolRun(pressure, requested, u_in, volume, failures, run.act_seconds)
-
-
-def replay(
-    plants: Plant, scenario: Scenario, requested: Floats
-) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
-    """Apply recorded commands again, with the expirations. Call it within ``float64()``.
-
-    Plants and cells as of :func:`step_through`, commands as of :class:`ProtocolRun`; arrays of
-    shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
-    """
-
-    def run(plant: Plant, scenario: Scenario, commands: Array) -> Any:
-        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True)
-
-    commands = jnp.asarray(requested.reshape(*requested.shape[:-2], -1))
-    return jax.vmap(run)(plants, scenario, commands)
+    return replace(run, **series, failures=failures)

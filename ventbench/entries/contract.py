@@ -15,25 +15,18 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ventbench.base.arrays import Floats
-from ventbench.entries.errors import (
-    GROUPS,
-    CheckReport,
-    Failure,
-    Finding,
-    Group,
-    SubmissionError,
-)  # fmt: skip
+from ventbench.entries.cells import ControllerSession, Runner
 from ventbench.entries.folder import CONTROLLER, Submission, open_submission, resolve
+from ventbench.entries.manifest import GROUPS, Finding, Group
 from ventbench.entries.review import inspect_folder
-from ventbench.entries.runner import ControllerSession, Runner
-from ventbench.sandbox.child.cell import ROW
+from ventbench.sandbox.child.cell import ROW, Failure, SubmissionError, printable
 from ventbench.task import draws, protocol
 from ventbench.task.interfaces import Task
 from ventbench.task.lungs import LUNG_IDS, LUNGS
@@ -201,16 +194,74 @@ LONGEST_S = 450.0
 _PLACE = re.compile(r"([\w./-]+\.py) line (\d+) ")
 _ADVICE = {
     "construct": "Controller() is called without arguments",
-    "reset": "reset(task) gets track, lung (None on the robustness track), dt, inspiration_steps",
-    "act": "act(observation) must answer whatever the sensors and the clock say",
+    "reset": "reset(self, task) gets track, lung (None for robustness), dt, inspiration_steps",
+    "act": "act(self, observation) must answer whatever the sensors and the clock say",
     "type": "return one int or float, for example with float(u_in)",
     "value": "look for a division by zero, an overflow or a logarithm",
     "timeout": "answer within milliseconds; train before submitting",
     "memory": "keep to 512 MiB beyond Python and its packages",
 }
 _IMPORT_ADVICE = "it must be possible to import it with what the sandbox has"
+_CLASS_ADVICE = "write a class Controller with reset(self, task) and act(self, observation)"
 _OTHER_ADVICE = "see the limits of the sandbox in docs/submitting.md"
 _TO_RUN: tuple[Group, ...] = ("run", "repeat", "time")
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """All findings of a submission."""
+
+    label: str  #: the submission, as the person named it.
+    findings: tuple[Finding, ...]  #: all of them, in the order of :data:`GROUPS`.
+    left_out: tuple[Group, ...] = ()  #: groups that could not be looked at because of the problems.
+    #: layers that the dry run had; None if it ran in this process, or did not run.
+    sandbox: dict[str, Any] | None = None
+    #: mean and largest time of an ``act``, microseconds; None if it did not run.
+    act_us: tuple[float, float] | None = None
+
+    @property
+    def problems(self) -> tuple[Finding, ...]:
+        """Findings that stop the submission."""
+        return tuple(finding for finding in self.findings if finding.problem)
+
+    @property
+    def notes(self) -> tuple[Finding, ...]:
+        """The other findings."""
+        return tuple(finding for finding in self.findings if not finding.problem)
+
+    @property
+    def ok(self) -> bool:
+        """Whether it can be submitted."""
+        return not self.problems
+
+    def lines(self) -> Iterable[str]:
+        """The report for a person: problems, then notes, then the verdict."""
+        label = printable(self.label)
+        for finding in (*self.problems, *self.notes):
+            yield from finding.message(label).split("\n")
+        if self.left_out:
+            yield f"{label}: not looked at yet: {', '.join(self.left_out)}; mend the above first"
+        if self.act_us is not None:
+            mean, largest = self.act_us
+            yield f"{label}: act takes {mean:.0f} us on average, {largest:.0f} us at most"
+        count = len(self.problems)
+        if count:
+            yield f"{label}: {count} {'problem' if count == 1 else 'problems'}; not ready to submit"
+        else:
+            yield f"{label}: no problems; ready to submit"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the report as JSON values."""
+        timing = {"mean": self.act_us[0], "max": self.act_us[1]} if self.act_us else None
+        return {
+            "submission": self.label,
+            "ok": self.ok,
+            "problems": [finding.to_json() for finding in self.problems],
+            "notes": [finding.to_json() for finding in self.notes],
+            "left_out": list(self.left_out),
+            "sandbox": self.sandbox,
+            "act_us": timing,
+        }
 
 
 #: Rounds of a check: all runs side by side, and the timed one.
@@ -291,9 +342,10 @@ def _ran(
         timed_answers = run_all(submission, [timed_run], runner, clock, count)
     except SubmissionError as error:
         # Each begins with the label.
-        texts = [problem.removeprefix(f"{name}: ") for problem in error.problems]
-        problems = [_placed("run", text, _IMPORT_ADVICE) for text in texts]
-        return _report(name, [*findings, *problems], left_out=_TO_RUN[1:], sandbox=sandbox)
+        for problem in str(error).split("\n"):
+            advice = _IMPORT_ADVICE if "while it was imported" in problem else _CLASS_ADVICE
+            findings.append(_placed("run", problem.removeprefix(f"{name}: "), advice))
+        return _report(name, findings, left_out=_TO_RUN[1:], sandbox=sandbox)
     findings += _failure_findings(runs, answers) or _failure_findings([timed_run], timed_answers)
     findings += _clipping_notes(answers.commands[: len(plain_runs)])
     repeats = (0, len(plain_runs))

@@ -24,8 +24,8 @@ import msgspec
 import numpy as np
 
 from ventbench.base import files
-from ventbench.entries.errors import Finding, SubmissionError, printable
-from ventbench.entries.manifest import MANIFEST, TRACKS, Manifest
+from ventbench.entries.manifest import MANIFEST, TRACKS, Finding, Manifest
+from ventbench.sandbox.child.cell import SubmissionError, printable
 from ventbench.sandbox.child.sources import CONTROLLER as CONTROLLER
 from ventbench.sandbox.child.sources import walk
 from ventbench.sandbox.reader import UnreadableError, read_apart

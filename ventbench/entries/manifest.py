@@ -1,4 +1,4 @@
-"""``submission.toml``: what an author says about an entry, read and checked."""
+"""``submission.toml``: what an author says about an entry, read and checked, and what is wrong."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import msgspec
 
-from ventbench.entries.errors import Finding, SubmissionError
+from ventbench.sandbox.child.cell import SubmissionError, printable
 from ventbench.task.interfaces import API_VERSION
 
 #: Name of the file.
@@ -206,6 +206,45 @@ def read_as_json(folder: str, label: str) -> dict[str, Any]:
     except SubmissionError as error:
         return {"manifest": None, "problems": error.problems}
     return {"manifest": dataclasses.asdict(manifest), "problems": ()}
+
+
+#: What is looked at, in this order.
+Group = Literal["files", "manifest", "source", "run", "repeat", "time"]
+GROUPS: tuple[Group, ...] = ("files", "manifest", "source", "run", "repeat", "time")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One problem or note."""
+
+    group: Group  #: what was looked at, one of :data:`GROUPS`.
+    file: str  #: path below the folder, or words such as ``"the folder"``; printable.
+    what: str  #: is wrong with it; printable.
+    advice: str  #: what to do; printable.
+    line: int | None = None  #: counted from 1; None where there is none.
+    column: int | None = None  #: counted from 1; None where there is none.
+    problem: bool = True  #: whether it stops the submission.
+
+    def __post_init__(self) -> None:
+        # File names, values and exceptions are the author's; a terminal and a page show this.
+        for name in ("file", "what", "advice"):
+            object.__setattr__(self, name, printable(getattr(self, name), 500))
+
+    @property
+    def where(self) -> str:
+        """File, line and column, such as ``"controller.py line 3, column 8"``."""
+        line = "" if self.line is None else f" line {self.line}"
+        return self.file + line + ("" if self.column is None else f", column {self.column}")
+
+    def message(self, label: str) -> str:
+        """Two lines for a person."""
+        kind = "" if self.problem else "note: "
+        return f"{label}: {kind}{self.where}: {self.what}\n    {self.advice}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the finding as JSON values."""
+        names = ("group", "file", "line", "column", "what", "advice")
+        return {name: getattr(self, name) for name in names}
 
 
 #: SPDX identifiers that most authors use.

@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import InProcess
@@ -208,7 +208,7 @@ def pid_errors(plants: Plant, cells: Scenario, gains: Floats) -> Floats:
         cells: batch shape ``(L, n, P)``.
         gains: P, I, D, %/cmH2O, shape ``(L, 3)``.
     """
-    with precision.float64():
+    with compilation.float64():
         arrays = jax.tree.map(jnp.asarray, (plants, gains, cells))
         pressure = np.asarray(_pid_pressures(*arrays))
     return metric.controllable_error(pressure, np.asarray(cells.pip)[..., None, None])
@@ -298,7 +298,7 @@ def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floa
     for breath in range(len(protocol.SCORED_BREATHS)):
         each, flat = _inspirations(plants, cells, breath)
         commands = reference.commands[..., breath, :].reshape(len(flat.pip), -1)
-        with precision.float64():
+        with compilation.float64():
             pressure = attainable.pressures(each, flat, commands)
         errors.append(np.mean(np.abs(pressure - flat.pip[:, None]), axis=1))
     return np.mean(errors, axis=0).reshape(np.shape(cells.pip))

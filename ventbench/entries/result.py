@@ -207,8 +207,8 @@ class Score:
         files.write_json(folder / "score.json", self.to_json())
         self.trajectories.save(folder / "trajectories.npz")
         if self.stressed is not None:
-            table = self.stressed.to_frame().to_csv(index=False, lineterminator="\n").encode()
-            files.write_atomically(folder / "stress.csv", lambda file: file.write(table))
+            table = self.stressed.to_frame().to_csv(index=False, lineterminator="\n")
+            files.write_text(folder / "stress.csv", table)
 
     def to_frame(self) -> pd.DataFrame:
         """Figures of all runs, one row each, stressed ones last.
@@ -329,16 +329,20 @@ class Score:
         published: bool = False,
         some: Bools | slice = slice(None),
     ) -> dict[str, Any] | None:
-        """Mean over some draws, ``(k, lungs)``, of all lungs or of those from ``first`` on."""
+        """Mean over some draws, ``(k, lungs)``, of all lungs or of those from ``first`` on.
+
+        Its interval resamples draws, rigs and members.
+        """
         if not len(values):
             return None
         assert self.rig_draws is not None
         means = values.mean(axis=1)
-        # A draw that failed must not be left out of a mean.
-        finite = bool(np.isfinite(means).all())
-        score, ci95 = (
-            self._over_rigs(values, first, some) if finite else (math.nan, (math.nan,) * 2)
-        )
+        score, ci95 = math.nan, (math.nan, math.nan)
+        if np.isfinite(means).all():  # a draw that failed must not be left out of a mean
+            lungs = slice(first, first + values.shape[1])
+            rig, member = self.rig_draws.rig[lungs, some], self.rig_draws.member[lungs, some]
+            score = float(values.mean())
+            ci95 = bootstrap.limits(bootstrap.resampled_scores(values.T, rig, member))
         about = self.rig_draws.about()
         return {
             "score": number(score),
@@ -369,17 +373,6 @@ class Score:
                 "pid_cmH2O": float(reference.pid[lungs].mean()),
             }
         }
-
-    def _over_rigs(
-        self, values: Floats, first: int, some: Bools | slice
-    ) -> tuple[float, tuple[float, float]]:
-        """Mean over draws with its interval, which resamples draws, rigs and members."""
-        assert self.rig_draws is not None
-        lungs = slice(first, first + values.shape[1])
-        rig, member = self.rig_draws.rig[lungs, some], self.rig_draws.member[lungs, some]
-        resampled = bootstrap.resampled_scores(values.T, rig, member)
-        low, high = np.quantile(resampled, (0.025, 0.975))
-        return float(values.mean()), (float(low), float(high))
 
     def _secondary(self, lungs: slice) -> dict[str, Any]:
         means, missing = {}, {}

@@ -6,9 +6,8 @@ attack, and a reader of a pull request should see them all without searching.
 :func:`inspect_folder` finds all that reading a folder shows in a limited process, which runs none
 of it.
 
-Checks of the Python sources of a submission, by reading: none of them is run or imported.
-The class ``Controller`` must be there with methods that can be called, and what the controller
-imports must be there too.
+Sources must be Python, and what the controller imports must be there. The class ``Controller`` is
+for the run to look at, see :mod:`ventbench.entries.contract`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import dataclasses
-import difflib
 import io
 import re
 import sys
@@ -27,10 +25,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ventbench.entries.errors import Finding
 from ventbench.entries.folder import CONTROLLER, MAX_BYTES, check_files
-from ventbench.entries.manifest import check_manifest
-from ventbench.sandbox.child.cell import CLASS, source_text
+from ventbench.entries.manifest import Finding, check_manifest
+from ventbench.sandbox.child.cell import source_text
 from ventbench.sandbox.child.sources import Import, imports, module_files, sources
 from ventbench.sandbox.pipes import OPTIONAL
 from ventbench.sandbox.reader import UnreadableError, read_apart
@@ -53,7 +50,6 @@ def check_sources(folder: Path) -> list[Finding]:
             trees[name] = tree
     if CONTROLLER in trees:
         try:
-            findings += _check_class(trees[CONTROLLER])
             findings += _check_imports(trees)
         except RecursionError:
             advice = "write a loop or a table in place of so many nested expressions"
@@ -87,105 +83,6 @@ def _declared(content: bytes) -> str:
         return tokenize.detect_encoding(io.BytesIO(content).readline)[0]
     except SyntaxError:
         return "of no known name"
-
-
-_METHODS = {"reset": "task", "act": "observation"}
-Function = ast.FunctionDef | ast.AsyncFunctionDef
-
-
-def _check_class(tree: ast.Module) -> list[Finding]:
-    """Look for the class and its methods in the parsed ``controller.py``."""
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    if CLASS in classes:
-        return list(_class(classes[CLASS]))
-    if _bound(tree):
-        return []  # imported or assigned: the run shows what it is
-    close = next(iter(difflib.get_close_matches(CLASS, classes, n=1, cutoff=0.3)), None)
-    line = classes[close].lineno if close else None
-    hint = f"; did you mean {close}?" if close else ""
-    advice = f"call the class {CLASS}" if close else f"write a class {CLASS}; see `ventbench new`"
-    return [_problem(f"defines no class {CLASS}{hint}", advice, line)]
-
-
-def _bound(tree: ast.Module) -> bool:
-    """Whether anything but a class statement at the top level may give the name a value."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id == CLASS:
-            return True
-        if isinstance(node, ast.alias) and (node.asname or node.name) in (CLASS, "*"):
-            return True
-        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == CLASS:
-            return True
-    return False
-
-
-def _problem(what: str, advice: str, line: int | None, column: int | None = None) -> Finding:
-    return Finding("source", CONTROLLER, what, advice, line, column)
-
-
-def _class(node: ast.ClassDef) -> Iterator[Finding]:
-    methods = {part.name: part for part in node.body if isinstance(part, Function)}
-    given = {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
-    inherits = bool(node.bases or node.keywords or node.decorator_list)
-    for name, argument in _METHODS.items():
-        if name in methods:
-            yield from _method(methods[name], argument)
-        elif not inherits and name not in given:
-            advice = f"write def {name}(self, {argument})"
-            yield _problem(f"class {CLASS} has no method {name}", advice, node.lineno)
-    if "__init__" in methods:
-        yield from _constructor(methods["__init__"])
-
-
-def _method(node: Function, argument: str) -> Iterator[Finding]:
-    signature = f"def {node.name}(self, {argument})"
-    place = node.lineno, node.col_offset + 1
-    if isinstance(node, ast.AsyncFunctionDef):
-        yield _problem(f"{node.name} is async", f"write {signature}", *place)
-        return
-    decorators = [d.id if isinstance(d, ast.Name) else "" for d in node.decorator_list]
-    if set(decorators) - {"staticmethod", "classmethod"}:
-        return  # may change everything
-    required, most = _arguments(node)
-    wanted = 1 if "staticmethod" in decorators else 2
-    if not required <= wanted <= most or _required_keywords(node):
-        what = f"{node.name} cannot be called as {node.name}({argument})"
-        yield _problem(what, f"write {signature}", *place)
-    inside = list(_inside(node))
-    if any(isinstance(part, ast.Yield | ast.YieldFrom) for part in inside):
-        yield _problem(f"{node.name} is a generator", "return a value, do not yield it", *place)
-    elif node.name == "act" and not any(map(_ends, inside)):
-        yield _problem("act returns nothing", "return u_in, a number in %", *place)
-
-
-def _inside(node: ast.AST) -> Iterator[ast.AST]:
-    """What a function does itself, not in functions within it."""
-    for child in ast.iter_child_nodes(node):
-        if not isinstance(child, Function | ast.Lambda | ast.ClassDef):
-            yield child
-            yield from _inside(child)
-
-
-def _ends(node: ast.AST) -> bool:
-    return isinstance(node, ast.Raise) or (isinstance(node, ast.Return) and node.value is not None)
-
-
-def _constructor(node: Function) -> Iterator[Finding]:
-    required, _ = _arguments(node)
-    if required > 1 or _required_keywords(node):
-        what = f"{CLASS}() needs arguments that it does not get"
-        advice = "give them defaults, or prepare in reset(self, task)"
-        yield _problem(what, advice, node.lineno, node.col_offset + 1)
-
-
-def _arguments(node: Function) -> tuple[int, float]:
-    """Fewest and most positional arguments, ``self`` among them."""
-    names = [*node.args.posonlyargs, *node.args.args]
-    return len(names) - len(node.args.defaults), float("inf") if node.args.vararg else len(names)
-
-
-def _required_keywords(node: Function) -> bool:
-    return any(default is None for default in node.args.kw_defaults)
 
 
 #: Packages beyond the standard library.
@@ -284,16 +181,12 @@ def review(folder: Path) -> list[Finding]:
     notes = []
     for path in sources(folder):
         name = path.relative_to(folder).as_posix()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                text = source_text(path.read_bytes())
-                tree = ast.parse(text, name)
-        except (SyntaxError, ValueError, RecursionError, MemoryError, OSError):
+        tree = _parsed(path, name)
+        if isinstance(tree, Finding):
             continue  # check_sources says so
         notes += [
             Finding("source", name, what, _ADVICE, line, problem=False)
-            for line, what in _characters(text)
+            for line, what in _characters(source_text(path.read_bytes()))
         ]
         seen = set()
         for node in ast.walk(tree):

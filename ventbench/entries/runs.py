@@ -18,10 +18,10 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.entries.errors import Failure
+from ventbench.sandbox.child.cell import Failure
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.task.metrics.bootstrap import resampled_scores
+from ventbench.task.metrics.bootstrap import limits, resampled_scores
 from ventbench.task.stressors import (
     CATEGORIES,
     WEIGHTS,
@@ -145,26 +145,21 @@ class Runs:
         """Weighted mean error of the stressed conditions, cmH2O, ``(L, n)``; NaN if one failed."""
         return self.over_conditions(self.error)
 
-    def resampled(self, values: Floats) -> Floats:
-        """Means over cells with draws, rigs and ensemble members resampled, alike for all entries.
+    def interval(self, values: Floats) -> tuple[float, float]:
+        """95 % interval of a mean over cells, with draws, rigs and ensemble members resampled.
 
-        PIPs are chosen, not drawn, and lungs and PIPs form a Latin square: what a PIP adds on
-        average is taken out before, as what a lung adds is. Values ``(L, n)`` of any unit, such as
-        a mean over conditions.
+        Alike for all entries. PIPs are chosen, not drawn, and lungs and PIPs form a Latin square:
+        what a PIP adds on average is taken out before, as what a lung adds is. Values ``(L, n)`` of
+        any unit, such as a mean over conditions.
         """
+        if values.shape[1] < 2 or not np.isfinite(values).all():
+            return math.nan, math.nan
         levels, index, count = np.unique(self.pips, return_inverse=True, return_counts=True)
         if count.min() > 1:
             index = index.reshape(values.shape)
             sums = np.bincount(index.ravel(), weights=values.ravel(), minlength=len(levels))
             values = values - (sums / count)[index] + values.mean()
-        return resampled_scores(values, self.rig, self.member)
-
-    def interval(self, values: Floats) -> tuple[float, float]:
-        """95 % interval of a mean over cells of values ``(L, n)``, by :meth:`resampled`."""
-        if values.shape[1] < 2 or not np.isfinite(values).all():
-            return math.nan, math.nan
-        low, high = np.quantile(self.resampled(values), (0.025, 0.975))
-        return float(low), float(high)
+        return limits(resampled_scores(values, self.rig, self.member))
 
     def comparable(self, other: Runs) -> bool:
         """Whether another entry was run under the same conditions on the same draws."""

@@ -12,24 +12,34 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from ventbench.base import precision
+from ventbench.base import compilation
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.entries.cells import Cells, ProtocolRun, as_float64, protocol_of, replay, run_cells
-from ventbench.entries.errors import SubmissionError
+from ventbench.entries.cells import (
+    Cells,
+    ProtocolRun,
+    Runner,
+    as_float64,
+    protocol_of,
+    run_cells,
+    runner_of,
+)
 from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.manifest import TRACKS
 from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
-from ventbench.entries.runner import Runner, runner_of
 from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure, Runs, number
 from ventbench.plants.catalog import Given
 from ventbench.plants.rigs import Rigs, load_rigs
-from ventbench.task import draws, protocol
+from ventbench.sandbox.child.cell import SubmissionError
+from ventbench.task import draws, protocol, rollouts
 from ventbench.task.draws import Draws
-from ventbench.task.environment import nominal_scenario
-from ventbench.task.interfaces import Task
+from ventbench.task.environment import Scenario, nominal_scenario
+from ventbench.task.interfaces import Plant, Task
 from ventbench.task.metrics.score import (
     InspirationSignals,
     controllable_error,
@@ -39,6 +49,7 @@ from ventbench.task.metrics.score import (
     steady_error,
     time_above_alarm,
 )
+from ventbench.task.rollouts import Script
 from ventbench.task.stressors import Condition
 from ventbench.trajectories import end_to_end
 
@@ -146,7 +157,7 @@ def run_protocol(
         reference=reference,
     )  # fmt: skip
     count = _counted(progress, 1 + stress)
-    with precision.float64():
+    with compilation.float64():
         run = run_cells(what.cells, runner, submission, tasks, count)
         under_stress = None
         if what.stressed is not None:
@@ -228,6 +239,22 @@ def enter(
     ]
 
 
+def replay(
+    plants: Plant, scenario: Scenario, requested: Floats
+) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
+    """Apply recorded commands again, with the expirations. Call it within ``float64()``.
+
+    Plants and cells as of :func:`~ventbench.entries.cells.step_through`, commands as of
+    :class:`ProtocolRun`; arrays of shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
+    """
+
+    def run(plant: Plant, scenario: Scenario, commands: Array) -> Any:
+        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True)
+
+    commands = jnp.asarray(requested.reshape(*requested.shape[:-2], -1))
+    return jax.vmap(run)(plants, scenario, commands)
+
+
 def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Sequence[Task]) -> Runs:
     """Figures of a run of cells, batch shape ``(S, L, n, P)``; a task for each lung."""
     pip, dt = (
@@ -307,7 +334,7 @@ def transfer(
         places.append(every + [every[0]] * (most - len(every)))
     rig, member = np.moveaxis(np.array(places), -1, 0)
     pips = np.broadcast_to(np.array(protocol.PIPS), (*rig.shape, len(protocol.PIPS)))
-    with precision.float64():
+    with compilation.float64():
         plants = draws.plants_of(rigs.plants, rig, member)
         scenario, every = nominal_scenario(pips), np.zeros(most, np.int64)
         cells = Cells(rigs.lungs, (Condition(),), plants, scenario, pips, every, rig, member)

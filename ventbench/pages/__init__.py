@@ -1,4 +1,4 @@
-"""Pictures of scored runs: rerun files, an HTML report, a figure (extra ``ventbench[view]``)."""
+"""Pictures of scored runs: rerun files and an HTML report (extra ``ventbench[view]``)."""
 
 from ventbench.pages.report import open_viewer, write_report, write_rerun
 

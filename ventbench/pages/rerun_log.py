@@ -184,8 +184,8 @@ def _plots(runs: Sequence[Trajectories]) -> tuple[Plot, ...]:
     )
 
 
-def blueprint(runs: Sequence[Trajectories], names: Sequence[str], tab: int = 0) -> rrb.Blueprint:
-    """Return the one blueprint; it opens at a tab: pressure, u_in, error, then the lungs."""
+def blueprint(runs: Sequence[Trajectories], names: Sequence[str]) -> rrb.Blueprint:
+    """Return the one blueprint: tabs of pressure, u_in and error, then of the lungs."""
     lungs = runs[0].lungs
     columns = len({parse_lung(lung).C for lung in lungs})
     plots = _plots(runs)
@@ -198,7 +198,7 @@ def blueprint(runs: Sequence[Trajectories], names: Sequence[str], tab: int = 0) 
         for plot in plots
     ]
     details = [_lung_tab(lung, plots, names[1:]) for lung in lungs]
-    tabs = rrb.Tabs(*grids, *details, active_tab=tab, name="Run")
+    tabs = rrb.Tabs(*grids, *details, active_tab=0, name="Run")
     return beside_text(tabs, "What you see", 3.6, TIMELINE)
 
 

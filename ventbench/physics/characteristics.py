@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from ventbench.base.arrays import Floats
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.physics.catalogue import mechanism
 from ventbench.physics.mechanism import Mechanism, Network, Pair, Values, View
 from ventbench.physics.nonparametric.basis import FilterBank

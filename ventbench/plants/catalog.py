@@ -34,7 +34,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
@@ -209,7 +209,7 @@ def _at_label(name: str, make: Callable[[Lung], Plant], for_breaths: PlantsFor) 
     """Simulators that need no more than a label, and so know every lung."""
 
     def stacked() -> Plant:
-        with precision.float64():
+        with compilation.float64():
             return stack_heterogeneous([make(entry) for entry in LUNGS])
 
     return Simulators(

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.plants import frozen
@@ -110,7 +110,7 @@ class Simulators:
         """
         wanted = lung(lung_id).id
         if self._make is not None:
-            with precision.float64():
+            with compilation.float64():
                 return jax.tree.map(np.asarray, self._make(lung(wanted)))
         stacked, known = self.stacked, [entry.id for entry in self.lungs]
         if wanted not in known:
@@ -138,7 +138,7 @@ class Simulators:
 
     def plant_of_breath(self, breaths: Breaths, index: int) -> Plant:
         """Return the plant of one recorded breath, without a leading axis; float64 leaves."""
-        with precision.float64():
+        with compilation.float64():
             stacked = self.for_breaths(breaths.select([index]))
             inner = stacked.plants if isinstance(stacked, VmappedPlant) else stacked
             return take(inner, 0)
@@ -217,7 +217,7 @@ class Simulators:
                 self._function, u_in, u_out, dt, lung(lung_id), initial_pressure, "the commands"
             )
         plant = self.plant(lung_id)
-        with precision.float64():
+        with compilation.float64():
             commands = (jnp.asarray(column, float)[None] for column in (u_in, u_out, dt))
             start = jnp.asarray([float(initial_pressure)])
             return np.asarray(open_loop(plant, start, *commands))[0]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.physics.model import Physics
@@ -106,7 +106,7 @@ def _physics_with_equal_parameters(plants: list[Physics]) -> list[Physics]:
         missing = [name for name in names if name not in plant.names]
         if "PEEP" in missing:
             raise InputError("some of the file's plants have a PEEP of their own and some not")
-        with precision.float64():
+        with compilation.float64():
             full = plant.having(**{name: plant.get(name) for name in missing})
         values = tuple(np.asarray(value) for value in full.values)
         completed.append(dataclasses.replace(full, values=values, **sizes))
@@ -151,7 +151,7 @@ def open_loop_breaths(
     n = len(breaths)
     batch = min(_BATCH, n)
     parts = []
-    with precision.float64():
+    with compilation.float64():
         for first in range(0, n, batch):
             index = np.minimum(np.arange(first, first + batch), n - 1)
             part = breaths.select(index)

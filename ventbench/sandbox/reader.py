@@ -72,7 +72,6 @@ def read_apart(
     folder: Path,
     arguments: Sequence[Any] = (),
     *,
-    memory: int = MEMORY,
     cpu_s: int = CPU_S,
 ) -> Any:
     """Call a function on a hostile folder in a limited process without rights.
@@ -81,7 +80,6 @@ def read_apart(
         function: ``"module:name"``; it is given ``str(folder)`` and the arguments.
         folder: all that it may read, besides Python and installed packages.
         arguments: JSON values.
-        memory: bytes of address space beyond the interpreter's.
         cpu_s: seconds of processor time.
 
     Returns:
@@ -96,7 +94,7 @@ def read_apart(
         "arguments": [real, *arguments],
         "readable": [real, ROOT, SITE, *libraries()],
         "site": SITE,
-        "memory": memory,
+        "memory": MEMORY,
         "cpu_s": cpu_s,
     }
     with (
@@ -125,15 +123,15 @@ def read_apart(
             process.kill()
         if code:
             stderr.seek(0)
-            raise UnreadableError(_why(code, memory, cpu_s, stderr.read(100_000)))
+            raise UnreadableError(_why(code, cpu_s, stderr.read(100_000)))
     return json.loads(answer)
 
 
-def _why(code: int, memory: int, cpu_s: int, said: bytes) -> str:
+def _why(code: int, cpu_s: int, said: bytes) -> str:
     if code in (-signal.SIGXCPU, -signal.SIGKILL):
         return f"takes more than {cpu_s} s of processor time to be read"
     if code == OUT_OF_MEMORY:
-        return f"takes more than {memory >> 20} MiB of memory to be read"
+        return f"takes more than {MEMORY >> 20} MiB of memory to be read"
     if code == TOO_DEEP:
         return "is nested too deeply to be read"
     if code < 0:

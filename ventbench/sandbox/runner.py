@@ -102,7 +102,7 @@ def check_floor(shown: Sequence[str]) -> None:
 
 
 class SandboxRunner:
-    """Runs controllers apart: a :class:`ventbench.entries.runner.Runner`.
+    """Runs controllers apart: a :class:`ventbench.entries.cells.Runner`.
 
     It does not exist below the floor of :data:`~ventbench.sandbox.child.lockdown.FLOOR`.
 
@@ -148,7 +148,7 @@ class SandboxRunner:
         }
 
     def start(self, submission: SubmittedFolder, tasks: Sequence[Task]) -> SandboxSession:
-        """Start the cells of a submission, as :class:`ventbench.entries.runner.Runner` says.
+        """Start the cells of a submission, as :class:`ventbench.entries.cells.Runner` says.
 
         Raises:
             SandboxError: if a cell does not show the layers of :attr:`sandbox`.
@@ -182,7 +182,7 @@ class SubmittedFolder(Protocol):
 class SandboxSession(Asked):
     """Fresh, locked-down controllers, one process each, which must show some layers to be in force.
 
-    It is a :class:`ventbench.entries.runner.ControllerSession`, and begins with a task a cell.
+    It is a :class:`ventbench.entries.cells.ControllerSession`, and begins with a task a cell.
 
     Raises:
         SandboxError: if a cell does not lock itself down.

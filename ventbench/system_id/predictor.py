@@ -18,8 +18,8 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench.base.arrays import Floats
+from ventbench.base.compilation import float64
 from ventbench.base.executor import parallel_map
-from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.physics.dead_time import resolution_of
 from ventbench.physics.model import Physics

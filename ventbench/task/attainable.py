@@ -23,9 +23,8 @@ own, half of them random.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import highspy
@@ -36,7 +35,7 @@ import optax
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
@@ -64,8 +63,6 @@ ACCEPTED, GOOD = 0.1, 0.7
 
 #: Cells whose derivatives are computed together: bounds memory.
 BATCH = 64
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,32 +113,25 @@ def _in_batches(function: Any, plants: Plant, cells: Scenario, u_in: Floats) -> 
 
 
 def attainable(
-    plants: Plant, cells: Scenario, *, starts: Sequence[int | Floats] = STARTS,
-    iterations: int = ITERATIONS, progress: Progress | None = None,
-) -> Attainable:  # fmt: skip
+    plants: Plant, cells: Scenario, *, starts: Sequence[int | Floats] = STARTS
+) -> Attainable:
     """Bound the least error of cells from above and below; see the module.
 
     Args:
         plants: leaves ``(n, ...)``.
         cells: batch shape ``(n,)``; their noise is not used.
         starts: see :data:`STARTS`; or commands to start at, %, shape ``(n, COMMANDS)``.
-        iterations: most linear programs of a cell and start.
-        progress: called with the number of programs solved, and of all at most.
     """
     # One breath of noise is as good as any: none is used.
     cells = cells.replace(noise=np.zeros((*np.shape(cells.pip), 1, 1)))  # type: ignore[attr-defined]
     n, pip = np.shape(cells.pip)[0], np.asarray(cells.pip)[:, None]
     best, witness = np.full(n, np.inf), np.zeros((n, COMMANDS))
-    total = len(starts) * iterations
-    with precision.float64():
-        for turn, start in enumerate(starts):
+    with compilation.float64():
+        for start in starts:
             if isinstance(start, int):
                 start = np.where(np.arange(COMMANDS) < start, protocol.U_MAX, HOLD)
             u_in = np.broadcast_to(start, (n, COMMANDS)).astype(float)
-            error = _descend(
-                plants, cells, pip, u_in, iterations,
-                lambda k, turn=turn: progress and progress(turn * iterations + k, total),
-            )  # fmt: skip
+            error = _descend(plants, cells, pip, u_in)
             better = error < best - 1e-12
             best, witness = np.where(better, error, best), np.where(better[:, None], u_in, witness)
         miss = pip - pressures(plants, cells, witness)
@@ -155,10 +145,7 @@ def attainable(
     return Attainable(best, lower, gains, witness)
 
 
-def _descend(
-    plants: Plant, cells: Scenario, pip: Floats, u_in: Floats, iterations: int,
-    progress: Callable[[int], object],
-) -> Floats:  # fmt: skip
+def _descend(plants: Plant, cells: Scenario, pip: Floats, u_in: Floats) -> Floats:
     """Improve commands in place; returns their errors, cmH2O, shape ``(n,)``."""
     n = len(u_in)
     miss = pip - pressures(plants, cells, u_in)
@@ -166,8 +153,7 @@ def _descend(
     radius, live, programs = np.full(n, FIRST_RADIUS), np.arange(n), LinearPrograms(COMMANDS)
     slopes = np.zeros((n, COMMANDS, COMMANDS))
     stale = np.ones(n, bool)
-    for k in range(iterations):
-        progress(k)
+    for _ in range(ITERATIONS):
         anew = live[stale[live]]
         if len(anew):
             some, cell = jax.tree.map(lambda x, i=anew: np.asarray(x)[i], (plants, cells))
@@ -249,8 +235,8 @@ RANDOM_STARTS, OPENED_STEPS = 4, (1, 3, 9, 20)
 ADAM_ITERATIONS, ADAM_RATE = 1500, 0.12
 
 
-def second_optimum(plants: Plant, cells: Scenario, *, iterations: int = ADAM_ITERATIONS) -> NDArray:
-    """Least error that Adam finds in n cells, in so many iterations of each start, cmH2O, ``(n,)``.
+def second_optimum(plants: Plant, cells: Scenario) -> NDArray:
+    """Least error that Adam finds in n cells, cmH2O, ``(n,)``.
 
     It is the mean of ``|p - PIP|`` over steps 2 to 34; noise of the cells is not used.
     """
@@ -262,11 +248,11 @@ def second_optimum(plants: Plant, cells: Scenario, *, iterations: int = ADAM_ITE
         6.0 * uniforms(DEVELOPMENT_SEED, "second optimum", (RANDOM_STARTS, COMMANDS)) - 3.0
     )
     best = np.full(n, np.inf)
-    with precision.float64():
+    with compilation.float64():
         plants, cells = jax.tree.map(jnp.asarray, (plants, cells))
         for start in starts:
             free = jnp.broadcast_to(jnp.asarray(start), (n, COMMANDS))
-            best = np.minimum(best, np.asarray(_search(plants, cells, free, iterations)))
+            best = np.minimum(best, np.asarray(_search(plants, cells, free)))
     return best
 
 
@@ -275,9 +261,9 @@ def _errors(plants: Plant, cells: Scenario, free: Array) -> Array:
     return jnp.mean(jnp.abs(pressure - cells.pip[:, None]), axis=-1)
 
 
-@partial(jax.jit, static_argnames="iterations")
-def _search(plants: Plant, cells: Scenario, start: Array, iterations: int) -> Array:
-    optimiser = optax.adam(optax.cosine_decay_schedule(ADAM_RATE, iterations))
+@jax.jit
+def _search(plants: Plant, cells: Scenario, start: Array) -> Array:
+    optimiser = optax.adam(optax.cosine_decay_schedule(ADAM_RATE, ADAM_ITERATIONS))
     gradient = jax.grad(lambda free: _errors(plants, cells, free).sum())
 
     def iterate(carry: tuple[Array, Any, Array], _: None) -> tuple[tuple[Array, Any, Array], None]:
@@ -287,5 +273,5 @@ def _search(plants: Plant, cells: Scenario, start: Array, iterations: int) -> Ar
         return (free, state, jnp.minimum(best, _errors(plants, cells, free))), None
 
     begun = (start, optimiser.init(start), _errors(plants, cells, start))
-    (_, _, best), _ = jax.lax.scan(iterate, begun, length=iterations)
+    (_, _, best), _ = jax.lax.scan(iterate, begun, length=ADAM_ITERATIONS)
     return best

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
@@ -272,7 +272,7 @@ def with_nominal(
         each lung, both of shape ``(L, 1 + n)``; the member of a reference rig is 0.
     """
     count = len(reference)
-    with precision.float64():
+    with compilation.float64():
         cells = jax.tree.map(np.asarray, nominal_scenario(np.asarray(pips, float)))
     nominal = jax.tree.map(lambda x: np.broadcast_to(x, (count, 1, *x.shape)), cells)
     rig, member = np.asarray(reference)[:, None], np.zeros((count, 1), np.int64)

@@ -23,7 +23,7 @@ import pandas as pd
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.controllers.pid import PID
 from ventbench.plants.catalog import Given
@@ -207,7 +207,7 @@ def drawn_errors(
     for first in range(0, len(gains), together):
         # The last batch is padded, so that all compile once.
         index = np.minimum(np.arange(first, first + together), len(gains) - 1)
-        with precision.float64():
+        with compilation.float64():
             arrays = jax.tree.map(jnp.asarray, (own, gains[index], cell))
             pressure = np.asarray(_pressures(*arrays))
         error = controllable_error(pressure, cell.pip[..., None, None]).mean(axis=1)

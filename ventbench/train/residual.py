@@ -25,7 +25,7 @@ import optax
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.base.resume import Checkpoint, fingerprint
 from ventbench.controllers.pid import PID
@@ -409,7 +409,7 @@ def train_residual(
         started, fresh = time.perf_counter(), []
         for seed in seeds:
             about_it = f"network {name}, seed {seed}" if len(seeds) > 1 else f"network {name}"
-            with precision.float32():
+            with compilation.float32():
                 each[seed][name] = fit(
                     plants, best, config=config, seed=seed, keep=True, weights=weights,
                     checkpoint=_checkpoint(out, name, seed),
@@ -456,7 +456,7 @@ def _errors(
 ) -> dict[str, float]:
     """Nominal error on the reference plant of each lung, float64, cmH2O."""
     errors = {}
-    with precision.float64():
+    with compilation.float64():
         cells = nominal_scenario(np.array(protocol.PIPS))
         wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
         for name in [list(lungs)[index] for index in where]:

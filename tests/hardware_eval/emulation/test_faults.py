@@ -14,8 +14,8 @@ from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.wire.client import Client, DisconnectedError, NoAnswerError
 from hardware_eval.wire.messages import Capability, Flag, Mode
 from tests.hardware_eval.stand_in import Bench
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.task import protocol

@@ -26,7 +26,7 @@ from proofs.real.parts import (
 )
 from proofs.real.rig import RECORDING, claims, cut, figures, prove
 from tests.diagnosis import made
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.errors import InputError
 from ventbench.diagnosis.findings import OpenLoopError
 from ventbench.diagnosis.result import Diagnosis
@@ -71,7 +71,7 @@ class Diagnoses:
         progress("fitting", 0.5)
         one = made.diagnosis(12)
         named = tuple(dataclasses.replace(one.mechanisms[0], name=name) for name in self.names)
-        with precision.float64():
+        with compilation.float64():
             plants = {
                 item.id: physics(item, {"valve_delay": {"delay": 0.04}, "leak": {"conductance": 2}})
                 for item in LUNGS
@@ -130,7 +130,7 @@ def test_only_pressures_are_changed():
 
 def test_what_is_removed_does_nothing():
     both = {"valve_delay": {"delay": 0.04}, "exhalation_valve_delay": {"opening": 0.03}}
-    with precision.float64():
+    with compilation.float64():
         plant = physics(lung("R20C50"), both)
         less = without(plant, ("valve_delay",))
     assert float(less.get("valve_delay.delay")) == 0.0
@@ -147,14 +147,14 @@ def test_the_most_important_is_no_patients_effort():
 
 
 def test_by_names_alone_leaves_the_names():
-    with precision.float64():
+    with compilation.float64():
         named = physics(lung("R5C10"), {"valve_delay": {"delay": 0.04}})
         both = named.having(**{"valve_shape.c1": 0.5})
     assert by_names_alone(named) is named
     alone = by_names_alone(both)
     assert float(alone.get("valve_shape.c1")) == 0.0  # type: ignore[attr-defined]
     assert float(alone.get("valve_delay.delay")) == 0.04  # type: ignore[attr-defined]
-    with precision.float64():
+    with compilation.float64():
         own = named.having(**{"valve_shape.c1": 0.2, "supply_memory.c1": 0.3})
     corrected = Corrected(named, both, own)
     less: Any = by_names_alone(corrected)
@@ -279,7 +279,7 @@ def test_the_unnamed_part_does_not_count_for_the_cut(recordings, tmp_path, monke
     """Its plants are simulated again without it; here names alone are as bad as the start."""
     one = made.diagnosis(12)
     start = physics(lung("R20C50"))
-    with precision.float64():
+    with compilation.float64():
         plant = start.having(**{"valve_shape.c1": 0.5})
     after = OpenLoopError(0.2, 0.3)
     loop = dataclasses.replace(one.open_loop, after=after)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import open_loop_report
+from ventbench import simulation
+from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
-from ventbench.base.precision import float64
 from ventbench.plants.stacking import open_loop_breaths
 from ventbench.recordings import join
 from ventbench.task.lungs import RECORDED_LUNGS, lung
@@ -70,7 +70,7 @@ def mean_errors(pooled, breaths, sessions):
     def of(part):
         return plants(pooled, groups_of(part, sessions, RECORDED_LUNGS))
 
-    return open_loop_report.errors(of, breaths)
+    return simulation.open_loop_errors(of, breaths)
 
 
 @pytest.mark.slow

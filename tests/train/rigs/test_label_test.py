@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base.precision import float32
+from ventbench.base.compilation import float32
 from ventbench.plants.sessions import Session, Sessions, find
 from ventbench.recordings import Breaths, join, make_breaths
 from ventbench.task.lungs import lung

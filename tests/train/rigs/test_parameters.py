@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ventbench.base.precision import float64
+from ventbench.base.compilation import float64
 from ventbench.plants.hybrid import Hybrid
 from ventbench.task.lungs import Lung
 from ventbench.train.rigs.parameters import (

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.plants import frozen
 from ventbench.plants.population import LUNG, NAMES, from_vector, to_vector
 from ventbench.train.rigs.data import InspirationData
@@ -63,7 +63,7 @@ def test_rigs_of_known_size_are_told_apart_through_the_gains_of_their_breaths():
         groups, np.full(n, 5.0), np.ones(n), u_in, np.full((n, samples), 0.032), zeros,
         np.full((n, samples), 1.0 / samples),
     )  # fmt: skip
-    with precision.float64():
+    with compilation.float64():
         rigs: Any = from_vector(true[at], np)
         rigs = rigs.replace(slopes=rigs.slopes * np.exp(gain)[:, None])
         pressure = simulate(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.controllers import rl_policy
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual
@@ -68,7 +68,7 @@ def test_nominal_cells_are_the_protocols(lungs):
 
 
 def test_the_pid_inside_the_features_is_the_pid(lungs):
-    with precision.float64():
+    with compilation.float64():
         cells = environment.nominal_scenario(np.asarray(protocol.PIPS))
         network = TanhNetwork((4,), 1)
         untrained = GaussianPolicy(init_parameters(network, jax.random.key(0)), network)
@@ -120,7 +120,7 @@ def test_rewards_and_errors_are_the_scores(lungs):
 @pytest.fixture(scope="module")
 def rig_lungs():
     """Two plants of each of two lungs, the second of twice the resistance; weights that tell."""
-    with precision.float32():
+    with compilation.float32():
         first = stack([single_compartment(lung) for lung in LUNGS[:2]])
         second = stack([single_compartment(Lung(2 * lung.R, lung.C)) for lung in LUNGS[:2]])
         weights = jnp.arange(12.0).reshape(2, 6) + 1.0

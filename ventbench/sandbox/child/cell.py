@@ -12,7 +12,7 @@ import itertools
 import math
 import sys
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -209,7 +209,7 @@ def controller_class(folder: Path, label: str | None = None) -> Callable[[], Any
         except (Exception, SystemExit) as error:
             what, detail = describe(error, folder)
             raise SubmissionError(f"{label}: {what} while it was imported: {detail}") from error
-        controller = _checked(getattr(module, CLASS, None), label)
+        controller = _checked(vars(module), label)
         undo.pop_all()
     return controller
 
@@ -226,9 +226,14 @@ def source_text(content: bytes) -> str:
     return content.removeprefix(codecs.BOM_UTF8).decode("utf-8")
 
 
-def _checked(controller: Any, label: str) -> Callable[[], Any]:
+def _checked(names: Mapping[str, Any], label: str) -> Callable[[], Any]:
+    """The class among the names of a module."""
+    controller = names.get(CLASS)
     if controller is None:
-        raise SubmissionError(f"{label}: {FILE} defines no class {CLASS}")
+        here = names.get("__name__")
+        own = [x.__name__ for x in names.values() if isinstance(x, type) and x.__module__ == here]
+        instead = f", but {', '.join(own[:3])}" if own else ""
+        raise SubmissionError(f"{label}: {FILE} defines no class {CLASS}{instead}")
     if not callable(controller):
         raise SubmissionError(
             f"{label}: {CLASS} in {FILE} is a {type(controller).__name__}, no class"

@@ -70,11 +70,11 @@ def resampled_means(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int 
     return np.concatenate(means)
 
 
-def summary(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int = SEED) -> Summary:
-    """Summarise values over breaths or draws, of any unit and shape; options as of the means.
+def summary(values: ArrayLike, *, resamples: int = RESAMPLES) -> Summary:
+    """Summarise values over breaths or draws, of any unit and shape.
 
-    The interval is the percentile bootstrap: 2.5 % and 97.5 % quantiles of
-    :func:`resampled_means`. NaN is a missing value, infinity is one like others.
+    The interval is that of :func:`resampled_means`. NaN is a missing value, infinity is one like
+    others.
     """
     values = np.ravel(np.asarray(values, float))
     values = values[~np.isnan(values)]
@@ -83,18 +83,22 @@ def summary(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int = SEED) 
     mean, median = float(np.mean(values)), float(np.median(values))
     if count == 1 or not np.all(np.isfinite(values)):
         return Summary(mean, median, (np.nan, np.nan), count)
-    means = resampled_means(values, resamples=resamples, seed=seed)
+    means = resampled_means(values, resamples=resamples)
+    return Summary(mean, median, limits(means), count)
+
+
+def limits(means: Floats) -> tuple[float, float]:
+    """95 % interval of resampled means: their 2.5 % and 97.5 % quantiles."""
     low, high = np.quantile(means, (0.025, 0.975))
-    return Summary(mean, median, (float(low), float(high)), count)
+    return float(low), float(high)
 
 
 def resampled_scores(
-    values: ArrayLike, rig: ArrayLike, member: ArrayLike, *, resamples: int = RESAMPLES,
-    seed: int = SEED,
-) -> Floats:  # fmt: skip
+    values: ArrayLike, rig: ArrayLike, member: ArrayLike, *, resamples: int = RESAMPLES
+) -> Floats:
     """Scores of resampled draws, rigs and members.
 
-    What is taken depends on the seed, the rigs and the members alone, so that two entries over the
+    What is taken depends on the rigs and the members alone, so that two entries over the
     same draws are resampled alike: the difference of their results is the paired bootstrap.
 
     Args:
@@ -102,7 +106,6 @@ def resampled_scores(
         rig: which rig it was, shape ``(L, n)``; ValueError if it is of another shape.
         member: which member, shape ``(L, n)``.
         resamples: number of resamples.
-        seed: of the bit generator PCG64.
     """
     values, rig, member = np.asarray(values, float), np.asarray(rig), np.asarray(member)
     if values.ndim != 2 or values.shape != rig.shape or values.shape != member.shape:
@@ -116,7 +119,7 @@ def resampled_scores(
     parts += _level(off.ravel(), member.ravel())
     changes = np.zeros(resamples)
     sizes = tuple(len(sums) for sums, _ in parts)
-    for (sums, widening), more in zip(parts, _excess(seed, resamples, sizes), strict=True):
+    for (sums, widening), more in zip(parts, _excess(resamples, sizes), strict=True):
         changes += widening * (more @ sums)
     changes += values.mean()
     return changes
@@ -133,13 +136,13 @@ def _level(off: Floats, level: NDArray) -> list[tuple[Floats, float]]:
 
 
 @functools.lru_cache(maxsize=4)
-def _excess(seed: int, resamples: int, sizes: tuple[int, ...]) -> tuple[Floats, ...]:
+def _excess(resamples: int, sizes: tuple[int, ...]) -> tuple[Floats, ...]:
     """How much more often than once each thing is taken, ``(resamples, size)`` for each size.
 
     All tables over the same draws are resampled alike, and a board does so thousands of times. All
     is made by whole numbers from the raw stream, which no numpy version changes.
     """
-    bits = np.random.PCG64(seed)
+    bits = np.random.PCG64(SEED)
     return tuple(_counts(bits, resamples, size) - 1.0 for size in sizes)
 
 

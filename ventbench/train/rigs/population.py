@@ -22,7 +22,7 @@ import numpy as np
 import tomli_w
 from jax import Array
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.plants import frozen, population
 from ventbench.plants.hybrid import Hybrid
@@ -115,7 +115,7 @@ def _linearised(
     breaths: _Breaths, rigs: Floats, function: Callable[..., tuple[Array, ...]]
 ) -> tuple[Floats, Floats, list[Floats]]:
     """Residuals, their weights, and derivatives of the pressures of all breaths."""
-    with precision.float64():
+    with compilation.float64():
         arguments = (rigs[breaths.at], breaths.gain, breaths.at_start())
         pressure, *slopes = map(np.asarray, function(*map(jnp.asarray, arguments), breaths.data))
     counted, noise = breaths.counted, breaths.noise
@@ -319,7 +319,7 @@ def train_population(
     settings = known.manifest["recipe"]["rigs"]
     data = load_rig_recordings(Path(recordings), folds=settings["folds"], seed=settings["seed"])
     weight = np.where(np.arange(len(data.breaths)) < data.measured, 1.0, settings["reconstructed"])
-    with precision.float64():
+    with compilation.float64():
         arranged = inspirations(data.breaths, known.sessions, data.labels)
     rigs = [(session, lung) for lung, own in zip(known.lung_ids, known.rigs, strict=True)
             for session in sorted(own)]  # fmt: skip

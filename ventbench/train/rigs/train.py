@@ -24,8 +24,8 @@ import numpy as np
 import tomli_w
 from scipy.special import ndtri
 
-from ventbench import open_loop_report
-from ventbench.base import files, precision
+from ventbench import simulation
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.resume import Format, WorkFolder
@@ -187,7 +187,7 @@ def train_rigs(
     scales, noise = Scales(), Noise()
     about = _provenance(data, listed, config, scales, noise)
     parts = WorkFolder(out / "parts", about)
-    with precision.float32():  # enough for a fit to noisy recordings, and twice as fast
+    with compilation.float32():  # enough for a fit to noisy recordings, and twice as fast
         problem = _arrange(data, table, listed, config, scales, noise)
         fits = _fits(problem, config, parts, report)
         manifest, members = _assess(problem, listed, fits, out)
@@ -386,12 +386,12 @@ def _assess(
     measured = data.measured_breaths
     known = seen(data.breaths, _seen_by(data))
     simulators = frozen.Frozen(out, {}, "", table, members, known)
-    own = open_loop_report.errors(simulators.cross_fitted, measured)
+    own = simulation.open_loop_errors(simulators.cross_fitted, measured)
     unseen = np.full(data.measured, np.nan)
     for left_out, part in zip(problem.rounds, fits.without_rigs, strict=True):
         shared = partial(_shared_plants, part.pooled, table, data.labels)
         which = np.isin(of_measured, left_out)
-        unseen[which] = open_loop_report.errors(shared, measured)[which]
+        unseen[which] = simulation.open_loop_errors(shared, measured)[which]
     lungs = {}
     for name in listed:
         index = measured.by_lung_index.get(name, np.empty(0, np.int64))
@@ -478,7 +478,7 @@ def _recorded_commands(problem: _Problem, rigs: Sequence[int]) -> list[int]:
 
 def _figures(prefix: str, error: Floats) -> dict[str, Any]:
     """Summary to 1e-6 cmH2O, empty where there is no breath, as TOML knows no null."""
-    summary = open_loop_report.summary(prefix, error)
+    summary = simulation.error_summary(prefix, error)
     if not summary[f"{prefix}breaths"]:
         return {}
     return jax.tree.map(lambda x: round(x, 6) if isinstance(x, float) else x, summary)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.base import precision
+from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.plants.catalog import Given
 from ventbench.task import environment as env
@@ -79,7 +79,7 @@ def load_lungs(simulator: Given = "frozen", *, rigs: Literal["training", "refere
         raise InputError(f"rigs is {rigs!r}; choose training or reference")
     trained_on = plants_to_train_on(simulator)
     kept = slice(None) if rigs == "training" else slice(1)
-    with precision.float32():
+    with compilation.float32():
         plants = jax.tree.map(
             lambda leaf: jnp.asarray(np.asarray(leaf)[kept], jnp.float32), trained_on.plants
         )

@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench.base import files, precision
+from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.resume import Checkpoint, fingerprint
@@ -156,7 +156,7 @@ def train(
         InputError: if the checkpoint belongs to another training.
         FloatingPointError: if a policy diverges.
     """
-    with precision.float32():
+    with compilation.float32():
         plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
         runs, first = _start(method, seeds, plants)
         points = -(-method.iterations // chunk)
@@ -404,7 +404,7 @@ def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> episodes.Lu
 
 def _pid_errors(lungs: episodes.Lungs) -> list[float]:
     """Nominal error of the PID that is corrected, on the lungs of each run, cmH2O."""
-    with precision.float32():
+    with compilation.float32():
         lungs = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), lungs)
         pid = PID(*rl_policy.GAINS)
         errors = jax.jit(jax.vmap(lambda own: nominal_error(own, pid)))(lungs)

@@ -136,7 +136,7 @@ def _run(
             progress(part.name, step, share)
 
     diagnosis = diagnose(
-        setting.breaths, simulator=setting.plant, rigs=setting.rigs, progress=tell,
+        setting.breaths, simulator=setting.plant, progress=tell,
         patient=False,  # the ventilator was connected to a test lung
     )  # fmt: skip
     diagnosis = dataclasses.replace(diagnosis, simulator=setting.plant_name)

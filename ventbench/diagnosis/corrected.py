@@ -5,8 +5,7 @@ simulators compete for each lung: as given; with R, C, R_ex and PEEP refitted; a
 *judging* breaths, which no fit and no test of a term has seen, decide: the refit replaces the given
 simulator, and the correction the refit, only where neither the root-mean-square nor the mean
 absolute error rises. Errors in reports are measured on the same breaths, so that on every lung
-``after <= refit <= before`` holds by construction. Where a recording is of several rigs, a fourth
-candidate has strengths of each rig; it replaces the correction on the same condition.
+``after <= refit <= before`` holds by construction.
 """
 
 from __future__ import annotations
@@ -16,19 +15,13 @@ from itertools import product
 
 import numpy as np
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.findings import RigParameters, Stage
-from ventbench.diagnosis.hypothesis import (
-    FittedModel,
-    Partition,
-    make_partition,
-    varies_by_breath,
-)
+from ventbench.diagnosis.findings import Stage
+from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, Split
 from ventbench.diagnosis.residual_analysis import open_loop_error
-from ventbench.diagnosis.rig_fit import RigFit, fit_rigs
 from ventbench.diagnosis.settings import CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.plants.corrected import Corrected
@@ -58,18 +51,16 @@ class Correction:
     #: True if the simulator is left as it is, because a correction would be worse.
     unchanged: bool = False
     notes: tuple[str, ...] = ()  #: notes for the reader.
-    rigs: tuple[RigParameters, ...] = ()  #: parameters of each rig, if they are chosen for a lung.
 
     @property
     def helps(self) -> bool:
         """Whether the correction is chosen for any lung."""
-        return bool({"after", "rigs"} & set(self.chosen.values()))
+        return "after" in self.chosen.values()
 
 
 def correct(
     breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None, simulators: Simulators,
-    rigs: Ints | None = None,
 ) -> Correction:  # fmt: skip
     """Correct a simulator by the difference of the models of the recording and of itself.
 
@@ -85,8 +76,6 @@ def correct(
         recording_model: identified from the recording.
         simulator_model: identified from the simulator's response; None for the base model.
         simulators: what was diagnosed.
-        rigs: rig of each breath, ``(n,)``; None if all breaths of a lung are of one rig. Only a
-            base model gets parameters of each rig.
     """
     if simulator_model is None:
         pressures, plants, notes = _base_model(breaths, data, split, before, recording_model)
@@ -106,15 +95,6 @@ def correct(
     if unchanged:
         given_everywhere: dict[str, Stage] = dict.fromkeys(chosen, "before")
         refitted = chosen = given_everywhere
-    of_lungs, by_rig = chosen, ()
-    if rigs is not None and simulator_model is None:
-        own = _of_rigs(breaths, data, split, recording_model, rigs)
-        if own is not None:
-            pressures = pressures | {"rigs": own.pressures(data, rigs, breaths.pressure[:, 0])}
-            chosen = _with_rigs(breaths, split, pressures, chosen)
-        if own is not None and "rigs" in chosen.values():
-            by_rig = _parameters_of_rigs(breaths, own, rigs, split)
-            notes = [*notes, _NOTE_ON_RIGS]
     final = {
         "before": before,
         "refit": _by_lung(breaths, pressures, refitted),
@@ -126,69 +106,25 @@ def correct(
             "could be corrected; the corrected pressures of the recorded breaths are in the "
             "diagnosis."
         )
-        return Correction(final, errors, {}, chosen, unchanged, (*notes, note), by_rig)
+        return Correction(final, errors, {}, chosen, unchanged, (*notes, note))
     given = {
         name: simulators.plant_of_breath(breaths, int(index[0]))
         for name, index in breaths.by_lung_index.items()
     }
     result: Plants = {}
-    for name, stage in of_lungs.items():
+    for name, stage in chosen.items():
         if simulator_model is None:
             result[name] = given[name] if stage == "before" else plants[stage][name]
         else:
             own = plants["before"][name]
             result[name] = Corrected(given[name], plants[stage][name], own)
-    return Correction(final, errors, result, chosen, unchanged, tuple(notes), by_rig)
+    return Correction(final, errors, result, chosen, unchanged, tuple(notes))
 
 
 _NOTE_ON_DRIFT = (
     "The corrected simulator is fitted for the least open-loop error: with the reported "
     "parameters, which allow for slow noise and for valve gains that scatter, it would err more."
 )
-
-_NOTE_ON_RIGS = (
-    "The recording is of several rigs: which mechanisms are missing is decided by all breaths, the "
-    "strengths are fitted to each rig around what the rigs have in common, and errors are those of "
-    "each breath's own rig. corrected.json has one plant a lung, without what is a rig's own."
-)
-
-
-def _of_rigs(
-    breaths: Breaths, data: Data, split: Split, model: IdentifiedModel, rigs: Ints
-) -> RigFit | None:
-    """The names of a model with parameters of each rig; without a nonparametric term."""
-    evaluator, conclusion = model.evaluator, model.conclusion
-    names = evaluator.training.predictor.names
-    partition = make_partition(data.select(split.fitted), names, evaluator.settings)
-    return fit_rigs(evaluator, conclusion.named, partition, rigs[split.fitted])
-
-
-def _with_rigs(
-    breaths: Breaths, split: Split, pressures: dict[str, Floats], chosen: dict[str, Stage]
-) -> dict[str, Stage]:
-    """What each lung gets if the judging breaths may also choose parameters of each rig."""
-    judged = breaths.inspiratory & (breaths.time > 0) & split.judging[:, None]
-    result = dict(chosen)
-    for name, index in breaths.by_lung_index.items():
-        own = np.zeros(len(breaths), bool)
-        own[index] = True
-        mask = judged & own[:, None]
-        mask = mask if mask.any() else judged
-        if _is_no_worse(breaths, pressures["rigs"], pressures[chosen[name]], mask):
-            result[name] = "rigs"
-    return result
-
-
-def _parameters_of_rigs(
-    breaths: Breaths, own: RigFit, rigs: Ints, split: Split
-) -> tuple[RigParameters, ...]:
-    result = []
-    for k, rig in enumerate(own.rigs.tolist()):
-        fitted = np.flatnonzero((rigs == rig) & split.fitted)
-        values = {path: float(value[k]) for path, value in own.values.items()}
-        ids = tuple(int(i) for i in breaths.breath_id[fitted])
-        result.append(RigParameters(str(breaths.lung_ids[fitted[0]]), rig, ids, values))
-    return tuple(result)
 
 
 def choose(

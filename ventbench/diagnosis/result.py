@@ -190,7 +190,6 @@ class Diagnosis(Findings):
             "plant": self.simulator,
             "split": self.split,
             "chosen": self.chosen,
-            "rigs": [asdict(rig) for rig in self.rigs],
             "changes": [asdict(change) for change in self.changes],
             "saturated": None
             if self.saturated is None

@@ -161,7 +161,7 @@ def groups(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     distance = diagnosis.open_loop
     everything = {"before": distance.before, "refit": distance.refit, "after": distance.after}
     rows = [("all", everything), *distance.groups.items()]
-    keys = [key for key, _, _ in charts.stages(diagnosis)]
+    keys = charts.stages(diagnosis)
     return [
         {"name": name, "cells": [_cell(values.get(key)) for key in keys]} for name, values in rows
     ]

@@ -17,7 +17,7 @@ from ventbench.entries.cells import PlantError, ProtocolRun
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import as_submission
 from ventbench.entries.runner import InProcessRunner
-from ventbench.physics.parameters import VALVE_GAIN
+from ventbench.physics.mechanism import VALVE_GAIN
 from ventbench.plants.population import NAMES, to_vector
 from ventbench.plants.rigs import load_rigs
 from ventbench.task.stressors import STRESSORS, stressor

@@ -12,8 +12,7 @@ from types import ModuleType
 from ventbench.base.errors import InputError
 from ventbench.physics import events as happening
 from ventbench.physics import mechanisms, nonparametric
-from ventbench.physics.mechanism import Mechanism
-from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
+from ventbench.physics.mechanism import BASE_PARAMETERS, Mechanism, Parameter
 
 #: What :func:`extended` adds to the library, by name.
 _added: dict[str, Mechanism] = {}

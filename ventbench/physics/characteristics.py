@@ -19,9 +19,8 @@ from jax import Array
 from ventbench.base.arrays import Floats
 from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism
-from ventbench.physics.mechanism import Mechanism, Network, Pair, Values, View
-from ventbench.physics.nonparametric.basis import FilterBank
-from ventbench.physics.parameters import BASE_PARAMETERS
+from ventbench.physics.mechanism import BASE_PARAMETERS, Mechanism, Network, Pair, Values, View
+from ventbench.physics.nonparametric import FilterBank
 
 #: Points of a static curve and of a response in time.
 _STATIC, _STEPS = 241, 160

@@ -20,8 +20,8 @@ from proofs.real.parts import PARTS, Part, Setting, by_names_alone, has_unnamed
 from ventbench import recordings
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.diagnosis.corrected import open_loop_error
 from ventbench.diagnosis.diagnose import diagnose
-from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths

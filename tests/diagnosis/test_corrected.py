@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 
 from ventbench.base import precision
 from ventbench.diagnosis import corrected as module
-from ventbench.diagnosis.corrected import choose, correct, fit_open_loop
+from ventbench.diagnosis.corrected import choose, compare_open_loop, correct, fit_open_loop
 from ventbench.diagnosis.evaluator import make_evaluator
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.identification import split
-from ventbench.diagnosis.residual_analysis import compare_open_loop
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics import paths, physics
 from ventbench.plants.catalog import load_simulators

@@ -14,8 +14,7 @@ from tests.diagnosis import made
 from ventbench.diagnosis import number_text
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
-from ventbench.diagnosis.residual_analysis import profiles
-from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.diagnosis.residual_analysis import EDGE, profiles
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.mechanics.labels import Estimate
 from ventbench.pages.diagnosis import report

@@ -104,8 +104,7 @@ class Adequacy:
 
 def check_residuals(
     breaths: Breaths, simulated: Floats, gain: Floats, start: Floats, noise_sd: float,
-    flow: Floats | None = None, volume: Floats | None = None, *, gains_scatter: bool = False,
-    settings: ResidualSettings = DEFAULT.residuals,
+    flow: Floats, volume: Floats, *, gains_scatter: bool, settings: ResidualSettings,
 ) -> Adequacy:  # fmt: skip
     """Test what a model leaves of a recording.
 
@@ -115,8 +114,8 @@ def check_residuals(
         gain: change of the pressures by the logarithm of the valve's gain, cmH2O, ``(n, T)``.
         start: change of the pressures by the pressure that a breath starts from, ``(n, T)``.
         noise_sd: standard deviation of the measurement, cmH2O.
-        flow: flow of the refitted simulator, mL/s, ``(n, T)``, or None.
-        volume: volume of the refitted simulator, mL, ``(n, T)``, or None.
+        flow: flow of the refitted simulator, mL/s, ``(n, T)``.
+        volume: volume of the refitted simulator, mL, ``(n, T)``.
         gains_scatter: whether gains that differ from breath to breath are no error.
         settings: levels and ranges.
     """

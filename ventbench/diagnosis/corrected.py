@@ -1,4 +1,4 @@
-"""The corrected simulator: its pressures for the recorded commands, and its plants.
+"""The corrected simulator: its pressures, its plants, and open-loop errors before and after.
 
 A correction may not make a simulator worse, whatever an identification has concluded. Three
 simulators compete for each lung: as given; with R, C, R_ex and PEEP refitted; and corrected. The
@@ -10,6 +10,7 @@ absolute error rises. Errors in reports are measured on the same breaths, so tha
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -18,11 +19,11 @@ import numpy as np
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.findings import Stage
+from ventbench.diagnosis.findings import OpenLoopComparison, OpenLoopError, Stage
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, Split
-from ventbench.diagnosis.residual_analysis import open_loop_error
-from ventbench.diagnosis.settings import CorrectionSettings
+from ventbench.diagnosis.residual_analysis import EDGE_SIZE
+from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.simulators import Simulators
@@ -30,6 +31,18 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Data
 from ventbench.system_id.problem import parameter_of, parameter_values
 from ventbench.task.interfaces import Plant
+
+#: Length of what is reported as the beginning of inspiration, s.
+_BEGINNING = 0.2
+
+#: Share of the breaths, those that err most, without which it is asked whether more than noise is
+#: left: a wrong first reading puts a whole breath off, since every simulation starts there.
+_SET_ASIDE = 0.1
+
+#: Time after the start of expiration from which little moves, s; fewest quiet samples of a breath
+#: that show the sensor's scatter; times that scatter that the noise may have (it is coloured, and a
+#: converter rounds a quiet signal more than a moving one); least scatter, cmH2O.
+_QUIET_AFTER, _QUIET_SAMPLES, _QUIET_FACTOR, _LEAST_NOISE = 0.6, 10, 3.0, 0.05
 
 #: Plants of the lungs, by label.
 Plants = dict[str, Plant]
@@ -323,3 +336,121 @@ def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, 
         for path in start:
             start[path][own] = points[best][own, names.index(path)]
     return start
+
+
+def open_loop_error(recorded: Floats, simulated: Floats, mask: Bools) -> OpenLoopError:
+    """Error over the samples of a mask, all ``(n, T)``; NaN if there is none."""
+    error = (simulated - recorded)[mask & np.isfinite(recorded) & np.isfinite(simulated)]
+    if error.size == 0:
+        return OpenLoopError(float("nan"), float("nan"))
+    return OpenLoopError(float(np.mean(np.abs(error))), float(np.sqrt(np.mean(error**2))))
+
+
+def compare_open_loop(
+    breaths: Breaths,
+    held_out: Bools,
+    pressures: dict[str, Floats],
+    noise_floor: float,
+    scatter_error: Floats | None = None,
+    sensor: float = float("nan"),
+) -> OpenLoopComparison:
+    """Open-loop errors of a simulator before and after its correction.
+
+    Args:
+        breaths: n recorded breaths of T samples.
+        held_out: breaths that no fit has seen, ``(n,)``.
+        pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
+            T)``.
+        noise_floor: standard deviation of the noise, cmH2O.
+        scatter_error: standard deviation of the pressure because gains or efforts differ from
+            breath to breath, cmH2O, ``(n, T)``; None if nothing does.
+        sensor: that of :func:`sensor_noise`.
+    """
+    # The first sample is where every simulation starts.
+    inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
+
+    def by_stage(mask: Bools) -> dict[str, OpenLoopError]:
+        return {
+            stage: open_loop_error(breaths.pressure, simulated, mask)
+            for stage, simulated in pressures.items()
+        }
+
+    whole = by_stage(inspiration)
+    parts = {
+        f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
+        "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
+        "expiration": (breaths.u_out == 1) & breaths.valid & held_out[:, None],
+    }
+    lungs = breaths.by_lung_index
+    if len(lungs) > 1:
+        for name, index in lungs.items():
+            of_lung = np.zeros(len(breaths), bool)
+            of_lung[index] = True
+            parts[f"lung {name}"] = inspiration & of_lung[:, None]
+    ids = tuple(int(i) for i in breaths.breath_id[held_out])
+    groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
+    scatter = 0.0
+    if scatter_error is not None:
+        scatter = float(np.sqrt(np.mean(scatter_error[inspiration] ** 2)))
+    error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
+    usual = _usual_error(error)
+    return OpenLoopComparison(
+        ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups, scatter, usual,
+        sensor,
+    )  # fmt: skip
+
+
+def _usual_error(error: Floats) -> float:
+    """Root mean square of errors ``(n, T)`` without the breaths that err most."""
+    squares, counts = np.nansum(error**2, axis=1), np.isfinite(error).sum(axis=1)
+    order = np.argsort(squares / np.maximum(counts, 1))
+    kept = order[: len(order) - math.ceil(_SET_ASIDE * len(order))] if len(order) > 2 else order
+    total = counts[kept].sum()
+    return float(np.sqrt(squares[kept].sum() / total)) if total else float("nan")
+
+
+def is_unexplained(
+    errors: OpenLoopComparison, settings: CorrectionSettings = DEFAULT.correction
+) -> bool:
+    """Whether the corrected simulator errs far more than the measurement and gains scatter."""
+    return bool(
+        min(errors.after.rmse, errors.usual) > settings.unexplained_ratio * errors.least_error
+        and errors.unexplained > settings.unexplained_error
+    )
+
+
+def sensor_noise(breaths: Breaths) -> float:
+    """Standard deviation of the sensor, cmH2O, by quiet readings alone; NaN if nothing is quiet.
+
+    Late in an expiration hardly anything moves, so that the scatter about a parabola shows the
+    sensor. A converter hides the scatter of a quiet signal; its step's own scatter is a floor.
+    """
+    late = (breaths.u_out == 1) & breaths.valid & np.isfinite(breaths.pressure)
+    scatter = []
+    for time, pressure, u_in, use in zip(
+        breaths.time, breaths.pressure, breaths.u_in, late, strict=True
+    ):
+        if use.sum() < _QUIET_SAMPLES:
+            continue
+        use = use & (time > time[use][0] + _QUIET_AFTER)
+        use &= np.abs(u_in - np.median(u_in[use]) if use.any() else u_in) < EDGE_SIZE
+        if use.sum() >= _QUIET_SAMPLES:
+            left = pressure[use] - np.polyval(np.polyfit(time[use], pressure[use], 2), time[use])
+            scatter.append(1.4826 * np.median(np.abs(left)))
+    if not scatter:
+        return float("nan")
+    step = np.diff(np.unique(breaths.pressure[late])).min(initial=np.inf) / np.sqrt(12.0)
+    return max(float(np.median(scatter)), float(step), _LEAST_NOISE)
+
+
+def noise_floor(noise_sd: float, sensor: float) -> float:
+    """Standard deviation of the measurement, cmH2O, which no simulator can beat.
+
+    The noise of a model that fits badly contains the model's own slow errors; the floor is never
+    more than a few times the scatter of the sensor.
+
+    Args:
+        noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
+        sensor: that of :func:`sensor_noise`; NaN if unknown.
+    """
+    return float(np.fmin(noise_sd, _QUIET_FACTOR * sensor))

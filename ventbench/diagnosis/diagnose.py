@@ -17,7 +17,14 @@ from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.acceptance import explained_share
 from ventbench.diagnosis.adequacy import check_residuals, detection_limits
 from ventbench.diagnosis.conclusion import Alternatives, Conclusion
-from ventbench.diagnosis.corrected import Correction, correct
+from ventbench.diagnosis.corrected import (
+    Correction,
+    compare_open_loop,
+    correct,
+    is_unexplained,
+    noise_floor,
+    sensor_noise,
+)
 from ventbench.diagnosis.evidence import IN_TIME, told_posterior
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import (
@@ -39,14 +46,7 @@ from ventbench.diagnosis.identification import (
     without_saturated,
 )
 from ventbench.diagnosis.intermittent import Intermittent, find
-from ventbench.diagnosis.residual_analysis import (
-    compare_open_loop,
-    flow_and_volume,
-    is_unexplained,
-    locate,
-    noise_floor,
-    sensor_noise,
-)
+from ventbench.diagnosis.residual_analysis import flow_and_volume, locate
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (

@@ -157,8 +157,8 @@ class Traces:
     before: Floats  #: pressure of the simulator as given, cmH2O.
     refit: Floats  #: pressure with R, C, R_ex and PEEP refitted, cmH2O.
     after: Floats  #: pressure of the corrected simulator, cmH2O.
-    flow: Floats | None = None  #: flow of the refitted simulator into the lung, mL/s, or None.
-    volume: Floats | None = None  #: volume of the refitted simulator, mL, or None.
+    flow: Floats  #: flow of the refitted simulator into the lung, mL/s.
+    volume: Floats  #: volume of the refitted simulator, mL.
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from ventbench.diagnosis.findings import ErrorRegion
-from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.diagnosis.residual_analysis import EDGE
 from ventbench.mechanics.labels import (
     APPARATUS,
     GAIN,

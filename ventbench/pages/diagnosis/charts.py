@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Floats, runs
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
-from ventbench.diagnosis.residual_analysis import Profile, profiles
-from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.diagnosis.residual_analysis import EDGE, Profile, profiles
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages.panels import area, path
 from ventbench.physics.characteristics import Characteristic

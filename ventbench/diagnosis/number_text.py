@@ -7,14 +7,7 @@ from collections.abc import Sequence
 
 from ventbench.diagnosis.findings import ErrorRegion
 from ventbench.diagnosis.residual_analysis import EDGE
-from ventbench.mechanics.labels import (
-    APPARATUS,
-    GAIN,
-    TOLERANCE_C,
-    TOLERANCE_R,
-    Estimate,
-    LungMatch,
-)
+from ventbench.mechanics.labels import GAIN, Estimate, LungMatch, tolerance_text
 from ventbench.physics import parameter
 
 #: Axes whose ranges are parts of a breath: an effect is described best by these.
@@ -183,10 +176,7 @@ def lung(match: LungMatch) -> str:
     gain = ""
     if match.source == "pressure":
         gain = f", and a valve gain wrong by {100 * (GAIN - 1):.0f} %"
-    tolerance = (
-        f"tolerance: R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, "
-        f"C by a factor of {TOLERANCE_C:g}{gain}"
-    )
+    tolerance = f"tolerance: {tolerance_text()}{gain}"
     others = [name for name in match.settings if name != match.label][:2]
     if match.label_matches:
         also = f" Within the same tolerance it could be {' or '.join(others)}." if others else ""

@@ -159,10 +159,8 @@ def choose(
     judged = breaths.inspiratory & (breaths.time > 0) & split.judging[:, None]
     refitted: dict[str, Stage] = {}
     corrected: dict[str, Stage] = {}
-    for name, index in breaths.by_lung_index.items():
-        own = np.zeros(len(breaths), bool)
-        own[index] = True
-        mask = judged & own[:, None]
+    for name in breaths.by_lung_index:
+        mask = judged & (breaths.lung_ids == name)[:, None]
         mask = mask if mask.any() else judged
         best: Stage = "before"
         if _is_no_worse(breaths, pressures["refit"], pressures[best], mask):
@@ -382,11 +380,8 @@ def compare_open_loop(
         "expiration": (breaths.u_out == 1) & breaths.valid & held_out[:, None],
     }
     lungs = breaths.by_lung_index
-    if len(lungs) > 1:
-        for name, index in lungs.items():
-            of_lung = np.zeros(len(breaths), bool)
-            of_lung[index] = True
-            parts[f"lung {name}"] = inspiration & of_lung[:, None]
+    for name in lungs if len(lungs) > 1 else ():
+        parts[f"lung {name}"] = inspiration & (breaths.lung_ids == name)[:, None]
     ids = tuple(int(i) for i in breaths.breath_id[held_out])
     groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
     scatter = 0.0

@@ -205,7 +205,7 @@ def _diagnose(
         data = make_data(driven)
         u_out = np.take_along_axis(recorded.u_out, index, axis=1)
         breaths = replace(driven, u_out=u_out)  # phases of the report are those of the recording
-        excluded += (*flow_drive.VENTILATOR_SIDE, *IN_TIME)
+        excluded += (*flow_drive.ventilator_side(), *IN_TIME)
         settings = flow_drive.without_ventilator(settings)
         notes += [*notes_on_flow, _NOTE_ON_FLOW]
     else:

@@ -360,17 +360,6 @@ class _Search:
         )
         return max(ways, key=lambda known: known.evidence)
 
-    def likeliest_scatter(
-        self, around: Simulated, fitted: FittedModel, noise: Noise, terms: Set = ()
-    ) -> float:
-        """Scatter of the gains beside a fit."""
-
-        def nats(scatter: float) -> float:
-            known = Known(around, fitted, self.base, noise, terms, scatter=scatter, loose=True)
-            return known.evidence
-
-        return max(_SCATTERS, key=nats)
-
     def fit(
         self, terms: Set, data: Data | None = None, noise: Noise | None = None,
         warm_start: FittedModel | None = None,
@@ -386,8 +375,8 @@ class _Search:
 
     def view(self, base: FittedModel, noise: Noise) -> _View:
         """Sets of terms by a linearisation around a base model."""
-        around = self.around(base)
-        likeliest = self.likeliest_scatter(around, base, noise)
+        around, self.scatters = self.around(base), _SCATTERS
+        likeliest = self.known(around, base, noise, loose=True).scatter
         self.scatters = tuple(sorted({min(SCATTER, likeliest), likeliest}))
         for _ in range(2):
             noise = self.known(around, base, noise, loose=True).left

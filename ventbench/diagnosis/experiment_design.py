@@ -331,18 +331,17 @@ class Rig:
 class Family:
     """k breaths of one kind."""
 
-    name: str  #: short.
     title: str  #: what to do on the rig, in words.
     u_in: Floats  #: commands of the inspiratory valve, %, ``(k, T)``.
     u_out: Floats  #: commands of the expiratory valve, 0/1, ``(k, T)``.
 
     def scaled(self, by: Floats) -> Family:
         """Return the family with each inspiration scaled by a factor, ``(k,)``."""
-        return Family(self.name, self.title, self.u_in * by[:, None], self.u_out)
+        return Family(self.title, self.u_in * by[:, None], self.u_out)
 
     def select(self, which: Bools) -> Family:
         """Return some of the breaths, by mask ``(k,)``."""
-        return Family(self.name, self.title, self.u_in[which], self.u_out[which])
+        return Family(self.title, self.u_in[which], self.u_out[which])
 
 
 #: Makes commands ``u_in`` (of any size) and ``u_out``, ``(k, T)``, and peak pressures, cmH2O,
@@ -361,9 +360,9 @@ def families(rig: Rig, samples: int, dt: float) -> tuple[Family, ...]:
     times = np.arange(samples, dtype=np.float64) * dt
     t = np.broadcast_to(times, (_VARIANTS, samples))
     made = []
-    for name, title, shape in _KINDS:
+    for title, shape in _KINDS:
         u_in, u_out, peaks = shape(rig, t)
-        made.append(Family(name, title, _sized(rig, dt, u_in, peaks), u_out))
+        made.append(Family(title, _sized(rig, dt, u_in, peaks), u_out))
     return tuple(made)
 
 
@@ -439,12 +438,12 @@ def _shutters(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 _KINDS = (
-    ("pressure_steps", "raise the pressure in one step and let it settle", _pressure_steps),
-    ("strong_pulses", "pulse the inspiratory valve at random, strongly", _pulses(30.0, 1)),
-    ("gentle_pulses", "pulse the inspiratory valve at random, gently", _pulses(16.0, 2)),
-    ("hold", "inflate fast, then hold 2 s with both valves shut, then exhale", _hold),
-    ("ramp", "open the inspiratory valve slowly and steadily", _ramp),
-    ("staircase", "move the inspiratory valve in small steps, up and down", _staircase),
-    ("long_expiration", "inflate fast, then exhale for a long time", _long_expiration),
-    ("shutters", "inflate fast, then open and shut the expiratory valve in turn", _shutters),
+    ("raise the pressure in one step and let it settle", _pressure_steps),
+    ("pulse the inspiratory valve at random, strongly", _pulses(30.0, 1)),
+    ("pulse the inspiratory valve at random, gently", _pulses(16.0, 2)),
+    ("inflate fast, then hold 2 s with both valves shut, then exhale", _hold),
+    ("open the inspiratory valve slowly and steadily", _ramp),
+    ("move the inspiratory valve in small steps, up and down", _staircase),
+    ("inflate fast, then exhale for a long time", _long_expiration),
+    ("inflate fast, then open and shut the expiratory valve in turn", _shutters),
 )

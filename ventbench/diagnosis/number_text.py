@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from ventbench.diagnosis.findings import ErrorRegion
 from ventbench.diagnosis.residual_analysis import EDGE
 from ventbench.mechanics.labels import GAIN, Estimate, LungMatch, tolerance_text
@@ -147,13 +149,8 @@ def _time(seconds: float) -> str:
 
 def breaths_in_words(ids: Sequence[int]) -> str:
     """Ids of breaths in words; those that follow each other as a range."""
-    runs: list[list[int]] = []
-    for number in ids:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1] = [runs[-1][0], number]
-        else:
-            runs.append([number])
-    shown = [" to ".join(map(str, run)) for run in runs]
+    parts = np.split(np.asarray(ids), np.flatnonzero(np.diff(ids) != 1) + 1)
+    shown = [" to ".join(map(str, dict.fromkeys((part[0], part[-1])))) for part in parts]
     if len(shown) > _LISTED:
         shown = [*shown[: _LISTED - 1], f"others up to {ids[-1]}"]
     text = " and ".join(filter(None, [", ".join(shown[:-1]), *shown[-1:]]))

@@ -189,7 +189,7 @@ class Diagnosis(Findings):
             "would_change": report_text.would_change(self),
             "notes": self.notes,
             "seconds": self.seconds,
-            "settings": self.settings.as_dict(),
+            "settings": asdict(self.settings),
             "format": FORMAT,
             "ventbench": VERSION,
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache, lru_cache
 from types import ModuleType
@@ -118,7 +118,8 @@ def parameter(path: str) -> Parameter:
     for candidate in among:
         if candidate.name == short:
             return candidate
-    raise InputError(f"no parameter {path!r}; {owner or 'the base'} has {_names(among)}")
+    known = ", ".join(candidate.name for candidate in among)
+    raise InputError(f"no parameter {path!r}; {owner or 'the base'} has {known}")
 
 
 @lru_cache
@@ -165,7 +166,3 @@ def _is_described(value: object, module: str) -> bool:
     if not isinstance(value, type) or value.__module__ != module:
         return False
     return issubclass(value, Mechanism) and "description" in vars(value)
-
-
-def _names(parameters: Iterable[Parameter]) -> str:
-    return ", ".join(p.name for p in parameters)

@@ -8,9 +8,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.adequacy import Adequacy, check_residuals, order_p_value, passes_fdr
 from ventbench.diagnosis.identification import without_saturated
 from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
+from ventbench.diagnosis.validation import Adequacy, check_residuals, order_p_value, passes_fdr
 from ventbench.recordings import join
 
 from . import made

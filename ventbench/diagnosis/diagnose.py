@@ -14,8 +14,6 @@ from ventbench import mechanics
 from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
-from ventbench.diagnosis.acceptance import explained_share
-from ventbench.diagnosis.adequacy import check_residuals, detection_limits
 from ventbench.diagnosis.conclusion import Alternatives, Conclusion
 from ventbench.diagnosis.corrected import (
     Correction,
@@ -56,6 +54,7 @@ from ventbench.diagnosis.simulator_comparison import (
     missing_mechanisms,
     refit_at_simulator_parameters,
 )
+from ventbench.diagnosis.validation import check_residuals, detection_limits, explained_share
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.plants.catalog import Given, load_simulators

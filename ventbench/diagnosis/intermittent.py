@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats
-from ventbench.diagnosis.adequacy import order_p_value
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.evidence import COMMANDS, told_posterior
 from ventbench.diagnosis.findings import MissingMechanism
@@ -36,6 +35,7 @@ from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, l
 from ventbench.diagnosis.identification import IdentifiedModel, held_out
 from ventbench.diagnosis.in_time import Paths, follow
 from ventbench.diagnosis.settings import SelectionConfig
+from ventbench.diagnosis.validation import order_p_value
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism
 from ventbench.plants.simulators import Simulators

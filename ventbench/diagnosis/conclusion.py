@@ -202,7 +202,7 @@ def _judge(evaluator: Evaluator, found: Posterior, chosen: Scored) -> _Judged:
     each: list[tuple[float, _Judged]] = []
     while True:
         whole, now = _fitted(evaluator, chosen), evaluator
-        gain_sd = _gain_sd(evaluator, whole, found.scatter)
+        gain_sd = _gain_sd(evaluator, whole, found.fitted[0].scatter)
         if gain_sd:
             now = replace(evaluator, gain_sd=gain_sd)
             whole = fit_with_noise(now, whole.hypothesis, whole)

@@ -77,7 +77,6 @@ class Posterior:
 
     fitted: tuple[Scored, ...]  #: sets that were fitted, likeliest first.
     weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
-    scatter: float  #: standard deviation of the logarithm of the breaths' gains.
 
     def swaps(self, names: frozenset[str], name: str) -> dict[str, float]:
         """Posterior odds of other names in the place of one of a set, the likeliest first."""
@@ -296,7 +295,7 @@ class _Search:
             self.rescore(around, noise)
         ordered = self.ordered()
         ranked = main.ways[main.scatters.index(ordered[0].scatter)]
-        return Posterior(tuple(ordered), weigh(ordered, ranked), ordered[0].scatter)
+        return Posterior(tuple(ordered), weigh(ordered, ranked))
 
     def leading(self) -> list[Scored]:
         """The likeliest set, and the likeliest of names alone if it is not far behind."""

@@ -332,7 +332,7 @@ class _Evidence:
         problem, x = _from_first_readings(evaluator, fitted, partition)
         linear = linearise(problem, x, clip=np.inf)
         strength, *others = mechanism(name).description.parameters
-        strengths = strengths or strength.screening_strengths()
+        strengths = strengths or strength.scan
         names, grids = [p.name for p in others if p.grid], [p.grid for p in others if p.grid]
         columns = [partition.predictor.names.index(f"{name}.{p}") for p in names]
         own = partition.predictor.names.index(f"{name}.{strength.name}")

@@ -22,7 +22,7 @@ _added: dict[str, Mechanism] = {}
 def extended(*added: Mechanism) -> Iterator[None]:
     """Add mechanisms to the library while the block runs, in all threads of the process.
 
-    Models, fits and screening then know them by name, as those of ``physics/mechanisms``.
+    Models, fits and searches then know them by name, as those of ``physics/mechanisms``.
 
     Raises:
         InputError: if the catalogue already has a mechanism or basis term of that name.

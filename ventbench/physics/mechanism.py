@@ -42,7 +42,8 @@ class Parameter:
     #: unless a fit is asked to free it.
     shape: bool = False
     follows: str | None = None  #: ``"R"`` or ``"C"`` if it scales with the lung's R or C.
-    #: values that a search must also try, as it may end in the wrong minimum.
+    #: values that a search must also try, as it may end in the wrong minimum; of the strength of an
+    #: event of some breaths, all that it tries.
     scan: tuple[float, ...] = ()
     #: True for a dead time: the likelihood is flat between two samples and falls off steeply where
     #: an edge passes one, so that its interval is a profile's.
@@ -50,11 +51,11 @@ class Parameter:
     #: standard deviation before any data, in coordinates, around ``neutral``; given for what must
     #: stay there where no data bear on it, be it a strength.
     spread: float | None = None
-    #: values at which screening tries the mechanism, for a parameter other than the strength that
+    #: values at which a search tries the mechanism, for a parameter other than the strength that
     #: changes the shape of the effect much; only the neutral value if empty.
     grid: tuple[float, ...] = ()
     #: True if the response has no useful derivative with respect to it, such as a choice between
-    #: two rules. A fit holds it at the grid value that screening chose.
+    #: two rules. A fit holds it at the grid value that a search chose.
     discrete: bool = False
     #: True for a shape parameter whose default is a guess. Final estimates free it, so that the
     #: interval of the strength allows for it.
@@ -75,17 +76,6 @@ class Parameter:
             raise ValueError(f"{self.name}: {values} must lie within {self.low}..{self.high}")
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"{self.name}: a log scale needs a positive lower bound")
-
-    def screening_strengths(self) -> tuple[float, ...]:
-        """Strengths at which screening evaluates the effect of this parameter's mechanism.
-
-        These are the values of ``scan`` if there are any, else a weak, a mild and a strong effect,
-        with both signs where the bounds allow it.
-        """
-        if self.scan:
-            return tuple(value for value in self.scan if value != self.neutral)
-        positive = (0.3 * self.mild, self.mild, self.strong)
-        return (*positive, *(-value for value in positive if -value >= self.low))
 
     def coordinate(self, value: ArrayLike) -> Floats:
         """Coordinate of a physical value in a fit: its logarithm on a log scale, else the value.

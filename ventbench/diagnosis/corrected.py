@@ -20,7 +20,7 @@ from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import OpenLoopComparison, OpenLoopError, Stage
-from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
+from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.identification import IdentifiedModel, Split
 from ventbench.diagnosis.residual_analysis import EDGE_SIZE
 from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings
@@ -209,7 +209,7 @@ def _base_model(
     final = recording_model.final_model
     after, notes = recording_model.pressures(final, data, first), []
     model = final
-    if not any(varies_by_breath(name) for name in final.names):
+    if not final.hypothesis.breath_terms:
         again = fit_open_loop(evaluator, final, recording_model.final, settings)
         pressure = recording_model.pressures(again, data, first)
         if error(pressure) < settings.drift_ratio * error(after):
@@ -279,7 +279,7 @@ def _least_error_model(
     None if it has parameters of each breath, which nobody knows of breaths to come.
     """
     evaluator, full = recording_model.evaluator, recording_model.conclusion.full
-    if any(varies_by_breath(name) for name in full.names):
+    if full.hypothesis.breath_terms:
         return None
     reduced = less_unmodelled(data, before, simulator_model).select(split.fitted)
     partition = evaluator.partition(reduced)

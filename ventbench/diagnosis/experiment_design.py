@@ -69,14 +69,10 @@ def request_breaths(
     if not alternatives:
         return None
     data = chosen.problem.data
-    best: _Design | None = None
-    for label in np.unique(data.lung):
-        recorded_rows = np.flatnonzero((data.lung == label) & (data.weight[:, 0].any(axis=1)))
-        if not recorded_rows.size:
-            continue
-        design = _best_on_lung(chosen, alternatives, noise, recorded_rows)
-        if design and (best is None or design.nats > best.nats):
-            best = design
+    recorded = data.weight[:, 0].any(axis=1)
+    lungs = (np.flatnonzero((data.lung == lung) & recorded) for lung in np.unique(data.lung))
+    designs = [_best_on_lung(chosen, alternatives, noise, rows) for rows in lungs if rows.size]
+    best = max(filter(None, designs), key=lambda design: design.nats, default=None)
     if best is None or best.nats < _LEAST:
         return None
     return _worded(best, (chosen, *alternatives), float(np.median(data.dt)))
@@ -201,8 +197,7 @@ class _Design:
     """Breaths of one or two families on one lung, with what they are expected to give."""
 
     nats: float
-    families: tuple[Family, ...]
-    members: tuple[tuple[int, ...], ...]
+    picks: list[tuple[Family, list[int]]]  #: families, and which of their breaths.
     lung: Lung
 
 
@@ -235,28 +230,27 @@ def _best_on_lung(
         )
     ]
     lung = Lung(float(problem.data.R[recorded_rows[0]]), float(problem.data.C[recorded_rows[0]]))
-    return _best(kinds, pairs, _BREATHS, lung)
+    return _best(kinds, pairs, lung)
 
 
-def _best(
-    kinds: tuple[Family, ...], pairs: Sequence[Contrast], breaths: int, lung: Lung
-) -> _Design | None:
+def _best(kinds: tuple[Family, ...], pairs: Sequence[Contrast], lung: Lung) -> _Design:
     """The family or mix of two whose smallest nats are the largest."""
     ends = np.cumsum([len(kind.u_in) for kind in kinds])
     firsts = ends - [len(kind.u_in) for kind in kinds]
-    sets = [(i,) for i in range(len(kinds))] + list(combinations(range(len(kinds)), 2))
-    best = None
-    for chosen in sets:
-        counts = [breaths] if len(chosen) == 1 else [breaths - breaths // 2, breaths // 2]
-        members = tuple(
-            tuple(np.linspace(0, len(kinds[i].u_in) - 1, count).round().astype(int).tolist())
+
+    def design(*chosen: int) -> _Design:
+        counts = [_BREATHS] if len(chosen) == 1 else [_BREATHS - _BREATHS // 2, _BREATHS // 2]
+        members = [
+            np.linspace(0, len(kinds[i].u_in) - 1, count).round().astype(int)
             for i, count in zip(chosen, counts, strict=True)
-        )
-        which = [firsts[i] + np.array(m, int) for i, m in zip(chosen, members, strict=True)]
-        nats = min(pair.nats(np.concatenate(which)) for pair in pairs)
-        if best is None or nats > best.nats:
-            best = _Design(nats, tuple(kinds[i] for i in chosen), members, lung)
-    return best
+        ]
+        which = np.concatenate([firsts[i] + m for i, m in zip(chosen, members, strict=True)])
+        picks = [(kinds[i], m.tolist()) for i, m in zip(chosen, members, strict=True)]
+        return _Design(min(pair.nats(which) for pair in pairs), picks, lung)
+
+    one = [design(i) for i in range(len(kinds))]
+    two = [design(*both) for both in combinations(range(len(kinds)), 2)]
+    return max([*one, *two], key=lambda design: design.nats)
 
 
 def _safe(
@@ -301,13 +295,9 @@ def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.int
 
 
 def _worded(design: _Design, hypotheses: Sequence[Fitted], dt: float) -> BreathRequest:
-    parts = [
-        f"{len(members)} x {kind.title}"
-        for kind, members in zip(design.families, design.members, strict=True)
-    ]
-    pairs = list(zip(design.families, design.members, strict=True))
-    u_in = np.concatenate([kind.u_in[list(members)] for kind, members in pairs])
-    u_out = np.concatenate([kind.u_out[list(members)] for kind, members in pairs])
+    parts = [f"{len(members)} x {kind.title}" for kind, members in design.picks]
+    u_in = np.concatenate([kind.u_in[members] for kind, members in design.picks])
+    u_out = np.concatenate([kind.u_out[members] for kind, members in design.picks])
     acts = [set(hypothesis.names) for hypothesis in hypotheses]
     common = acts[0].intersection(*acts[1:])
     names = [" + ".join(sorted(own - common)) or "no further mechanism" for own in acts]

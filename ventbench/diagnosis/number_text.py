@@ -67,6 +67,11 @@ def rounded(value: float, places: int) -> str:
     return text.removeprefix("-") if float(text) == 0 else text
 
 
+def capital(text: str) -> str:
+    """The text with a capital at its start."""
+    return text[:1].upper() + text[1:]
+
+
 def probability(p_value: float) -> str:
     """A p-value as it is written in text."""
     return "p < 0.01" if p_value < 0.01 else f"p = {p_value:.2f}"
@@ -109,8 +114,7 @@ def error_region(region: ErrorRegion, noise: float = 0.0) -> str:
         region: the range to describe.
         noise: standard deviation of the measurement, cmH2O; far smaller errors have no sign.
     """
-    text = error_phrase(region, noise)
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{capital(error_phrase(region, noise))}."
 
 
 def error_phrase(region: ErrorRegion, noise: float) -> str:

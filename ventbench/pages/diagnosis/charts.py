@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Floats, runs
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
+from ventbench.diagnosis.number_text import capital
 from ventbench.diagnosis.residual_analysis import EDGE, Profile, profiles
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages.panels import area, path
@@ -236,7 +237,7 @@ def _panel(
     seen = [recorded[within], *(simulated[key][within] for key in looks if key != "before")]
     near = Chart(
         (low, high), limits(*seen), "", "magnified, cmH2O",
-        f"{name[:1].upper() + name[1:]} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
+        f"{capital(name)} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
     )  # fmt: skip
     for chart, part in ((pressure, slice(None)), (near, within)):
         chart.line("seen", time[part], recorded[part])

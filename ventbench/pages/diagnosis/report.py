@@ -182,7 +182,7 @@ def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
     shown = characteristic(missing.name, _values(diagnosis, missing), largest_command=largest)
     return {
         "name": missing.name,
-        "heading": about.title[:1].upper() + about.title[1:],
+        "heading": number_text.capital(about.title),
         "simulator": {
             key: number_text.quantity_like(value, missing.parameters[key], f"{missing.name}.{key}")
             for key, value in missing.simulator_values.items()

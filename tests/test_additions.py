@@ -36,7 +36,7 @@ class Balloon:
 
 MECHANISM = """
 from ventbench.physics.mechanism import Description, Mechanism
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Parameter
 
 
 class Chimney(Mechanism):

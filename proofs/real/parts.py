@@ -20,11 +20,9 @@ from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
-from ventbench.plants import frozen
 from ventbench.plants.catalog import Given
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import load_plants
-from ventbench.plants.sessions import Sessions
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings.breaths import Breaths
 from ventbench.task.interfaces import Plant
@@ -48,8 +46,6 @@ class Setting:
     wanted: str | None = None  #: mechanism that must be named, or None.
     #: JSON values: what was injected or removed.
     about: dict[str, Any] = field(default_factory=dict)
-    #: the rigs of the recording, if strengths are fitted to each of them.
-    rigs: Sessions | None = None
 
 
 @dataclass(frozen=True)
@@ -65,8 +61,7 @@ class Part:
 
 
 def _rc(breaths: Breaths, out: Path) -> Setting:
-    # The clocks of the simulators' training tell the ventilators apart.
-    return Setting(breaths, "physics", "physics", rigs=frozen.load().sessions)
+    return Setting(breaths, "physics", "physics")
 
 
 def _two_balloon(breaths: Breaths, out: Path) -> Setting:

@@ -21,8 +21,8 @@ from proofs.real.parts import PARTS, Part, Setting, by_names_alone
 from ventbench import recordings
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.diagnosis.corrected import open_loop_error
 from ventbench.diagnosis.diagnose import diagnose
-from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths
@@ -131,8 +131,7 @@ def prove(
 
 def _run(part: Part, setting: Setting, key: dict[str, Any], out: Path, progress: Progress) -> None:
     diagnosis = diagnose(
-        setting.breaths, simulator=setting.plant, rigs=setting.rigs,
-        progress=partial(progress, part.name),
+        setting.breaths, simulator=setting.plant, progress=partial(progress, part.name),
         patient=False,  # the ventilator was connected to a test lung
     )  # fmt: skip
     diagnosis = dataclasses.replace(diagnosis, simulator=setting.plant_name)

@@ -8,9 +8,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.adequacy import Adequacy, check_residuals, order_p_value, passes_fdr
 from ventbench.diagnosis.identification import without_saturated
 from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
+from ventbench.diagnosis.validation import Adequacy, check_residuals, order_p_value, passes_fdr
 from ventbench.recordings import join
 
 from . import made
@@ -40,7 +40,8 @@ def checked(
     pressure = pressure + noise + np.reshape(zeros, (-1, 1))
     return check_residuals(
         dataclasses.replace(recorded, pressure=pressure), simulated, (slope - simulated) / 0.01,
-        np.zeros_like(slope), made.NOISE, gains_scatter=scatter, settings=settings,
+        np.zeros_like(slope), made.NOISE, 22.8 * u_in, np.zeros_like(slope),
+        gains_scatter=scatter, settings=settings,
     )  # fmt: skip
 
 

@@ -13,12 +13,10 @@ from hypothesis import strategies as st
 
 from ventbench.base import compilation
 from ventbench.diagnosis import corrected as module
-from ventbench.diagnosis.corrected import choose, correct, fit_open_loop
+from ventbench.diagnosis.corrected import choose, compare_open_loop, correct, fit_open_loop
 from ventbench.diagnosis.evaluator import make_evaluator
-from ventbench.diagnosis.findings import Stage
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.identification import split
-from ventbench.diagnosis.residual_analysis import compare_open_loop
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics import paths, physics
 from ventbench.plants.catalog import load_simulators
@@ -56,21 +54,6 @@ def fake(monkeypatch) -> None:
     monkeypatch.setattr(module, "refit_base_parameters", lambda *_: None)
     monkeypatch.setattr(module, "_least_error_model", lambda *_: None)
     monkeypatch.setattr(module.estimates, "plants_of", lambda fitted, evaluator: plants(R=25.0))
-
-
-def test_strengths_of_rigs_stand_only_where_no_error_rises():
-    one = made.breaths(n=24, samples=30)
-    both = dataclasses.replace(one, R=np.where(np.arange(24) % 2, 20.0, 5.0))
-    off = {"R5C50": {"refit": 1.0, "rigs": 0.5}, "R20C50": {"refit": 1.0, "rigs": 1.5}}
-    sizes = {
-        stage: np.array([off[lung][stage] for lung in both.lung_ids])[:, None]
-        for stage in ("refit", "rigs")
-    }
-    pressures = {stage: both.pressure + size for stage, size in sizes.items()}
-    lungs: dict[str, Stage] = dict.fromkeys(off, "refit")
-    assert set(both.lung_ids) == set(off)
-    chosen = module._with_rigs(both, split(both), pressures, lungs)
-    assert chosen == {"R5C50": "rigs", "R20C50": "refit"}
 
 
 @settings(max_examples=60)

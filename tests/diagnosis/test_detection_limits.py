@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis import report_text
-from ventbench.diagnosis.adequacy import detection_limits
 from ventbench.diagnosis.evaluator import fit_with_noise
 from ventbench.diagnosis.hypothesis import Hypothesis, varies_by_breath
+from ventbench.diagnosis.validation import detection_limits
 from ventbench.physics import library, mechanism
 
 from . import made, small

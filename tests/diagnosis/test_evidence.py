@@ -52,7 +52,7 @@ def test_odds_of_other_names_are_those_of_sets_that_differ_in_one() -> None:
     weights = {("leak", "valve_lag"): 0.5, ("leak", "valve_delay"): 0.2, ("leak",): 0.1,
                ("valve_lag", "zero_step"): 0.05, ("valve_delay", "zero_step"): 0.15}  # fmt: skip
     named = {frozenset(names): weight for names, weight in weights.items()}
-    found = Posterior((), named, 0.0)
+    found = Posterior((), named)
     best = frozenset({"leak", "valve_lag"})
     assert found.swaps(best, "valve_lag") == pytest.approx({"valve_delay": 0.4})
     assert found.swaps(best, "leak") == pytest.approx({"zero_step": 0.1})

@@ -124,7 +124,7 @@ def test_nothing_to_ask():
 
 def test_commands_of_all_kinds_are_possible():
     kinds = families(Rig(5.0, 50.0, 22.8, 5.0), T, DT)
-    assert len({kind.name for kind in kinds}) == len(kinds) == 8
+    assert len({kind.title for kind in kinds}) == len(kinds) == 8
     for kind in kinds:
         assert kind.u_in.shape == kind.u_out.shape == (5, T)
         assert kind.u_in.min() >= 0.0

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.acceptance import (
+from ventbench.diagnosis.settings import DEFAULT
+from ventbench.diagnosis.validation import (
     excludes_neutral,
     explained_share,
     is_consistent,
     is_plausible,
 )
-from ventbench.diagnosis.settings import DEFAULT
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics import library
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from hardware_eval.emulation.cases import Base
-from ventbench.diagnosis import acceptance
-from ventbench.diagnosis.acceptance import passes_heldout_test
+from ventbench.diagnosis import validation
 from ventbench.diagnosis.evaluator import (
     estimate_noise,
     fit_with_noise,
 )
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.settings import HeldOutTestSettings
+from ventbench.diagnosis.validation import passes_heldout_test
 from ventbench.system_id import Noise
 
 from . import small
@@ -23,9 +23,9 @@ from . import small
 
 def test_a_mechanism_is_needed_if_and_only_if_it_acts(turbulent, both):
     named, without = both
-    assert acceptance.is_needed(turbulent, named, without)
+    assert validation.is_needed(turbulent, named, without)
     idle = turbulent.fit(Hypothesis(("turbulent_resistance", "leak")), named.noise, named)
-    assert not acceptance.is_needed(turbulent, idle, named)
+    assert not validation.is_needed(turbulent, idle, named)
 
 
 def test_cross_validation_runs_only_where_the_training_breaths_clearly_ask(
@@ -37,11 +37,11 @@ def test_cross_validation_runs_only_where_the_training_breaths_clearly_ask(
         asked.append(given)
         return np.full(small.BREATHS, 1.0)
 
-    monkeypatch.setattr(acceptance, "cross_validated_gain", of_all)
-    monkeypatch.setattr(acceptance, "passes_heldout_test", lambda gained, *_: len(gained) > 8)
-    assert acceptance.is_needed(turbulent, *both)
+    monkeypatch.setattr(validation, "cross_validated_gain", of_all)
+    monkeypatch.setattr(validation, "passes_heldout_test", lambda gained, *_: len(gained) > 8)
+    assert validation.is_needed(turbulent, *both)
     assert len(asked) == 1
-    assert not acceptance.is_needed(turbulent, *reversed(both))
+    assert not validation.is_needed(turbulent, *reversed(both))
     assert len(asked) == 1
 
 
@@ -49,9 +49,9 @@ def test_a_negligible_term_is_far_weaker_than_mild_and_explains_little(turbulent
     named, _ = both
     two = turbulent.fit(Hypothesis(("turbulent_resistance", "sensor_drift")), named.noise, named)
     assert abs(two.column("sensor_drift.drift")[0]) < 0.2 * 1.2
-    assert acceptance.is_negligible(turbulent, two, named, "sensor_drift")
+    assert validation.is_negligible(turbulent, two, named, "sensor_drift")
     without = turbulent.fit(two.hypothesis.without("turbulent_resistance"), two.noise, two)
-    assert not acceptance.is_negligible(turbulent, two, without, "turbulent_resistance")
+    assert not validation.is_negligible(turbulent, two, without, "turbulent_resistance")
 
 
 def test_a_weak_term_that_explains_nearly_all_is_not_negligible():
@@ -60,7 +60,7 @@ def test_a_weak_term_that_explains_nearly_all_is_not_negligible():
     assert weak.column("valve_dead_band.width")[0] < 0.2 * 1.5
     without = evaluator.fit(Hypothesis(), weak.noise, weak)
     assert evaluator.criterion(without) - evaluator.criterion(weak) > 100.0
-    assert not acceptance.is_negligible(evaluator, weak, without, "valve_dead_band")
+    assert not validation.is_negligible(evaluator, weak, without, "valve_dead_band")
 
 
 THRESHOLD = HeldOutTestSettings().threshold
@@ -150,7 +150,7 @@ def test_nothing_is_selected_in_noise(coloured, seed):
 def test_a_term_that_another_replaces_is_dropped():
     evaluator = small.split(small.made(small.effect("sensor_lag", tau=0.12)))
     both = evaluator.fit(Hypothesis(("sensor_drift", "sensor_lag")), Noise((0.2,), (0.0,)))
-    left = acceptance.drop_redundant_terms(evaluator, both, both.names)
+    left = validation.drop_redundant_terms(evaluator, both, both.names)
     assert left.hypothesis.names == ("sensor_lag",)
 
 

@@ -13,7 +13,7 @@ from ventbench.diagnosis.settings import DEFAULT, VERSION, SelectionConfig
 
 
 def test_settings_are_frozen_versioned_json_values():
-    values = json.loads(json.dumps(DEFAULT.as_dict()))
+    values = json.loads(json.dumps(dataclasses.asdict(DEFAULT)))
     assert values["version"] == VERSION
     assert values["held_out_test"]["threshold"] == 4.6
     assert set(values) == {field.name for field in dataclasses.fields(SelectionConfig)}

@@ -14,8 +14,7 @@ from tests.diagnosis import made
 from ventbench.diagnosis import number_text
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
-from ventbench.diagnosis.residual_analysis import profiles
-from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.diagnosis.residual_analysis import EDGE, profiles
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.mechanics.labels import Estimate
 from ventbench.pages.diagnosis import report
@@ -328,21 +327,3 @@ def test_rerun_of_other_verdicts_and_names(tmp_path: Path) -> None:
     text = entities["/about"]["text"][0]
     assert all(ord(c) < 0x180 for c in text), "the viewer ends itself over what its font lacks"
     assert "\\!\\[i\\]" in text, "a name is neither link nor image"
-
-
-def test_a_figure_of_held_out_breaths_and_errors(found: Diagnosis) -> None:
-    pytest.importorskip("matplotlib", reason="needs the extra ventbench[view]")
-    figure = found.plot()
-    *breaths, errors = figure.axes
-    assert len(breaths) == 3
-    held = found.traces.breaths.breath_id[found.traces.held_out]
-    for axis in breaths:
-        assert [line.get_label() for line in axis.lines] == [
-            "recorded", "simulator as given", "R and C refitted", "corrected",
-        ]  # fmt: skip
-        assert int(axis.get_title().split()[1].strip(",")) in held
-    widths = [bar.get_width() for bar in errors.patches]  # type: ignore[attr-defined]
-    loop = found.open_loop
-    assert widths == [loop.before.rmse, loop.refit.rmse, loop.after.rmse]
-    nothing = made.nothing(6).plot()
-    assert len(nothing.axes[-1].patches) == 2, "there is no correction"

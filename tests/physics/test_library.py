@@ -13,7 +13,7 @@ from ci.generated_tables import mechanisms
 from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
 from ventbench.physics import library, mechanism, parameter, paths, physics, strength_path
-from ventbench.physics.catalogue import basis_terms, special_cases
+from ventbench.physics.catalogue import basis_terms, intermittent, special_cases
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.task.lungs import Lung
 from ventbench.task.rollouts import open_loop
@@ -72,13 +72,12 @@ def test_the_sites_table_has_equation_and_parameters():
         assert all(f"`{item.name}`" in line for item in own.description.parameters)
 
 
-@pytest.mark.parametrize("name", library())
-def test_screening_strengths_are_possible(name):
+@pytest.mark.parametrize("name", intermittent())
+def test_strengths_that_are_tried_of_an_event_are_possible(name):
     strength = mechanism(name).description.strength
-    tried = strength.screening_strengths()
-    assert tried
-    assert strength.neutral not in tried
-    assert all(strength.low <= value <= strength.high for value in tried)
+    assert strength.scan
+    assert strength.neutral not in strength.scan
+    assert all(strength.low <= value <= strength.high for value in strength.scan)
 
 
 def play_of(width, smooth):

@@ -10,8 +10,7 @@ from ventbench.base.compilation import float64
 from ventbench.physics import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
 from ventbench.physics.characteristics import characteristic
-from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.physics.nonparametric.basis import BasisTerm
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS, BasisTerm
 from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.system_id import Predictor, fit, make_data, parameter_values
 from ventbench.system_id.data import Noise

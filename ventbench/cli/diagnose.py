@@ -136,7 +136,7 @@ def _table(lungs: dict[str, Mechanics]) -> Any:
     )
     return table_of(
         "Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O", columns, rows,
-        left=columns, caption=f"A label holds with {tolerance_text()}, beyond the intervals.",
+        left=columns, caption=f"Tolerance of a label beyond the intervals: {tolerance_text()}.",
     )  # fmt: skip
 
 

@@ -15,12 +15,6 @@ import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.diagnosis import evidence
-from ventbench.diagnosis.acceptance import (
-    is_consistent,
-    is_needed,
-    is_negligible,
-    passes_heldout_test,
-)
 from ventbench.diagnosis.evaluator import (
     Evaluator,
     cross_validated_gain,
@@ -30,6 +24,12 @@ from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior, Scored
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
 from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
 from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
+from ventbench.diagnosis.validation import (
+    is_consistent,
+    is_needed,
+    is_negligible,
+    passes_heldout_test,
+)
 from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Noise, robust_noise
@@ -202,7 +202,7 @@ def _judge(evaluator: Evaluator, found: Posterior, chosen: Scored) -> _Judged:
     each: list[tuple[float, _Judged]] = []
     while True:
         whole, now = _fitted(evaluator, chosen), evaluator
-        gain_sd = _gain_sd(evaluator, whole, found.scatter)
+        gain_sd = _gain_sd(evaluator, whole, found.fitted[0].scatter)
         if gain_sd:
             now = replace(evaluator, gain_sd=gain_sd)
             whole = fit_with_noise(now, whole.hypothesis, whole)

@@ -1,35 +1,29 @@
-"""The corrected simulator: its pressures for the recorded commands, and its plants.
+"""The corrected simulator: its pressures, its plants, and open-loop errors before and after.
 
 A correction may not make a simulator worse, whatever an identification has concluded. Three
 simulators compete for each lung: as given; with R, C, R_ex and PEEP refitted; and corrected. The
 *judging* breaths, which no fit and no test of a term has seen, decide: the refit replaces the given
 simulator, and the correction the refit, only where neither the root-mean-square nor the mean
 absolute error rises. Errors in reports are measured on the same breaths, so that on every lung
-``after <= refit <= before`` holds by construction. Where a recording is of several rigs, a fourth
-candidate has strengths of each rig; it replaces the correction on the same condition.
+``after <= refit <= before`` holds by construction.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.findings import RigParameters, Stage
-from ventbench.diagnosis.hypothesis import (
-    FittedModel,
-    Partition,
-    make_partition,
-    varies_by_breath,
-)
+from ventbench.diagnosis.findings import OpenLoopComparison, OpenLoopError, Stage
+from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.identification import IdentifiedModel, Split
-from ventbench.diagnosis.residual_analysis import open_loop_error
-from ventbench.diagnosis.rig_fit import RigFit, fit_rigs
-from ventbench.diagnosis.settings import CorrectionSettings
+from ventbench.diagnosis.residual_analysis import EDGE_SIZE
+from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.simulators import Simulators
@@ -37,6 +31,18 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Data
 from ventbench.system_id.problem import parameter_of, parameter_values
 from ventbench.task.interfaces import Plant
+
+#: Length of what is reported as the beginning of inspiration, s.
+_BEGINNING = 0.2
+
+#: Share of the breaths, those that err most, without which it is asked whether more than noise is
+#: left: a wrong first reading puts a whole breath off, since every simulation starts there.
+_SET_ASIDE = 0.1
+
+#: Time after the start of expiration from which little moves, s; fewest quiet samples of a breath
+#: that show the sensor's scatter; times that scatter that the noise may have (it is coloured, and a
+#: converter rounds a quiet signal more than a moving one); least scatter, cmH2O.
+_QUIET_AFTER, _QUIET_SAMPLES, _QUIET_FACTOR, _LEAST_NOISE = 0.6, 10, 3.0, 0.05
 
 #: Plants of the lungs, by label.
 Plants = dict[str, Plant]
@@ -58,18 +64,16 @@ class Correction:
     #: True if the simulator is left as it is, because a correction would be worse.
     unchanged: bool = False
     notes: tuple[str, ...] = ()  #: notes for the reader.
-    rigs: tuple[RigParameters, ...] = ()  #: parameters of each rig, if they are chosen for a lung.
 
     @property
     def helps(self) -> bool:
         """Whether the correction is chosen for any lung."""
-        return bool({"after", "rigs"} & set(self.chosen.values()))
+        return "after" in self.chosen.values()
 
 
 def correct(
     breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None, simulators: Simulators,
-    rigs: Ints | None = None,
 ) -> Correction:  # fmt: skip
     """Correct a simulator by the difference of the models of the recording and of itself.
 
@@ -85,8 +89,6 @@ def correct(
         recording_model: identified from the recording.
         simulator_model: identified from the simulator's response; None for the base model.
         simulators: what was diagnosed.
-        rigs: rig of each breath, ``(n,)``; None if all breaths of a lung are of one rig. Only a
-            base model gets parameters of each rig.
     """
     if simulator_model is None:
         pressures, plants, notes = _base_model(breaths, data, split, before, recording_model)
@@ -106,15 +108,6 @@ def correct(
     if unchanged:
         given_everywhere: dict[str, Stage] = dict.fromkeys(chosen, "before")
         refitted = chosen = given_everywhere
-    of_lungs, by_rig = chosen, ()
-    if rigs is not None and simulator_model is None:
-        own = _of_rigs(breaths, data, split, recording_model, rigs)
-        if own is not None:
-            pressures = pressures | {"rigs": own.pressures(data, rigs, breaths.pressure[:, 0])}
-            chosen = _with_rigs(breaths, split, pressures, chosen)
-        if own is not None and "rigs" in chosen.values():
-            by_rig = _parameters_of_rigs(breaths, own, rigs, split)
-            notes = [*notes, _NOTE_ON_RIGS]
     final = {
         "before": before,
         "refit": _by_lung(breaths, pressures, refitted),
@@ -126,69 +119,25 @@ def correct(
             "could be corrected; the corrected pressures of the recorded breaths are in the "
             "diagnosis."
         )
-        return Correction(final, errors, {}, chosen, unchanged, (*notes, note), by_rig)
+        return Correction(final, errors, {}, chosen, unchanged, (*notes, note))
     given = {
         name: simulators.plant_of_breath(breaths, int(index[0]))
         for name, index in breaths.by_lung_index.items()
     }
     result: Plants = {}
-    for name, stage in of_lungs.items():
+    for name, stage in chosen.items():
         if simulator_model is None:
             result[name] = given[name] if stage == "before" else plants[stage][name]
         else:
             own = plants["before"][name]
             result[name] = Corrected(given[name], plants[stage][name], own)
-    return Correction(final, errors, result, chosen, unchanged, tuple(notes), by_rig)
+    return Correction(final, errors, result, chosen, unchanged, tuple(notes))
 
 
 _NOTE_ON_DRIFT = (
     "The corrected simulator is fitted for the least open-loop error: with the reported "
     "parameters, which allow for slow noise and for valve gains that scatter, it would err more."
 )
-
-_NOTE_ON_RIGS = (
-    "The recording is of several rigs: which mechanisms are missing is decided by all breaths, the "
-    "strengths are fitted to each rig around what the rigs have in common, and errors are those of "
-    "each breath's own rig. corrected.json has one plant a lung, without what is a rig's own."
-)
-
-
-def _of_rigs(
-    breaths: Breaths, data: Data, split: Split, model: IdentifiedModel, rigs: Ints
-) -> RigFit | None:
-    """The names of a model with parameters of each rig; without a nonparametric term."""
-    evaluator, conclusion = model.evaluator, model.conclusion
-    names = evaluator.training.predictor.names
-    partition = make_partition(data.select(split.fitted), names, evaluator.settings)
-    return fit_rigs(evaluator, conclusion.named, partition, rigs[split.fitted])
-
-
-def _with_rigs(
-    breaths: Breaths, split: Split, pressures: dict[str, Floats], chosen: dict[str, Stage]
-) -> dict[str, Stage]:
-    """What each lung gets if the judging breaths may also choose parameters of each rig."""
-    judged = breaths.inspiratory & (breaths.time > 0) & split.judging[:, None]
-    result = dict(chosen)
-    for name, index in breaths.by_lung_index.items():
-        own = np.zeros(len(breaths), bool)
-        own[index] = True
-        mask = judged & own[:, None]
-        mask = mask if mask.any() else judged
-        if _is_no_worse(breaths, pressures["rigs"], pressures[chosen[name]], mask):
-            result[name] = "rigs"
-    return result
-
-
-def _parameters_of_rigs(
-    breaths: Breaths, own: RigFit, rigs: Ints, split: Split
-) -> tuple[RigParameters, ...]:
-    result = []
-    for k, rig in enumerate(own.rigs.tolist()):
-        fitted = np.flatnonzero((rigs == rig) & split.fitted)
-        values = {path: float(value[k]) for path, value in own.values.items()}
-        ids = tuple(int(i) for i in breaths.breath_id[fitted])
-        result.append(RigParameters(str(breaths.lung_ids[fitted[0]]), rig, ids, values))
-    return tuple(result)
 
 
 def choose(
@@ -210,10 +159,8 @@ def choose(
     judged = breaths.inspiratory & (breaths.time > 0) & split.judging[:, None]
     refitted: dict[str, Stage] = {}
     corrected: dict[str, Stage] = {}
-    for name, index in breaths.by_lung_index.items():
-        own = np.zeros(len(breaths), bool)
-        own[index] = True
-        mask = judged & own[:, None]
+    for name in breaths.by_lung_index:
+        mask = judged & (breaths.lung_ids == name)[:, None]
         mask = mask if mask.any() else judged
         best: Stage = "before"
         if _is_no_worse(breaths, pressures["refit"], pressures[best], mask):
@@ -262,7 +209,7 @@ def _base_model(
     final = recording_model.final_model
     after, notes = recording_model.pressures(final, data, first), []
     model = final
-    if not any(varies_by_breath(name) for name in final.names):
+    if not final.hypothesis.breath_terms:
         again = fit_open_loop(evaluator, final, recording_model.final, settings)
         pressure = recording_model.pressures(again, data, first)
         if error(pressure) < settings.drift_ratio * error(after):
@@ -332,7 +279,7 @@ def _least_error_model(
     None if it has parameters of each breath, which nobody knows of breaths to come.
     """
     evaluator, full = recording_model.evaluator, recording_model.conclusion.full
-    if any(varies_by_breath(name) for name in full.names):
+    if full.hypothesis.breath_terms:
         return None
     reduced = less_unmodelled(data, before, simulator_model).select(split.fitted)
     partition = evaluator.partition(reduced)
@@ -387,3 +334,118 @@ def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, 
         for path in start:
             start[path][own] = points[best][own, names.index(path)]
     return start
+
+
+def open_loop_error(recorded: Floats, simulated: Floats, mask: Bools) -> OpenLoopError:
+    """Error over the samples of a mask, all ``(n, T)``; NaN if there is none."""
+    error = (simulated - recorded)[mask & np.isfinite(recorded) & np.isfinite(simulated)]
+    if error.size == 0:
+        return OpenLoopError(float("nan"), float("nan"))
+    return OpenLoopError(float(np.mean(np.abs(error))), float(np.sqrt(np.mean(error**2))))
+
+
+def compare_open_loop(
+    breaths: Breaths,
+    held_out: Bools,
+    pressures: dict[str, Floats],
+    noise_floor: float,
+    scatter_error: Floats | None = None,
+    sensor: float = float("nan"),
+) -> OpenLoopComparison:
+    """Open-loop errors of a simulator before and after its correction.
+
+    Args:
+        breaths: n recorded breaths of T samples.
+        held_out: breaths that no fit has seen, ``(n,)``.
+        pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
+            T)``.
+        noise_floor: standard deviation of the noise, cmH2O.
+        scatter_error: standard deviation of the pressure because gains or efforts differ from
+            breath to breath, cmH2O, ``(n, T)``; None if nothing does.
+        sensor: that of :func:`sensor_noise`.
+    """
+    # The first sample is where every simulation starts.
+    inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
+
+    def by_stage(mask: Bools) -> dict[str, OpenLoopError]:
+        return {
+            stage: open_loop_error(breaths.pressure, simulated, mask)
+            for stage, simulated in pressures.items()
+        }
+
+    whole = by_stage(inspiration)
+    parts = {
+        f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
+        "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
+        "expiration": (breaths.u_out == 1) & breaths.valid & held_out[:, None],
+    }
+    lungs = breaths.by_lung_index
+    for name in lungs if len(lungs) > 1 else ():
+        parts[f"lung {name}"] = inspiration & (breaths.lung_ids == name)[:, None]
+    ids = tuple(int(i) for i in breaths.breath_id[held_out])
+    groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
+    scatter = 0.0
+    if scatter_error is not None:
+        scatter = float(np.sqrt(np.mean(scatter_error[inspiration] ** 2)))
+    error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
+    usual = _usual_error(error)
+    return OpenLoopComparison(
+        ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups, scatter, usual,
+        sensor,
+    )  # fmt: skip
+
+
+def _usual_error(error: Floats) -> float:
+    """Root mean square of errors ``(n, T)`` without the breaths that err most."""
+    squares, counts = np.nansum(error**2, axis=1), np.isfinite(error).sum(axis=1)
+    order = np.argsort(squares / np.maximum(counts, 1))
+    kept = order[: len(order) - math.ceil(_SET_ASIDE * len(order))] if len(order) > 2 else order
+    total = counts[kept].sum()
+    return float(np.sqrt(squares[kept].sum() / total)) if total else float("nan")
+
+
+def is_unexplained(
+    errors: OpenLoopComparison, settings: CorrectionSettings = DEFAULT.correction
+) -> bool:
+    """Whether the corrected simulator errs far more than the measurement and gains scatter."""
+    return bool(
+        min(errors.after.rmse, errors.usual) > settings.unexplained_ratio * errors.least_error
+        and errors.unexplained > settings.unexplained_error
+    )
+
+
+def sensor_noise(breaths: Breaths) -> float:
+    """Standard deviation of the sensor, cmH2O, by quiet readings alone; NaN if nothing is quiet.
+
+    Late in an expiration hardly anything moves, so that the scatter about a parabola shows the
+    sensor. A converter hides the scatter of a quiet signal; its step's own scatter is a floor.
+    """
+    late = (breaths.u_out == 1) & breaths.valid & np.isfinite(breaths.pressure)
+    scatter = []
+    for time, pressure, u_in, use in zip(
+        breaths.time, breaths.pressure, breaths.u_in, late, strict=True
+    ):
+        if use.sum() < _QUIET_SAMPLES:
+            continue
+        use = use & (time > time[use][0] + _QUIET_AFTER)
+        use &= np.abs(u_in - np.median(u_in[use]) if use.any() else u_in) < EDGE_SIZE
+        if use.sum() >= _QUIET_SAMPLES:
+            left = pressure[use] - np.polyval(np.polyfit(time[use], pressure[use], 2), time[use])
+            scatter.append(1.4826 * np.median(np.abs(left)))
+    if not scatter:
+        return float("nan")
+    step = np.diff(np.unique(breaths.pressure[late])).min(initial=np.inf) / np.sqrt(12.0)
+    return max(float(np.median(scatter)), float(step), _LEAST_NOISE)
+
+
+def noise_floor(noise_sd: float, sensor: float) -> float:
+    """Standard deviation of the measurement, cmH2O, which no simulator can beat.
+
+    The noise of a model that fits badly contains the model's own slow errors; the floor is never
+    more than a few times the scatter of the sensor.
+
+    Args:
+        noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
+        sensor: that of :func:`sensor_noise`; NaN if unknown.
+    """
+    return float(np.fmin(noise_sd, _QUIET_FACTOR * sensor))

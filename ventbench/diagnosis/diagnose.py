@@ -14,10 +14,15 @@ from ventbench import mechanics
 from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
-from ventbench.diagnosis.acceptance import explained_share
-from ventbench.diagnosis.adequacy import check_residuals, detection_limits
 from ventbench.diagnosis.conclusion import Alternatives, Conclusion
-from ventbench.diagnosis.corrected import Correction, correct
+from ventbench.diagnosis.corrected import (
+    Correction,
+    compare_open_loop,
+    correct,
+    is_unexplained,
+    noise_floor,
+    sensor_noise,
+)
 from ventbench.diagnosis.evidence import IN_TIME, told_posterior
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import (
@@ -39,14 +44,7 @@ from ventbench.diagnosis.identification import (
     without_saturated,
 )
 from ventbench.diagnosis.intermittent import Intermittent, find
-from ventbench.diagnosis.residual_analysis import (
-    compare_open_loop,
-    flow_and_volume,
-    is_unexplained,
-    locate,
-    noise_floor,
-    sensor_noise,
-)
+from ventbench.diagnosis.residual_analysis import flow_and_volume, locate
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
@@ -56,10 +54,10 @@ from ventbench.diagnosis.simulator_comparison import (
     missing_mechanisms,
     refit_at_simulator_parameters,
 )
+from ventbench.diagnosis.validation import check_residuals, detection_limits, explained_share
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.plants.catalog import Given, load_simulators
-from ventbench.plants.sessions import Sessions
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.decimation import decimate, is_fast
@@ -98,7 +96,6 @@ def diagnose(
     lung: str | None = None,
     patient: bool = False,
     drive: Drive = "auto",
-    rigs: Sessions | None = None,
     progress: Progress | None = None,
     settings: SelectionConfig = DEFAULT,
 ) -> Diagnosis:
@@ -124,8 +121,6 @@ def diagnose(
         drive: what the model follows: ``"valve"``, the recorded commands; ``"flow"``, the recorded
             flow, which says nothing of the valves; ``"auto"``, the flow only if ``u_in`` is zero
             throughout, so that no command was recorded.
-        rigs: the rigs of the recording, told by the clocks of their breaths, if there are several;
-            strengths are then fitted to each rig. Only for the base model.
         progress: receives the current step in words, and the share that is done.
         settings: every threshold.
 
@@ -160,7 +155,7 @@ def diagnose(
     posterior = None  # that of all breaths has all effects
     while True:
         found = _diagnose(
-            breaths, simulators, patient, by_flow, rigs, progress or (lambda what, share: None),
+            breaths, simulators, patient, by_flow, progress or (lambda what, share: None),
             settings, look=not by_flow and len(told) < _MOST_INTERMITTENT,
         )  # fmt: skip
         if isinstance(found, Diagnosis):
@@ -179,7 +174,7 @@ def diagnose(
 
 
 def _diagnose(
-    breaths: Breaths, simulators: Simulators, patient: bool, by_flow: bool, rigs: Sessions | None,
+    breaths: Breaths, simulators: Simulators, patient: bool, by_flow: bool,
     tell: Progress, settings: SelectionConfig, *, look: bool,
 ) -> Diagnosis | Intermittent:  # fmt: skip
     """Diagnose breaths in which all effects act alike; see :func:`diagnose`.
@@ -189,7 +184,6 @@ def _diagnose(
         simulators: what to diagnose.
         patient: whether somebody may breathe.
         by_flow: whether the recorded flow drives the model.
-        rigs: the rigs of the recording.
         tell: receives the current step.
         settings: every threshold.
         look: whether to look for an effect of some breaths, which is returned alone.
@@ -210,7 +204,7 @@ def _diagnose(
         data = make_data(driven)
         u_out = np.take_along_axis(recorded.u_out, index, axis=1)
         breaths = replace(driven, u_out=u_out)  # phases of the report are those of the recording
-        excluded += (*flow_drive.VENTILATOR_SIDE, *IN_TIME)
+        excluded += (*flow_drive.ventilator_side(), *IN_TIME)
         settings = flow_drive.without_ventilator(settings)
         notes += [*notes_on_flow, _NOTE_ON_FLOW]
     else:
@@ -250,9 +244,8 @@ def _diagnose(
                 (recording_model, kept), notes = steady, []
                 missing = {name: changed for name, changed in missing.items() if name in kept}
         correction = correct(
-            breaths, data, uses, before, recording_model, simulator_model, simulators,
-            None if rigs is None or by_flow else rigs.assign(recorded),
-        )  # fmt: skip
+            breaths, data, uses, before, recording_model, simulator_model, simulators
+        )
         return _Comparison(recording_model, missing, notes, correction)
 
     comparison = compared(recording_model)
@@ -342,7 +335,6 @@ def _diagnose(
                       pressures["after"], flow, volume),
         split=_ids(breaths, uses),
         chosen=correction.chosen,
-        rigs=correction.rigs,
         changes=adequacy.changes,
         saturated=saturated,
         gain_scatter=conclusion.gain_sd,

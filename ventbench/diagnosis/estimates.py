@@ -24,8 +24,7 @@ from ventbench.physics.catalogue import (
     strength_path,
 )
 from ventbench.physics.characteristics import characteristic
-from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.physics.nonparametric.basis import BasisTerm
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS, BasisTerm
 from ventbench.system_id import ConfidenceInterval, Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.predictor import START, Predictor

@@ -77,7 +77,6 @@ class Posterior:
 
     fitted: tuple[Scored, ...]  #: sets that were fitted, likeliest first.
     weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
-    scatter: float  #: standard deviation of the logarithm of the breaths' gains.
 
     def swaps(self, names: frozenset[str], name: str) -> dict[str, float]:
         """Posterior odds of other names in the place of one of a set, the likeliest first."""
@@ -296,7 +295,7 @@ class _Search:
             self.rescore(around, noise)
         ordered = self.ordered()
         ranked = main.ways[main.scatters.index(ordered[0].scatter)]
-        return Posterior(tuple(ordered), weigh(ordered, ranked), ordered[0].scatter)
+        return Posterior(tuple(ordered), weigh(ordered, ranked))
 
     def leading(self) -> list[Scored]:
         """The likeliest set, and the likeliest of names alone if it is not far behind."""
@@ -360,17 +359,6 @@ class _Search:
         )
         return max(ways, key=lambda known: known.evidence)
 
-    def likeliest_scatter(
-        self, around: Simulated, fitted: FittedModel, noise: Noise, terms: Set = ()
-    ) -> float:
-        """Scatter of the gains beside a fit."""
-
-        def nats(scatter: float) -> float:
-            known = Known(around, fitted, self.base, noise, terms, scatter=scatter, loose=True)
-            return known.evidence
-
-        return max(_SCATTERS, key=nats)
-
     def fit(
         self, terms: Set, data: Data | None = None, noise: Noise | None = None,
         warm_start: FittedModel | None = None,
@@ -386,8 +374,8 @@ class _Search:
 
     def view(self, base: FittedModel, noise: Noise) -> _View:
         """Sets of terms by a linearisation around a base model."""
-        around = self.around(base)
-        likeliest = self.likeliest_scatter(around, base, noise)
+        around, self.scatters = self.around(base), _SCATTERS
+        likeliest = self.known(around, base, noise, loose=True).scatter
         self.scatters = tuple(sorted({min(SCATTER, likeliest), likeliest}))
         for _ in range(2):
             noise = self.known(around, base, noise, loose=True).left

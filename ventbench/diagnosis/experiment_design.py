@@ -69,14 +69,10 @@ def request_breaths(
     if not alternatives:
         return None
     data = chosen.problem.data
-    best: _Design | None = None
-    for label in np.unique(data.lung):
-        recorded_rows = np.flatnonzero((data.lung == label) & (data.weight[:, 0].any(axis=1)))
-        if not recorded_rows.size:
-            continue
-        design = _best_on_lung(chosen, alternatives, noise, recorded_rows)
-        if design and (best is None or design.nats > best.nats):
-            best = design
+    recorded = data.weight[:, 0].any(axis=1)
+    lungs = (np.flatnonzero((data.lung == lung) & recorded) for lung in np.unique(data.lung))
+    designs = [_best_on_lung(chosen, alternatives, noise, rows) for rows in lungs if rows.size]
+    best = max(filter(None, designs), key=lambda design: design.nats, default=None)
     if best is None or best.nats < _LEAST:
         return None
     return _worded(best, (chosen, *alternatives), float(np.median(data.dt)))
@@ -201,8 +197,7 @@ class _Design:
     """Breaths of one or two families on one lung, with what they are expected to give."""
 
     nats: float
-    families: tuple[Family, ...]
-    members: tuple[tuple[int, ...], ...]
+    picks: list[tuple[Family, list[int]]]  #: families, and which of their breaths.
     lung: Lung
 
 
@@ -235,28 +230,27 @@ def _best_on_lung(
         )
     ]
     lung = Lung(float(problem.data.R[recorded_rows[0]]), float(problem.data.C[recorded_rows[0]]))
-    return _best(kinds, pairs, _BREATHS, lung)
+    return _best(kinds, pairs, lung)
 
 
-def _best(
-    kinds: tuple[Family, ...], pairs: Sequence[Contrast], breaths: int, lung: Lung
-) -> _Design | None:
+def _best(kinds: tuple[Family, ...], pairs: Sequence[Contrast], lung: Lung) -> _Design:
     """The family or mix of two whose smallest nats are the largest."""
     ends = np.cumsum([len(kind.u_in) for kind in kinds])
     firsts = ends - [len(kind.u_in) for kind in kinds]
-    sets = [(i,) for i in range(len(kinds))] + list(combinations(range(len(kinds)), 2))
-    best = None
-    for chosen in sets:
-        counts = [breaths] if len(chosen) == 1 else [breaths - breaths // 2, breaths // 2]
-        members = tuple(
-            tuple(np.linspace(0, len(kinds[i].u_in) - 1, count).round().astype(int).tolist())
+
+    def design(*chosen: int) -> _Design:
+        counts = [_BREATHS] if len(chosen) == 1 else [_BREATHS - _BREATHS // 2, _BREATHS // 2]
+        members = [
+            np.linspace(0, len(kinds[i].u_in) - 1, count).round().astype(int)
             for i, count in zip(chosen, counts, strict=True)
-        )
-        which = [firsts[i] + np.array(m, int) for i, m in zip(chosen, members, strict=True)]
-        nats = min(pair.nats(np.concatenate(which)) for pair in pairs)
-        if best is None or nats > best.nats:
-            best = _Design(nats, tuple(kinds[i] for i in chosen), members, lung)
-    return best
+        ]
+        which = np.concatenate([firsts[i] + m for i, m in zip(chosen, members, strict=True)])
+        picks = [(kinds[i], m.tolist()) for i, m in zip(chosen, members, strict=True)]
+        return _Design(min(pair.nats(which) for pair in pairs), picks, lung)
+
+    one = [design(i) for i in range(len(kinds))]
+    two = [design(*both) for both in combinations(range(len(kinds)), 2)]
+    return max([*one, *two], key=lambda design: design.nats)
 
 
 def _safe(
@@ -301,13 +295,9 @@ def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.int
 
 
 def _worded(design: _Design, hypotheses: Sequence[Fitted], dt: float) -> BreathRequest:
-    parts = [
-        f"{len(members)} x {kind.title}"
-        for kind, members in zip(design.families, design.members, strict=True)
-    ]
-    pairs = list(zip(design.families, design.members, strict=True))
-    u_in = np.concatenate([kind.u_in[list(members)] for kind, members in pairs])
-    u_out = np.concatenate([kind.u_out[list(members)] for kind, members in pairs])
+    parts = [f"{len(members)} x {kind.title}" for kind, members in design.picks]
+    u_in = np.concatenate([kind.u_in[members] for kind, members in design.picks])
+    u_out = np.concatenate([kind.u_out[members] for kind, members in design.picks])
     acts = [set(hypothesis.names) for hypothesis in hypotheses]
     common = acts[0].intersection(*acts[1:])
     names = [" + ".join(sorted(own - common)) or "no further mechanism" for own in acts]
@@ -331,18 +321,17 @@ class Rig:
 class Family:
     """k breaths of one kind."""
 
-    name: str  #: short.
     title: str  #: what to do on the rig, in words.
     u_in: Floats  #: commands of the inspiratory valve, %, ``(k, T)``.
     u_out: Floats  #: commands of the expiratory valve, 0/1, ``(k, T)``.
 
     def scaled(self, by: Floats) -> Family:
         """Return the family with each inspiration scaled by a factor, ``(k,)``."""
-        return Family(self.name, self.title, self.u_in * by[:, None], self.u_out)
+        return Family(self.title, self.u_in * by[:, None], self.u_out)
 
     def select(self, which: Bools) -> Family:
         """Return some of the breaths, by mask ``(k,)``."""
-        return Family(self.name, self.title, self.u_in[which], self.u_out[which])
+        return Family(self.title, self.u_in[which], self.u_out[which])
 
 
 #: Makes commands ``u_in`` (of any size) and ``u_out``, ``(k, T)``, and peak pressures, cmH2O,
@@ -361,9 +350,9 @@ def families(rig: Rig, samples: int, dt: float) -> tuple[Family, ...]:
     times = np.arange(samples, dtype=np.float64) * dt
     t = np.broadcast_to(times, (_VARIANTS, samples))
     made = []
-    for name, title, shape in _KINDS:
+    for title, shape in _KINDS:
         u_in, u_out, peaks = shape(rig, t)
-        made.append(Family(name, title, _sized(rig, dt, u_in, peaks), u_out))
+        made.append(Family(title, _sized(rig, dt, u_in, peaks), u_out))
     return tuple(made)
 
 
@@ -439,12 +428,12 @@ def _shutters(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 _KINDS = (
-    ("pressure_steps", "raise the pressure in one step and let it settle", _pressure_steps),
-    ("strong_pulses", "pulse the inspiratory valve at random, strongly", _pulses(30.0, 1)),
-    ("gentle_pulses", "pulse the inspiratory valve at random, gently", _pulses(16.0, 2)),
-    ("hold", "inflate fast, then hold 2 s with both valves shut, then exhale", _hold),
-    ("ramp", "open the inspiratory valve slowly and steadily", _ramp),
-    ("staircase", "move the inspiratory valve in small steps, up and down", _staircase),
-    ("long_expiration", "inflate fast, then exhale for a long time", _long_expiration),
-    ("shutters", "inflate fast, then open and shut the expiratory valve in turn", _shutters),
+    ("raise the pressure in one step and let it settle", _pressure_steps),
+    ("pulse the inspiratory valve at random, strongly", _pulses(30.0, 1)),
+    ("pulse the inspiratory valve at random, gently", _pulses(16.0, 2)),
+    ("inflate fast, then hold 2 s with both valves shut, then exhale", _hold),
+    ("open the inspiratory valve slowly and steadily", _ramp),
+    ("move the inspiratory valve in small steps, up and down", _staircase),
+    ("inflate fast, then exhale for a long time", _long_expiration),
+    ("inflate fast, then open and shut the expiratory valve in turn", _shutters),
 )

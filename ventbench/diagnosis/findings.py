@@ -18,7 +18,7 @@ from ventbench.task.interfaces import Plant
 Verdict = Literal["named", "nothing_missing", "unnamed"]
 
 #: A simulator as given, with R, C, R_ex and PEEP refitted, and corrected.
-Stage = Literal["before", "refit", "after", "rigs"]
+Stage = Literal["before", "refit", "after"]
 
 
 #: What may have an order in time: the valve's gain, the zero of the pressure, the errors' size.
@@ -157,8 +157,8 @@ class Traces:
     before: Floats  #: pressure of the simulator as given, cmH2O.
     refit: Floats  #: pressure with R, C, R_ex and PEEP refitted, cmH2O.
     after: Floats  #: pressure of the corrected simulator, cmH2O.
-    flow: Floats | None = None  #: flow of the refitted simulator into the lung, mL/s, or None.
-    volume: Floats | None = None  #: volume of the refitted simulator, mL, or None.
+    flow: Floats  #: flow of the refitted simulator into the lung, mL/s.
+    volume: Floats  #: volume of the refitted simulator, mL.
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,16 +183,6 @@ class BreathRequest:
         columns = zip(number, time, self.u_in.ravel(), self.u_out.ravel(), strict=True)
         rows = [f"{k},{t:.6f},{u:.4f},{int(o)}" for k, t, u, o in columns]
         return "\n".join(["breath_id,time_step,u_in,u_out", *rows]) + "\n"
-
-
-@dataclass(frozen=True)
-class RigParameters:
-    """Parameters of one rig of the recording."""
-
-    lung: str  #: label of its lung.
-    rig: int  #: number of the rig.
-    breaths: tuple[int, ...]  #: ids of its breaths that were fitted.
-    parameters: dict[str, float]  #: by path, such as ``R`` or ``sensor_lag.tau``.
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,9 +215,8 @@ class Findings:
     #: ids of the breaths by use: ``training``, ``testing`` and ``judging``; few breaths of a lung
     #: have both of the last two uses.
     split: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    #: what the corrected simulator of each lung is, by label: the simulator as given, refitted,
-    #: corrected, or corrected with strengths of each rig, whichever errs least on the judging
-    #: breaths.
+    #: what the corrected simulator of each lung is, by label: the simulator as given, refitted or
+    #: corrected, whichever errs least on the judging breaths.
     chosen: dict[str, Stage] = field(default_factory=dict)
     #: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths have the
     #: same gain.
@@ -235,8 +224,6 @@ class Findings:
     #: if nothing is missing: smallest strength of each mechanism that would have been seen, in the
     #: unit of the strength, by name; infinite if none would.
     detection_limits: dict[str, float] = field(default_factory=dict)
-    #: parameters of each rig where the correction has them; empty otherwise.
-    rigs: tuple[RigParameters, ...] = ()
     #: what changes in the course of the recording and is in no model.
     changes: tuple[Change, ...] = ()
     #: reading at which the pressure sensor saturates, cmH2O, and share of the readings that do,

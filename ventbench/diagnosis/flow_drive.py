@@ -14,22 +14,13 @@ import numpy as np
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.diagnosis.settings import SelectionConfig
-from ventbench.physics.catalogue import basis_terms, parameter
+from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 
-#: Mechanisms of the ventilator's side, on which a prescribed flow has no bearing.
-VENTILATOR_SIDE = (
-    "valve_delay", "valve_lag", "valve_dead_band", "valve_curve", "valve_hysteresis",
-    "command_rounding", "supply_droop", "supply_pressure", "exhalation_valve_delay", "gain_step",
-    "gain_drift", "clock_offset", "clock_skew",
-)  # fmt: skip
-
-#: Nonparametric terms of the ventilator's side.
-_VENTILATOR_TERMS = frozenset(
-    {"valve_shape", "command_memory", "command_plays", "supply_memory",
-     "outlet_shape", "outlet_memory"}
-)  # fmt: skip
+#: Parts of the ventilator, on which a prescribed flow has no bearing; and clocks of the commands.
+_VENTILATOR = ("command", "inspiratory valve", "supply", "expiratory valve")
+_CLOCKS = ("clock_offset", "clock_skew")
 
 #: Interval of the readings that are used, s, as far as whole samples allow, and most readings of a
 #: breath.
@@ -162,10 +153,19 @@ def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: 
     )
 
 
+def ventilator_side() -> tuple[str, ...]:
+    """Mechanisms of the ventilator's side, of which nothing can be said."""
+    return (*filter(_is_of_ventilator, library()), *_CLOCKS)
+
+
+def _is_of_ventilator(name: str) -> bool:
+    return mechanism(name).description.site in _VENTILATOR
+
+
 def without_ventilator(settings: SelectionConfig) -> SelectionConfig:
     """Settings whose nonparametric terms are those of the lung's side."""
     chosen = settings.search.nonparametric_terms
-    terms = tuple(t for t in (chosen or basis_terms()) if t not in _VENTILATOR_TERMS)
+    terms = tuple(t for t in (chosen or basis_terms()) if not _is_of_ventilator(t))
     return replace(settings, search=replace(settings.search, nonparametric_terms=terms))
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.acceptance import excludes_neutral, is_weak
 from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name, without_term
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator, make_problem
 from ventbench.diagnosis.hypothesis import (
@@ -25,6 +24,7 @@ from ventbench.diagnosis.hypothesis import (
     varies_by_breath,
 )
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
+from ventbench.diagnosis.validation import excludes_neutral, is_weak
 from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths

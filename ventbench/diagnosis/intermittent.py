@@ -28,19 +28,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats
-from ventbench.diagnosis.adequacy import order_p_value
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.evidence import COMMANDS, told_posterior
 from ventbench.diagnosis.findings import MissingMechanism
-from ventbench.diagnosis.hypothesis import (
-    FittedModel,
-    Hypothesis,
-    Partition,
-    linearise,
-)
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
 from ventbench.diagnosis.identification import IdentifiedModel, held_out
 from ventbench.diagnosis.in_time import Paths, follow
 from ventbench.diagnosis.settings import SelectionConfig
+from ventbench.diagnosis.validation import order_p_value
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism
 from ventbench.plants.simulators import Simulators
@@ -262,9 +257,8 @@ def _paths(
     problem, x = _from_first_readings(evaluator, fitted, partition)
     for _ in range(2):  # the start is that of a breath with the commands that reached the valve
         paths = follow(problem, x, partition, share, lag or None)
-        x = evaluator.refit_breath_parameters(fitted, _with_commands(evaluator, partition, paths))[
-            1
-        ]
+        reached = _with_commands(evaluator, partition, paths)
+        x = evaluator.refit_breath_parameters(fitted, reached)[1]
     return paths
 
 
@@ -305,10 +299,8 @@ def _everywhere(found: _Found, data: Data) -> tuple[Bools, Floats | None, dict[s
         return acts, None, {}
     some = evaluator.partition(data.select(acts))
     fine = _Evidence.of(evaluator, found.fitted, some, name, tuple(centre * _MULTIPLES))
-    logs, each = (
-        np.log(centre * _MULTIPLES),
-        np.logaddexp.reduce(fine.nats, axis=1),
-    )  # whatever its course
+    logs = np.log(centre * _MULTIPLES)
+    each = np.logaddexp.reduce(fine.nats, axis=1)  # whatever its course
     weights = np.exp(each - np.logaddexp.reduce(each, axis=0))  # (s, k)
     own = logs @ weights
     step = logs[1] - logs[0]
@@ -340,7 +332,7 @@ class _Evidence:
         problem, x = _from_first_readings(evaluator, fitted, partition)
         linear = linearise(problem, x, clip=np.inf)
         strength, *others = mechanism(name).description.parameters
-        strengths = strengths or strength.screening_strengths()
+        strengths = strengths or strength.scan
         names, grids = [p.name for p in others if p.grid], [p.grid for p in others if p.grid]
         columns = [partition.predictor.names.index(f"{name}.{p}") for p in names]
         own = partition.predictor.names.index(f"{name}.{strength.name}")

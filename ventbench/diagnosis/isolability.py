@@ -22,7 +22,7 @@ from ventbench.base.errors import InputError, InputTypeError
 from ventbench.diagnosis.experiment_design import Rig, families
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
-from ventbench.physics.parameters import REFITTED
+from ventbench.physics.mechanism import REFITTED
 from ventbench.recordings.breaths import Breaths
 from ventbench.simulation import Controls, read_controls
 from ventbench.system_id import START, Data, Noise, Predictor, parameter_values

@@ -14,7 +14,7 @@ from scipy import linalg, special
 from ventbench.base.arrays import Floats
 from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.physics.catalogue import library, mechanism, strength_path
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.mechanism import Parameter
 from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import parameter_of

@@ -5,16 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from ventbench.diagnosis.findings import ErrorRegion
-from ventbench.diagnosis.residual_axes import EDGE
-from ventbench.mechanics.labels import (
-    APPARATUS,
-    GAIN,
-    TOLERANCE_C,
-    TOLERANCE_R,
-    Estimate,
-    LungMatch,
-)
+from ventbench.diagnosis.residual_analysis import EDGE
+from ventbench.mechanics.labels import GAIN, Estimate, LungMatch, tolerance_text
 from ventbench.physics import parameter
 
 #: Axes whose ranges are parts of a breath: an effect is described best by these.
@@ -72,6 +67,11 @@ def rounded(value: float, places: int) -> str:
     return text.removeprefix("-") if float(text) == 0 else text
 
 
+def capital(text: str) -> str:
+    """The text with a capital at its start."""
+    return text[:1].upper() + text[1:]
+
+
 def probability(p_value: float) -> str:
     """A p-value as it is written in text."""
     return "p < 0.01" if p_value < 0.01 else f"p = {p_value:.2f}"
@@ -114,8 +114,7 @@ def error_region(region: ErrorRegion, noise: float = 0.0) -> str:
         region: the range to describe.
         noise: standard deviation of the measurement, cmH2O; far smaller errors have no sign.
     """
-    text = error_phrase(region, noise)
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{capital(error_phrase(region, noise))}."
 
 
 def error_phrase(region: ErrorRegion, noise: float) -> str:
@@ -154,13 +153,8 @@ def _time(seconds: float) -> str:
 
 def breaths_in_words(ids: Sequence[int]) -> str:
     """Ids of breaths in words; those that follow each other as a range."""
-    runs: list[list[int]] = []
-    for number in ids:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1] = [runs[-1][0], number]
-        else:
-            runs.append([number])
-    shown = [" to ".join(map(str, run)) for run in runs]
+    parts = np.split(np.asarray(ids), np.flatnonzero(np.diff(ids) != 1) + 1)
+    shown = [" to ".join(map(str, dict.fromkeys((part[0], part[-1])))) for part in parts]
     if len(shown) > _LISTED:
         shown = [*shown[: _LISTED - 1], f"others up to {ids[-1]}"]
     text = " and ".join(filter(None, [", ".join(shown[:-1]), *shown[-1:]]))
@@ -183,10 +177,7 @@ def lung(match: LungMatch) -> str:
     gain = ""
     if match.source == "pressure":
         gain = f", and a valve gain wrong by {100 * (GAIN - 1):.0f} %"
-    tolerance = (
-        f"tolerance: R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, "
-        f"C by a factor of {TOLERANCE_C:g}{gain}"
-    )
+    tolerance = f"tolerance: {tolerance_text()}{gain}"
     others = [name for name in match.settings if name != match.label][:2]
     if match.label_matches:
         also = f" Within the same tolerance it could be {' or '.join(others)}." if others else ""

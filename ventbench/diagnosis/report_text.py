@@ -15,6 +15,7 @@ from ventbench.diagnosis.findings import (
 from ventbench.diagnosis.number_text import (
     PHASES,
     breaths_in_words,
+    capital,
     error_phrase,
     error_region,
     lung,
@@ -397,7 +398,7 @@ def missing_mechanism(missing: MissingMechanism) -> str:
         meaning = meanings.get(name, name)
         # "Dead time" need not be said twice.
         values.append(text if meaning in about.title else f"{text} ({meaning})")
-    start = _capital(about.title)
+    start = capital(about.title)
     if missing.changed and not missing.simulator_values:
         start += ", which the simulator has with another strength"
     preferred = f"preferred over other names: {100 * missing.confidence:.0f} %"
@@ -518,7 +519,3 @@ def _listed(names: Sequence[str], word: str = "and") -> str:
     if len(names) < 2:
         return "".join(names)
     return f"{', '.join(names[:-1])} {word} {names[-1]}"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -1,4 +1,4 @@
-"""Open-loop errors of a simulator: how large they are, and where they lie, with p-values.
+"""Where a simulator errs: ranges of phase, command, pressure and others, with p-values.
 
 Breaths are the independent unit of the tests, since the samples of one breath share its noise.
 Under the null hypothesis the errors of a breath are as likely with the opposite sign, in all ranges
@@ -8,29 +8,35 @@ makes it (Westfall and Young, Resampling-Based Multiple Testing, 1993).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
-from ventbench.diagnosis.findings import ErrorRegion, OpenLoopComparison, OpenLoopError
-from ventbench.diagnosis.residual_axes import EDGE_SIZE, Axis, axes
-from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings, ResidualSettings
+from ventbench.diagnosis.findings import ErrorRegion
+from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 
-#: Length of what is reported as the beginning of inspiration, s.
-_BEGINNING = 0.2
+#: Share of the extreme values at either end that the ranges of a quantity need not hold.
+_EXTREME = 0.005
 
-#: Share of the breaths, those that err most, without which it is asked whether more than noise is
-#: left: a wrong first reading puts a whole breath off, since every simulation starts there.
-_SET_ASIDE = 0.1
+#: Width of the ranges of time in a phase, s; about how many ranges flow, volume and pressure are
+#: divided into; parts that the recording is divided into.
+_PHASE_STEP, _RANGES, _COUNT = 0.1, 10, 5
 
-#: Time after the start of expiration from which little moves, s; fewest quiet samples of a breath
-#: that show the sensor's scatter; times that scatter that the noise may have (it is coloured, and a
-#: converter rounds a quiet signal more than a moving one); least scatter, cmH2O.
-_QUIET_AFTER, _QUIET_SAMPLES, _QUIET_FACTOR, _LEAST_NOISE = 0.6, 10, 3.0, 0.05
+#: Ends of the ranges of the inspiratory valve's command, %, and of the time since an edge, s.
+_OPENINGS = np.array(
+    [0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0]
+)
+_EDGE_TIMES = np.array([0.0, 0.035, 0.07, 0.105, 0.15, 0.2, 0.3, 0.5, 1.0, 3.0])
+
+#: Change of the inspiratory valve's command that is an edge, percentage points.
+EDGE_SIZE = 5.0
+
+#: Axis of the time since a valve's edge.
+EDGE = "time since a valve edge"
 
 #: Share of the chance of any range that the test of the mean gets; the test of the square, whose
 #: differences are skewed, errs less often than it may.
@@ -39,6 +45,21 @@ _MEAN_SHARE = 0.8
 #: Excess of the squared error that is reported, as a share of the noise's variance: noise that
 #: differs a little from range to range is no missing physics.
 MIN_EXCESS = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """k neighbouring ranges of one quantity, and the range in which each sample lies."""
+
+    name: str  #: name of the quantity, such as ``time since inspiration``.
+    unit: str  #: unit of ``edges``.
+    edges: Floats  #: ends of the ranges, ``(k + 1,)``.
+    bins: Ints  #: index of the range of each sample, -1 for none, ``(n, T)``.
+    merge: bool = True  #: whether neighbouring ranges may be merged.
+
+    def __len__(self) -> int:
+        """Number of ranges k."""
+        return len(self.edges) - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,154 +72,15 @@ class Profile:
     breaths: Ints  #: number of breaths with samples in the range, ``(k,)``.
 
 
-def open_loop_error(recorded: Floats, simulated: Floats, mask: Bools) -> OpenLoopError:
-    """Error over the samples of a mask, all ``(n, T)``; NaN if there is none."""
-    error = (simulated - recorded)[mask & np.isfinite(recorded) & np.isfinite(simulated)]
-    if error.size == 0:
-        return OpenLoopError(float("nan"), float("nan"))
-    return OpenLoopError(float(np.mean(np.abs(error))), float(np.sqrt(np.mean(error**2))))
-
-
-def compare_open_loop(
-    breaths: Breaths,
-    held_out: Bools,
-    pressures: dict[str, Floats],
-    noise_floor: float,
-    scatter_error: Floats | None = None,
-    sensor: float = float("nan"),
-) -> OpenLoopComparison:
-    """Open-loop errors of a simulator before and after its correction.
-
-    Args:
-        breaths: n recorded breaths of T samples.
-        held_out: breaths that no fit has seen, ``(n,)``.
-        pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
-            T)``.
-        noise_floor: standard deviation of the noise, cmH2O.
-        scatter_error: standard deviation of the pressure because gains or efforts differ from
-            breath to breath, cmH2O, ``(n, T)``; None if nothing does.
-        sensor: that of :func:`sensor_noise`.
-    """
-    # The first sample is where every simulation starts.
-    inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
-
-    def by_stage(mask: Bools) -> dict[str, OpenLoopError]:
-        return {
-            stage: open_loop_error(breaths.pressure, simulated, mask)
-            for stage, simulated in pressures.items()
-        }
-
-    whole = by_stage(inspiration)
-    parts = {
-        f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
-        "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
-        "expiration": (breaths.u_out == 1) & breaths.valid & held_out[:, None],
-    }
-    lungs = breaths.by_lung_index
-    if len(lungs) > 1:
-        for name, index in lungs.items():
-            of_lung = np.zeros(len(breaths), bool)
-            of_lung[index] = True
-            parts[f"lung {name}"] = inspiration & of_lung[:, None]
-    ids = tuple(int(i) for i in breaths.breath_id[held_out])
-    groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
-    scatter = 0.0
-    if scatter_error is not None:
-        scatter = float(np.sqrt(np.mean(scatter_error[inspiration] ** 2)))
-    error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
-    usual = _usual_error(error)
-    return OpenLoopComparison(
-        ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups, scatter, usual,
-        sensor,
-    )  # fmt: skip
-
-
-def _usual_error(error: Floats) -> float:
-    """Root mean square of errors ``(n, T)`` without the breaths that err most."""
-    squares, counts = np.nansum(error**2, axis=1), np.isfinite(error).sum(axis=1)
-    order = np.argsort(squares / np.maximum(counts, 1))
-    kept = order[: len(order) - math.ceil(_SET_ASIDE * len(order))] if len(order) > 2 else order
-    total = counts[kept].sum()
-    return float(np.sqrt(squares[kept].sum() / total)) if total else float("nan")
-
-
-def is_unexplained(
-    errors: OpenLoopComparison, settings: CorrectionSettings = DEFAULT.correction
-) -> bool:
-    """Whether the corrected simulator errs far more than the measurement and gains scatter."""
-    return bool(
-        min(errors.after.rmse, errors.usual) > settings.unexplained_ratio * errors.least_error
-        and errors.unexplained > settings.unexplained_error
-    )
-
-
-def sensor_noise(breaths: Breaths) -> float:
-    """Standard deviation of the sensor, cmH2O, by quiet readings alone; NaN if nothing is quiet.
-
-    Late in an expiration hardly anything moves, so that the scatter about a parabola shows the
-    sensor. A converter hides the scatter of a quiet signal; its step's own scatter is a floor.
-    """
-    late = (breaths.u_out == 1) & breaths.valid & np.isfinite(breaths.pressure)
-    scatter = []
-    for time, pressure, u_in, use in zip(
-        breaths.time, breaths.pressure, breaths.u_in, late, strict=True
-    ):
-        if use.sum() < _QUIET_SAMPLES:
-            continue
-        use = use & (time > time[use][0] + _QUIET_AFTER)
-        use &= np.abs(u_in - np.median(u_in[use]) if use.any() else u_in) < EDGE_SIZE
-        if use.sum() >= _QUIET_SAMPLES:
-            left = pressure[use] - np.polyval(np.polyfit(time[use], pressure[use], 2), time[use])
-            scatter.append(1.4826 * np.median(np.abs(left)))
-    if not scatter:
-        return float("nan")
-    step = np.diff(np.unique(breaths.pressure[late])).min(initial=np.inf) / np.sqrt(12.0)
-    return max(float(np.median(scatter)), float(step), _LEAST_NOISE)
-
-
-def noise_floor(noise_sd: float, sensor: float) -> float:
-    """Standard deviation of the measurement, cmH2O, which no simulator can beat.
-
-    The noise of a model that fits badly contains the model's own slow errors; the floor is never
-    more than a few times the scatter of the sensor.
-
-    Args:
-        noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
-        sensor: that of :func:`sensor_noise`; NaN if unknown.
-    """
-    return float(np.fmin(noise_sd, _QUIET_FACTOR * sensor))
-
-
-def flow_and_volume(breaths: Breaths, fit: Fit, pressure: Floats) -> tuple[Floats, Floats]:
-    """Flow into the lung, mL/s, and volume above that of the first sample, mL, both ``(n, T)``.
-
-    The flow is that of the inspiratory valve of the base model, minus what leaves through the
-    expiratory valve at the simulated pressure. Each sample has what flowed just before it.
-
-    Args:
-        breaths: n breaths.
-        fit: gives the gain of the valve, expiratory resistance and PEEP.
-        pressure: simulated, cmH2O, ``(n, T)``.
-    """
-    gain, out, peep = (float(np.median(fit.column(name))) for name in ("gain", "R_ex", "PEEP"))
-    flow = np.zeros_like(pressure)
-    vented = np.maximum(pressure[:, 1:] - peep, 0.0) / out * 1e3
-    flow[:, 1:] = gain * breaths.u_in[:, :-1] - np.where(breaths.u_out[:, :-1] == 1, vented, 0.0)
-    volume = np.zeros_like(flow)
-    volume[:, 1:] = np.cumsum(np.nan_to_num(flow[:, 1:]) * breaths.dt[:, :-1], axis=1)
-    return flow, volume
-
-
 def locate(
     breaths: Breaths,
     refit: Floats,
     noise_sd: float,
-    flow: Floats | None = None,
-    volume: Floats | None = None,
+    flow: Floats,
+    volume: Floats,
     *,
     settings: ResidualSettings = DEFAULT.residuals,
     least: float = 0.0,
-    seed: int = 0,
 ) -> tuple[ErrorRegion, ...]:
     """Find the ranges of phase, command, pressure and other quantities in which a simulator errs.
 
@@ -210,28 +92,25 @@ def locate(
     Args:
         breaths: n breaths of T samples.
         refit: pressure of the refitted simulator, cmH2O, ``(n, T)``.
-        noise_sd: standard deviation of the measurement, cmH2O; NaN to take it from the errors.
-        flow: flow of the refitted simulator, mL/s, ``(n, T)``, or None.
-        volume: volume of the refitted simulator, mL, ``(n, T)``, or None.
+        noise_sd: standard deviation of the measurement, cmH2O.
+        flow: flow of the refitted simulator, mL/s, ``(n, T)``.
+        volume: volume of the refitted simulator, mL, ``(n, T)``.
         settings: ranges and levels.
         least: root-mean-square error, cmH2O, that a mean error must add to the noise.
-        seed: seed of the random sign flips.
 
     Returns:
         Regions; first those with a p-value of at most ``settings.certain``, each group by its share
         of the error. Neighbouring ranges with errors of one sign are merged.
     """
     error, usable = errors(breaths, refit)
-    all_axes = axes(breaths, refit, flow, volume)
-    if len(breaths) < settings.min_breaths or not all_axes or not usable.any():
+    if len(breaths) < settings.min_breaths or not usable.any():
         return ()
+    all_axes = axes(breaths, refit, flow, volume)
     columns = [_test_columns(axis, error, usable) for axis in all_axes]
     mean, excess, outside = (np.concatenate(part, axis=1) for part in zip(*columns, strict=True))
-    variance = _noise_variance(noise_sd, error, usable)
-    by_mean = p_values(mean, two_sided=True, seed=seed, settings=settings)
-    by_square = p_values(
-        excess, two_sided=False, seed=seed + 1, weight=outside[0], settings=settings
-    )
+    variance = noise_sd**2
+    by_mean = p_values(mean, two_sided=True, seed=0, settings=settings)
+    by_square = p_values(excess, two_sided=False, seed=1, weight=outside[0], settings=settings)
     with np.errstate(invalid="ignore"):
         is_material = _nanmean(excess) > MIN_EXCESS * variance
         by_square = np.where(is_material, by_square, 1.0)
@@ -271,8 +150,8 @@ def locate(
 def profiles(
     breaths: Breaths,
     refit: Floats,
-    flow: Floats | None = None,
-    volume: Floats | None = None,
+    flow: Floats,
+    volume: Floats,
     *,
     simulated: Floats | None = None,
 ) -> tuple[Profile, ...]:
@@ -427,14 +306,6 @@ def _nanmean(values: Floats) -> Floats:
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 
-def _noise_variance(noise_sd: float, error: Floats, usable: Bools) -> float:
-    """Variance of the noise; if not given, the median of the samples' mean squares over breaths."""
-    if np.isfinite(noise_sd) and noise_sd > 0:
-        return float(noise_sd) ** 2
-    count = usable.sum(axis=0)
-    return float(np.median((error**2).sum(axis=0)[count > 0] / count[count > 0]))
-
-
 def _runs(significant: Bools, sign: Floats, merge: bool) -> list[tuple[int, int]]:
     """First and last index of runs of neighbours with one sign."""
     runs: list[tuple[int, int]] = []
@@ -449,3 +320,133 @@ def _runs(significant: Bools, sign: Floats, merge: bool) -> list[tuple[int, int]
 def _is_whole_axis(axis: Axis, usable: Bools, first: int, last: int) -> bool:
     used = axis.bins[usable & (axis.bins >= 0)]
     return bool(used.size) and first <= used.min() and last >= used.max()
+
+
+def axes(breaths: Breaths, pressure: Floats, flow: Floats, volume: Floats) -> tuple[Axis, ...]:
+    """All axes of a recording.
+
+    A sample is assigned to the phase, command and edge that acted before it, because these caused
+    it. Pressure, flow and volume are those of the simulator: sorted by the recorded values, noise
+    alone would have a mean error in the outermost ranges.
+
+    Args:
+        breaths: n breaths of T samples.
+        pressure: simulated, cmH2O, ``(n, T)``.
+        flow: simulated, into the lung, mL/s, ``(n, T)``.
+        volume: simulated, mL, ``(n, T)``.
+    """
+    acted = before(np.asarray(breaths.u_out)) == 0
+    start = np.where(acted & breaths.valid, breaths.time, np.inf).min(axis=1, keepdims=True)
+    # The first sample of expiration is still the end of inspiration.
+    opened = np.where(
+        (breaths.u_out == 1) & (breaths.time >= start) & breaths.valid, breaths.time, np.inf
+    ).min(axis=1, keepdims=True)
+    # A breath without the phase has no time in it.
+    start, opened = (np.where(np.isfinite(time), time, np.nan) for time in (start, opened))
+    u_in = before(breaths.u_in)
+
+    def edges(values: Floats) -> Floats:
+        return round_edges(values, breaths.valid)
+
+    return (
+        _phase("time since inspiration", breaths.time - start, acted & breaths.valid),
+        _phase("time since expiration", breaths.time - opened, ~acted & breaths.valid),
+        _axis("valve opening", "%", _OPENINGS, u_in, acted),
+        _axis(EDGE, "s", _EDGE_TIMES, since_edge(breaths)),
+        _axis("pressure", "cmH2O", edges(pressure), pressure),
+        _axis("flow", "mL/s", edges(flow), flow),
+        _axis("volume", "mL", edges(volume), volume),
+        *_parts(breaths),
+        *_lungs(breaths),
+    )
+
+
+def before(values: NDArray) -> NDArray:
+    """Value that acted on each sample: that of the sample before, ``(n, T)``.
+
+    The first sample has its own value.
+    """
+    return np.concatenate([values[:, :1], values[:, :-1]], axis=1)
+
+
+def since_edge(breaths: Breaths) -> Floats:
+    """Time since either valve's last edge before each sample, s; NaN before any, ``(n, T)``."""
+    u_in, u_out = breaths.u_in, np.asarray(breaths.u_out, float)
+    is_edge = np.zeros(u_in.shape, bool)
+    is_edge[:, 0] = u_in[:, 0] > EDGE_SIZE  # a breath begins with the valve shut
+    is_edge[:, 1:] = (np.abs(np.diff(u_in)) > EDGE_SIZE) | (np.diff(u_out) != 0)
+    at = np.maximum.accumulate(np.where(is_edge, breaths.time, -np.inf), axis=1)
+    earlier = np.concatenate([np.full((len(at), 1), -np.inf), at[:, :-1]], axis=1)
+    return np.where(np.isfinite(earlier), breaths.time - earlier, np.nan)
+
+
+def round_edges(values: Floats, valid: Bools) -> Floats:
+    """Ends of about ten ranges at round numbers, without the most extreme values."""
+    inside = values[valid & np.isfinite(values)]
+    if inside.size == 0:
+        return np.array([0.0, 1.0])
+    low, high = np.quantile(inside, [_EXTREME, 1.0 - _EXTREME])
+    wanted = max((high - low) / _RANGES, 1e-6)
+    scale = 10.0 ** np.floor(np.log10(wanted))
+    step = scale * next(x for x in (1.0, 2.0, 5.0, 10.0) if x * scale >= 0.999 * wanted)
+    first, last = np.floor(low / step), max(np.ceil(high / step), np.floor(low / step) + 1)
+    return np.round(step * np.arange(first, last + 1), 9)
+
+
+def _axis(name: str, unit: str, edges: Floats, values: Floats, inside: Bools | bool = True) -> Axis:
+    """Sort values into ranges; a value beyond the ends is in none."""
+    # Sums of times carry rounding errors.
+    bins = np.searchsorted(edges, values + 1e-9, side="right") - 1
+    with np.errstate(invalid="ignore"):
+        bins[np.abs(values - edges[-1]) < 1e-6] = len(edges) - 2
+        within = inside & np.isfinite(values) & (bins >= 0) & (bins < len(edges) - 1)
+    return Axis(name, unit, edges, np.where(within, bins, -1))
+
+
+def _phase(name: str, time: Floats, inside: Bools) -> Axis:
+    step = _PHASE_STEP
+    longest = np.max(time, initial=step, where=inside & np.isfinite(time))
+    edges = np.round(step * np.arange(np.ceil(longest / step - 1e-6) + 1), 6)
+    return _axis(name, "s", edges, time, inside)
+
+
+def _parts(breaths: Breaths) -> list[Axis]:
+    """Parts of the recording by the number of the breath."""
+    n, count = len(breaths), min(_COUNT, len(breaths))
+    cuts = np.round(np.linspace(0, n, count + 1))
+    number = np.repeat(np.arange(n)[:, None], breaths.time.shape[1], axis=1)
+    bins = np.where(breaths.valid, np.searchsorted(cuts, number, side="right") - 1, -1)
+    return [Axis("breath number", "1", cuts, bins)] if count > 1 else []
+
+
+def _lungs(breaths: Breaths) -> list[Axis]:
+    """One axis for each lung if there are several, over the whole breath."""
+    if len(breaths.by_lung_index) < 2:
+        return []
+    end = float(np.max(breaths.time, initial=0.0, where=breaths.valid))
+    lungs = []
+    for name in breaths.by_lung_index:
+        inside = (breaths.lung_ids == name)[:, None] & breaths.valid
+        bins = np.where(inside, 0, -1)
+        lungs.append(Axis(f"lung {name}", "s", np.array([0.0, end]), bins, merge=False))
+    return lungs
+
+
+def flow_and_volume(breaths: Breaths, fit: Fit, pressure: Floats) -> tuple[Floats, Floats]:
+    """Flow into the lung, mL/s, and volume above that of the first sample, mL, both ``(n, T)``.
+
+    The flow is that of the inspiratory valve of the base model, minus what leaves through the
+    expiratory valve at the simulated pressure. Each sample has what flowed just before it.
+
+    Args:
+        breaths: n breaths.
+        fit: gives the gain of the valve, expiratory resistance and PEEP.
+        pressure: simulated, cmH2O, ``(n, T)``.
+    """
+    gain, out, peep = (float(np.median(fit.column(name))) for name in ("gain", "R_ex", "PEEP"))
+    flow = np.zeros_like(pressure)
+    vented = np.maximum(pressure[:, 1:] - peep, 0.0) / out * 1e3
+    flow[:, 1:] = gain * breaths.u_in[:, :-1] - np.where(breaths.u_out[:, :-1] == 1, vented, 0.0)
+    volume = np.zeros_like(flow)
+    volume[:, 1:] = np.cumsum(np.nan_to_num(flow[:, 1:]) * breaths.dt[:, :-1], axis=1)
+    return flow, volume

@@ -1,4 +1,4 @@
-"""A diagnosis and what can be made of it: text, JSON, a table, a figure, files."""
+"""A diagnosis and what can be made of it: text, JSON, a table, files."""
 
 from __future__ import annotations
 
@@ -22,17 +22,12 @@ from ventbench.system_id.data import Floats
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
 #: Version of the layout of ``diagnosis.json``; keys are only ever added.
 FORMAT = "ventbench-diagnosis-1"
 
-
 #: File of the commands to record next.
 RECORD_NEXT = "record_next.csv"
-
-#: Pictures lie above the diagnosis; they are imported only when they are asked for.
-_VIEWS = "ventbench.pages.diagnosis"
 
 #: Columns of :meth:`Diagnosis.to_frame`.
 _COLUMNS = (
@@ -90,18 +85,6 @@ class Diagnosis(Findings):
         ]
         return pd.DataFrame(rows, columns=list(_COLUMNS))
 
-    def plot(self) -> Figure:
-        """Draw held-out breaths, and errors before and after the correction.
-
-        Returns:
-            A matplotlib figure, which a notebook shows and ``savefig`` writes.
-
-        Raises:
-            InputError: if the extra ``ventbench[view]`` is missing.
-        """
-        errors.require("matplotlib")
-        return import_module(f"{_VIEWS}.charts").figure(self)
-
     def save(self, folder: Path | str) -> list[Path]:
         """Write the diagnosis as JSON, a page and a rerun file, and what follows from it.
 
@@ -121,7 +104,9 @@ class Diagnosis(Findings):
             OSError: if a file cannot be written.
         """
         errors.require("jinja2", "rerun")
-        report, log = (import_module(f"{_VIEWS}.{name}") for name in ("report", "rerun_log"))
+        # Pictures lie above the diagnosis; they are imported only when they are asked for.
+        views = "ventbench.pages.diagnosis"
+        report, log = (import_module(f"{views}.{name}") for name in ("report", "rerun_log"))
         folder = Path(folder)
         plain, corrected = folder / "diagnosis.json", folder / "corrected.json"
         files.write_json(plain, self.as_dict())
@@ -190,7 +175,6 @@ class Diagnosis(Findings):
             "plant": self.simulator,
             "split": self.split,
             "chosen": self.chosen,
-            "rigs": [asdict(rig) for rig in self.rigs],
             "changes": [asdict(change) for change in self.changes],
             "saturated": None
             if self.saturated is None
@@ -205,7 +189,7 @@ class Diagnosis(Findings):
             "would_change": report_text.would_change(self),
             "notes": self.notes,
             "seconds": self.seconds,
-            "settings": self.settings.as_dict(),
+            "settings": asdict(self.settings),
             "format": FORMAT,
             "ventbench": VERSION,
         }

@@ -7,8 +7,7 @@ together is told in ``docs/missing_physics_method.md``.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 #: Raised when a value or the meaning of a setting changes.
 VERSION = "evidence-1"
@@ -169,7 +168,7 @@ class ResidualSettings:
 
 @dataclass(frozen=True)
 class SelectionConfig:
-    """All settings of a diagnosis; :meth:`as_dict` is part of ``diagnosis.json``."""
+    """All settings of a diagnosis, which are part of ``diagnosis.json``."""
 
     data: DataSettings = field(default_factory=DataSettings)
     fit: FitSettings = field(default_factory=FitSettings)
@@ -180,10 +179,6 @@ class SelectionConfig:
     simulator: SimulatorSettings = field(default_factory=SimulatorSettings)
     residuals: ResidualSettings = field(default_factory=ResidualSettings)
     version: str = VERSION
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values, by group and name."""
-        return asdict(self)
 
 
 #: What a diagnosis uses unless it is told otherwise.

@@ -14,15 +14,15 @@ from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.acceptance import (
-    drop_redundant_terms,
-    is_weak,
-    passes_heldout_test,
-)
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, groups_by_label
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, identify
 from ventbench.diagnosis.settings import DEFAULT
+from ventbench.diagnosis.validation import (
+    drop_redundant_terms,
+    is_weak,
+    passes_heldout_test,
+)
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id import Fit, fit
 from ventbench.system_id.data import Data, Noise

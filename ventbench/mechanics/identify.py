@@ -40,8 +40,8 @@ from ventbench.mechanics.regression import (
 from ventbench.mechanics.segments import Segment, clipped_share, segments
 from ventbench.mechanics.term_selection import (
     FEWEST_BREATHS,
-    DelayEstimate,
     SelectedTerm,
+    Term,
     delay,
     select_terms,
 )
@@ -165,17 +165,6 @@ _SENSORS = {"inertance": ("flow_sensor_lag",), "leak": ("flow_sensor_zero",)}
 _MOST_LEAK = 0.5
 
 
-@dataclass(frozen=True)
-class Term:
-    """An effect that a lung needs beyond R and C."""
-
-    name: str  #: name of the effect.
-    parameters: dict[str, Estimate]  #: estimated parameters by short name.
-    nats: float  #: log-likelihood ratio on held-out breaths.
-    effect: float  #: root mean square of what the term alone explains, cmH2O.
-    alternatives: tuple[str, ...]  #: names of effects that would explain nearly as much.
-
-
 @dataclass(frozen=True, eq=False)
 class Mechanics:
     """Mechanics of a lung."""
@@ -286,7 +275,7 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     match = match_label(label, best.resistance, best.compliance(), source)
     return Mechanics(
         name, best.resistance(0.0), best.compliance(), full.offset(),
-        (*_delay_term(delayed_by, best), *(full.term(term) for term in selected)),
+        (*_with_equivalent_lag(delayed_by, best), *(full.term(term) for term in selected)),
         match, noise, len(table), samples, notes, faults,
     )  # fmt: skip
 
@@ -326,19 +315,17 @@ def _best_for_label(full: LungFit, plain: LungFit, label: Lung) -> LungFit:
     return plain
 
 
-def _delay_term(delayed_by: DelayEstimate | None, lung: LungFit) -> tuple[Term, ...]:
+def _with_equivalent_lag(delayed_by: Term | None, lung: LungFit) -> tuple[Term, ...]:
     """The delay; for a circuit also the lag of a pressure sensor that would do the same."""
     if delayed_by is None:
         return ()
-    name, value = delayed_by.name, delayed_by.value
-    if name == "circuit_compliance":
-        shared = lung.resistance(0.0).value / (1.0 + value.value / lung.compliance().value)
-        low, high = (1e-3 * shared * end for end in value.ci95)
-        lag = Estimate(1e-3 * shared * value.value, "s", (low, high))
-        parameters = {"compliance": value, "equivalent_lag": lag}
-    else:
-        parameters = {"tau": value}
-    return (Term(name, parameters, delayed_by.nats, delayed_by.effect, delayed_by.alternatives),)
+    if delayed_by.name != "circuit_compliance":
+        return (delayed_by,)
+    value = delayed_by.parameters["compliance"]
+    shared = lung.resistance(0.0).value / (1.0 + value.value / lung.compliance().value)
+    low, high = (1e-3 * shared * end for end in value.ci95)
+    lag = Estimate(1e-3 * shared * value.value, "s", (low, high))
+    return (replace(delayed_by, parameters={"compliance": value, "equivalent_lag": lag}),)
 
 
 def _notes(

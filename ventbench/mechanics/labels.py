@@ -153,8 +153,8 @@ def label_texts(match: LungMatch) -> tuple[str, str]:
 def tolerance_text() -> str:
     """How far R and C may be from a label that holds, in words."""
     return (
-        f"R within a factor of {TOLERANCE_R:g} (and {APPARATUS:g} cmH2O/(L/s) of tubes), "
-        f"C within a factor of {TOLERANCE_C:g}"
+        f"R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, "
+        f"C by a factor of {TOLERANCE_C:g}"
     )
 
 

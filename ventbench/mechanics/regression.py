@@ -122,8 +122,6 @@ def lagged(time: Floats, values: Floats, lag: float) -> Floats:
 
     Exact for signals that are linear between the samples.
     """
-    if lag <= 0.0 or len(time) < 2:
-        return values
     step = np.diff(time)[:, None]
     kept = np.exp(-step / lag)
     falls = lag * np.diff(values, axis=0) / step * (1.0 - kept)
@@ -301,12 +299,9 @@ def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> flo
     """Root mean square of what a column explains beyond the others, cmH2O."""
     others = [c for c in fitted.columns if c != column]
     total = table.products[:, 0].sum(axis=0)
-    square = total[column, column]
-    if others:
-        cross = total[others, column]
-        square = square - cross @ np.linalg.solve(
-            _regularised(total[np.ix_(others, others)]), cross
-        )
+    cross = total[others, column]
+    explained = cross @ np.linalg.solve(_regularised(total[np.ix_(others, others)]), cross)
+    square = total[column, column] - explained
     x = fitted.coefficients[fitted.columns.index(column)]
     return float(abs(x) * np.sqrt(max(square, 0.0) / table.freedom.sum()))
 

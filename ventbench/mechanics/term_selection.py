@@ -175,20 +175,18 @@ def splits(count: int) -> list[Bools]:
 
 
 @dataclass(frozen=True)
-class DelayEstimate:
-    """What delays the pressure behind a change of the flow: the circuit, or the pressure sensor."""
+class Term:
+    """An effect that a lung needs beyond R and C."""
 
-    name: str  #: ``circuit_compliance`` or ``sensor_lag``.
-    #: compliance of the circuit between flow sensor and lung, mL/cmH2O, or time constant of the
-    #: pressure sensor, s.
-    value: Estimate
+    name: str  #: name of the effect.
+    parameters: dict[str, Estimate]  #: estimated parameters by short name.
     nats: float  #: log-likelihood ratio on held-out breaths.
-    effect: float  #: root mean square of what it alone explains, cmH2O.
-    alternatives: tuple[str, ...]  #: the other name if it would explain nearly as much.
+    effect: float  #: root mean square of what the term alone explains, cmH2O.
+    alternatives: tuple[str, ...]  #: names of effects that would explain nearly as much.
 
 
-def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], DelayEstimate | None]:
-    """Estimate what delays the pressure, and take it into account.
+def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]:
+    """Estimate what delays the pressure behind a change of the flow, and take it into account.
 
     Since a delay changes the signals of every other term, it is estimated first, on a grid.
 
@@ -234,7 +232,7 @@ def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], DelayEstima
     least = most - max(LEAST_NATS, _ALTERNATIVE_SHARE * (most - none))
     chosen = next(estimate for name, estimate in candidates.items() if gains[name] >= least)
     others = tuple(name for name in gains if name != chosen.name and gains[name] >= least)
-    value = chosen.value.value
+    value = next(iter(chosen.parameters.values())).value
     if chosen.name == _SENSOR.name:
         delayed = tuple(replace(segment, lag=value) for segment in segments)
     else:
@@ -276,7 +274,7 @@ def behind_circuit(segment: Segment, smooth: tuple[Floats, Floats], compliance: 
 
     ``smooth`` are its pressure without noise, cmH2O, and the derivative of it, cmH2O/s, ``(m,)``.
     """
-    if compliance == 0.0 or len(segment.time) < 2:
+    if compliance == 0.0:
         return segment
     c, (pressure, rise) = compliance / 1000.0, smooth
     return replace(
@@ -312,6 +310,7 @@ class _DelayFamily:
     """A cause of a delay, and the strengths to choose from."""
 
     name: str  #: name of the effect.
+    parameter: str  #: name of its strength.
     unit: str  #: unit of its strength.
     grid: tuple[float, ...]  #: strengths, equally spaced from zero on.
     least: float  #: least strength that is reported.
@@ -321,15 +320,16 @@ class _DelayFamily:
 #: Circuits from 0 to 4 mL/cmH2O, and sensors from 0 to 150 ms. A lag shorter than a sample at
 #: 100 Hz cannot be told from clocks that differ, so that it is not reported.
 _CIRCUIT = _DelayFamily(
-    "circuit_compliance", "mL/cmH2O", tuple(np.arange(0.0, 4.01, 0.25).tolist()),
+    "circuit_compliance", "compliance", "mL/cmH2O", tuple(np.arange(0.0, 4.01, 0.25).tolist()),
     least=0.1, deviation=0.02,
 )  # fmt: skip
 _SENSOR = _DelayFamily(
-    "sensor_lag", "s", tuple(np.arange(0.0, 0.1501, 0.01).tolist()), least=0.01, deviation=0.001
-)
+    "sensor_lag", "tau", "s", tuple(np.arange(0.0, 0.1501, 0.01).tolist()),
+    least=0.01, deviation=0.001,
+)  # fmt: skip
 
 
-def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> DelayEstimate | None:
+def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> Term | None:
     """The strength of a delay; None if held-out breaths do not need it."""
     null, count = tables[0], len(tables[0])
     columns = range(null.products.shape[-1] - 1)
@@ -352,7 +352,8 @@ def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> DelayEstima
     nearest = tables[round(value / family.grid[1])]
     variances = [_residual_variance(table, every) for table in (null, nearest)]
     effect = float(np.sqrt(max(variances[0] - variances[1], 0.0)))
-    return DelayEstimate(family.name, Estimate(value, family.unit, ends), nats, effect, ())
+    strength = {family.parameter: Estimate(value, family.unit, ends)}
+    return Term(family.name, strength, nats, effect, ())
 
 
 def _value(table: CrossProducts, which: Bools) -> float:

@@ -2,9 +2,8 @@
 
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.dead_time import resolution, resolution_of
-from ventbench.physics.mechanism import Description, Mechanism
+from ventbench.physics.mechanism import Description, Mechanism, Parameter
 from ventbench.physics.model import Physics, PhysicsState, physics
-from ventbench.physics.parameters import Parameter
 
 __all__ = [
     "Description", "Mechanism", "Parameter", "Physics", "PhysicsState", "library", "mechanism",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache, lru_cache
 from types import ModuleType
@@ -12,8 +12,7 @@ from types import ModuleType
 from ventbench.base.errors import InputError
 from ventbench.physics import events as happening
 from ventbench.physics import mechanisms, nonparametric
-from ventbench.physics.mechanism import Mechanism
-from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
+from ventbench.physics.mechanism import BASE_PARAMETERS, Mechanism, Parameter
 
 #: What :func:`extended` adds to the library, by name.
 _added: dict[str, Mechanism] = {}
@@ -23,7 +22,7 @@ _added: dict[str, Mechanism] = {}
 def extended(*added: Mechanism) -> Iterator[None]:
     """Add mechanisms to the library while the block runs, in all threads of the process.
 
-    Models, fits and screening then know them by name, as those of ``physics/mechanisms``.
+    Models, fits and searches then know them by name, as those of ``physics/mechanisms``.
 
     Raises:
         InputError: if the catalogue already has a mechanism or basis term of that name.
@@ -119,7 +118,8 @@ def parameter(path: str) -> Parameter:
     for candidate in among:
         if candidate.name == short:
             return candidate
-    raise InputError(f"no parameter {path!r}; {owner or 'the base'} has {_names(among)}")
+    known = ", ".join(candidate.name for candidate in among)
+    raise InputError(f"no parameter {path!r}; {owner or 'the base'} has {known}")
 
 
 @lru_cache
@@ -166,7 +166,3 @@ def _is_described(value: object, module: str) -> bool:
     if not isinstance(value, type) or value.__module__ != module:
         return False
     return issubclass(value, Mechanism) and "description" in vars(value)
-
-
-def _names(parameters: Iterable[Parameter]) -> str:
-    return ", ".join(p.name for p in parameters)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +18,8 @@ from jax import Array
 from ventbench.base.arrays import Floats
 from ventbench.base.compilation import float64
 from ventbench.physics.catalogue import mechanism
-from ventbench.physics.mechanism import Mechanism, Network, Pair, Values, View
-from ventbench.physics.nonparametric.basis import FilterBank
-from ventbench.physics.parameters import BASE_PARAMETERS
+from ventbench.physics.mechanism import BASE_PARAMETERS, Mechanism, Network, Pair, Values, View
+from ventbench.physics.nonparametric import FilterBank
 
 #: Points of a static curve and of a response in time.
 _STATIC, _STEPS = 241, 160
@@ -80,9 +78,10 @@ def characteristic(
         if shown.stateful and shown.description.site == "expiratory valve":
             return _late_outlet(shown, own, base, end)
         if shown.has("inflow"):
-            return _flow_step(shown, own, end)
+            return _response(shown, own, shown.inflow, end, 0.0, _FLOW, "flow of the valve, L/s")
         if shown.has("reading"):
-            return _pressure_step(shown, own, end)
+            label = "reading of the sensor, cmH2O"
+            return _response(shown, own, shown.reading, end, _LOW, _HIGH, label)
         if shown.has("sensor_output"):
             return _sensor(shown, own)
         if shown.has("network"):
@@ -173,30 +172,16 @@ def _late_outlet(
     return Characteristic(x * 1e3, told.astype(np.float64), done, *labels)
 
 
-def _flow_step(shown: Mechanism, own: Values, end: float) -> Characteristic:
-    """Flow of the valve after its command steps to 0.5 L/s."""
-    zero = jnp.asarray(0.0)
-    state = shown.initial_state(own, zero, zero) if shown.stateful else zero
-    step = partial(shown.inflow, own)
-    return _response(step, state, end, 0.0, _FLOW, "flow of the valve, L/s")
-
-
-def _pressure_step(shown: Mechanism, own: Values, end: float) -> Characteristic:
-    """Reading of the sensor after the pressure steps from 5 to 20 cmH2O."""
-    low = jnp.asarray(_LOW)
-    state = shown.initial_state(own, jnp.asarray(0.0), low) if shown.stateful else low
-    step = partial(shown.reading, own)
-    return _response(step, state, end, _LOW, _HIGH, "reading of the sensor, cmH2O")
-
-
 def _response(
-    hook: Callable[[Array, Array, Array], Pair], state: Array, end: float, low: float, high: float,
+    shown: Mechanism, own: Values, hook: Callable[..., Pair], end: float, low: float, high: float,
     y_label: str,
 ) -> Characteristic:  # fmt: skip
     """Response to a step from ``low`` to ``high`` at time zero, with the edge as a vertical."""
-    after = []
+    state, after = jnp.asarray(low), []
+    if shown.stateful:
+        state = shown.initial_state(own, jnp.asarray(0.0), state)
     for _ in range(_STEPS):
-        now, state = hook(jnp.asarray(high), state, jnp.asarray(end / _STEPS))
+        now, state = hook(own, jnp.asarray(high), state, jnp.asarray(end / _STEPS))
         after.append(float(now))
     x = np.concatenate([[-0.1 * end, 0.0, 0.0], end / _STEPS * np.arange(1, _STEPS + 1)])
     step = np.concatenate([[low, low], np.full(_STEPS + 1, high)])

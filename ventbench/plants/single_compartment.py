@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench.physics.parameters import EXPIRATORY_RESISTANCE, VALVE_GAIN
+from ventbench.physics.mechanism import EXPIRATORY_RESISTANCE, VALVE_GAIN
 from ventbench.task.interfaces import Signals
 from ventbench.task.lungs import Lung
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.physics.catalogue import mechanism, parameter, paths, strength_path
-from ventbench.physics.parameters import REFITTED, Parameter
+from ventbench.physics.mechanism import REFITTED, Parameter
 from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.predictor import START, Predictor, needs_small_steps

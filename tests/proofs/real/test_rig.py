@@ -64,9 +64,8 @@ class Diagnoses:
         self.names = names
         self.asked: list[dict[str, Any]] = []
 
-    def __call__(self, breaths, *, simulator, patient, progress, rigs) -> Diagnosis:
+    def __call__(self, breaths, *, simulator, patient, progress) -> Diagnosis:
         assert not patient  # nobody breathed on the rig
-        assert (rigs is not None) == (simulator == "physics")  # strengths of rigs: part rc
         self.asked.append({"breaths": breaths, "plant": simulator})
         progress("fitting", 0.5)
         one = made.diagnosis(12)

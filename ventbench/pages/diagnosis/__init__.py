@@ -1,1 +1,1 @@
-"""Pictures of a diagnosis: HTML report, rerun file and figure (extra ``ventbench[view]``)."""
+"""Pictures of a diagnosis: HTML report and rerun file (extra ``ventbench[view]``)."""

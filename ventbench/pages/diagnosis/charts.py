@@ -1,40 +1,31 @@
-"""Charts of a diagnosis: lines, bands and ticks in picture units for the template; a figure."""
+"""Charts of a diagnosis: lines, bands and ticks in picture units for the template."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench import palette
 from ventbench.base.arrays import Floats, runs
-from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
-from ventbench.diagnosis.residual_analysis import Profile, profiles
-from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.diagnosis.number_text import capital
+from ventbench.diagnosis.residual_analysis import EDGE, Profile, profiles
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages.panels import area, path
 from ventbench.physics.characteristics import Characteristic
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 #: Room for the labels: left, right, top, bottom, picture units.
 LEFT, RIGHT, TOP, BOTTOM = 40.0, 16.0, 16.0, 30.0
 
-#: The three simulators in the order of the legend: key, text, class of the line.
-STAGES = (
-    ("before", "simulator as given", "before"),
-    ("refit", "R and C refitted", "refit"),
-    ("after", "corrected", "after"),
-)
+#: The three simulators in the order of the legend, by key, which is the class of the line.
+STAGES = {"before": "simulator as given", "refit": "R and C refitted", "after": "corrected"}
 
 
-def stages(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+def stages(diagnosis: Diagnosis) -> dict[str, str]:
     """Those of :data:`STAGES` that a diagnosis has; not all where nothing is missing."""
-    return [x for x in STAGES if x[0] != "after" or diagnosis.verdict != "nothing_missing"]
+    nothing = diagnosis.verdict == "nothing_missing"
+    return {key: text for key, text in STAGES.items() if not (nothing and key == "after")}
 
 
 #: Breaths that are shown of either kind.
@@ -214,7 +205,7 @@ def worst(diagnosis: Diagnosis) -> list[tuple[int, str]]:
 def panels(diagnosis: Diagnosis) -> list[BreathPanel]:
     """Charts of the breaths of :func:`worst`."""
     traces = diagnosis.traces
-    by_stage = {key: rmse(traces, getattr(traces, key)) for key, _, _ in STAGES}
+    by_stage = {key: rmse(traces, getattr(traces, key)) for key in STAGES}
     several = len(traces.breaths.by_lung_index) > 1
     shown = []
     for i, why in worst(diagnosis):
@@ -222,20 +213,19 @@ def panels(diagnosis: Diagnosis) -> list[BreathPanel]:
         if several:
             name += f", {traces.breaths.lung_ids[i]}"
         errors = {key: float(values[i]) for key, values in by_stage.items()}
-        shown.append(_panel(traces, i, name, why, errors, diagnosis.verdict != "nothing_missing"))
+        shown.append(_panel(traces, i, name, why, errors, [*stages(diagnosis)]))
     return shown
 
 
 def _panel(
-    traces: Traces, i: int, name: str, why: str, errors: dict[str, float], corrected: bool
+    traces: Traces, i: int, name: str, why: str, errors: dict[str, float], looks: list[str]
 ) -> BreathPanel:
-    """Charts of one breath."""
+    """Charts of one breath, with the lines of some stages."""
     breath = traces.breaths
-    looks = [(key, look) for key, _, look in STAGES if look != "after" or corrected]
     end = _end(traces, i)
     use = breath.valid[i] & (breath.time[i] <= end)
     time, recorded = breath.time[i][use], breath.pressure[i][use]
-    simulated = {key: getattr(traces, key)[i][use] for key, _ in looks}
+    simulated = {key: getattr(traces, key)[i][use] for key in looks}
     pressure = Chart(
         (0.0, end), limits(recorded, traces.refit[i][use], traces.after[i][use]), "", "cmH2O",
         f"Pressure of {name}: recorded, and simulated before, after refit and corrected.",
@@ -244,24 +234,24 @@ def _panel(
     low, high = window(time, recorded, simulated["refit"])
     pressure.band(low, high)
     within = (time >= low - 1e-9) & (time <= high + 1e-9)
-    seen = [recorded[within], *(simulated[key][within] for key, _ in looks if key != "before")]
+    seen = [recorded[within], *(simulated[key][within] for key in looks if key != "before")]
     near = Chart(
         (low, high), limits(*seen), "", "magnified, cmH2O",
-        f"{name[:1].upper() + name[1:]} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
+        f"{capital(name)} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
     )  # fmt: skip
     for chart, part in ((pressure, slice(None)), (near, within)):
         chart.line("seen", time[part], recorded[part])
-        for key, look in looks:
-            chart.line(look, time[part], simulated[key][part])
+        for key in looks:
+            chart.line(key, time[part], simulated[key][part])
     left = {key: recorded - values for key, values in simulated.items()}
     error = Chart(
-        (0.0, end), limits(*(left[key] for key, _ in looks if key != "before"), least=1.0), "",
+        (0.0, end), limits(*(left[key] for key in looks if key != "before"), least=1.0), "",
         "recorded − simulated, cmH2O",
         f"Error of {name}, recorded minus simulated: as given, refitted and corrected.",
         height=110.0,
     )  # fmt: skip
-    for key, look in looks:
-        error.line(look, time, left[key])
+    for key in looks:
+        error.line(key, time, left[key])
     valve = command(time, breath.u_in[i][use], end, f"Commands of {name}.", 84.0)
     return BreathPanel(name, why, errors, pressure, near, error, valve)
 
@@ -384,61 +374,3 @@ def _open(time: np.ndarray, u_out: np.ndarray) -> list[tuple[float, float]]:
     """Times during which the expiratory valve is open."""
     ends = np.append(time, time[-1])
     return [(float(ends[a]), float(ends[b])) for a, b in runs(u_out > 0.5)]
-
-
-#: Colours of the recording and of the three simulators in the figure, on white.
-COLORS = {
-    "recorded": palette.INK, "before": palette.GREY, "refit": palette.RUNS[1],
-    "after": palette.RUNS[0],
-}  # fmt: skip
-
-
-def figure(diagnosis: Diagnosis) -> Figure:
-    """Draw the held-out breaths with the largest errors, and the errors of all held-out breaths.
-
-    A matplotlib figure without global state; a notebook shows it, ``savefig`` writes it.
-    """
-    from matplotlib.figure import Figure
-
-    shown = [(key, text) for key, text, _ in stages(diagnosis)]
-    chosen = [index for index, _ in worst(diagnosis)[:WORST]]
-    plot = Figure(figsize=(4.2 * (len(chosen) + 1), 3.6), layout="constrained")
-    axes = np.atleast_1d(plot.subplots(1, len(chosen) + 1))
-    for axis, index in zip(axes, chosen, strict=False):
-        _breath(axis, diagnosis, index, shown)
-    if chosen:
-        axes[0].set_ylabel("airway pressure, cmH2O")
-        axes[0].legend(frameon=False, fontsize="small")
-    _error_bars(axes[-1], diagnosis, shown)
-    plot.suptitle(report_text.headline(diagnosis), fontsize="medium", wrap=True)
-    return plot
-
-
-def _breath(axis: Any, diagnosis: Diagnosis, index: int, shown: list[tuple[str, str]]) -> None:
-    traces = diagnosis.traces
-    valid = traces.breaths.valid[index]
-    time = traces.breaths.time[index][valid]
-    recorded = traces.breaths.pressure[index][valid]
-    axis.plot(time, recorded, color=COLORS["recorded"], linewidth=2.0, label="recorded")
-    for key, text in shown:
-        pressure = getattr(traces, key)[index][valid]
-        axis.plot(time, pressure, color=COLORS[key], linewidth=1.2, label=text)
-    lung = traces.breaths.lung_ids[index]
-    axis.set_title(f"breath {traces.breaths.breath_id[index]}, {lung}", fontsize="small")
-    axis.set_xlabel("time, s")
-
-
-def _error_bars(axis: Any, diagnosis: Diagnosis, shown: list[tuple[str, str]]) -> None:
-    """Root-mean-square errors as bars, with the noise of the measurement as a line."""
-    errors = diagnosis.open_loop
-    for row, (key, _) in enumerate(shown):
-        error = getattr(errors, key).rmse
-        axis.barh(row, error, color=COLORS[key])
-        axis.annotate(f"{error:.2f}", (error, row), (4, 0), textcoords="offset points", va="center")
-    if np.isfinite(errors.noise_floor):
-        axis.axvline(errors.noise_floor, color="#5b636d", linestyle=":")
-        axis.set_xlabel("RMS error, cmH2O (dotted: noise)")
-    axis.set_yticks(range(len(shown)), [text for _, text in shown])
-    axis.invert_yaxis()
-    axis.margins(x=0.2)
-    axis.set_title(f"{len(errors.held_out_breaths)} held-out breaths", fontsize="small")

@@ -161,7 +161,7 @@ def groups(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     distance = diagnosis.open_loop
     everything = {"before": distance.before, "refit": distance.refit, "after": distance.after}
     rows = [("all", everything), *distance.groups.items()]
-    keys = [key for key, _, _ in charts.stages(diagnosis)]
+    keys = charts.stages(diagnosis)
     return [
         {"name": name, "cells": [_cell(values.get(key)) for key in keys]} for name, values in rows
     ]
@@ -182,7 +182,7 @@ def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
     shown = characteristic(missing.name, _values(diagnosis, missing), largest_command=largest)
     return {
         "name": missing.name,
-        "heading": about.title[:1].upper() + about.title[1:],
+        "heading": number_text.capital(about.title),
         "simulator": {
             key: number_text.quantity_like(value, missing.parameters[key], f"{missing.name}.{key}")
             for key, value in missing.simulator_values.items()

@@ -88,7 +88,7 @@ def log_lung(
         send(stream, entity, time[order], shown, [name], [color], width, TIMELINE)
 
     line("pressure/recorded", breaths.pressure, "recorded", COLORS["recorded"], 3.0)
-    for key, text, _ in stages(diagnosis):
+    for key, text in stages(diagnosis).items():
         simulated = getattr(traces, key)[index]
         line(f"pressure/{key}", simulated, text, COLORS[key], 1.5)
         line(f"error/{key}", breaths.pressure - simulated, text, COLORS[key], 1.5)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Network, Values, View
-from ventbench.physics.nonparametric.basis import (
+from ventbench.physics.nonparametric import (
     BasisTerm,
     FilterBank,
     Lines,
@@ -68,16 +68,11 @@ class FlowShape(BasisTerm):
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Tangent of the curve at the last flow."""
-        drop, slope = self._drop(values, view.flow)
-        return network.plus(resistance=slope, recoil=drop - slope * view.flow)
-
-    def _drop(self, values: Values, flow: Array) -> tuple[Array, Array]:
-        c = self.coefficients(values)
-        inwards, steeper_in = PiecewiseQuadratic(_FLOW_KNOTS)(jnp.maximum(flow, 0.0), [0.0, *c[:3]])
-        outwards, steeper_out = PiecewiseQuadratic(_FLOW_KNOTS)(
-            jnp.maximum(-flow, 0.0), [0.0, *c[3:]]
-        )
-        return inwards - outwards, steeper_in + steeper_out
+        c, flow, curve = self.coefficients(values), view.flow, PiecewiseQuadratic(_FLOW_KNOTS)
+        inwards, steeper_in = curve(jnp.maximum(flow, 0.0), [0.0, *c[:3]])
+        outwards, steeper_out = curve(jnp.maximum(-flow, 0.0), [0.0, *c[3:]])
+        slope = steeper_in + steeper_out
+        return network.plus(resistance=slope, recoil=inwards - outwards - slope * flow)
 
 
 #: V / C where the factor bends, cmH2O; at the first, near the end of expiration, it is 1.

@@ -5,11 +5,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Pair, Values
-from ventbench.physics.nonparametric.basis import (
-    FilterBank,
-    Lines,
-    coefficients,
-)
+from ventbench.physics.nonparametric import FilterBank, Lines, coefficients
 
 #: Pressures where the curve bends, cmH2O.
 _SENSOR_KNOTS = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Network, Pair, Values, View
-from ventbench.physics.nonparametric.basis import (
+from ventbench.physics.nonparametric import (
     BasisTerm,
     FilterBank,
     Lines,

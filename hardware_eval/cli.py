@@ -362,7 +362,7 @@ def collect(
 
     Example: `ventbench-hardware collect --port /dev/ttyACM0 --lung R20C50 --breaths 600`
     """
-    from hardware_eval.bench import collect as collection
+    from hardware_eval.bench.drive import collect as run_collection
     from hardware_eval.results import evaluate as ev
     from ventbench.cli.options import bar
     from ventbench.task import protocol
@@ -378,7 +378,7 @@ def collect(
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
         with bar("exploring") as exploring:
-            done = collection.collect(
+            done = run_collection(
                 bench, label, breaths, out, seed=seed, ease=ease,
                 about={"device": ev.device_about(line)},
                 progress=lambda number: exploring(number, breaths),

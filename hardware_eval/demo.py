@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hardware_eval.bench.collect import collect
+from hardware_eval.bench.drive import collect
 from hardware_eval.bench.loop import Bench, Operator, SilentOperator
 from hardware_eval.bench.plan import Plan, make_plan
 from hardware_eval.bench.raw_log import lines

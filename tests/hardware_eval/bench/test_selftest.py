@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hardware_eval.bench import selftest as selftest_module
-from hardware_eval.bench.collect import collect
+from hardware_eval.bench.drive import collect
 from hardware_eval.bench.identity import measured_lung
 from hardware_eval.bench.loop import Bench, SilentOperator
 from hardware_eval.bench.selftest import LIMITS, Driven, selftest, span_finding

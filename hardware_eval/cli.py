@@ -400,10 +400,6 @@ def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Empty folder for everything.")] = Path(
         "runs/demo"
     ),
-    fast: Annotated[
-        bool,
-        typer.Option("--fast", help="On a virtual clock in this process, not on a terminal."),
-    ] = False,
     breaths: Annotated[int, typer.Option(min=12, help="Breaths to explore.")] = 36,
     plant: Annotated[
         str,
@@ -423,8 +419,8 @@ def demo(
 
     to = told(json)
     done = run_demo(
-        conceal, out, breaths=breaths, simulator=plant, real_time=not fast,
-        sandbox=not in_process, tell=lambda text: print(text, file=to, flush=True),
+        conceal, out, breaths=breaths, simulator=plant, sandbox=not in_process,
+        tell=lambda text: print(text, file=to, flush=True),
     )  # fmt: skip
     emit(done.as_dict(), json)
     print(f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}", file=to)

@@ -44,30 +44,6 @@ def serial_line(path: str, baud_rate: int = BAUD_RATE) -> Callable[[], int | Non
     return open_line
 
 
-def tcp_line(host: str, port: int) -> tuple[Callable[[], int | None], socket.socket]:
-    """Listen on TCP; one host at a time, the next one when it has gone.
-
-    Raises:
-        InputError: if the address cannot be used.
-    """
-    try:
-        server = socket.create_server((host, port))
-    except OSError as error:
-        raise InputError(f"--listen {host}:{port}: {error}") from error
-    server.setblocking(False)
-
-    def open_line() -> int | None:
-        try:
-            connection, _ = server.accept()
-        except BlockingIOError:
-            return None
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setblocking(False)
-        return connection.detach()
-
-    return open_line, server
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program on the People's Ventilator; returns the exit code."""
     parser = argparse.ArgumentParser(
@@ -78,7 +54,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--config", type=Path, required=True, help="TOML file of the ventilator")
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--port", help="serial port to the host, such as /dev/ttyGS0")
-    where.add_argument("--listen", metavar="HOST:PORT", help="TCP address for socket:// hosts")
     where.add_argument(
         "--vent", action="store_true", help="vent once and end (for ExecStopPost of systemd)"
     )
@@ -94,9 +69,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(given: argparse.Namespace) -> int:
     from hardware_eval.device.pvp import PvpSensor, PvpValves
 
-    host, _, number = (given.listen or ":0").rpartition(":")
-    if not number.isdigit():
-        raise InputError(f"--listen {given.listen}: write HOST:PORT, such as 0.0.0.0:5005")
     PvpValves(given.config).close()  # vented; what is wrong with them is told here
     if given.vent:
         return 0
@@ -109,11 +81,6 @@ def _run(given: argparse.Namespace) -> int:
             f"range, up to {sensor.identity.highest:.4g}: nothing could trip it. Give a smaller "
             f"--pressure-limit, or the sensor's own highest_pressure in {given.config}"
         )
-    listener: socket.socket | None = None
-    if given.listen:
-        open_line, listener = tcp_line(host, int(number))
-    else:
-        open_line = serial_line(given.port or "")
     process, orders = deadman.start(
         f"{PvpValves.__module__}:{PvpValves.__name__}", str(given.config)
     )
@@ -121,13 +88,11 @@ def _run(given: argparse.Namespace) -> int:
     try:
         if reason := realtime.prefer():
             print(f"no real-time scheduling: {reason}", file=sys.stderr)
-        _serve_until_signal(hal, settings, open_line)
+        _serve_until_signal(hal, settings, serial_line(given.port))
     finally:
         hal.close()
         process.wait()
         sensor.close()
-        if listener is not None:
-            listener.close()
     if hal.lost:
         PvpValves(given.config).close()  # the deadman could not
         print("the deadman has gone; vented", file=sys.stderr)

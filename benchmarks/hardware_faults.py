@@ -25,9 +25,9 @@ from hardware_eval.bench.loop import Bench, EmergencyStop, SilentOperator, run_o
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
-from hardware_eval.emulation import faults
-from hardware_eval.emulation.faults import FaultKind
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation import electronics
+from hardware_eval.emulation.electronics import FaultKind
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError
 from hardware_eval.wire.messages import Reading
@@ -165,7 +165,7 @@ def trial(device: LoopbackDevice, lung: str, fault: Fault, moment: float) -> tup
     client.hello()
     begins = device.clock.now() + REST + moment
     if fault.lung is not None:
-        hal.faults = (faults.Fault(fault.lung[0], begins, strength=fault.lung[1]),)
+        hal.faults = (electronics.Fault(fault.lung[0], begins, strength=fault.lung[1]),)
 
     def dies(wanted: float) -> float:
         DeadClient.dead = True
@@ -251,7 +251,7 @@ def _selftest(device: LoopbackDevice, lung: str, fault: Fault) -> str:
     """What the self-test says of the fault, if it is there from the start."""
     hal: Any = device.service.hal
     assert fault.lung is not None
-    hal.faults = (faults.Fault(fault.lung[0], device.clock.now(), strength=fault.lung[1]),)
+    hal.faults = (electronics.Fault(fault.lung[0], device.clock.now(), strength=fault.lung[1]),)
     client = Client(device, device.clock)
     client.hello()
     try:

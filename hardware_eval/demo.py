@@ -39,7 +39,7 @@ from hardware_eval.bench.plan import Plan, make_plan
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.session import dry_run
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, breath_begun, conceal, reveal
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results.evaluate import Line

@@ -19,12 +19,12 @@ import numpy as np
 
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
-from hardware_eval.emulation.faults import parse
+from hardware_eval.emulation.electronics import parse
 from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
 
 if TYPE_CHECKING:
-    from hardware_eval.emulation.loopback import LoopbackDevice
+    from hardware_eval.emulation.emulator import LoopbackDevice
 
 #: What the emulator is told for a perturbation; see :mod:`hardware_eval.emulation.emulator`. A
 #: leak as if the expiratory valve stood open by a twentieth; a tube pinched to three times the

@@ -253,7 +253,7 @@ def dry_run(
         What went wrong, one sentence each, empty if the plan is safe there; and entry, lung, PIP
         and error, cmH2O, of each run that completed.
     """
-    from hardware_eval.emulation.loopback import LoopbackDevice
+    from hardware_eval.emulation.emulator import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
 
     problems: list[str] = []

@@ -20,7 +20,7 @@ try:
     from hardware_eval.device import deadman
     from hardware_eval.device.port import Guard, Port
     from hardware_eval.device.program import DeviceService, DeviceSettings
-    from hardware_eval.wire.link import BAUD_RATE
+    from hardware_eval.wire.client import BAUD_RATE
 except InputError as missing:  # an extra that brings the wire
     print(f"python -m hardware_eval.device: {missing}", file=sys.stderr)
     raise SystemExit(2) from None

@@ -6,6 +6,8 @@ is what the plant shows by then. A loop of 30 ms so reads what a scored run read
 A lung may have *concealed* physics, which any words determine: one strong effect of the library,
 its strength and its lung, added to a simulator. The answer is published encrypted, with its hash,
 when the lung is made; the words open it.
+
+Run as a program, it is the process of the emulated electronics with such a lung.
 """
 
 from __future__ import annotations
@@ -14,8 +16,11 @@ import copy
 import hashlib
 import json
 import math
+import socket
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +41,7 @@ from hardware_eval.emulation.cases import (
     random_generator,
     unseal,
 )
-from hardware_eval.emulation.faults import Fault, FaultKind, active
+from hardware_eval.emulation.electronics import Fault, FaultKind, active, serve
 from hardware_eval.wire.messages import Capability
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -331,3 +336,35 @@ def _draw(words: str) -> tuple[Effect, Lung]:
     ]
     case = strong[int(rng.integers(len(strong)))]
     return case.effects[0], Lung(case.lung_R, case.lung_C)
+
+
+def emulated_lung(
+    lung: str, plant: str, words: str | None, seal: Path | None, **sensor: Any
+) -> SimulatedHal:
+    """Make the lung that ``emulate`` is asked for.
+
+    Raises:
+        InputError: if there is none.
+    """
+    if words is None:
+        return simulated_lung(lung, plant, **sensor)
+    concealed = conceal(words, plant)
+    hal = SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
+    hal.told = f"{hal.identity.name}, with physics {concealed.seal['commitment'][:16]}..."
+    if seal:
+        concealed.write(seal)
+    return hal
+
+
+def _main() -> None:
+    with Connection(int(sys.argv[1])) as bus, socket.socket(fileno=int(sys.argv[2])) as wire:
+        given = bus.recv()
+        about = {name: given.pop(name) for name in ("begun", "normally_open", "monostable", "log")}
+        try:
+            serve(bus, wire, lambda: emulated_lung(**given), **about)
+        except (InputError, OSError) as error:  # of the lung, of --log or --seal
+            bus.send(str(error))
+
+
+if __name__ == "__main__":
+    _main()

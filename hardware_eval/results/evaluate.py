@@ -28,7 +28,7 @@ from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.bench.selftest import Sheet
 from hardware_eval.realtime import Clock, RealClock
 from hardware_eval.results import record as records
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, Link
 from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
 from ventbench.board import record
@@ -40,8 +40,7 @@ from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 
 if TYPE_CHECKING:
-    from hardware_eval.emulation.loopback import LoopbackDevice
-    from hardware_eval.wire.link import Link
+    from hardware_eval.emulation.emulator import LoopbackDevice
 
 #: Kinds of runs whose lung is as its label says.
 UNDISTURBED = ("ramp", "scored", "control")
@@ -111,11 +110,9 @@ VIRTUAL = "virtual:"
 
 def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
     """Open a port, say nothing, and return it with the clock it lives by; see :func:`connect`."""
-    from hardware_eval.wire.link import Link
-
     if not port.startswith(VIRTUAL):
         return Link(port), RealClock()
-    from hardware_eval.emulation.loopback import LoopbackDevice
+    from hardware_eval.emulation.emulator import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
 
     # With the noise and the converter of a PVP: without them all repeats would be one.
@@ -134,8 +131,6 @@ def connect(port: str) -> Line:
         LinkError: if it cannot be opened, or no device answers.
         InputError: if there is no such emulated lung.
     """
-    from hardware_eval.wire.link import Link
-
     transport, clock = carrier(port)
     client = Client(transport, clock)
     try:

@@ -9,10 +9,9 @@ import pytest
 
 from hardware_eval.bench.loop import Bench, SilentOperator
 from hardware_eval.bench.safety import DEFAULT
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.results.evaluate import Line
-from hardware_eval.wire import link
 from hardware_eval.wire.client import Client
 
 LUNG = "R5C20"
@@ -22,7 +21,7 @@ LUNG = "R5C20"
 def _ports_are_patient() -> Iterator[None]:
     """A host that stands still for a second must not look like a port that has gone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(link, "WRITE_TIMEOUT", 600.0)
+        patch.setattr("hardware_eval.wire.client.WRITE_TIMEOUT", 600.0)
         yield
 
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from hardware_eval import cli
 from hardware_eval.bench.controllers import ControllerFailedError, SubmissionController
 from hardware_eval.bench.raw_log import breaths
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client

@@ -17,8 +17,8 @@ from hardware_eval.bench.calibrate import Calibration, device_of, fit, load, mea
 from hardware_eval.bench.loop import Bench, SilentOperator
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
-from hardware_eval.emulation.faults import Fault, FaultKind
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.electronics import Fault, FaultKind
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
 from tests.hardware_eval import stand_in

@@ -15,8 +15,8 @@ from hardware_eval.bench.drive import collect
 from hardware_eval.bench.identity import measured_lung
 from hardware_eval.bench.loop import Bench, SilentOperator
 from hardware_eval.bench.selftest import LIMITS, Driven, selftest, span_finding
-from hardware_eval.emulation.faults import Fault, FaultKind, LineFaultKind
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.electronics import Fault, FaultKind, LineFaultKind
+from hardware_eval.emulation.emulator import LoopbackDevice
 from ventbench.base.errors import InputError
 
 from .test_identity import probed

@@ -18,8 +18,8 @@ from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
 from hardware_eval.bench.raw_log import RawLog, breaths, lines
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.session import run_plan
-from hardware_eval.emulation.faults import Fault, FaultKind, LineFaultKind
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.electronics import Fault, FaultKind, LineFaultKind
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import LinkError
 from ventbench import rollout
 from ventbench.controllers.pid import PID

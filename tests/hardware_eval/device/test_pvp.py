@@ -23,8 +23,7 @@ from hardware_eval.device import __main__ as board
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves
-from hardware_eval.wire.client import Client
-from hardware_eval.wire.link import Link
+from hardware_eval.wire.client import Client, Link
 from hardware_eval.wire.messages import PROTOCOL_VERSION, Hello, Mode, Packet, encode
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError

@@ -8,8 +8,8 @@ from typing import Any
 import flax.struct
 import pytest
 
-from hardware_eval.emulation.faults import Fault, FaultKind, Line, LineFaultKind, parse
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.electronics import Fault, FaultKind, Line, LineFaultKind, parse
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.wire.client import Client, DisconnectedError, NoAnswerError
 from hardware_eval.wire.messages import Capability, Flag, Mode

@@ -27,9 +27,8 @@ from typer.testing import CliRunner
 from hardware_eval import cli, realtime
 from hardware_eval.emulation.emulator import Emulator
 from hardware_eval.emulation.firmware import Firmware, Order
-from hardware_eval.wire.client import Client, NoAnswerError, RefusedError
+from hardware_eval.wire.client import Client, Link, NoAnswerError, RefusedError
 from hardware_eval.wire.conformance import conformance
-from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Flag, Mode
 from tests.hardware_eval.firmware.core import FIRMWARE, tool
 from ventbench.base.errors import InputError

@@ -15,14 +15,16 @@ import typer
 
 from hardware_eval.commands import (
     Calibrated,
+    Lung,
     Port,
     Yes,
     bench_on,
+    calibrate,
     calibration_of,
     known_by,
     numbers,
-    register,
     told,
+    trial,
 )
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -210,26 +212,19 @@ def run(
 def emulate(context: typer.Context) -> None:
     """Emulate the ventilator and a lung on a pseudo-terminal; prints its path.
 
-    Options: --lung, --plant, --conceal WORDS, --seal FILE, --link PATH, --control SOCKET, --fault
-    KIND@START[-END][:STRENGTH], --noise, --quantum, --highest, --log FILE,
-    --electronics FILE, --normally-closed, --no-monostable, --firmware FILE; `emulate --help`
-    explains them.
+    Its options, such as --lung, --conceal, --fault and --firmware: `emulate --help`.
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """
     from hardware_eval.emulation.emulator import main as run_emulator
 
-    code = run_emulator(context.args)
-    if code:
-        raise typer.Exit(code)
+    raise typer.Exit(run_emulator(context.args))
 
 
 @app.command()
 def selftest(
     port: Port,
-    lung: Annotated[
-        str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
-    ],
+    lung: Lung,
     plant: options.PlantName = "frozen",
     skip: Skip = None,
     calibration: Calibrated = None,
@@ -315,7 +310,7 @@ def compare(
 
     Example: `ventbench-hardware compare runs/hardware --out runs/mismatch`
     """
-    from hardware_eval.results.replay import recorded_breaths, scored_plants
+    from hardware_eval.results.record import recorded_breaths, scored_plants
     from ventbench.open_loop_report import mean_errors, summary
 
     breaths = recorded_breaths(recorded, log)
@@ -344,9 +339,7 @@ def compare(
 @app.command()
 def collect(
     port: Port,
-    lung: Annotated[
-        str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
-    ],
+    lung: Lung,
     breaths: Annotated[int, typer.Option(min=1, help="Breaths in all.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of the disturbances.")] = 0,
     out: Annotated[
@@ -446,7 +439,7 @@ def replay(
 
     Example: `ventbench-hardware replay runs/hardware`
     """
-    from hardware_eval.results.replay import replay as run_replay
+    from hardware_eval.results.record import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
     emit(report.as_dict(), json)
@@ -455,7 +448,8 @@ def replay(
         raise typer.Exit(1)
 
 
-register(app)
+app.command()(trial)
+app.command()(calibrate)
 
 
 def main() -> None:

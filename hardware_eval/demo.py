@@ -34,16 +34,15 @@ import numpy as np
 from jax import Array
 
 from hardware_eval.bench.drive import collect
-from hardware_eval.bench.loop import Bench, SilentOperator
-from hardware_eval.bench.plan import Plan, make_plan
+from hardware_eval.bench.loop import Bench, Operator
+from hardware_eval.bench.plan import make_plan
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.bench.safety import DEFAULT
-from hardware_eval.bench.session import dry_run
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, breath_begun, conceal, reveal
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results.evaluate import Line
-from hardware_eval.results.replay import scored_plants
+from hardware_eval.results.record import scored_plants
 from hardware_eval.wire.client import Client
 from ventbench.base import files, precision
 from ventbench.base.arrays import Floats
@@ -325,13 +324,17 @@ def demo(
     plain = tested.plant(lung)
     planned = plan_controller(plain, PIPS)
     entry = planned.write(out / "entries", "first")
-    simulated = error_on(SimulatedHal(plain, noise=NOISE, quantum=QUANTUM), entry, lung, PIPS)
+
+    def evaluated(line: Line, entry: Path, name: str) -> dict[float, float]:
+        return errors_on(line, entry, lung, PIPS, out / name, sandbox=sandbox)
+
+    simulated = evaluated(emulated_line(plain, lung), entry, "simulated")
     step("A controller is planned on the simulator", f"{_mean(simulated):.2f} cmH2O there")
-    line = _line(hidden.plant, lung)
-    measured = _errors(entry, line, lung, out / "first", sandbox)
+    line = emulated_line(hidden.plant, lung)
+    measured = evaluated(line, entry, "first")
     against = _against(simulated, measured, "simulation")
     step("The same controller on the lung", f"{_said(measured)}{against}")
-    bench = Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=_REST)
+    bench = Bench(line.client, line.clock, DEFAULT, Operator(), rest=_REST)
     explored = collect(bench, lung, breaths, out / "explored").breaths
     step("The lung is explored", f"{len(explored)} breaths")
     diagnosis = diagnose(explored, simulator=tested, lung=lung)
@@ -352,7 +355,7 @@ def demo(
     replanned = plan_controller(diagnosis.plants.get(lung, plain), PIPS)
     second = replanned.write(out / "entries", "replanned")
     step("The controller is planned again on it", f"{replanned.error:.2f} cmH2O predicted")
-    retuned = _errors(second, line, lung, out / "second", sandbox)
+    retuned = evaluated(line, second, "second")
     against = _against(measured, retuned, "the first")
     step("The replanned controller on the lung", f"{_said(retuned)}{against}")
     _, effect = reveal(seal, words)
@@ -369,31 +372,8 @@ def demo(
     return done
 
 
-def _plan(name: str, lung: str, pips: tuple[float, ...]) -> Plan:
-    return make_plan([name], [lung], pips=pips, repeats=1, control_every=0)
-
-
-def error_on(
-    hal: SimulatedHal, entry: Path, lung: str, pips: tuple[float, ...]
-) -> dict[float, float]:
-    """Errors of an entry on an emulator in this process, cmH2O, by PIP; infinite if it stopped.
-
-    Args:
-        hal: the emulated lung.
-        entry: folder of the entry, which runs in this process.
-        lung: its label, which the entry is told.
-        pips: cmH2O.
-    """
-    plan = _plan(entry.name, lung, pips)
-    make = ev.controllers([open_submission(str(entry))], plan.track, ev.make_runner(False),
-                          real_time=False)  # fmt: skip
-    _, errors = dry_run(plan, make, DEFAULT, _REST, lung=lambda label: hal)
-    by_pip = {pip: error for *_, pip, error in errors}
-    return {pip: by_pip.get(pip, float("inf")) for pip in pips}
-
-
-def _line(plant: Plant, lung: str) -> Line:
-    """A line to an emulated lung in this process, on a virtual clock."""
+def emulated_line(plant: Plant, lung: str) -> Line:
+    """A line to an emulated lung of a label, in this process on a virtual clock."""
     hal = SimulatedHal(plant, name=f"emulated {lung}", noise=NOISE, quantum=QUANTUM)
     device = LoopbackDevice(hal)
     client = Client(device, device.clock)
@@ -401,19 +381,35 @@ def _line(plant: Plant, lung: str) -> Line:
     return Line(client, device.clock)
 
 
-def _errors(entry: Path, line: Line, lung: str, out: Path, sandbox: bool) -> dict[float, float]:
-    """Evaluate an entry; errors of its scored runs by PIP, infinite where one was stopped."""
-    plan = _plan(entry.name, lung, PIPS)
+def errors_on(
+    line: Line, entry: Path, lung: str, pips: tuple[float, ...], out: Path, *, sandbox: bool
+) -> dict[float, float]:
+    """Evaluate an entry, one scored run at each PIP.
+
+    Args:
+        line: to the lung.
+        entry: folder of the entry.
+        lung: label of the lung, which the entry is told.
+        pips: cmH2O.
+        out: folder of the log.
+        sandbox: run the entry as in scoring.
+
+    Returns:
+        Errors by PIP, cmH2O; infinite where a check stopped the run.
+
+    Raises:
+        InputError: if the plan does not finish.
+    """
+    plan = make_plan([entry.name], [lung], pips=pips, repeats=1, control_every=0)
     done = ev.evaluate(
-        [open_submission(str(entry))], line, out, SilentOperator(), plan=plan, sandbox=sandbox,
+        [open_submission(str(entry))], line, out, Operator(), plan=plan, sandbox=sandbox,
         dry=False, operator_name="ventbench-hardware demo", notes="emulated lung", rest=_REST,
     )  # fmt: skip
     if not done.complete:
         raise InputError(f"{entry.name} did not finish its plan: {done.reason}")
-    errors: dict[float, float] = {}
+    errors = dict.fromkeys(pips, float("inf"))
     for logged in lines(done.log):
         scored = logged["type"] == "run" and logged["kind"] == "scored"
-        if scored and logged["status"] != "aborted":
-            error = logged.get("error")
-            errors[logged["pip"]] = float("inf") if error is None else error
-    return dict(sorted(errors.items()))
+        if scored and logged.get("error") is not None:
+            errors[logged["pip"]] = logged["error"]
+    return errors

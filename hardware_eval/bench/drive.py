@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -275,7 +275,7 @@ def collect(
         for line in logged:
             if line["type"] == "collection" and line["plan"] != plan:
                 raise InputError(f"{log.path} is of {line['plan']}; choose another --out")
-        safe = bench.settings.as_dict()
+        safe = asdict(bench.settings)
         log.append({"type": "collection", "plan": plan, "safety": safe, **(about or {})})
         try:
             for number in range(1, count + 1):

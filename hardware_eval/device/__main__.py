@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import signal
 import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 
 from hardware_eval import realtime
 from ventbench.base.errors import InputError
@@ -26,14 +24,14 @@ except InputError as missing:  # an extra that brings the wire
     raise SystemExit(2) from None
 
 
-def serial_line(path: str, baud_rate: int = BAUD_RATE) -> Callable[[], int | None]:
+def serial_line(path: str) -> Callable[[], int | None]:
     """Return what opens a serial port; None while it is not there."""
 
     def open_line() -> int | None:
         import serial
 
         try:
-            port = serial.Serial(path, baud_rate, exclusive=True)
+            port = serial.Serial(path, BAUD_RATE, exclusive=True)
         except serial.SerialException:
             return None
         descriptor = os.dup(port.fileno())
@@ -102,19 +100,12 @@ def _run(given: argparse.Namespace) -> int:
 def _serve_until_signal(
     hal: deadman.SupervisedHal, settings: DeviceSettings, open_line: Callable[[], int | None]
 ) -> None:
-    ended = False
-
-    def end(number: int, frame: FrameType | None) -> None:
-        nonlocal ended
-        ended = True
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, end)
+    ended = realtime.told_to_end()
     port = Port(open_line, os.close)
     awake = notifier()
     try:
         Guard(DeviceService(hal, settings, time.monotonic()), port).run(
-            lambda: ended or hal.lost or awake()
+            lambda: ended() or hal.lost or awake()
         )
     finally:
         port.close()

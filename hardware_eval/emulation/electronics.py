@@ -136,9 +136,9 @@ def parse(text: str, now: float = 0.0) -> Fault:
     return Fault(kind, now + start, now + end, strength)
 
 
-def active(faults: Iterable[Fault], now: float) -> dict[object, Fault]:
-    """Faults that act at ``now``, s, by kind; of two of one kind the later of the sequence."""
-    return {fault.kind: fault for fault in faults if fault.start <= now < fault.end}
+def active(faults: Iterable[Fault], now: float) -> dict[object, float]:
+    """Strengths of what acts at ``now``, s, by kind; of two of one kind the later one's."""
+    return {fault.kind: fault.strength for fault in faults if fault.start <= now < fault.end}
 
 
 class Line:
@@ -167,22 +167,18 @@ class Line:
         kinds = active(self.faults, now)
         if LineFaultKind.SILENT in kinds:
             return now, b""
-        due = now
-        if LineFaultKind.LATE in kinds:
-            due += kinds[LineFaultKind.LATE].strength
+        due = now + kinds.get(LineFaultKind.LATE, 0.0)
         if LineFaultKind.JITTER in kinds:
-            due += float(self._random.uniform(0.0, kinds[LineFaultKind.JITTER].strength))
+            due += float(self._random.uniform(0.0, kinds[LineFaultKind.JITTER]))
         self._latest = max(self._latest, due)  # a line keeps the order
         return self._latest, self._damaged(kinds, data)
 
-    def _damaged(self, kinds: dict[object, Fault], data: bytes) -> bytes:
-        if LineFaultKind.LOSS in kinds and self._random.uniform() < (
-            kinds[LineFaultKind.LOSS].strength
-        ):
+    def _damaged(self, kinds: dict[object, float], data: bytes) -> bytes:
+        if LineFaultKind.LOSS in kinds and self._random.uniform() < kinds[LineFaultKind.LOSS]:
             return b""
         if LineFaultKind.NOISE in kinds and data:
             array = np.frombuffer(data, np.uint8).copy()
-            hit = self._random.uniform(size=len(array)) < kinds[LineFaultKind.NOISE].strength
+            hit = self._random.uniform(size=len(array)) < kinds[LineFaultKind.NOISE]
             array[hit] ^= (1 << self._random.integers(0, 8, int(hit.sum()))).astype(np.uint8)
             return array.tobytes()
         return data

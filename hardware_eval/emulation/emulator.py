@@ -13,7 +13,6 @@ import contextlib
 import heapq
 import math
 import os
-import signal
 import socket
 import sys
 import time
@@ -23,7 +22,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from hardware_eval import realtime
@@ -74,12 +72,10 @@ class LoopbackDevice:
     """
 
     def __init__(
-        self, hal: Hal, settings: DeviceSettings | None = None,
-        clock: VirtualClock | None = None, latency: float = 0.001, line: Line | None = None,
-    ) -> None:  # fmt: skip
-        """Start the device on a clock, its own if none is given."""
-        self.line = line or Line()
-        self.clock = clock or VirtualClock()
+        self, hal: Hal, settings: DeviceSettings | None = None, latency: float = 0.001
+    ) -> None:
+        """Start the device on a clock of its own."""
+        self.line, self.clock = Line(), VirtualClock()
         self.start = self.clock.now()
         self.latency = latency
         self.service = DeviceService(hal, settings or DeviceSettings(), self.start)
@@ -364,10 +360,7 @@ def _emulate(given: argparse.Namespace) -> int:
     faults = [parse(text) for text in given.fault]
     line_faults = [fault for fault in faults if isinstance(fault.kind, LineFaultKind)]
     limit = given.pressure_limit
-    try:
-        settings = DeviceSettings() if limit is None else DeviceSettings(limit)
-    except ValueError as error:
-        raise InputError(str(error)) from error
+    settings = DeviceSettings() if limit is None else DeviceSettings(limit)
     about = {name: getattr(given, name) for name in ("lung", "plant", "words", "seal")}
     sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
     begun = time.monotonic()
@@ -396,20 +389,13 @@ def _emulate(given: argparse.Namespace) -> int:
         if given.realtime and reason:
             emulator.close()
             raise InputError(f"--realtime: {reason}; run as root, or without it")
-        ended = False
-
-        def end(number: int, frame: FrameType | None) -> None:
-            nonlocal ended
-            ended = True
-
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, end)
+        ended = realtime.told_to_end()
         if isinstance(hal, Firmware):
             hal.start(lambda: emulator.port.inbox.put(b""))
         print(emulator.terminal, flush=True)
         processes = ", ".join(f"{name} {number}" for name, number in hal.processes.items())
         print(f"{hal.told} ({processes}); Ctrl-C ends it", file=sys.stderr, flush=True)
-        emulator.run(lambda: ended or hal.lost)
+        emulator.run(lambda: ended() or hal.lost)
         print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
     finally:
         hal.close()

@@ -164,11 +164,9 @@ class SimulatedHal:
             self._ambient_from = None
         if self._noise:
             pressure += self._noise * float(self._random.standard_normal())
-        if FaultKind.SENSOR_OFFSET in kinds:
-            pressure += kinds[FaultKind.SENSOR_OFFSET].strength
+        pressure += kinds.get(FaultKind.SENSOR_OFFSET, 0.0)
         if FaultKind.SENSOR_NOISY in kinds:
-            strength = kinds[FaultKind.SENSOR_NOISY].strength
-            pressure += strength * float(self._random.standard_normal())
+            pressure += kinds[FaultKind.SENSOR_NOISY] * float(self._random.standard_normal())
         if self._quantum:
             pressure = round(pressure / self._quantum) * self._quantum
         pressure = min(pressure, self._highest)
@@ -178,12 +176,10 @@ class SimulatedHal:
             pressure = self._stuck_reading
         else:
             self._stuck_reading = math.nan
-        if FaultKind.SENSOR_LOST in kinds:
-            pressure = math.nan
-        if FaultKind.SENSOR_DROPOUTS in kinds and self._random.uniform() < (
-            kinds[FaultKind.SENSOR_DROPOUTS].strength
-        ):
-            pressure = math.nan
+        lost = FaultKind.SENSOR_LOST in kinds
+        if FaultKind.SENSOR_DROPOUTS in kinds:
+            lost |= bool(self._random.uniform() < kinds[FaultKind.SENSOR_DROPOUTS])
+        pressure = math.nan if lost else pressure
         self._last = Sample(now, pressure, flow, saturated=pressure >= self._highest)
         return self._last
 
@@ -203,26 +199,22 @@ class SimulatedHal:
             self._restart = 1.0
         self._command = (u_in, u_out)
 
-    def _by(self, now: float, kinds: dict[object, Fault]) -> tuple[jax.Array, jax.Array]:
+    def _by(self, now: float, kinds: dict[object, float]) -> tuple[jax.Array, jax.Array]:
         """State and readings at ``now`` if the present command is held until then."""
         u_in, u_out = self._command
-        share, r_scale = float(u_out), 1.0
+        share, r_scale = float(u_out), kinds.get(FaultKind.PINCHED, 1.0)
         if FaultKind.VALVE_STUCK in kinds:
             if math.isnan(self._stuck_valve):
                 self._stuck_valve = u_in
             u_in = self._stuck_valve
         else:
             self._stuck_valve = math.nan
-        if FaultKind.VALVE_WEAK in kinds:
-            u_in *= kinds[FaultKind.VALVE_WEAK].strength
+        u_in *= kinds.get(FaultKind.VALVE_WEAK, 1.0)
         if FaultKind.EXPIRATORY_STUCK in kinds:
             share = 0.0
-        if FaultKind.LEAK in kinds:
-            share = max(share, kinds[FaultKind.LEAK].strength)
+        share = max(share, kinds.get(FaultKind.LEAK, 0.0))
         if FaultKind.DISCONNECTED in kinds:
             u_in, share = 0.0, 1.0
-        if FaultKind.PINCHED in kinds:
-            r_scale = kinds[FaultKind.PINCHED].strength
         if FaultKind.OCCLUDED in kinds:
             r_scale = _OCCLUSION
         held = max(now - (now if self._since is None else self._since), SHORTEST_HOLD)

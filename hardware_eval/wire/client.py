@@ -199,12 +199,11 @@ class Link:
         url: a device such as ``/dev/ttyACM0``, ``socket://host:port`` or ``loop://``.
     """
 
-    def __init__(self, url: str, baud_rate: int = BAUD_RATE, patience: float = 60.0) -> None:
+    def __init__(self, url: str, patience: float = 60.0) -> None:
         """Open a port.
 
         Args:
             url: whatever :func:`serial.serial_for_url` takes.
-            baud_rate: bits per second.
             patience: time after which :meth:`reopen` gives up, s.
 
         Raises:
@@ -212,7 +211,7 @@ class Link:
                 PortForbiddenError say why.
         """
         self.url = url
-        self._baud_rate, self._patience = baud_rate, patience
+        self._patience = patience
         self._port = self._open()
         self._traffic = _Traffic(self._port)
 
@@ -255,7 +254,7 @@ class Link:
 
     def _open(self) -> serial.Serial:
         try:
-            port = serial.serial_for_url(self.url, self._baud_rate, do_not_open=True)
+            port = serial.serial_for_url(self.url, BAUD_RATE, do_not_open=True)
             if isinstance(port, serial.Serial):
                 port.exclusive = True  # a second program would steal bytes
             port.write_timeout = WRITE_TIMEOUT

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hardware_eval.bench.loop import Bench, SilentOperator
+from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import simulated_lung
@@ -48,4 +48,4 @@ def line(device: LoopbackDevice) -> Line:
 
 @pytest.fixture
 def bench(line: Line) -> Bench:
-    return Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=2.0)
+    return Bench(line.client, line.clock, DEFAULT, Operator(), rest=2.0)

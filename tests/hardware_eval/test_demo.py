@@ -10,8 +10,15 @@ import numpy as np
 import pytest
 
 from hardware_eval.bench.controllers import SubmissionController
-from hardware_eval.demo import GAINS, PlannedController, demo, error_on, plan_controller
-from hardware_eval.emulation.simulated import SimulatedHal, reveal
+from hardware_eval.demo import (
+    GAINS,
+    PlannedController,
+    demo,
+    emulated_line,
+    errors_on,
+    plan_controller,
+)
+from hardware_eval.emulation.simulated import reveal
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.entries.folder import open_submission
 from ventbench.entries.runner import InProcessRunner
@@ -59,12 +66,12 @@ def test_what_the_simulator_lacks_costs_and_a_plan_with_it_does_better(tmp_path:
     true: Plant = physics(
         lung(LUNG), {"turbulent_resistance": {"quadratic": 11.0}, "valve_lag": {"tau": 0.02}}
     )
-    hal = SimulatedHal(true, noise=0.1, quantum=0.07)
+    line = emulated_line(true, LUNG)
     planned = {name: plan_controller(x, PIPS) for name, x in (("plain", plain), ("true", true))}
     errors = {}
     for name, controller in planned.items():
-        entry = controller.write(tmp_path, name)
-        errors[name] = error_on(hal.at_rest(), entry, LUNG, PIPS)
+        entry, out = controller.write(tmp_path, name), tmp_path / f"{name}_run"
+        errors[name] = errors_on(line, entry, LUNG, PIPS, out, sandbox=False)
         assert sorted(errors[name]) == list(PIPS)
     mean = {name: np.mean(list(by_pip.values())) for name, by_pip in errors.items()}
     assert mean["plain"] > 1.3 * planned["plain"].error

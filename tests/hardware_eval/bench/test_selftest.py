@@ -13,7 +13,7 @@ import pytest
 from hardware_eval.bench import selftest as selftest_module
 from hardware_eval.bench.drive import collect
 from hardware_eval.bench.identity import measured_lung
-from hardware_eval.bench.loop import Bench, SilentOperator
+from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.selftest import LIMITS, Driven, selftest, span_finding
 from hardware_eval.emulation.electronics import Fault, FaultKind, LineFaultKind
 from hardware_eval.emulation.emulator import LoopbackDevice
@@ -212,7 +212,7 @@ def test_exploring_stops_when_nothing_can_be_trusted(
     hal.faults = (Fault(FaultKind.DISCONNECTED, device.clock.now()),)
     told: list[str] = []
 
-    class Listens(SilentOperator):
+    class Listens(Operator):
         def tell(self, text: str) -> None:
             told.append(text)
 

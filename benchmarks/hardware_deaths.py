@@ -36,8 +36,7 @@ import numpy as np
 
 from hardware_eval import realtime
 from hardware_eval.emulation.emulator import tell
-from hardware_eval.wire.client import Client, LinkError
-from hardware_eval.wire.link import Link
+from hardware_eval.wire.client import Client, Link, LinkError
 from hardware_eval.wire.messages import Mode
 from ventbench.base import files
 

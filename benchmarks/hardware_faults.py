@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.controllers import ControllerFailedError, PIDController
-from hardware_eval.bench.loop import Bench, EmergencyStop, SilentOperator, run_once
+from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, run_once
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
-from hardware_eval.emulation import faults
-from hardware_eval.emulation.faults import FaultKind
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation import electronics
+from hardware_eval.emulation.electronics import FaultKind
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError
 from hardware_eval.wire.messages import Reading
@@ -90,7 +90,7 @@ class DeadClient(Client):
         return super().vent()
 
 
-class StopKey(SilentOperator):
+class StopKey(Operator):
     """Presses the emergency stop at a moment."""
 
     def __init__(self, device: LoopbackDevice, moment: float) -> None:
@@ -165,7 +165,7 @@ def trial(device: LoopbackDevice, lung: str, fault: Fault, moment: float) -> tup
     client.hello()
     begins = device.clock.now() + REST + moment
     if fault.lung is not None:
-        hal.faults = (faults.Fault(fault.lung[0], begins, strength=fault.lung[1]),)
+        hal.faults = (electronics.Fault(fault.lung[0], begins, strength=fault.lung[1]),)
 
     def dies(wanted: float) -> float:
         DeadClient.dead = True
@@ -181,7 +181,7 @@ def trial(device: LoopbackDevice, lung: str, fault: Fault, moment: float) -> tup
         trouble = dies
     if fault.device is not None:
         trouble = acts
-    operator = StopKey(device, begins) if fault.key else SilentOperator()
+    operator = StopKey(device, begins) if fault.key else Operator()
     bench = Bench(client, device.clock, DEFAULT, operator, rest=REST)
     run = PlannedRun(0, "scored", "pid", lung, 20.0, 1)
     controller = Troubled(device, lung, begins, trouble)
@@ -251,11 +251,11 @@ def _selftest(device: LoopbackDevice, lung: str, fault: Fault) -> str:
     """What the self-test says of the fault, if it is there from the start."""
     hal: Any = device.service.hal
     assert fault.lung is not None
-    hal.faults = (faults.Fault(fault.lung[0], device.clock.now(), strength=fault.lung[1]),)
+    hal.faults = (electronics.Fault(fault.lung[0], device.clock.now(), strength=fault.lung[1]),)
     client = Client(device, device.clock)
     client.hello()
     try:
-        bench = Bench(client, device.clock, DEFAULT, SilentOperator(), rest=REST)
+        bench = Bench(client, device.clock, DEFAULT, Operator(), rest=REST)
         sheet = selftest(bench, lung)
         bad = [x.name.replace("_", " ") for x in sheet.findings if not x.ok]
         found = f"no-go: {', '.join(bad)}" if bad else "go"

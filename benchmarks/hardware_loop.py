@@ -24,8 +24,7 @@ import numpy as np
 
 from hardware_eval import realtime
 from hardware_eval.bench.loop import ON_TIME_S, answer_by
-from hardware_eval.wire.client import Client, NoAnswerError, RefusedError
-from hardware_eval.wire.link import Link
+from hardware_eval.wire.client import Client, Link, NoAnswerError, RefusedError
 from ventbench.task import protocol, waveform
 
 #: Late steps that are shown.

@@ -2,13 +2,13 @@
 
 The package uses ventbench; ventbench never imports it. ``PROTOCOL.md`` specifies the wire.
 
-The host holds a :class:`~hardware_eval.wire.client.Client`. It talks either through
-a :class:`~hardware_eval.wire.link.Link` (a serial port, a socket, the emulator's pseudo-terminal),
-or to a :class:`~hardware_eval.emulation.loopback.LoopbackDevice`, which runs the device's program
+The host holds a :class:`~hardware_eval.wire.client.Client`. It talks either through a
+:class:`~hardware_eval.wire.client.Link` (a serial port, a socket, the emulator's pseudo-terminal),
+or to a :class:`~hardware_eval.emulation.emulator.LoopbackDevice`, which runs the device's program
 in the same process on a virtual clock, faster than real time::
 
     from hardware_eval.wire.client import Client
-    from hardware_eval.emulation.loopback import LoopbackDevice
+    from hardware_eval.emulation.emulator import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
 
     device = LoopbackDevice(simulated_lung("R20C50"))

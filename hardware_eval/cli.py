@@ -15,14 +15,16 @@ import typer
 
 from hardware_eval.commands import (
     Calibrated,
+    Lung,
     Port,
     Yes,
     bench_on,
+    calibrate,
     calibration_of,
     known_by,
     numbers,
-    register,
     told,
+    trial,
 )
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -210,26 +212,19 @@ def run(
 def emulate(context: typer.Context) -> None:
     """Emulate the ventilator and a lung on a pseudo-terminal; prints its path.
 
-    Options: --lung, --plant, --conceal WORDS, --seal FILE, --link PATH, --control SOCKET, --fault
-    KIND@START[-END][:STRENGTH], --noise, --quantum, --highest, --log FILE,
-    --electronics FILE, --normally-closed, --no-monostable, --firmware FILE; `emulate --help`
-    explains them.
+    Its options, such as --lung, --conceal, --fault and --firmware: `emulate --help`.
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """
     from hardware_eval.emulation.emulator import main as run_emulator
 
-    code = run_emulator(context.args)
-    if code:
-        raise typer.Exit(code)
+    raise typer.Exit(run_emulator(context.args))
 
 
 @app.command()
 def selftest(
     port: Port,
-    lung: Annotated[
-        str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
-    ],
+    lung: Lung,
     plant: options.PlantName = "frozen",
     skip: Skip = None,
     calibration: Calibrated = None,
@@ -315,7 +310,7 @@ def compare(
 
     Example: `ventbench-hardware compare runs/hardware --out runs/mismatch`
     """
-    from hardware_eval.results.replay import recorded_breaths, scored_plants
+    from hardware_eval.results.record import recorded_breaths, scored_plants
     from ventbench.simulation import error_summary, mean_errors
 
     breaths = recorded_breaths(recorded, log)
@@ -344,9 +339,7 @@ def compare(
 @app.command()
 def collect(
     port: Port,
-    lung: Annotated[
-        str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
-    ],
+    lung: Lung,
     breaths: Annotated[int, typer.Option(min=1, help="Breaths in all.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of the disturbances.")] = 0,
     out: Annotated[
@@ -362,7 +355,7 @@ def collect(
 
     Example: `ventbench-hardware collect --port /dev/ttyACM0 --lung R20C50 --breaths 600`
     """
-    from hardware_eval.bench import collect as collection
+    from hardware_eval.bench.drive import collect as run_collection
     from hardware_eval.results import evaluate as ev
     from ventbench.cli.options import bar
     from ventbench.task import protocol
@@ -378,7 +371,7 @@ def collect(
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
         with bar("exploring") as exploring:
-            done = collection.collect(
+            done = run_collection(
                 bench, label, breaths, out, seed=seed, ease=ease,
                 about={"device": ev.device_about(line)},
                 progress=lambda number: exploring(number, breaths),
@@ -400,10 +393,6 @@ def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Empty folder for everything.")] = Path(
         "runs/demo"
     ),
-    fast: Annotated[
-        bool,
-        typer.Option("--fast", help="On a virtual clock in this process, not on a terminal."),
-    ] = False,
     breaths: Annotated[int, typer.Option(min=12, help="Breaths to explore.")] = 36,
     plant: Annotated[
         str,
@@ -423,8 +412,8 @@ def demo(
 
     to = told(json)
     done = run_demo(
-        conceal, out, breaths=breaths, simulator=plant, real_time=not fast,
-        sandbox=not in_process, tell=lambda text: print(text, file=to, flush=True),
+        conceal, out, breaths=breaths, simulator=plant, sandbox=not in_process,
+        tell=lambda text: print(text, file=to, flush=True),
     )  # fmt: skip
     emit(done.as_dict(), json)
     print(f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}", file=to)
@@ -450,7 +439,7 @@ def replay(
 
     Example: `ventbench-hardware replay runs/hardware`
     """
-    from hardware_eval.results.replay import replay as run_replay
+    from hardware_eval.results.record import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
     emit(report.as_dict(), json)
@@ -459,7 +448,8 @@ def replay(
         raise typer.Exit(1)
 
 
-register(app)
+app.command()(trial)
+app.command()(calibrate)
 
 
 def main() -> None:

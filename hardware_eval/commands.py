@@ -28,6 +28,7 @@ Port = Annotated[
         "time."
     ),
 ]
+Lung = Annotated[str, typer.Option(help="Label of the mounted lung.", autocompletion=known_lungs)]
 Yes = Annotated[
     bool, typer.Option("--yes", help="Confirm every question; for an emulator, not for a bench.")
 ]
@@ -42,32 +43,25 @@ def told(json: Path | None) -> TextIO:
 def bench_on(
     port: str, *, yes: bool, control: Path | None = None
 ) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
-    """A bench with a person at it, whose keys are stops; the line is released at the end."""
+    """A bench with a person at it; the line is released at the end.
+
+    Any key is the emergency stop, which ends the command with exit code 1.
+    """
     from hardware_eval.bench.console import ConsoleOperator
-    from hardware_eval.bench.loop import Bench
+    from hardware_eval.bench.loop import Bench, EmergencyStop
     from hardware_eval.bench.safety import DEFAULT
     from hardware_eval.results import evaluate as ev
 
     line = ev.connect(port)
     try:
         person = ConsoleOperator(yes=yes, control=control, device=line.device)
-        with keys(person):
+        with person.keys():
             yield line, Bench(line.client, line.clock, DEFAULT, person), person
+    except EmergencyStop:
+        print("stopped: the operator pressed the emergency stop", file=sys.stderr)
+        raise typer.Exit(1) from None
     finally:
         line.client.close()
-
-
-@contextlib.contextmanager
-def keys(person: ConsoleOperator) -> Iterator[None]:
-    """Any key is the emergency stop; it ends the command with exit code 1."""
-    from hardware_eval.bench.loop import EmergencyStop
-
-    with person.keys():
-        try:
-            yield
-        except EmergencyStop:
-            print("stopped: the operator pressed the emergency stop", file=sys.stderr)
-            raise typer.Exit(1) from None
 
 
 Calibrated = Annotated[
@@ -99,9 +93,7 @@ def trial(
 def calibrate(
     part: Annotated[str, typer.Argument(help="zero, span, valve, peep, flow, leak or lung.")],
     port: Port,
-    lung: Annotated[
-        str, typer.Option(help="Label of the mounted lung.", autocompletion=known_lungs)
-    ] = "R5C20",
+    lung: Lung = "R5C20",
     reference: Annotated[
         str | None,
         typer.Option(
@@ -171,9 +163,3 @@ def numbers(option: str, text: str | None) -> list[float]:
         return [float(part) for part in text.split(",")] if text else []
     except ValueError:
         raise InputError(f"{option} {text!r}: write numbers separated by commas") from None
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(trial)
-    app.command()(calibrate)

@@ -4,39 +4,58 @@ An emulated lung conceals physics that the simulators lack, drawn from the libra
 controller that was planned on a simulator runs on it and does worse than there. The comparison of a
 recording with the simulator names what is missing; the controller is planned again on the corrected
 simulator and runs on the same lung. Only then the seal is opened. Nothing in between reads it.
+
+A simulator says which commands bring the pressure to its target and keep it there, and which
+pressures they give. The controller sends these commands, and a PI controller answers the difference
+between measured and planned pressure (two degrees of freedom: Horowitz, *Synthesis of Feedback
+Systems*, 1963). It is as good as its simulator: commands planned without a leak are too small for a
+lung that leaks, and feedback corrects that late. So it shows what a better simulator is worth. A
+PID tuned on it hardly does, as its gains serve many lungs.
+
+The commands are those of least error, by sequential linear programming
+(:mod:`ventbench.task.attainable`). What is planned is the reading of the sensor, which is all
+that a bench measures and scores. And it is planned for the second breath of a run and those after
+it, which a bench scores: a slow lung has not emptied since the breath before.
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import flax.struct
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from hardware_eval.bench.collect import collect
-from hardware_eval.bench.loop import Bench, Operator, SilentOperator
-from hardware_eval.bench.plan import Plan, make_plan
+from hardware_eval.bench.drive import collect
+from hardware_eval.bench.loop import Bench, Operator
+from hardware_eval.bench.plan import make_plan
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.bench.safety import DEFAULT
-from hardware_eval.bench.session import dry_run
-from hardware_eval.emulation.loopback import LoopbackDevice
-from hardware_eval.emulation.simulated import SimulatedHal, conceal, reveal
-from hardware_eval.planned import PlannedController, plan_controller
+from hardware_eval.emulation.emulator import LoopbackDevice
+from hardware_eval.emulation.simulated import SimulatedHal, breath_begun, conceal, reveal
 from hardware_eval.results import evaluate as ev
-from hardware_eval.results.evaluate import Evaluation, Line
-from hardware_eval.results.replay import scored_plants
+from hardware_eval.results.evaluate import Line
+from hardware_eval.results.record import scored_plants
 from hardware_eval.wire.client import Client
-from ventbench.base import files
+from ventbench.base import compilation, files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.diagnosis.diagnose import diagnose
 from ventbench.entries.folder import open_submission
-from ventbench.task.interfaces import Plant
+from ventbench.entries.scaffold import contents
+from ventbench.task import attainable as bound
+from ventbench.task import environment as env
+from ventbench.task import protocol, rollouts
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Plant, Signals
 
 #: PIPs of the demo, cmH2O: few, so that it takes minutes.
 PIPS = (10.0, 20.0, 30.0)
@@ -51,11 +70,156 @@ SIMULATOR = "physics"
 #: Noise of the emulated sensor, cmH2O, and the step of its converter (PVP's).
 NOISE, QUANTUM = 0.1, 0.0703
 
-#: Patience with an emulator that starts, s.
-_STARTS_S = 90.0
-
 #: Rest before a run, s.
 _REST = 2.0
+
+#: Steps that the starts of the search for commands open the valve for: a short and a long rise.
+STARTS = (2, 8)
+
+#: Breaths before the one that is planned: by then the breaths of the slowest lung (R20C50, 1.25 s)
+#: differ by less than a twentieth of what is left in it.
+BEFORE = 2
+
+#: P and I of the feedback, %/cmH2O. With more P a lung of 20 cmH2O/(L/s) rings when its valve is a
+#: step late.
+GAINS = (0.5, 10.0)
+
+#: The controller of an entry, before its numbers.
+_CONTROLLER = '''"""Commands planned on a simulator, and feedback where the lung departs from it."""
+
+STEP = {step}  # s
+TIME_CONSTANT = {time_constant}  # s, of the averaged difference
+GAINS = {gains}  # P and I, %/cmH2O
+
+# Each row: PIP, cmH2O; planned commands, %; pressures that they should give, cmH2O.
+PLAN = (
+{rows}
+)
+
+
+def between(pip, column, step):
+    """Value of the plan at a PIP: linear between two rows, that of the nearest beyond."""
+    below = max((row for row in PLAN if row[0] <= pip), default=PLAN[0])
+    above = min((row for row in PLAN if row[0] >= pip), default=PLAN[-1])
+    share = 0.0 if below is above else (pip - below[0]) / (above[0] - below[0])
+    return (1.0 - share) * below[column][step] + share * above[column][step]
+
+
+class Controller:
+    """One for each run of three breaths."""
+
+    def reset(self, task):
+        """Nothing to prepare."""
+
+    def act(self, observation):
+        """Return u_in, %, for the next step."""
+        if observation.time == 0:  # a new breath
+            self.integral = 0.0
+        step = min(round(observation.time / STEP), len(PLAN[0][1]) - 1)
+        missing = between(observation.target, 2, step) - observation.pressure
+        a = observation.dt / (observation.dt + TIME_CONSTANT)
+        self.integral += a * (missing - self.integral)
+        p, i = GAINS
+        return between(observation.target, 1, step) + p * missing + i * self.integral
+'''
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedController:
+    """Feedforward of N PIPs over the T steps of an inspiration."""
+
+    pips: tuple[float, ...]  #: cmH2O, rising, N of them.
+    commands: Floats  #: planned, %, shape ``(N, T)``.
+    #: that the simulator gives under them, one before each command, cmH2O, shape ``(N, T)``.
+    pressures: Floats
+
+    @property
+    def error(self) -> float:
+        """Mean ``|pressure - PIP|`` on the simulator, cmH2O."""
+        return float(np.mean(np.abs(self.pressures - np.array(self.pips)[:, None])))
+
+    def write(self, folder: Path, name: str) -> Path:
+        """Write it as a submission ``folder/name``; returns that folder."""
+        rows = [
+            f"    ({pip}, {_numbers(commands)},\n     {_numbers(pressures)}),"
+            for pip, commands, pressures in zip(
+                self.pips, self.commands, self.pressures, strict=True
+            )
+        ]
+        controller = _CONTROLLER.format(
+            step=protocol.DT, time_constant=TIME_CONSTANT, gains=GAINS, rows="\n".join(rows)
+        )
+        made = contents(name, "other") | {"controller.py": controller.encode()}
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        for file, content in made.items():
+            (folder / name / file).write_bytes(content)
+        return folder / name
+
+
+def _numbers(values: Floats) -> str:
+    return f"({', '.join(f'{value:.3f}' for value in values)})"
+
+
+@flax.struct.dataclass
+class _Breathing:
+    """A plant at the end of an expiration, whose airway pressure is the reading of its sensor."""
+
+    plant: Any  #: the plant.
+    state: Any  #: of the plant when an inspiration begins, with the batch axes of the plant.
+
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Signals]:
+        return self.state, Signals(pressure)
+
+    def step(self, state: Any, u_in: Array, u_out: Array, dt: Array) -> tuple[Any, Signals]:
+        state, signals = self.plant.step(state, u_in, u_out, dt)
+        return state, Signals(signals.reading)
+
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> _Breathing:
+        return _Breathing(self.plant.vary(r_scale, c_scale, gain), self.state)
+
+    def parameters(self) -> Any:
+        return self.plant.parameters()
+
+
+def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
+    """Plan a controller on a simulator.
+
+    Args:
+        plant: the simulator of a lung, without a batch shape.
+        pips: cmH2O, rising; commands of a PIP between two are interpolated.
+
+    Raises:
+        ValueError: if the PIPs do not rise.
+    """
+    if not pips or any(b <= a for a, b in itertools.pairwise(pips)):
+        raise ValueError(f"PIPs {pips} cmH2O must rise")
+    n = len(pips)
+    with compilation.float64():
+        cells = env.nominal_scenario(np.asarray(pips))
+        cells = cells.replace(noise=np.zeros((n, 1, 1)))  # type: ignore[attr-defined]
+        wide = jax.tree.map(lambda leaf: np.asarray(leaf, float), plant)
+        stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf))), wide)
+        state, _ = jax.vmap(type(plant).init)(stacked, cells.start, cells.peep)
+        for turn in range(1 + BEFORE):
+            breathing = _Breathing(stacked, state)
+            best = bound.attainable(breathing, cells, starts=STARTS)
+            after = bound.pressures(breathing, cells, best.commands)
+            # The last command of an inspiration acts on no scored pressure: it stays.
+            commands = np.concatenate([best.commands, best.commands[:, -1:]], axis=1)
+            pressures = np.concatenate([np.asarray(cells.start)[:, None], after], axis=1)
+            if turn < BEFORE:
+                state, start = _breath_after(breathing, cells, commands)
+                cells = cells.replace(start=start)  # type: ignore[attr-defined]
+    return PlannedController(pips, commands, pressures)
+
+
+@jax.jit
+@jax.vmap
+def _breath_after(plant: _Breathing, cell: Scenario, commands: Array) -> tuple[Any, Array]:
+    """State and reading after a breath, when the next inspiration begins."""
+    loop, _, _ = rollouts.inspiration(plant, cell, rollouts.commanded, inputs=commands)
+    loop, _ = rollouts.expiration(plant, cell, loop)
+    return breath_begun(loop.plant, jnp.ones(())), loop.signals.reading
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +229,13 @@ class Demo:
     words: str  #: what the lung was drawn from.
     lung: str  #: its label.
     commitment: str  #: hash of the sealed answer, published first.
-    #: P and I of the feedback before and after the correction, %/cmH2O.
-    gains: tuple[tuple[float, ...], tuple[float, ...]]
     #: error of the entry on the emulator of the plain simulator, by PIP.
     simulated: dict[float, float]
     measured: dict[float, float]  #: its error on the lung that conceals something, by PIP.
     verdict: str  #: of the diagnosis.
     named: dict[str, dict[str, float]]  #: mechanisms that it names, with their parameters.
-    #: held-out open-loop error before, refitted and after the correction.
-    open_loop: tuple[float, float, float]
+    #: held-out open-loop error ``before``, ``refit`` and ``after`` the correction.
+    open_loop_mae: dict[str, float]
     predicted: float  #: error of the replanned entry on the corrected simulator, mean over PIPs.
     retuned: dict[float, float]  #: error of the replanned entry on the lung, by PIP.
     truth: dict[str, Any]  #: what the seal held.
@@ -92,40 +254,13 @@ class Demo:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
-        return files.json_values(
-            {
-                "words": self.words,
-                "lung": self.lung,
-                "commitment": self.commitment,
-                "gains": {"entry": self.gains[0], "retuned": self.gains[1]},
-                "errors": {
-                    "simulated": self.simulated,
-                    "measured": self.measured,
-                    "retuned": self.retuned,
-                    "predicted_mean": self.predicted,
-                },
-                "verdict": self.verdict,
-                "named": self.named,
-                "open_loop_mae": dict(
-                    zip(("before", "refit", "after"), self.open_loop, strict=True)
-                ),
-                "truth": self.truth,
-                "right": self.right,
-                "better": self.better,
-                "steps": self.steps,
-                "seconds": self.seconds,
-            }
-        )
+        return files.json_values({**vars(self), "right": self.right, "better": self.better})
 
 
 def _mechanism(name: str, parameters: Mapping[str, float]) -> str:
     """A mechanism and its parameters in words."""
     values = ", ".join(f"{key} {value:.3g}" for key, value in parameters.items())
     return f"{name.replace('_', ' ')} ({values})"
-
-
-def _gains(planned: PlannedController) -> str:
-    return " ".join(f"{gain:g}" for gain in planned.gains)
 
 
 def _mean(errors: Mapping[float, float]) -> float:
@@ -151,28 +286,23 @@ def demo(
     words: str,
     out: Path,
     *,
-    pips: tuple[float, ...] = PIPS,
     breaths: int = BREATHS,
     simulator: str = SIMULATOR,
-    real_time: bool = True,
     sandbox: bool = True,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Demo:
-    """Run the demo.
+    """Run the demo, in this process on a virtual clock.
 
     Args:
         words: any words; they determine lung and concealed physics, and open the seal.
         out: an empty folder for everything.
-        pips: cmH2O.
         breaths: breaths to collect for the diagnosis.
         simulator: name of the simulators, which the concealed physics is added to.
-        real_time: over a pseudo-terminal in real time; else in this process on a virtual clock.
         sandbox: run entries as in scoring.
         tell: told every step and its figures as it ends.
 
     Raises:
         InputError: if the folder is not empty, or a plan does not finish.
-        LinkError: if the emulator is lost.
     """
     began = time.perf_counter()
     if out.exists() and any(out.iterdir()):
@@ -192,21 +322,21 @@ def demo(
     step("A lung is sealed", f"{lung}; commitment {commitment[:16]}...")
     tested = scored_plants(simulator, [lung])
     plain = tested.plant(lung)
-    planned = plan_controller(plain, pips)
+    planned = plan_controller(plain, PIPS)
     entry = planned.write(out / "entries", "first")
-    plan = _plan("first", lung, pips)
-    simulated = error_on(SimulatedHal(plain, noise=NOISE, quantum=QUANTUM), entry, lung, pips)
-    step(
-        "A controller is planned on the simulator",
-        f"{_mean(simulated):.2f} cmH2O there; feedback P I = {_gains(planned)}",
-    )
-    with _line(hidden.plant, words, simulator, lung, out, real_time) as line:
-        measured = _errors(_evaluate(plan, entry, line, out / "first", sandbox))
-        against = _against(simulated, measured, "simulation")
-        step("The same controller on the lung", f"{_said(measured)}{against}")
-        bench = Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=_REST)
-        explored = collect(bench, lung, breaths, out / "explored").breaths
-        step("The lung is explored", f"{len(explored)} breaths")
+
+    def evaluated(line: Line, entry: Path, name: str) -> dict[float, float]:
+        return errors_on(line, entry, lung, PIPS, out / name, sandbox=sandbox)
+
+    simulated = evaluated(emulated_line(plain, lung), entry, "simulated")
+    step("A controller is planned on the simulator", f"{_mean(simulated):.2f} cmH2O there")
+    line = emulated_line(hidden.plant, lung)
+    measured = evaluated(line, entry, "first")
+    against = _against(simulated, measured, "simulation")
+    step("The same controller on the lung", f"{_said(measured)}{against}")
+    bench = Bench(line.client, line.clock, DEFAULT, Operator(), rest=_REST)
+    explored = collect(bench, lung, breaths, out / "explored").breaths
+    step("The lung is explored", f"{len(explored)} breaths")
     diagnosis = diagnose(explored, simulator=tested, lung=lung)
     diagnosis.save(out / "diagnosis")
     named = {
@@ -215,21 +345,17 @@ def demo(
     }
     said = "; ".join(_mechanism(name, values) for name, values in named.items())
     step("The diagnosis", f"{diagnosis.verdict}: {said or 'no mechanism is named'}")
-    errors = diagnosis.open_loop
-    open_loop = errors.before.mae, errors.refit.mae, errors.after.mae
+    mae = {name: getattr(diagnosis.open_loop, name).mae for name in ("before", "refit", "after")}
     step(
         "The corrected simulator",
-        "held-out open-loop error {:.2f}, refitted {:.2f}, corrected {:.2f}".format(*open_loop),
+        "held-out open-loop error {before:.2f}, refitted {refit:.2f}, corrected {after:.2f}".format(
+            **mae
+        ),
     )
-    replanned = plan_controller(diagnosis.plants.get(lung, plain), pips)
+    replanned = plan_controller(diagnosis.plants.get(lung, plain), PIPS)
     second = replanned.write(out / "entries", "replanned")
-    step(
-        "The controller is planned again on it",
-        f"{replanned.error:.2f} cmH2O predicted; feedback P I = {_gains(replanned)}",
-    )
-    with _line(hidden.plant, words, simulator, lung, out, real_time) as line:
-        again = _plan("replanned", lung, pips)
-        retuned = _errors(_evaluate(again, second, line, out / "second", sandbox))
+    step("The controller is planned again on it", f"{replanned.error:.2f} cmH2O predicted")
+    retuned = evaluated(line, second, "second")
     against = _against(measured, retuned, "the first")
     step("The replanned controller on the lung", f"{_said(retuned)}{against}")
     _, effect = reveal(seal, words)
@@ -237,8 +363,8 @@ def demo(
     found = "named" if effect.name in named else "not named"
     step("The seal is opened", f"{truth}, {effect.strength}: {found}")
     done = Demo(
-        words, lung, commitment, (planned.gains, replanned.gains), simulated, measured,
-        diagnosis.verdict, named, open_loop, replanned.error, retuned,
+        words, lung, commitment, simulated, measured, diagnosis.verdict, named, mae,
+        replanned.error, retuned,
         {"name": effect.name, "strength": effect.strength, "parameters": dict(effect.parameters)},
         tuple(steps), time.perf_counter() - began,
     )  # fmt: skip
@@ -246,79 +372,44 @@ def demo(
     return done
 
 
-def _plan(name: str, lung: str, pips: tuple[float, ...]) -> Plan:
-    return make_plan([name], [lung], pips=pips, repeats=1, control_every=0)
+def emulated_line(plant: Plant, lung: str) -> Line:
+    """A line to an emulated lung of a label, in this process on a virtual clock."""
+    hal = SimulatedHal(plant, name=f"emulated {lung}", noise=NOISE, quantum=QUANTUM)
+    device = LoopbackDevice(hal)
+    client = Client(device, device.clock)
+    client.hello()
+    return Line(client, device.clock)
 
 
-def error_on(
-    hal: SimulatedHal, entry: Path, lung: str, pips: tuple[float, ...]
+def errors_on(
+    line: Line, entry: Path, lung: str, pips: tuple[float, ...], out: Path, *, sandbox: bool
 ) -> dict[float, float]:
-    """Errors of an entry on an emulator in this process, cmH2O, by PIP; infinite if it stopped.
+    """Evaluate an entry, one scored run at each PIP.
 
     Args:
-        hal: the emulated lung.
-        entry: folder of the entry, which runs in this process.
-        lung: its label, which the entry is told.
+        line: to the lung.
+        entry: folder of the entry.
+        lung: label of the lung, which the entry is told.
         pips: cmH2O.
+        out: folder of the log.
+        sandbox: run the entry as in scoring.
+
+    Returns:
+        Errors by PIP, cmH2O; infinite where a check stopped the run.
+
+    Raises:
+        InputError: if the plan does not finish.
     """
-    plan = _plan(entry.name, lung, pips)
-    make = ev.controllers([open_submission(str(entry))], plan.track, ev.make_runner(False),
-                          real_time=False)  # fmt: skip
-    _, errors = dry_run(plan, make, DEFAULT, _REST, lung=lambda label: hal)
-    by_pip = {pip: error for *_, pip, error in errors}
-    return {pip: by_pip.get(pip, float("inf")) for pip in pips}
-
-
-def _evaluate(plan: Plan, entry: Path, line: Line, out: Path, sandbox: bool) -> Evaluation:
-    operator: Operator = SilentOperator()
-    submission = open_submission(str(entry))
+    plan = make_plan([entry.name], [lung], pips=pips, repeats=1, control_every=0)
     done = ev.evaluate(
-        [submission], line, out, operator, plan=plan, sandbox=sandbox, dry=False,
-        operator_name="ventbench-hardware demo", notes="emulated lung", rest=_REST,
+        [open_submission(str(entry))], line, out, Operator(), plan=plan, sandbox=sandbox,
+        dry=False, operator_name="ventbench-hardware demo", notes="emulated lung", rest=_REST,
     )  # fmt: skip
     if not done.complete:
         raise InputError(f"{entry.name} did not finish its plan: {done.reason}")
-    return done
-
-
-def _errors(done: Evaluation) -> dict[float, float]:
-    """Errors of the scored runs by PIP; a stopped run counts as infinite."""
-    errors: dict[float, float] = {}
-    for line in lines(done.log):
-        if line["type"] == "run" and line["kind"] == "scored" and line["status"] != "aborted":
-            error = line.get("error")
-            errors[line["pip"]] = float("inf") if error is None else error
-    return dict(sorted(errors.items()))
-
-
-@contextmanager
-def _line(
-    plant: Plant, words: str, simulator: str, lung: str, out: Path, real_time: bool
-) -> Iterator[Line]:
-    """A line to the emulated lung: in its own process, or in this one on a virtual clock."""
-    if not real_time:
-        hal = SimulatedHal(plant, name=f"emulated {lung}", noise=NOISE, quantum=QUANTUM)
-        device = LoopbackDevice(hal)
-        client = Client(device, device.clock)
-        client.hello()
-        yield Line(client, device.clock)
-        return
-    command = [sys.executable, "-m", "hardware_eval", "emulate", "--conceal", words]
-    command += ["--plant", simulator, "--noise", str(NOISE), "--quantum", str(QUANTUM)]
-    with open(out / "emulator.log", "a") as log:
-        emulator = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
-    try:
-        assert emulator.stdout is not None
-        port = emulator.stdout.readline().strip()
-        if not port:
-            raise InputError(f"the emulator did not start; see {out / 'emulator.log'}")
-        line = ev.connect(port)
-        try:
-            yield line
-        finally:
-            line.client.close()
-    finally:
-        emulator.terminate()
-        emulator.wait(_STARTS_S)
-        if emulator.stdout is not None:
-            emulator.stdout.close()
+    errors = dict.fromkeys(pips, float("inf"))
+    for logged in lines(done.log):
+        scored = logged["type"] == "run" and logged["kind"] == "scored"
+        if scored and logged.get("error") is not None:
+            errors[logged["pip"]] = logged["error"]
+    return errors

@@ -9,19 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
-
-
-class Clock(Protocol):
-    """Time that never goes back."""
-
-    def now(self) -> float:
-        """Time since an arbitrary start, s."""
-        ...
-
-    def sleep_until(self, instant: float) -> None:
-        """Return at ``instant``, s, or at once if it has passed."""
-        ...
 
 
 class RealClock:
@@ -40,9 +27,9 @@ class RealClock:
 class VirtualClock:
     """A clock that moves when it is told to, and takes along what runs on it."""
 
-    def __init__(self, start: float = 0.0) -> None:
-        """Start at ``start``, s."""
-        self._now = start
+    def __init__(self) -> None:
+        """Start at 0 s."""
+        self._now = 0.0
         self._passengers: list[Callable[[float], None]] = []
 
     def now(self) -> float:
@@ -63,6 +50,18 @@ class VirtualClock:
     def advance(self, seconds: float) -> None:
         """Let time pass."""
         self.sleep_until(self._now + seconds)
+
+
+#: Time that never goes back.
+Clock = RealClock | VirtualClock
+
+
+def told_to_end() -> Callable[[], bool]:
+    """Return what says whether a signal came that would end this process; it no longer does."""
+    came: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda number, frame: came.append(number))
+    return lambda: bool(came)
 
 
 #: Priority among real-time processes: below the kernel's own threads.

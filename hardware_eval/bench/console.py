@@ -8,23 +8,20 @@ import math
 import os
 import re
 import select
-import socket
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
-from hardware_eval.emulation.faults import parse
+from hardware_eval.emulation.electronics import parse
+from hardware_eval.emulation.emulator import LoopbackDevice, tell
 from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
-
-if TYPE_CHECKING:
-    from hardware_eval.emulation.loopback import LoopbackDevice
 
 #: What the emulator is told for a perturbation; see :mod:`hardware_eval.emulation.emulator`. A
 #: leak as if the expiratory valve stood open by a twentieth; a tube pinched to three times the
@@ -46,7 +43,7 @@ _KEYS, _GONE = 4096, b"\x04"
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
-class ConsoleOperator:
+class ConsoleOperator(Operator):
     """Asks and tells at a terminal; while a run goes on, any key is the emergency stop.
 
     Keys are read from the terminal's descriptor and nowhere else, so that none waits in a buffer.
@@ -106,9 +103,7 @@ class ConsoleOperator:
         if self._yes or self._terminal is None:
             print("y (--yes)" if self._yes else "n (no terminal; give --yes to confirm)")
             return self._yes
-        if self._pressed(self._reaction):
-            print("stop (a key came before the question)", flush=True)
-            raise EmergencyStop
+        self._react()
         answer = self._pressed(None)
         print(answer.decode("ascii", "replace"), flush=True)
         return answer.lower() == b"y"
@@ -123,9 +118,7 @@ class ConsoleOperator:
         print(question, end="", flush=True)
         if self._terminal is None:
             raise InputError(f"{question}there is no terminal to answer at")
-        if self._pressed(self._reaction):
-            print("stop (a key came before the question)", flush=True)
-            raise EmergencyStop
+        self._react()
         typed = b""
         while not typed.endswith((b"\n", b"\r")):
             keys = self._pressed(None)
@@ -142,6 +135,12 @@ class ConsoleOperator:
     def stop(self) -> bool:
         """Whether a key has been pressed, or the terminal has gone."""
         return self._terminal is not None and bool(self._pressed(0.0))
+
+    def _react(self) -> None:
+        """Let a person read a question; a key that comes before is a stop."""
+        if self._pressed(self._reaction):
+            print("stop (a key came before the question)", flush=True)
+            raise EmergencyStop
 
     def _pressed(self, timeout: float | None) -> bytes:
         """Keys that come within a time, s; those of a terminal that has gone are end-of-file."""
@@ -164,18 +163,13 @@ class ConsoleOperator:
             hal.faults = (parse(EMULATED[perturbation], self._device.clock.now()),) if on else ()
             return
         if self._control is not None:
-            text = EMULATED[perturbation] if on else "clear"
-            # A session must not fail because nobody disturbs it.
-            with (
-                contextlib.suppress(OSError),
-                socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender,
-            ):
-                sender.sendto(text.encode(), str(self._control))
+            with contextlib.suppress(InputError):  # a session goes on though nobody disturbs it
+                tell(self._control, EMULATED[perturbation] if on else "clear")
             return
         print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
 
 
-class Blind:
+class Blind(Operator):
     """An operator to whom entries are called by numbers, whatever is asked, told or shown.
 
     Attributes:

@@ -1,11 +1,18 @@
-"""Driving the valves step by step, watched by the checks of a session."""
+"""Driving the valves step by step, watched by the checks of a session: for tests, and to explore.
+
+The exploration is the paper's (section 4.2 and table), which makes training recordings: targeted,
+by safe PIDs, with the ranges and limits of :mod:`ventbench.train.exploration`. Each of its breaths
+starts from a lung at rest, as those of a simulator do.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,19 +20,133 @@ from hardware_eval import realtime
 from hardware_eval.bench import safety
 from hardware_eval.bench.loop import (
     Bench,
+    BreathLog,
     EmergencyStop,
     answer_by,
     is_held_up,
     no_collection,
     sample_of,
 )
+from hardware_eval.bench.plan import PlannedRun
+from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.wire.client import LinkError, NoAnswerError, RefusedError
 from ventbench.base.arrays import Floats
+from ventbench.base.errors import InputError
+from ventbench.recordings.breaths import Breaths, write
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
+from ventbench.train.exploration import RANGES, explore
 
 #: Chooses valves from the step and the pressure.
 Commands = Callable[[int, float], tuple[float, int]]
+
+#: Rest before a breath that explores in time constants of the labelled lung with its expiratory
+#: valve, and its limits, s.
+_TIME_CONSTANTS, _REST = 4.0, (0.5, 6.0)
+
+#: Resistance of that valve, cmH2O/(L/s).
+_OUTLET = 5.0
+
+#: Breaths in a row that a check stopped, after which nobody is left to trust.
+_STOPPED = 3
+
+
+class Watched:
+    """Valves that are driven step by step, until a check trips and vents the lung.
+
+    Args:
+        bench: device, clock, safety, operator.
+        lung: label, for the checks.
+        pip: highest pressure that is meant, cmH2O, for the checks.
+
+    Attributes:
+        pip: see there; may be changed between two breaths.
+        log: what happened since :meth:`begin`.
+        answered: whether the device answered, of each reading in it.
+        last: command in force.
+        trips: why it ended: messages of the checks, or the device's refusal; empty as it goes on.
+        held_up: whether host or line, too slow for the loop, ended it, and nothing else.
+        missed: answers that did not come in time.
+    """
+
+    def __init__(self, bench: Bench, lung: str, pip: float) -> None:
+        self._bench, self._lung, self.pip = bench, parse_lung(lung), pip
+
+    def begin(self) -> None:
+        """Vent, rest, and arm the device."""
+        client, clock = self._bench.client, self._bench.clock
+        self.log, self.answered, self.last = BreathLog(), list[bool](), (0.0, 1)
+        self.trips: tuple[str, ...] = ()
+        self.held_up, self.missed = False, 0
+        self._safety = safety.init(self._lung)
+        client.vent()
+        clock.sleep_until(clock.now() + self._bench.rest)
+        self._start = self._deadline = clock.now() + protocol.DT
+        try:
+            client.arm()
+        except RefusedError as error:
+            self._end(f"the device cannot be armed: {error}")
+
+    def look(self) -> float:
+        """Pressure at the deadline of the next step, cmH2O; NaN if there is none.
+
+        Raises:
+            EmergencyStop: if the operator pressed the key; the lung is vented.
+            LinkError: if the device is lost.
+        """
+        bench, log = self._bench, self.log
+        bench.clock.sleep_until(self._deadline)
+        self._began = began = bench.clock.now()
+        if bench.operator.stop():
+            self.vent()
+            raise EmergencyStop
+        if self.trips:
+            return math.nan
+        reading = None
+        with contextlib.suppress(NoAnswerError):
+            reading = bench.client.heartbeat()
+        self.missed += reading is None
+        sample = sample_of(reading, began, self.last, self.pip, began - self._deadline)
+        log.time.append(began - self._start)
+        log.pressure.append(sample.pressure)
+        log.flow.append(sample.flow)
+        log.target.append(self.pip)
+        log.late.append(sample.late)
+        self.answered.append(sample.answered)
+        self._safety = safety.step(bench.settings, self._safety, sample)
+        if trips := self._safety.trips:
+            held_up = all(trip.check in safety.TIMING_CHECKS for trip in trips)
+            self._end(*(trip.message for trip in trips), held_up=held_up)
+        return sample.pressure
+
+    def send(self, wanted: float, u_out: int) -> None:
+        """Hold a command, % and 0/1, cut to what is safe, until the next step's deadline."""
+        bench, log, deadline = self._bench, self.log, self._deadline
+        self._deadline += protocol.DT
+        if self.trips:
+            return
+        u_in, _ = safety.limit_command(bench.settings, self.last[0], wanted)
+        try:
+            bench.client.command(u_in, u_out, answer_by(deadline, bench.clock.now()))
+        except RefusedError as error:
+            self._end(str(error), held_up=is_held_up(error.refusal.flags))
+            return
+        except NoAnswerError:
+            self.missed += 1
+        self.last = (u_in, u_out)
+        log.requested.append(wanted)
+        log.u_in.append(u_in)
+        log.u_out.append(u_out)
+        log.busy.append(bench.clock.now() - self._began)
+
+    def vent(self) -> None:
+        """Vent the lung."""
+        with contextlib.suppress(LinkError):  # then the watchdog does
+            self._bench.client.vent()
+
+    def _end(self, *trips: str, held_up: bool = False) -> None:
+        self.vent()
+        self.trips, self.held_up = trips, held_up
 
 
 @dataclass(frozen=True)
@@ -35,9 +156,7 @@ class Driven:
     Attributes:
         time, pressure, flow, u_in, u_out, late, busy: s, cmH2O, mL/s, %, 0/1, s, s; flow is NaN
             where it is not measured.
-        trips: messages of the safety checks that tripped; the lung was vented then.
-        held_up: whether host or line, too slow for the loop, ended it, and nothing else.
-        missed: answers that did not come in time.
+        trips, held_up, missed: see :class:`Watched`.
     """
 
     time: Floats
@@ -58,7 +177,7 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
     Where the device did not answer a step in time, the pressure is that between its neighbours.
 
     Args:
-        bench: device, clock, safety.
+        bench: device, clock, safety, operator.
         lung: label, for the checks.
         commands: called with the step and the pressure, cmH2O.
         steps: how many.
@@ -68,61 +187,120 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
         EmergencyStop: if the operator pressed the key.
         LinkError: if the device is lost.
     """
-    client, clock = bench.client, bench.clock
-    rows: list[tuple[float, ...]] = []
-    watched = safety.init(parse_lung(lung))
-    last: tuple[float, int] = (0.0, 1)
-    trips: tuple[str, ...] = ()
-    held_up, missed = False, 0
-    with contextlib.ExitStack() as stack:
-        stack.callback(_vent, bench)
-        client.vent()
-        clock.sleep_until(clock.now() + bench.rest)
-        stack.enter_context(no_collection())
-        stack.enter_context(realtime.priority())
-        start = clock.now() + protocol.DT
-        try:
-            client.arm()
-        except RefusedError as error:
-            trips, steps = (f"the device cannot be armed: {error}",), 0
-        for step in range(steps):
-            deadline = start + step * protocol.DT
-            clock.sleep_until(deadline)
-            began = clock.now()
-            if bench.operator.stop():
-                raise EmergencyStop
-            reading, late = None, began - deadline
-            with contextlib.suppress(NoAnswerError):
-                reading = client.heartbeat()
-            missed += reading is None
-            sample = sample_of(reading, began, last, pip, late)
-            pressure = sample.pressure
-            watched = safety.step(bench.settings, watched, sample)
-            if watched.trips:
-                trips = tuple(trip.message for trip in watched.trips)
-                held_up = all(trip.check in safety.TIMING_CHECKS for trip in watched.trips)
-                break
-            wanted, u_out = commands(step, pressure) if math.isfinite(pressure) else last
-            u_in, _ = safety.limit_command(bench.settings, last[0], wanted)
-            try:
-                client.command(u_in, u_out, answer_by(deadline, clock.now()))
-            except RefusedError as error:
-                trips, held_up = (str(error),), is_held_up(error.refusal.flags)
-                break
-            except NoAnswerError:
-                missed += 1
-            last = (u_in, u_out)
-            busy = clock.now() - began
-            flow, answered = sample.flow, sample.answered
-            rows.append((began - start, pressure, flow, *last, late, busy, answered))
-    columns = np.array(rows, float).reshape(-1, 8).T
-    time, heard = columns[0], columns[7] > 0.0
+    watched = Watched(bench, lung, pip)
+    try:
+        with no_collection(), realtime.priority():
+            watched.begin()
+            for step in range(steps):
+                pressure = watched.look()
+                known = math.isfinite(pressure)
+                if not watched.trips:
+                    watched.send(*(commands(step, pressure) if known else watched.last))
+                if watched.trips:
+                    break
+    finally:
+        watched.vent()
+    log = watched.log
+    whole = slice(len(log.u_in))
+    names = ("time", "pressure", "flow", "u_in", "u_out", "late", "busy")
+    columns = {name: np.array(getattr(log, name)[whole], float) for name in names}
+    time, heard = columns["time"], np.array(watched.answered[whole], bool)
     if heard.any():
-        for column in columns[1:3]:
-            column[~heard] = np.interp(time[~heard], time[heard], column[heard])
-    return Driven(*columns[:7], trips, held_up, missed)  # type: ignore[arg-type]
+        for name in ("pressure", "flow"):
+            columns[name][~heard] = np.interp(time[~heard], time[heard], columns[name][heard])
+    return Driven(**columns, trips=watched.trips, held_up=watched.held_up, missed=watched.missed)
 
 
-def _vent(bench: Bench) -> None:
-    with contextlib.suppress(LinkError):  # then the watchdog does
-        bench.client.vent()
+class BenchVentilator(Watched):
+    """A device as the exploration drives it; see ``VentilatorInterface`` there.
+
+    After a check has tripped, or the device has vented, it gives no pressures until the next start.
+    """
+
+    width = 1
+    dt = protocol.DT
+
+    def start(self, peep: float) -> Floats:
+        """Vent until the lung is at rest, then begin a breath."""
+        self.begin()
+        return np.full(1, self.look())
+
+    def step(self, u_in: Floats, u_out: Floats) -> Floats:
+        """Hold a command until the next step's deadline."""
+        self.send(float(u_in[0]), int(u_out[0]))
+        return np.full(1, self.look())
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What was collected."""
+
+    breaths: Breaths  #: all whole breaths of the folder, also of earlier sessions.
+    recording: Path  #: their file in the public schema.
+    stopped: str  #: why it ended early; empty if it did not.
+
+
+def collect(
+    bench: Bench, lung: str, count: int, out: Path, *, seed: int = 0,
+    ease: float = protocol.SAFETY_PRESSURE, about: dict[str, Any] | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Collection:  # fmt: skip
+    """Explore a lung at all PIPs in turn; a folder with breaths of the same seed is continued.
+
+    Args:
+        bench: device, clock, safety, operator.
+        lung: label of the mounted lung.
+        count: breaths in all.
+        out: folder of the log and the recording.
+        seed: of the disturbances.
+        ease: pressure above which the valve closes, cmH2O.
+        about: device, operator and notes for the log.
+        progress: called with the number of finished breaths.
+
+    Raises:
+        InputError: if there are no ranges for the lung, or the folder is of another collection.
+        LinkError: if the device is lost; what is done is kept.
+    """
+    if lung not in RANGES:
+        raise InputError(f"no ranges to explore {lung} in; they exist for {', '.join(RANGES)}")
+    if count < 1:
+        raise InputError(f"{count} breaths to collect: ask for one at least")
+    plan = {"lung": lung, "seed": seed, "pips": list(protocol.PIPS)}
+    label, stopped, spoilt = parse_lung(lung), "", 0
+    rest = float(np.clip(_TIME_CONSTANTS * 1e-3 * label.C * (label.R + _OUTLET), *_REST))
+    ventilator = BenchVentilator(replace(bench, rest=rest), lung, max(protocol.PIPS))
+    with RawLog(out / LOG) as log:
+        logged = list(lines(log.path))
+        done = {line["repeat"] for line in logged if line["type"] == "breath"}
+        for line in logged:
+            if line["type"] == "collection" and line["plan"] != plan:
+                raise InputError(f"{log.path} is of {line['plan']}; choose another --out")
+        safe = asdict(bench.settings)
+        log.append({"type": "collection", "plan": plan, "safety": safe, **(about or {})})
+        try:
+            for number in range(1, count + 1):
+                if number in done:
+                    continue
+                pip = protocol.PIPS[(number - 1) % len(protocol.PIPS)]
+                ventilator.pip = pip
+                # A breath at a time, each with a seed of its own: a restart repeats none.
+                own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
+                with no_collection(), realtime.priority():
+                    explore(ventilator, lung, 1, seed=own, ease=ease, pips=(pip,))
+                run = PlannedRun(number, "explore", "exploration", lung, pip, number)
+                line = ventilator.log.line(run, 0, 0)
+                log.append({**line, "whole": not ventilator.trips})
+                spoilt = spoilt + 1 if ventilator.trips else 0
+                progress(number)
+                if ventilator.trips:
+                    bench.operator.tell(f"breath {number} stopped: {ventilator.trips[0]}")
+                if spoilt >= _STOPPED:
+                    stopped = ventilator.trips[0]
+                    break
+        except EmergencyStop:
+            stopped = "the operator pressed the emergency stop"
+        finally:
+            ventilator.vent()
+    breaths = recording(out / LOG, kinds=("explore",))
+    write(breaths, out / RECORDING)
+    return Collection(breaths, out / RECORDING, stopped)

@@ -14,9 +14,9 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -58,42 +58,22 @@ ON_TIME_S = 0.002
 _BIAS = float(waveform.expiratory_command(protocol.BREATH_STEPS - 1))
 
 
-class Operator(Protocol):
-    """The person at the bench."""
+class Operator:
+    """The person at the bench; this one confirms everything, for dry runs and tests."""
 
     def confirm(self, question: str) -> bool:
         """Ask; False ends the session."""
-        ...
-
-    def tell(self, text: str) -> None:
-        """Say something."""
-        ...
-
-    def stop(self) -> bool:
-        """Whether the emergency stop has been pressed; called at every step."""
-        ...
-
-    def disturb(self, perturbation: str, on: bool) -> None:
-        """Open a leak or pinch the tube now, or undo it."""
-        ...
-
-
-class SilentOperator:
-    """Confirms everything; for dry runs, tests and ``--yes``."""
-
-    def confirm(self, question: str) -> bool:
-        """Yes."""
         return True
 
     def tell(self, text: str) -> None:
-        """Say nothing."""
+        """Say something."""
 
     def stop(self) -> bool:
-        """No key to press."""
+        """Whether the emergency stop has been pressed; called at every step."""
         return False
 
     def disturb(self, perturbation: str, on: bool) -> None:
-        """No hand to do it."""
+        """Open a leak or pinch the tube now, or undo it."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +111,17 @@ class BreathLog:
         about = {"run": run.number, "attempt": attempt, "breath": breath, "entry": run.entry}
         label = {"kind": run.kind, "lung": run.lung, "pip": run.pip, "repeat": run.repeat}
         return {"type": "breath", **about, **label, **rounded, "u_out": list(self.u_out)}
+
+    @classmethod
+    def of_line(cls, line: Mapping[str, Any]) -> BreathLog:
+        """The breath that a line of the log holds."""
+        columns: dict[str, Any] = {
+            name: [math.nan if value is None else value for value in line[name]]
+            for name in vars(cls())
+            if name != "target"
+        }
+        steps = np.arange(len(columns["time"]))
+        return cls(**columns, target=waveform.target(steps, line["pip"]).tolist())
 
 
 #: Shows a breath of a run while the lung breathes out; told how many runs of the plan are done, and

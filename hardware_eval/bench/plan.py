@@ -23,6 +23,9 @@ from ventbench.task.lungs import LUNG_IDS, scored_lung
 #: between them; with a leak or a pinched tube at an announced moment; exploring for recordings.
 Kind = Literal["ramp", "scored", "control", "perturbed", "explore"]
 
+#: Those whose lung is as its label says.
+UNDISTURBED = ("ramp", "scored", "control")
+
 #: What happens to the tube in a perturbed run.
 PERTURBATIONS = ("leak", "pinch")
 
@@ -80,11 +83,6 @@ class Plan:
         values = asdict(self)
         del values["runs"]
         return values
-
-    @property
-    def breaths(self) -> int:
-        """Breaths of all runs."""
-        return len(self.runs) * protocol.BREATHS
 
 
 def make_plan(

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from hardware_eval.bench.loop import BreathLog
+from hardware_eval.bench.plan import PlannedRun
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, make_breaths
 from ventbench.task.lungs import lung as parse_lung
@@ -77,12 +78,7 @@ class RawLog:
     def __enter__(self) -> RawLog:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -117,42 +113,13 @@ def lines(path: Path) -> Iterator[dict[str, Any]]:
 
 @dataclass(frozen=True, eq=False)
 class LoggedBreath:
-    """One breath of a log.
+    """One breath of a log."""
 
-    Attributes:
-        run: number of its run in the plan.
-        attempt: how often the run had been begun before, from 0.
-        breath: its place in the run, from 0.
-        entry: name of the controller.
-        kind: kind of the run.
-        lung: label.
-        pip: cmH2O.
-        repeat: repetition, from 1.
-        complete: whether its run was finished and no check had tripped.
-        time, u_in, u_out, pressure, flow, requested, late: arrays ``(T,)``: s, %, 0/1, cmH2O,
-            mL/s, %, s.
-    """
-
-    run: int
-    attempt: int
-    breath: int
-    entry: str
-    kind: str
-    lung: str
-    pip: float
-    repeat: int
-    complete: bool
-    time: np.ndarray
-    u_in: np.ndarray
-    u_out: np.ndarray
-    pressure: np.ndarray
-    flow: np.ndarray
-    requested: np.ndarray
-    late: np.ndarray
-
-
-def _floats(values: list[float | None]) -> np.ndarray:
-    return np.array([np.nan if value is None else value for value in values], float)
+    run: PlannedRun  #: what ran.
+    attempt: int  #: how often the run had been begun before, from 0.
+    breath: int  #: its place in the run, from 0.
+    complete: bool  #: whether its run was finished and no check had tripped.
+    log: BreathLog  #: what happened.
 
 
 def breaths(path: Path) -> list[LoggedBreath]:
@@ -169,49 +136,42 @@ def breaths(path: Path) -> list[LoggedBreath]:
     }
     return [
         LoggedBreath(
-            line["run"], line["attempt"], line["breath"], line["entry"], line["kind"],
-            line["lung"], line["pip"], line["repeat"],
-            (line["run"], line["attempt"]) in finished,
-            *(_floats(line[key]) for key in ("time", "u_in", "u_out", "pressure", "flow")),
-            *(_floats(line[key]) for key in ("requested", "late")),
+            PlannedRun(
+                line["run"], line["kind"], line["entry"], line["lung"], line["pip"], line["repeat"]
+            ),
+            line["attempt"], line["breath"], (line["run"], line["attempt"]) in finished,
+            BreathLog.of_line(line),
         )
         for line in logged
         if line["type"] == "breath"
     ]  # fmt: skip
 
 
-def recording(path: Path, *, kinds: tuple[str, ...] = (), whole: bool = True) -> Breaths:
+def recording(path: Path, kinds: Sequence[str]) -> Breaths:
     """Breaths of a log as a recording in the public schema.
 
     Args:
         path: of the log.
-        kinds: kinds of runs that are taken; all if empty.
-        whole: leave out breaths that a safety check cut short.
+        kinds: kinds of runs that are taken.
 
     Returns:
-        Breaths of equally many samples; the longest are those of most breaths.
+        Breaths of equally many samples, those of most breaths: without what a check cut short.
 
     Raises:
         InputError: if there is no such breath.
     """
-    taken = [b for b in breaths(path) if (not kinds or b.kind in kinds) and len(b.time) > 1]
-    if whole and taken:
-        lengths = [len(b.time) for b in taken]
-        usual = max(set(lengths), key=lengths.count)
-        taken = [b for b in taken if len(b.time) == usual]
-    taken = [b for b in taken if np.isfinite(b.pressure).all()]
+    taken = [b for b in breaths(path) if b.run.kind in kinds and len(b.log.time) > 1]
+    lengths = [len(b.log.time) for b in taken]
+    usual = max(set(lengths), key=lengths.count, default=0)
+    taken = [b for b in taken if len(b.log.time) == usual and np.isfinite(b.log.pressure).all()]
     if not taken:
-        raise InputError(
-            f"{path} holds no whole breath{' of ' + ', '.join(kinds) if kinds else ''}"
-        )
-    samples = min(len(b.time) for b in taken)
-    labels = [parse_lung(b.lung) for b in taken]
+        raise InputError(f"{path} holds no whole breath of {', '.join(kinds)}")
+    labels = [parse_lung(b.run.lung) for b in taken]
 
     def stacked(name: str) -> np.ndarray:
-        return np.stack([getattr(b, name)[:samples] for b in taken])
+        return np.array([getattr(b.log, name) for b in taken], float)
 
-    time = stacked("time")
-    flow = stacked("flow")
+    time, flow = stacked("time"), stacked("flow")
     return make_breaths(
         np.arange(len(taken)) + 1, [x.R for x in labels], [x.C for x in labels],
         time - time[:, :1], np.clip(stacked("u_in"), 0.0, 100.0), stacked("u_out"),

@@ -13,8 +13,8 @@ and valves that stop working. A check that has tripped stays tripped until the o
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
@@ -135,10 +135,6 @@ class SafetySettings:
     def checks(self) -> dict[str, Check]:
         """All checks by name."""
         return {name: value for name, value in vars(self).items() if isinstance(value, Check)}
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values for records and logs."""
-        return asdict(self)
 
 
 DEFAULT = SafetySettings()

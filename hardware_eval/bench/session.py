@@ -7,8 +7,8 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict
+from typing import Any
 
 from hardware_eval.bench.controllers import ControllerFailedError, MakeController, control_pid
 from hardware_eval.bench.loop import (
@@ -16,8 +16,8 @@ from hardware_eval.bench.loop import (
     Bench,
     BreathLog,
     EmergencyStop,
+    Operator,
     RunResult,
-    SilentOperator,
     run_once,
 )
 from hardware_eval.bench.plan import CONTROL, Plan, PlannedRun, progress
@@ -26,9 +26,6 @@ from hardware_eval.bench.safety import SafetySettings
 from hardware_eval.bench.selftest import PARTS, Sheet
 from hardware_eval.realtime import take_priority
 from hardware_eval.wire.client import Client, LinkError
-
-if TYPE_CHECKING:
-    from hardware_eval.emulation.simulated import SimulatedHal
 
 #: Runs that the bench spoils in a row before the session gives up.
 MAX_ATTEMPTS = 3
@@ -40,15 +37,6 @@ MAX_HELD_UP = 10
 _COUNTED = ("asked", "late_answers", "limited", "outside", "fallback", "longest_fallback")
 
 
-@dataclass(frozen=True)
-class SessionEnd:
-    """How a session ended."""
-
-    complete: bool  #: whether the plan is done.
-    reason: str  #: why not; empty if it is.
-    runs: int  #: runs of this session.
-
-
 def run_plan(
     bench: Bench,
     plan: Plan,
@@ -57,8 +45,7 @@ def run_plan(
     *,
     about: Mapping[str, Any],
     before_lung: Callable[[str], Sheet | None] = lambda lung: None,
-    prepare_run: Callable[[PlannedRun], None] = lambda run: None,
-) -> SessionEnd:
+) -> str:
     """Run what is left of a plan.
 
     Args:
@@ -68,10 +55,9 @@ def run_plan(
         log: of the plan; what it holds already is not run again.
         about: what the session's line in the log says besides the plan: device, operator, notes.
         before_lung: tests a lung once it is confirmed; None where nobody does.
-        prepare_run: called before each run; an emulator mounts the lung here.
 
     Returns:
-        How it ended; the lung is vented in every case.
+        Why the plan is not done; empty if it is. The lung is vented in every case.
 
     Raises:
         InputError: if the log is of another plan.
@@ -82,50 +68,40 @@ def run_plan(
     attempts = dict(state.attempts)
     if not any(line["type"] == "plan" for line in logged):
         log.append({"type": "plan", "plan": plan.as_dict()})
-    log.append({"type": "session", **about, "safety": _safety(bench)})
-    remaining = state.remaining(plan)
-    end = SessionEnd(not remaining, "", 0)
+    own = None if bench.fallback is None else asdict(bench.fallback)
+    log.append({"type": "session", **about, "safety": {**asdict(bench.settings), "fallback": own}})
+    remaining, reason = state.remaining(plan), ""
     try:
-        end = _runs(
-            bench, plan, remaining, attempts, make_controller, log, before_lung, prepare_run
-        )
+        reason = _runs(bench, plan, remaining, attempts, make_controller, log, before_lung)
     except EmergencyStop:
-        end = SessionEnd(False, "the operator pressed the emergency stop", 0)
+        reason = "the operator pressed the emergency stop"
     except BaseException as error:
-        end = SessionEnd(False, f"{type(error).__name__}: {error}", 0)
+        reason = f"{type(error).__name__}: {error}"
         raise
     finally:
         with contextlib.suppress(LinkError):
             bench.client.vent()
-        log.append({"type": "session_ends", "complete": end.complete, "reason": end.reason})
-    return end
-
-
-def _safety(bench: Bench) -> dict[str, Any]:
-    """Checks, limits and fallback, as records have them."""
-    own = None if bench.fallback is None else asdict(bench.fallback)
-    return {**bench.settings.as_dict(), "fallback": own}
+        log.append({"type": "session_ends", "complete": not reason, "reason": reason})
+    return reason
 
 
 def _runs(
     bench: Bench, plan: Plan, remaining: Sequence[PlannedRun], attempts: dict[int, int],
     make_controller: MakeController, log: RawLog, before_lung: Callable[[str], Sheet | None],
-    prepare_run: Callable[[PlannedRun], None],
-) -> SessionEnd:  # fmt: skip
-    mounted, spoilt, held_up, made = "", 0, 0, 0
+) -> str:  # fmt: skip
+    mounted, spoilt, held_up = "", 0, 0
     queue = list(remaining)
     while queue:
         run = queue[0]
         if run.lung != mounted:
             reason = _mount(bench, run.lung, log, before_lung)
             if reason:
-                return SessionEnd(False, reason, made)
+                return reason
             mounted = run.lung
         if run.kind == "ramp" and not bench.operator.confirm(
             f"{run.entry} on {run.lung}: raise PIP to {run.pip:g} cmH2O?"
         ):
-            return SessionEnd(False, "the operator did not confirm the next PIP", made)
-        prepare_run(run)
+            return "the operator did not confirm the next PIP"
         try:
             place = len(plan.runs) - len(queue), len(plan.runs)
             result = _one(bench, run, attempts, make_controller, log, place)
@@ -140,7 +116,6 @@ def _runs(
             bench.client.reconnect()
             log.append({"type": "event", "what": "reconnected"})
             continue
-        made += 1
         if result.held_up and held_up + 1 < MAX_HELD_UP:
             held_up += 1
             bench.operator.tell(f"{result.reason}: host or line was held up; the run is repeated")
@@ -150,7 +125,7 @@ def _runs(
             if spoilt >= MAX_ATTEMPTS or not bench.operator.confirm(
                 f"{result.reason}. Mend the bench; run it again?"
             ):
-                return SessionEnd(False, result.reason, made)
+                return result.reason
             continue
         spoilt = held_up = 0
         queue.pop(0)
@@ -162,7 +137,7 @@ def _runs(
                 log.append(_run_line(other, attempts.get(other.number, 0), "failed", reason))
             queue = [x for x in queue if x not in skipped]
             bench.operator.tell(f"{reason}; its other runs on this lung are left out")
-    return SessionEnd(True, "", made)
+    return ""
 
 
 def _mount(bench: Bench, lung: str, log: RawLog, before_lung: Callable[[str], Sheet | None]) -> str:
@@ -234,10 +209,9 @@ def _run_line(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[s
 
 
 def dry_run(
-    plan: Plan, make_controller: MakeController, settings: SafetySettings, rest: float = REST_S,
-    lung: Callable[[str], SimulatedHal] | None = None,
-) -> tuple[list[str], list[tuple[str, str, float, float]]]:  # fmt: skip
-    """Run every distinct run of a plan once on emulated lungs, by the same code as on a bench.
+    plan: Plan, make_controller: MakeController, settings: SafetySettings, rest: float = REST_S
+) -> tuple[list[str], list[tuple[str, str, float, float]]]:
+    """Run every distinct run of a plan once on the frozen simulators, by the code of a bench.
 
     Repetitions are left out: on a simulator they are the same. Lungs start as on the bench, vented
     for the same time.
@@ -247,13 +221,12 @@ def dry_run(
         make_controller: makes the controller of a run.
         settings: of the safety.
         rest: time at rest before each run, s.
-        lung: the emulated lung of a label; if not given, that of the frozen simulators.
 
     Returns:
         What went wrong, one sentence each, empty if the plan is safe there; and entry, lung, PIP
         and error, cmH2O, of each run that completed.
     """
-    from hardware_eval.emulation.loopback import LoopbackDevice
+    from hardware_eval.emulation.emulator import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
 
     problems: list[str] = []
@@ -266,10 +239,10 @@ def dry_run(
             continue
         seen.add(key)
         if bench is None or run.lung != mounted:
-            device, mounted = LoopbackDevice((lung or simulated_lung)(run.lung)), run.lung
+            device, mounted = LoopbackDevice(simulated_lung(run.lung)), run.lung
             client = Client(device, device.clock)
             client.hello()
-            bench = Bench(client, device.clock, settings, SilentOperator(), rest=rest)
+            bench = Bench(client, device.clock, settings, Operator(), rest=rest)
         try:
             controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
         except ControllerFailedError as error:

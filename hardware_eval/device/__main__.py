@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import signal
 import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 
 from hardware_eval import realtime
 from ventbench.base.errors import InputError
@@ -20,20 +18,20 @@ try:
     from hardware_eval.device import deadman
     from hardware_eval.device.port import Guard, Port
     from hardware_eval.device.program import DeviceService, DeviceSettings
-    from hardware_eval.wire.link import BAUD_RATE
+    from hardware_eval.wire.client import BAUD_RATE
 except InputError as missing:  # an extra that brings the wire
     print(f"python -m hardware_eval.device: {missing}", file=sys.stderr)
     raise SystemExit(2) from None
 
 
-def serial_line(path: str, baud_rate: int = BAUD_RATE) -> Callable[[], int | None]:
+def serial_line(path: str) -> Callable[[], int | None]:
     """Return what opens a serial port; None while it is not there."""
 
     def open_line() -> int | None:
         import serial
 
         try:
-            port = serial.Serial(path, baud_rate, exclusive=True)
+            port = serial.Serial(path, BAUD_RATE, exclusive=True)
         except serial.SerialException:
             return None
         descriptor = os.dup(port.fileno())
@@ -42,30 +40,6 @@ def serial_line(path: str, baud_rate: int = BAUD_RATE) -> Callable[[], int | Non
         return descriptor
 
     return open_line
-
-
-def tcp_line(host: str, port: int) -> tuple[Callable[[], int | None], socket.socket]:
-    """Listen on TCP; one host at a time, the next one when it has gone.
-
-    Raises:
-        InputError: if the address cannot be used.
-    """
-    try:
-        server = socket.create_server((host, port))
-    except OSError as error:
-        raise InputError(f"--listen {host}:{port}: {error}") from error
-    server.setblocking(False)
-
-    def open_line() -> int | None:
-        try:
-            connection, _ = server.accept()
-        except BlockingIOError:
-            return None
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setblocking(False)
-        return connection.detach()
-
-    return open_line, server
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -78,7 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--config", type=Path, required=True, help="TOML file of the ventilator")
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--port", help="serial port to the host, such as /dev/ttyGS0")
-    where.add_argument("--listen", metavar="HOST:PORT", help="TCP address for socket:// hosts")
     where.add_argument(
         "--vent", action="store_true", help="vent once and end (for ExecStopPost of systemd)"
     )
@@ -94,9 +67,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(given: argparse.Namespace) -> int:
     from hardware_eval.device.pvp import PvpSensor, PvpValves
 
-    host, _, number = (given.listen or ":0").rpartition(":")
-    if not number.isdigit():
-        raise InputError(f"--listen {given.listen}: write HOST:PORT, such as 0.0.0.0:5005")
     PvpValves(given.config).close()  # vented; what is wrong with them is told here
     if given.vent:
         return 0
@@ -109,11 +79,6 @@ def _run(given: argparse.Namespace) -> int:
             f"range, up to {sensor.identity.highest:.4g}: nothing could trip it. Give a smaller "
             f"--pressure-limit, or the sensor's own highest_pressure in {given.config}"
         )
-    listener: socket.socket | None = None
-    if given.listen:
-        open_line, listener = tcp_line(host, int(number))
-    else:
-        open_line = serial_line(given.port or "")
     process, orders = deadman.start(
         f"{PvpValves.__module__}:{PvpValves.__name__}", str(given.config)
     )
@@ -121,13 +86,11 @@ def _run(given: argparse.Namespace) -> int:
     try:
         if reason := realtime.prefer():
             print(f"no real-time scheduling: {reason}", file=sys.stderr)
-        _serve_until_signal(hal, settings, open_line)
+        _serve_until_signal(hal, settings, serial_line(given.port))
     finally:
         hal.close()
         process.wait()
         sensor.close()
-        if listener is not None:
-            listener.close()
     if hal.lost:
         PvpValves(given.config).close()  # the deadman could not
         print("the deadman has gone; vented", file=sys.stderr)
@@ -137,19 +100,12 @@ def _run(given: argparse.Namespace) -> int:
 def _serve_until_signal(
     hal: deadman.SupervisedHal, settings: DeviceSettings, open_line: Callable[[], int | None]
 ) -> None:
-    ended = False
-
-    def end(number: int, frame: FrameType | None) -> None:
-        nonlocal ended
-        ended = True
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, end)
+    ended = realtime.told_to_end()
     port = Port(open_line, os.close)
     awake = notifier()
     try:
         Guard(DeviceService(hal, settings, time.monotonic()), port).run(
-            lambda: ended or hal.lost or awake()
+            lambda: ended() or hal.lost or awake()
         )
     finally:
         port.close()

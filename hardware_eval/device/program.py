@@ -45,6 +45,7 @@ from hardware_eval.wire.messages import (
     feed_bytes,
     microseconds,
 )
+from ventbench.base.errors import InputError
 from ventbench.task import protocol
 
 #: Version of this program: what a device tells as its firmware.
@@ -134,10 +135,10 @@ class DeviceSettings:
         """Check the limit.
 
         Raises:
-            ValueError: if it is outside what is safe.
+            InputError: if it is outside what is safe.
         """
         if not 0.0 < self.pressure_limit <= 100.0:
-            raise ValueError(f"pressure limit {self.pressure_limit} cmH2O is outside 0..100")
+            raise InputError(f"pressure limit {self.pressure_limit} cmH2O is outside 0..100")
 
 
 @dataclass(frozen=True, slots=True)

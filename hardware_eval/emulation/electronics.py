@@ -1,17 +1,22 @@
-"""What an emulated ventilator is besides its computer: lung, sensor, valves, supply, monostable.
+"""What an emulated ventilator is besides its computer and its lung, and what can go wrong with it.
 
-It runs in a process of its own and so outlives the device's program and its deadman, as real
-electronics do. Pins keep what they were last told. What the valves then do depends on their kind:
+Sensor, valves, supply and monostable run with the lung in a process of its own, which outlives the
+device's program and its deadman, as real electronics do. Pins keep what they were last told. What
+the valves then do depends on their kind:
 
 - *open without current*: the monostable and a lost supply cut the current; both vent.
 - *closed without current* (PVP's own): the monostable holds the expiratory valve open through a
   gate of its own, which vents; without supply nothing can, and the lung stays closed.
+
+Faults are those of lung, valves and sensor, and of the line to the host.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
+import re
 import signal
 import socket
 import struct
@@ -19,20 +24,19 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from hardware_eval import realtime
 from hardware_eval.device import deadman
 from hardware_eval.device.program import Hal, Identity, Sample
-from hardware_eval.emulation.faults import Fault, FaultKind, active
 from ventbench.base.errors import InputError
-
-if TYPE_CHECKING:
-    from hardware_eval.emulation.simulated import SimulatedHal
 
 #: What the pins are told: inspiratory valve, %, and expiratory valve, 0 or 1.
 LINES = struct.Struct("<fB")
@@ -43,8 +47,141 @@ _LOOK = 0.020
 #: Time for which the electronics outlive their last wire, s.
 _AFTER = 0.5
 
-#: Patience with the start of the process, which compiles the lung, s.
-_STARTS = 300.0
+#: Module of the process, and patience with its start, which compiles the lung, s.
+_PROCESS, _STARTS = "hardware_eval.emulation.simulated", 300.0
+
+
+class FaultKind(Enum):
+    """What can go wrong with a lung on its ventilator; ``strength`` is in the unit given here."""
+
+    #: The sensor keeps showing what it showed when the fault began.
+    SENSOR_STUCK = "sensor_stuck"
+    #: The sensor shows ``strength`` cmH2O too much.
+    SENSOR_OFFSET = "sensor_offset"
+    #: The sensor gives no value.
+    SENSOR_LOST = "sensor_lost"
+    #: The sensor scatters with a standard deviation of ``strength`` cmH2O more.
+    SENSOR_NOISY = "sensor_noisy"
+    #: The sensor's bus is blocked: nobody who reads it gets on.
+    BUS_BLOCKED = "bus_blocked"
+    #: Each sample is lost with probability ``strength``.
+    SENSOR_DROPOUTS = "sensor_dropouts"
+    #: The inspiratory valve stays where it was.
+    VALVE_STUCK = "valve_stuck"
+    #: The inspiratory valve opens to the share ``strength`` of what is commanded.
+    VALVE_WEAK = "valve_weak"
+    #: The expiratory valve stays closed.
+    EXPIRATORY_STUCK = "expiratory_stuck"
+    #: The tube is off: nothing reaches the lung, the sensor shows ambient pressure.
+    DISCONNECTED = "disconnected"
+    #: The airway's resistance is ``strength`` times its value (a pinched tube: 3).
+    PINCHED = "pinched"
+    #: The airway's resistance is a hundred times its value.
+    OCCLUDED = "occluded"
+    #: A leak as if the expiratory valve stood open by the share ``strength``.
+    LEAK = "leak"
+
+
+class LineFaultKind(Enum):
+    """What can go wrong on the line; ``strength`` is in the unit given here."""
+
+    #: The device's answers come ``strength`` seconds later.
+    LATE = "late"
+    #: They come later by a random time, uniform up to ``strength`` seconds, in order.
+    JITTER = "jitter"
+    #: Each write of either side is lost with probability ``strength``.
+    LOSS = "loss"
+    #: Each byte of either side has one bit flipped with probability ``strength``.
+    NOISE = "noise"
+    #: The device says nothing, though it goes on.
+    SILENT = "silent"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault of the simulated hardware or of the line."""
+
+    kind: FaultKind | LineFaultKind  #: what goes wrong.
+    start: float  #: from when, s on the device's clock.
+    end: float = math.inf  #: until when, s.
+    strength: float = 1.0  #: how much; see the kinds.
+
+
+_TEXT = re.compile(
+    r"(?P<kind>\w+)@(?P<start>[\d.]+)(?:-(?P<end>[\d.]+))?(?::(?P<strength>[-\d.]+))?"
+)
+
+
+def parse(text: str, now: float = 0.0) -> Fault:
+    """Read a fault as people write it: ``KIND@START[-END][:STRENGTH]``, seconds from ``now`` on.
+
+    Raises:
+        InputError: if it says nothing of the kind.
+    """
+    kinds = {kind.value: kind for kind in (*FaultKind, *LineFaultKind)}
+    match = _TEXT.fullmatch(text.strip())
+    kind = kinds.get(match["kind"]) if match else None
+    try:
+        if match is None or kind is None:
+            raise ValueError
+        start, end = float(match["start"]), float(match["end"] or "inf")
+        strength = float(match["strength"] or 1.0)
+        if not start < end:
+            raise ValueError
+    except ValueError:
+        raise InputError(
+            f"fault {text!r}: write KIND@START[-END][:STRENGTH], times in s, such as "
+            f"leak@10-13:0.1; kinds: {', '.join(kinds)}"
+        ) from None
+    return Fault(kind, now + start, now + end, strength)
+
+
+def active(faults: Iterable[Fault], now: float) -> dict[object, float]:
+    """Strengths of what acts at ``now``, s, by kind; of two of one kind the later one's."""
+    return {fault.kind: fault.strength for fault in faults if fault.start <= now < fault.end}
+
+
+class Line:
+    """What a line with faults makes of written bytes.
+
+    Attributes:
+        faults: what goes wrong; may be replaced while it runs.
+    """
+
+    def __init__(self, faults: Sequence[Fault] = (), seed: int = 0) -> None:
+        """Start with faults; ``seed`` is that of losses, flips and delays."""
+        self.faults = tuple(faults)
+        self._random = np.random.default_rng(seed)
+        self._latest = -math.inf
+
+    def to_device(self, now: float, data: bytes) -> bytes:
+        """What arrives at the device of what the host wrote at ``now``, s."""
+        if not self.faults:
+            return data
+        return self._damaged(active(self.faults, now), data)
+
+    def to_host(self, now: float, data: bytes) -> tuple[float, bytes]:
+        """When, s, and what leaves towards the host of what the device wrote at ``now``, s."""
+        if not self.faults and self._latest <= now:
+            return now, data
+        kinds = active(self.faults, now)
+        if LineFaultKind.SILENT in kinds:
+            return now, b""
+        due = now + kinds.get(LineFaultKind.LATE, 0.0)
+        if LineFaultKind.JITTER in kinds:
+            due += float(self._random.uniform(0.0, kinds[LineFaultKind.JITTER]))
+        self._latest = max(self._latest, due)  # a line keeps the order
+        return self._latest, self._damaged(kinds, data)
+
+    def _damaged(self, kinds: dict[object, float], data: bytes) -> bytes:
+        if LineFaultKind.LOSS in kinds and self._random.uniform() < kinds[LineFaultKind.LOSS]:
+            return b""
+        if LineFaultKind.NOISE in kinds and data:
+            array = np.frombuffer(data, np.uint8).copy()
+            hit = self._random.uniform(size=len(array)) < kinds[LineFaultKind.NOISE]
+            array[hit] ^= (1 << self._random.integers(0, 8, int(hit.sum()))).astype(np.uint8)
+            return array.tobytes()
+        return data
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +224,7 @@ class Pins:
 
 
 def switch_on(given: dict[str, Any]) -> tuple[subprocess.Popen[bytes], Connection, socket.socket]:
-    """Start the electronics with arguments of :func:`serve` and :func:`emulated_lung`.
+    """Start the electronics with arguments of :func:`serve`, and with those of their lung.
 
     Returns:
         The process, the sensor's bus, and the pins, see :func:`serve`.
@@ -95,7 +232,7 @@ def switch_on(given: dict[str, Any]) -> tuple[subprocess.Popen[bytes], Connectio
     here, there = Pipe()
     pins, wire = socket.socketpair()
     process = subprocess.Popen(
-        [sys.executable, "-m", __name__, str(there.fileno()), str(wire.fileno())],
+        [sys.executable, "-m", _PROCESS, str(there.fileno()), str(wire.fileno())],
         pass_fds=(there.fileno(), wire.fileno()), start_new_session=True,
     )  # fmt: skip
     there.close()
@@ -123,7 +260,7 @@ class EmulatedHal(deadman.SupervisedHal):
     """Deadman and electronics as processes, as the device's program sees them."""
 
     def __init__(self, given: dict[str, Any], clock: Callable[[], float], begun: float) -> None:
-        """Start both, with arguments of :func:`serve` and :func:`emulated_lung`.
+        """Start both, with arguments as of :func:`switch_on`.
 
         ``clock`` is the program's, s, and ``begun`` its zero on ``time.monotonic``, s.
 
@@ -264,37 +401,3 @@ def serve(
             except OSError:
                 sources.remove(bus)
                 left = left if sources else now + _AFTER
-
-
-def emulated_lung(
-    lung: str, plant: str, conceal: str | None, seal: Path | None, **sensor: Any
-) -> SimulatedHal:
-    """Make the lung that ``emulate`` is asked for.
-
-    Raises:
-        InputError: if there is none.
-    """
-    from hardware_eval.emulation import simulated
-
-    if conceal is None:
-        return simulated.simulated_lung(lung, plant, **sensor)
-    concealed = simulated.conceal(conceal, plant)
-    hal = simulated.SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
-    hal.told = f"{hal.identity.name}, with physics {concealed.seal['commitment'][:16]}..."
-    if seal:
-        concealed.write(seal)
-    return hal
-
-
-def _main() -> None:
-    with Connection(int(sys.argv[1])) as bus, socket.socket(fileno=int(sys.argv[2])) as wire:
-        given = bus.recv()
-        about = {name: given.pop(name) for name in ("begun", "normally_open", "monostable", "log")}
-        try:
-            serve(bus, wire, lambda: emulated_lung(**given), **about)
-        except (InputError, OSError) as error:  # of the lung, of --log or --seal
-            bus.send(str(error))
-
-
-if __name__ == "__main__":
-    _main()

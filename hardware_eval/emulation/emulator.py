@@ -1,8 +1,9 @@
-"""An emulated device on a real pseudo-terminal: the device's own program over a simulated lung.
+"""An emulated device: the device's own program over a simulated lung, in this process or apart.
 
-``ventbench-hardware emulate`` runs it. The path that it prints is a serial port for any program.
-The cable can be pulled, and faults can begin, while it runs: by lines of text on a socket
-(``--control``), see :class:`Emulator`.
+In this process it lives on a virtual clock, without a wire (:class:`LoopbackDevice`). On a real
+pseudo-terminal, which is a serial port for any program, ``ventbench-hardware emulate`` runs it in
+real time. The cable can be pulled, and faults can begin, while it runs: by lines of text on a
+socket (``--control``), see :class:`Emulator`.
 """
 
 from __future__ import annotations
@@ -12,24 +13,32 @@ import contextlib
 import heapq
 import math
 import os
-import signal
 import socket
 import sys
 import time
 import tty
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from hardware_eval import realtime
+from hardware_eval.device.deadman import MONOSTABLE
 from hardware_eval.device.port import Guard, Port
-from hardware_eval.device.program import DeviceService, DeviceSettings
-from hardware_eval.emulation.faults import Fault, FaultKind, Line, LineFaultKind, parse
+from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
+from hardware_eval.emulation.electronics import (
+    EmulatedHal,
+    Fault,
+    FaultKind,
+    Line,
+    LineFaultKind,
+    parse,
+)
 from hardware_eval.emulation.firmware import Firmware
-from hardware_eval.emulation.loopback import Actuation
+from hardware_eval.realtime import VirtualClock
+from hardware_eval.wire.client import DisconnectedError
 from hardware_eval.wire.messages import Flag
 from ventbench.base.errors import InputError
 
@@ -38,6 +47,108 @@ _REMEMBERED = 100_000
 
 #: Bytes that are read at once.
 _CHUNK = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Actuation:
+    """A change of the valves: device time, s; inspiratory valve, %; expiratory valve, 0 or 1."""
+
+    time: float
+    u_in: float
+    u_out: int
+
+
+class LoopbackDevice:
+    """A transport whose other end is a device; time passes only while somebody waits.
+
+    Attributes:
+        clock: the clock of host and device.
+        start: time at which the device started, s.
+        service: program and hardware of the device.
+        latency: time that bytes take each way, s; may be changed while it runs.
+        line: what the line does to bytes; its faults may be changed while it runs.
+        actuations: every change of the valves.
+        plugged: whether the cable is in; :meth:`unplug` and :meth:`plug` change it.
+    """
+
+    def __init__(
+        self, hal: Hal, settings: DeviceSettings | None = None, latency: float = 0.001
+    ) -> None:
+        """Start the device on a clock of its own."""
+        self.line, self.clock = Line(), VirtualClock()
+        self.start = self.clock.now()
+        self.latency = latency
+        self.service = DeviceService(hal, settings or DeviceSettings(), self.start)
+        self.actuations = [Actuation(self.start, 0.0, 1)]
+        self.plugged = True
+        self._next = self.start + PERIOD
+        self._order = count()
+        self._incoming: list[tuple[float, int, bytes]] = []
+        self._outgoing: list[tuple[float, int, bytes]] = []
+        self.clock.carry(self._run_until)
+
+    def write(self, data: bytes) -> None:
+        """Send bytes to the device; DisconnectedError if the cable is out."""
+        self._require_cable()
+        arrival = self.clock.now() + self.latency
+        data = self.line.to_device(self.clock.now() - self.start, data)
+        if data:
+            heapq.heappush(self._incoming, (arrival, next(self._order), data))
+
+    def read(self, timeout: float) -> bytes:
+        """Wait for bytes from the device; empty if none come within ``timeout``, s."""
+        deadline = self.clock.now() + timeout
+        while True:
+            self._require_cable()
+            now, ready = self.clock.now(), b""
+            while self._outgoing and self._outgoing[0][0] <= now:
+                ready += heapq.heappop(self._outgoing)[2]
+            if ready or now >= deadline:
+                return ready
+            coming = [self._next, deadline]
+            coming += [queue[0][0] for queue in (self._incoming, self._outgoing) if queue]
+            self.clock.sleep_until(max(min(coming), now + 1e-6))
+
+    def close(self) -> None:
+        """Nothing to release; the device goes on."""
+
+    def reopen(self) -> None:
+        """Connect again; DisconnectedError if the cable is still out."""
+        self._require_cable()
+
+    def unplug(self) -> None:
+        """Pull the cable; what is on the way is lost."""
+        self.plugged = False
+        self._incoming.clear()
+        self._outgoing.clear()
+
+    def plug(self) -> None:
+        """Put the cable back."""
+        self.plugged = True
+
+    def _require_cable(self) -> None:
+        if not self.plugged:
+            raise DisconnectedError("the cable to the device is out")
+
+    def _run_until(self, instant: float) -> None:
+        while True:
+            arrival = self._incoming[0][0] if self._incoming else float("inf")
+            now = min(self._next, arrival)
+            if now > instant:
+                return
+            data = b""
+            while self._incoming and self._incoming[0][0] <= now:
+                data += heapq.heappop(self._incoming)[2]
+            if self._next <= now:
+                self._next += PERIOD
+            answers = self.service.step(now, data)
+            if answers and self.plugged:
+                due, answers = self.line.to_host(now - self.start, answers)
+                due += self.start + self.latency
+                heapq.heappush(self._outgoing, (due, next(self._order), answers))
+            state, last = self.service.state, self.actuations[-1]
+            if (state.u_in, state.u_out) != (last.u_in, last.u_out):
+                self.actuations.append(Actuation(now, state.u_in, state.u_out))
 
 
 class Emulator(Guard):
@@ -218,7 +329,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--lung", default="R20C50", help="lung on the ventilator")
     add("--plant", default="frozen", help="simulator: a name, a file or module:function")
-    add("--conceal", metavar="WORDS",
+    add("--conceal", metavar="WORDS", dest="words",
         help="a lung with physics that the simulator lacks; the words determine it")  # fmt: skip
     add("--seal", type=Path, help="where the sealed answer of --conceal goes (JSON)")
     add("--link", type=Path, help="symbolic link to make to the terminal")
@@ -246,17 +357,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _emulate(given: argparse.Namespace) -> int:
-    from hardware_eval.device.deadman import MONOSTABLE
-    from hardware_eval.emulation.electronics import EmulatedHal
-
     faults = [parse(text) for text in given.fault]
     line_faults = [fault for fault in faults if isinstance(fault.kind, LineFaultKind)]
     limit = given.pressure_limit
-    try:
-        settings = DeviceSettings() if limit is None else DeviceSettings(limit)
-    except ValueError as error:
-        raise InputError(str(error)) from error
-    about = {name: getattr(given, name) for name in ("lung", "plant", "conceal", "seal")}
+    settings = DeviceSettings() if limit is None else DeviceSettings(limit)
+    about = {name: getattr(given, name) for name in ("lung", "plant", "words", "seal")}
     sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
     begun = time.monotonic()
     asked = {
@@ -284,20 +389,13 @@ def _emulate(given: argparse.Namespace) -> int:
         if given.realtime and reason:
             emulator.close()
             raise InputError(f"--realtime: {reason}; run as root, or without it")
-        ended = False
-
-        def end(number: int, frame: FrameType | None) -> None:
-            nonlocal ended
-            ended = True
-
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, end)
+        ended = realtime.told_to_end()
         if isinstance(hal, Firmware):
             hal.start(lambda: emulator.port.inbox.put(b""))
         print(emulator.terminal, flush=True)
         processes = ", ".join(f"{name} {number}" for name, number in hal.processes.items())
         print(f"{hal.told} ({processes}); Ctrl-C ends it", file=sys.stderr, flush=True)
-        emulator.run(lambda: ended or hal.lost)
+        emulator.run(lambda: ended() or hal.lost)
         print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
     finally:
         hal.close()

@@ -24,7 +24,7 @@ from cobs import cobs
 
 from hardware_eval.device.program import Sample
 from hardware_eval.emulation import electronics
-from hardware_eval.emulation.faults import Fault
+from hardware_eval.emulation.electronics import Fault
 from hardware_eval.wire.messages import (
     FLOW_STEPS,
     PRESSURE_STEPS,

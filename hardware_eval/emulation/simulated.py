@@ -6,6 +6,8 @@ is what the plant shows by then. A loop of 30 ms so reads what a scored run read
 A lung may have *concealed* physics, which any words determine: one strong effect of the library,
 its strength and its lung, added to a simulator. The answer is published encrypted, with its hash,
 when the lung is made; the words open it.
+
+Run as a program, it is the process of the emulated electronics with such a lung.
 """
 
 from __future__ import annotations
@@ -14,8 +16,11 @@ import copy
 import hashlib
 import json
 import math
+import socket
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +41,7 @@ from hardware_eval.emulation.cases import (
     random_generator,
     unseal,
 )
-from hardware_eval.emulation.faults import Fault, FaultKind, active
+from hardware_eval.emulation.electronics import Fault, FaultKind, active, serve
 from hardware_eval.wire.messages import Capability
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -159,11 +164,9 @@ class SimulatedHal:
             self._ambient_from = None
         if self._noise:
             pressure += self._noise * float(self._random.standard_normal())
-        if FaultKind.SENSOR_OFFSET in kinds:
-            pressure += kinds[FaultKind.SENSOR_OFFSET].strength
+        pressure += kinds.get(FaultKind.SENSOR_OFFSET, 0.0)
         if FaultKind.SENSOR_NOISY in kinds:
-            strength = kinds[FaultKind.SENSOR_NOISY].strength
-            pressure += strength * float(self._random.standard_normal())
+            pressure += kinds[FaultKind.SENSOR_NOISY] * float(self._random.standard_normal())
         if self._quantum:
             pressure = round(pressure / self._quantum) * self._quantum
         pressure = min(pressure, self._highest)
@@ -173,12 +176,10 @@ class SimulatedHal:
             pressure = self._stuck_reading
         else:
             self._stuck_reading = math.nan
-        if FaultKind.SENSOR_LOST in kinds:
-            pressure = math.nan
-        if FaultKind.SENSOR_DROPOUTS in kinds and self._random.uniform() < (
-            kinds[FaultKind.SENSOR_DROPOUTS].strength
-        ):
-            pressure = math.nan
+        lost = FaultKind.SENSOR_LOST in kinds
+        if FaultKind.SENSOR_DROPOUTS in kinds:
+            lost |= bool(self._random.uniform() < kinds[FaultKind.SENSOR_DROPOUTS])
+        pressure = math.nan if lost else pressure
         self._last = Sample(now, pressure, flow, saturated=pressure >= self._highest)
         return self._last
 
@@ -198,26 +199,22 @@ class SimulatedHal:
             self._restart = 1.0
         self._command = (u_in, u_out)
 
-    def _by(self, now: float, kinds: dict[object, Fault]) -> tuple[jax.Array, jax.Array]:
+    def _by(self, now: float, kinds: dict[object, float]) -> tuple[jax.Array, jax.Array]:
         """State and readings at ``now`` if the present command is held until then."""
         u_in, u_out = self._command
-        share, r_scale = float(u_out), 1.0
+        share, r_scale = float(u_out), kinds.get(FaultKind.PINCHED, 1.0)
         if FaultKind.VALVE_STUCK in kinds:
             if math.isnan(self._stuck_valve):
                 self._stuck_valve = u_in
             u_in = self._stuck_valve
         else:
             self._stuck_valve = math.nan
-        if FaultKind.VALVE_WEAK in kinds:
-            u_in *= kinds[FaultKind.VALVE_WEAK].strength
+        u_in *= kinds.get(FaultKind.VALVE_WEAK, 1.0)
         if FaultKind.EXPIRATORY_STUCK in kinds:
             share = 0.0
-        if FaultKind.LEAK in kinds:
-            share = max(share, kinds[FaultKind.LEAK].strength)
+        share = max(share, kinds.get(FaultKind.LEAK, 0.0))
         if FaultKind.DISCONNECTED in kinds:
             u_in, share = 0.0, 1.0
-        if FaultKind.PINCHED in kinds:
-            r_scale = kinds[FaultKind.PINCHED].strength
         if FaultKind.OCCLUDED in kinds:
             r_scale = _OCCLUSION
         held = max(now - (now if self._since is None else self._since), SHORTEST_HOLD)
@@ -331,3 +328,35 @@ def _draw(words: str) -> tuple[Effect, Lung]:
     ]
     case = strong[int(rng.integers(len(strong)))]
     return case.effects[0], Lung(case.lung_R, case.lung_C)
+
+
+def emulated_lung(
+    lung: str, plant: str, words: str | None, seal: Path | None, **sensor: Any
+) -> SimulatedHal:
+    """Make the lung that ``emulate`` is asked for.
+
+    Raises:
+        InputError: if there is none.
+    """
+    if words is None:
+        return simulated_lung(lung, plant, **sensor)
+    concealed = conceal(words, plant)
+    hal = SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
+    hal.told = f"{hal.identity.name}, with physics {concealed.seal['commitment'][:16]}..."
+    if seal:
+        concealed.write(seal)
+    return hal
+
+
+def _main() -> None:
+    with Connection(int(sys.argv[1])) as bus, socket.socket(fileno=int(sys.argv[2])) as wire:
+        given = bus.recv()
+        about = {name: given.pop(name) for name in ("begun", "normally_open", "monostable", "log")}
+        try:
+            serve(bus, wire, lambda: emulated_lung(**given), **about)
+        except (InputError, OSError) as error:  # of the lung, of --log or --seal
+            bus.send(str(error))
+
+
+if __name__ == "__main__":
+    _main()

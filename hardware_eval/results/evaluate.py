@@ -22,13 +22,13 @@ from hardware_eval.bench.controllers import (
 )
 from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import REST_S, Bench, Operator, Show
-from hardware_eval.bench.plan import Plan, PlannedRun
+from hardware_eval.bench.plan import UNDISTURBED, Plan, PlannedRun
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.bench.selftest import Sheet
 from hardware_eval.realtime import Clock, RealClock
 from hardware_eval.results import record as records
-from hardware_eval.wire.client import Client
+from hardware_eval.wire.client import Client, Link
 from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
 from ventbench.board import record
@@ -40,11 +40,7 @@ from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 
 if TYPE_CHECKING:
-    from hardware_eval.emulation.loopback import LoopbackDevice
-    from hardware_eval.wire.link import Link
-
-#: Kinds of runs whose lung is as its label says.
-UNDISTURBED = ("ramp", "scored", "control")
+    from hardware_eval.emulation.emulator import LoopbackDevice
 
 
 @dataclass(frozen=True)
@@ -111,11 +107,9 @@ VIRTUAL = "virtual:"
 
 def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
     """Open a port, say nothing, and return it with the clock it lives by; see :func:`connect`."""
-    from hardware_eval.wire.link import Link
-
     if not port.startswith(VIRTUAL):
         return Link(port), RealClock()
-    from hardware_eval.emulation.loopback import LoopbackDevice
+    from hardware_eval.emulation.emulator import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
 
     # With the noise and the converter of a PVP: without them all repeats would be one.
@@ -134,8 +128,6 @@ def connect(port: str) -> Line:
         LinkError: if it cannot be opened, or no device answers.
         InputError: if there is no such emulated lung.
     """
-    from hardware_eval.wire.link import Link
-
     transport, clock = carrier(port)
     client = Client(transport, clock)
     try:
@@ -227,8 +219,8 @@ def evaluate(
     shows: Sequence[Show] = (), sandbox: bool = True, dry: bool = True,
     before_lung: Callable[[Bench, str], Sheet | None] = lambda bench, lung: None,
     settings: SafetySettings = DEFAULT, operator_name: str = "", notes: str = "",
-    rest: float = REST_S, prepare_run: Callable[[PlannedRun], None] = lambda run: None,
-    calibration: Calibration | None = None, fallback: FallbackSettings | None = None,
+    rest: float = REST_S, calibration: Calibration | None = None,
+    fallback: FallbackSettings | None = None,
 ) -> Evaluation:  # fmt: skip
     """Run a plan, or what is left of it, and make the records once it is done.
 
@@ -246,7 +238,6 @@ def evaluate(
         operator_name: for the record.
         notes: for the record.
         rest: time at rest before each run, s.
-        prepare_run: see :func:`hardware_eval.bench.session.run_plan`.
         calibration: of the device, for the record.
         fallback: takes over from entries that are late or leave their envelope; not in the dry run.
 
@@ -281,10 +272,9 @@ def evaluate(
     bench = Bench(line.client, line.clock, settings, operator, shows, rest, fallback)
     make = controllers(submissions, plan.track, runner, real_time=line.real)
     with RawLog(log_path) as log, _ends_by_exception(), _quick_switches():
-        end = session.run_plan(
-            bench, plan, make, log, about=about,
-            before_lung=lambda lung: before_lung(bench, lung), prepare_run=prepare_run,
-        )  # fmt: skip
+        reason = session.run_plan(
+            bench, plan, make, log, about=about, before_lung=lambda lung: before_lung(bench, lung)
+        )
     written: Path | None = None
     with contextlib.suppress(InputError):  # no whole breath yet
         breaths = recording(log_path, kinds=UNDISTURBED)
@@ -293,7 +283,7 @@ def evaluate(
     made: dict[str, Path] = {}
     stopped: dict[str, str] = {}
     unrun: set[str] = set()
-    for submission in submissions if end.complete else ():
+    for submission in () if reason else submissions:
         name = submission.manifest.name
         content = records.hardware_record(log_path, submission)
         made[name] = records.save(out, content)
@@ -302,7 +292,7 @@ def evaluate(
             runs = checked.errors.size
             stopped[name] = f"{len(stops)} of {runs} runs failed, the first: {stops[0].reason}"
             unrun |= {name} if len(stops) == runs else set()
-    return Evaluation(end.complete, end.reason, log_path, written, made, stopped, frozenset(unrun))
+    return Evaluation(not reason, reason, log_path, written, made, stopped, frozenset(unrun))
 
 
 @contextlib.contextmanager

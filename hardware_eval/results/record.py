@@ -1,7 +1,10 @@
-"""From the log of a plan to the hardware records of its entries, and to a public recording.
+"""From the log of a plan to the hardware records of its entries; and both read again.
 
 The record holds the measured pressures of every scored inspiration, from which the score follows,
 and names the raw log by its hash. ``ventbench board add`` takes it.
+
+The breaths behind a record serve to compare simulators with the lung, too: these get the recorded
+commands, and what they then do otherwise is the mismatch, whatever the controller did.
 """
 
 from __future__ import annotations
@@ -9,58 +12,30 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hardware_eval.bench.loop import ON_TIME_S
-from hardware_eval.bench.plan import CONTROL, Plan, make_plan, progress
-from hardware_eval.bench.raw_log import LoggedBreath, breaths, lines
+from hardware_eval.bench.loop import ON_TIME_S, BreathLog
+from hardware_eval.bench.plan import CONTROL, UNDISTURBED, Plan, make_plan, progress
+from hardware_eval.bench.raw_log import LOG, LoggedBreath, breaths, lines, recording
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, create, record, schema
 from ventbench.board.record import TRACK, HardwareRecord
 from ventbench.entries.folder import Submission, combined_hash, file_hashes
+from ventbench.plants.catalog import load_simulators
+from ventbench.plants.simulators import Simulators
+from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.read import load
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics.score import passes_safety_gate
 
 #: Longest reason of a stopped run in a record, characters.
 _REASON = 1000
-
-
-@dataclass(frozen=True)
-class Jitter:
-    """Statistics of the loop's deadlines.
-
-    Attributes:
-        steps: how many there were.
-        on_time: share of steps that began within 2 ms of their deadline.
-        lost: steps that began after the deadline of the next one.
-        worst: how late the latest step began, s.
-        late_answers: steps whose controller did not answer in time.
-        late_share: their share of the steps whose controller was asked.
-        longest_answer: longest time that an answer took, s.
-        outside: answers that the fallback refused.
-        fallback_share: share of the steps that the fallback commanded.
-        longest_fallback: steps in a row that it commanded, at most.
-        busy_median, busy_worst: time from a step's beginning to its command's answer, s.
-    """
-
-    steps: int
-    on_time: float
-    lost: int
-    worst: float
-    late_answers: int
-    late_share: float
-    longest_answer: float
-    outside: int
-    fallback_share: float
-    longest_fallback: int
-    busy_median: float
-    busy_worst: float
 
 
 def plan_of(logged: list[dict[str, Any]], label: str) -> Plan:
@@ -81,8 +56,17 @@ def plan_of(logged: list[dict[str, Any]], label: str) -> Plan:
     raise InputError(f"{label} holds no plan: no session has begun")
 
 
-def jitter(log: Path, entry: str | None = None) -> Jitter:
+def timing(log: Path, entry: str | None = None) -> dict[str, float]:
     """Statistics of all steps of a log; answers of one entry's runs, or of all.
+
+    Returns:
+        ``steps``, and those that began after the deadline of the next one (``lost``); the share
+        that began within 2 ms of the deadline (``on_time``), and the latest (``worst``, s); answers
+        that came late (``late_answers``), their share of those that were asked for
+        (``late_share``), and the longest (``longest_answer``, s); answers that the fallback refused
+        (``outside``), its share of the steps (``fallback_share``), and most in a row
+        (``longest_fallback``); time from a step's beginning to its command's answer
+        (``busy_median``, ``busy_worst``, s).
 
     Raises:
         InputError: if it holds no step.
@@ -99,12 +83,19 @@ def jitter(log: Path, entry: str | None = None) -> Jitter:
     if not late:
         raise InputError(f"{log} holds no breath")
     delays, asked = np.array(late, float), max(sums["asked"], 1)
-    return Jitter(
-        len(delays), float(np.mean(delays <= ON_TIME_S)), int(np.sum(delays > protocol.DT)),
-        float(delays.max()), sums["late_answers"], sums["late_answers"] / asked,
-        longest["longest_answer"], sums["outside"], sums["fallback"] / asked,
-        int(longest["longest_fallback"]), float(np.median(busy)), float(np.max(busy)),
-    )  # fmt: skip
+    return {
+        "steps": len(delays),
+        "on_time": float(np.mean(delays <= ON_TIME_S)),
+        "lost": int(np.sum(delays > protocol.DT)),
+        "worst": float(delays.max()),
+        "late_answers": sums["late_answers"],
+        "late_share": sums["late_answers"] / asked,
+        "outside": sums["outside"],
+        "fallback_share": sums["fallback"] / asked,
+        **longest,
+        "busy_median": float(np.median(busy)),
+        "busy_worst": float(np.max(busy)),
+    }
 
 
 def hardware_record(log: Path, submission: Submission) -> bytes:
@@ -161,7 +152,7 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
         "control": _control(log),
         "safety": about["safety"],
         "selftest": _skipped(logged, lungs),
-        "timing": dataclasses.asdict(jitter(log, name)),
+        "timing": timing(log, name),
         "sandbox": about["sandbox"],
         "provenance": {},
         "versions": create.versions(),
@@ -187,17 +178,18 @@ def _check_same(sessions: list[dict[str, Any]], log: Path, name: str) -> None:
 _Cell = tuple[str, float, int]
 
 
-def _scored(log: Path, name: str) -> dict[_Cell, list[LoggedBreath]]:
+def _scored(log: Path, name: str) -> dict[_Cell, list[BreathLog]]:
     """Breaths of the complete scored runs of an entry, by lung, PIP and repetition."""
-    runs: dict[_Cell, list[LoggedBreath]] = {}
+    runs: dict[_Cell, list[BreathLog]] = {}
     for breath in breaths(log):
-        if breath.entry == name and breath.kind == "scored" and breath.complete:
-            runs.setdefault((breath.lung, breath.pip, breath.repeat), []).append(breath)
+        run = breath.run
+        if run.entry == name and run.kind == "scored" and breath.complete:
+            runs.setdefault((run.lung, run.pip, run.repeat), []).append(breath.log)
     return runs
 
 
 def _tables(
-    plan: Plan, lungs: list[str], runs: Mapping[_Cell, list[LoggedBreath]],
+    plan: Plan, lungs: list[str], runs: Mapping[_Cell, list[BreathLog]],
     logged: list[dict[str, Any]], name: str,
 ) -> dict[str, Any]:  # fmt: skip
     """Errors, traces, stops and safety of every cell."""
@@ -284,3 +276,121 @@ def save(folder: Path, content: bytes) -> Path:
     path = folder / f"{canonical.digest(content)}{record.SUFFIX}"
     files.write_atomically(path, lambda file: file.write(content))
     return path
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a log says."""
+
+    runs: int  #: runs of the plan.
+    done: int  #: those that need not run again.
+    breaths: int  #: breaths in the log, of all attempts.
+    timing: dict[str, float]  #: statistics of the loop, see :func:`timing`.
+    problems: tuple[str, ...]  #: where the record and the log differ; empty without a record.
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return files.json_values(dataclasses.asdict(self))
+
+    def __str__(self) -> str:
+        steps = (
+            "{steps} steps, {on_time:.2%} within 2 ms, latest {worst:.4f} s, {lost} lost, "
+            "{late_answers} late answers ({late_share:.2%}), longest {longest_answer:.4f} s, "
+            "{outside} outside the envelope; fallback {fallback_share:.2%} of steps, at most "
+            "{longest_fallback} in a row"
+        )
+        done = f"{self.done} of {self.runs} runs are done, {self.breaths} breaths logged"
+        return "\n".join([done, steps.format(**self.timing), *self.problems])
+
+
+def replay(
+    log: Path, *, record: Path | None = None, rerun: str | None = None, mcap: Path | None = None
+) -> Replay:
+    """Read a log again.
+
+    Args:
+        log: the file, or the folder that holds it.
+        record: a hardware record to check against it.
+        rerun: ``"live"`` or the path of an ``.rrd`` file to show the breaths in.
+        mcap: MCAP file to write them to.
+
+    Raises:
+        InputError: if there is no such log, or the record is none.
+    """
+    log = log / LOG if log.is_dir() else log
+    logged = list(lines(log))
+    plan = plan_of(logged, str(log))
+    everything = breaths(log)
+    _show(everything, rerun, mcap, len(plan.runs))
+    problems = () if record is None else tuple(_differences(record, log, plan, logged))
+    done = len(progress(plan, logged).done)
+    return Replay(len(plan.runs), done, len(everything), timing(log), problems)
+
+
+def _show(everything: list[LoggedBreath], rerun: str | None, mcap: Path | None, total: int) -> None:
+    from hardware_eval.bench.console import McapView, RerunView
+
+    written = McapView(mcap) if mcap else None
+    shows = [RerunView(rerun).breath] if rerun else []
+    shows += [written.breath] if written else []
+    for breath in everything if shows else ():
+        for show in shows:
+            show(breath.run, breath.log, breath.run.number, total)
+    if written:
+        written.close()
+
+
+def _differences(path: Path, log: Path, plan: Plan, logged: list[dict[str, Any]]) -> list[str]:
+    """Where a record says something else than the log."""
+    loaded, problems = _loaded(path), []
+    if files.sha256(log) != loaded.header.recording.sha256:
+        problems.append(f"{log} is not the recording that the record names by its hash")
+    lungs = list(loaded.header.lungs)
+    tables = _tables(plan, lungs, _scored(log, loaded.name), logged, loaded.name)
+    errors = np.array(tables["errors"], float)
+    for lung, own, said in zip(lungs, errors, loaded.errors, strict=True):
+        if own.shape != said.shape or not np.allclose(own, said, 0.0, 1e-3, equal_nan=True):
+            problems.append(f"{lung}: the log gives other errors than the record")
+    return problems
+
+
+def _loaded(path: Path) -> HardwareRecord:
+    loaded = record.load(path)
+    if not isinstance(loaded, HardwareRecord):
+        raise InputError(f"{path} is not a hardware record")
+    return loaded
+
+
+def scored_plants(simulator: Any, lungs: list[str]) -> Simulators:
+    """The plants that entries are scored on, by lung.
+
+    By name the frozen simulators choose a rig by the clock of a recording; one of exactly 30 ms
+    tells none, and what matters here is the rig that scores.
+    """
+    simulators = load_simulators(simulator)
+    if not simulators.has_plants:
+        return simulators
+    plants = load_simulators({lung: simulators.plant(lung) for lung in lungs})
+    return replace(plants, name=simulators.name)
+
+
+def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
+    """The breaths behind a hardware record, a log, a session's folder or a recording.
+
+    The raw log that a record names is looked for beside it if it is not given.
+
+    Raises:
+        InputError: if the log is not there, or not the one that the record names.
+    """
+    if path.is_dir():
+        path = path / LOG
+    if path.name.endswith(".jsonl"):
+        return recording(path, kinds=(*UNDISTURBED, "explore"))
+    if not path.name.endswith(".json"):
+        return load(path)
+    loaded, log = _loaded(path), log or path.parent / LOG
+    if not log.is_file():
+        raise InputError(f"{log} is not there: give --log FILE, the raw recording of {path}")
+    if files.sha256(log) != loaded.header.recording.sha256:
+        raise InputError(f"{log} is not the raw recording that {path} names by its hash")
+    return recording(log, kinds=UNDISTURBED)

@@ -27,8 +27,7 @@ import numpy as np
 from scipy import stats
 
 from hardware_eval.bench.identity import Interval, interval
-from hardware_eval.bench.raw_log import lines
-from hardware_eval.results.evaluate import LOG
+from hardware_eval.bench.raw_log import LOG, lines
 from hardware_eval.results.record import plan_of
 from ventbench.base import files
 from ventbench.base.arrays import Floats
@@ -60,24 +59,21 @@ def mounted_anew(by_mounting: Floats) -> tuple[Floats, Floats, Floats]:
 def kendall(simulated: Floats, measured: Floats) -> Floats:
     """Kendall's tau-b of one order, ``(E,)``, with each of some, ``(..., E)``."""
     first, second = np.triu_indices(len(simulated), 1)
-    own = np.sign(simulated[first] - simulated[second])
-    other = np.sign(measured[..., first] - measured[..., second])
-    pairs = np.sqrt((own**2).sum() * (other**2).sum(axis=-1))
-    return (own * other).sum(axis=-1) / np.maximum(pairs, 1e-300)
+    return _cosine(*(np.sign(x[..., first] - x[..., second]) for x in (simulated, measured)))
 
 
 def spearman(simulated: Floats, measured: Floats) -> Floats:
     """Spearman's rho of one order, ``(E,)``, with each of some, ``(..., E)``."""
-    own = stats.rankdata(simulated)
-    other = stats.rankdata(measured, axis=-1)
-    own, other = own - own.mean(), other - other.mean(axis=-1, keepdims=True)
+    middle = 0.5 * (len(simulated) + 1)
+    return _cosine(*(stats.rankdata(x, axis=-1) - middle for x in (simulated, measured)))
+
+
+def _cosine(own: Floats, other: Floats) -> Floats:
     scale = np.sqrt((own**2).sum() * (other**2).sum(axis=-1))
     return (own * other).sum(axis=-1) / np.maximum(scale, 1e-300)
 
 
-def agreement(
-    simulated: Floats, measured: Floats, *, draws: int = DRAWS, seed: int = SEED
-) -> dict[str, Interval]:
+def agreement(simulated: Floats, measured: Floats, *, draws: int = DRAWS) -> dict[str, Interval]:
     """Rank agreement of entries in simulation and on the bench, ``kendall`` and ``spearman``.
 
     The drawn means share their mountings, so that what a mounting does to all entries changes no
@@ -87,13 +83,12 @@ def agreement(
         simulated: score of each entry and mounting in simulation, ``(E, M)``, two entries at least.
         measured: on the bench, ``(E, M)``; with one mounting there is no interval.
         draws: number of draws.
-        seed: of the draws.
     """
     mountings = measured.shape[1]
     own, means = simulated.mean(axis=1), measured.mean(axis=1)
     drawn = means[None]
     if mountings > 1:
-        random = np.random.default_rng(seed)
+        random = np.random.default_rng(SEED)
         off = measured - simulated
         off = off - off.mean(axis=1, keepdims=True)
         normal = random.standard_normal((draws, mountings)) / math.sqrt(mountings)
@@ -191,7 +186,6 @@ def analyse(logs: Sequence[Path]) -> Trial:
 def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> EntryTrial:
     """One entry: errors ``(M, P, K)``, NaN where a run failed; in simulation ``(M, P)``."""
     repeats = errors.shape[-1]
-    unknown = Interval(math.nan)
     by_mounting = errors.mean(axis=(1, 2)) - simulated.mean(axis=1)
     gaps = {name: Interval(float(gap)) for name, gap in zip(mountings, by_mounting, strict=True)}
     score, gap = Interval(float(errors.mean())), Interval(float(by_mounting.mean()))
@@ -212,8 +206,7 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
     success = Interval(float(done.sum()) / errors.size, float(share.low), float(share.high))
     each = errors[0].size
     return EntryTrial(
-        score if math.isfinite(score.value) else unknown,
-        gap if math.isfinite(gap.value) else unknown, gaps, success,
+        score, gap, gaps, success,
         {name: (int(n), each) for name, n in zip(mountings, done, strict=True)}, within, between,
     )  # fmt: skip
 

@@ -459,19 +459,18 @@ class Clause:
 
 
 def conformance(
-    transport: Transport, clock: Clock, tell: Callable[[Clause], None] = lambda clause: None,
-    seed: int = 0,
-) -> list[Clause]:  # fmt: skip
+    transport: Transport, clock: Clock, tell: Callable[[Clause], None] = lambda clause: None
+) -> list[Clause]:
     """Try a device by the specification, by the clock of its transport.
 
     Returns all lines, in the order of :data:`CLAUSES`, then those of :data:`NOT_TRIED`; ``tell`` is
-    called with each as it is known. ``seed`` is that of the session numbers.
+    called with each as it is known.
 
     Raises:
         NoAnswerError: if there is no device.
         DisconnectedError: if the port goes away.
     """
-    host, done = Probe(transport, clock, seed), []
+    host, done = Probe(transport, clock), []
     for attempt in range(_ATTEMPTS):
         try:
             host.hello()

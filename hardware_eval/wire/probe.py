@@ -65,9 +65,9 @@ class Probe:
         heard: packets that nobody has asked for yet.
     """
 
-    def __init__(self, transport: Transport, clock: Clock, seed: int) -> None:
-        """Begin on a transport by its clock; ``seed`` is that of the session numbers."""
-        self.transport, self.clock, self.random = transport, clock, Random(seed)
+    def __init__(self, transport: Transport, clock: Clock) -> None:
+        """Begin on a transport by its clock."""
+        self.transport, self.clock, self.random = transport, clock, Random(0)
         self.session = self.sequence = 0
         self.watchdog = WATCHDOG
         self._parser = ParserState()

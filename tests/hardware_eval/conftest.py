@@ -7,12 +7,11 @@ from typing import Any
 
 import pytest
 
-from hardware_eval.bench.loop import Bench, SilentOperator
+from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.results.evaluate import Line
-from hardware_eval.wire import link
 from hardware_eval.wire.client import Client
 
 LUNG = "R5C20"
@@ -22,7 +21,7 @@ LUNG = "R5C20"
 def _ports_are_patient() -> Iterator[None]:
     """A host that stands still for a second must not look like a port that has gone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(link, "WRITE_TIMEOUT", 600.0)
+        patch.setattr("hardware_eval.wire.client.WRITE_TIMEOUT", 600.0)
         yield
 
 
@@ -49,4 +48,4 @@ def line(device: LoopbackDevice) -> Line:
 
 @pytest.fixture
 def bench(line: Line) -> Bench:
-    return Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=2.0)
+    return Bench(line.client, line.clock, DEFAULT, Operator(), rest=2.0)

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from hardware_eval import cli
 from hardware_eval.bench.controllers import ControllerFailedError, SubmissionController
 from hardware_eval.bench.raw_log import breaths
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
@@ -63,7 +63,7 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
     again = invoke("replay", str(out), "--record", told["records"]["pid_best"], "--mcap", str(file))
     with open(file, "rb") as opened:  # read by the package's own reader
         messages = [json.loads(x.data) for _, _, x in make_reader(opened).iter_messages()]
-    logged = [breath for breath in breaths(out / "raw.jsonl") if len(breath.time)]
+    logged = [breath.log for breath in breaths(out / "raw.jsonl") if breath.log.time]
     assert len(messages) == sum(len(breath.time) for breath in logged)
     assert messages[5]["pressure"] == logged[0].pressure[5]
     assert again.exit_code == 0, again.output

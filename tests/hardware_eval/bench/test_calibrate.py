@@ -14,11 +14,11 @@ from scipy import stats
 
 from hardware_eval.bench import calibrate
 from hardware_eval.bench.calibrate import Calibration, device_of, fit, load, measure
-from hardware_eval.bench.loop import Bench, SilentOperator
+from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
-from hardware_eval.emulation.faults import Fault, FaultKind
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.electronics import Fault, FaultKind
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
 from tests.hardware_eval import stand_in
@@ -46,7 +46,7 @@ def test_the_line_is_that_of_scipy_and_its_intervals_cover() -> None:
     assert late.value - 2.0 == pytest.approx(np.mean(y[4:] - y[[2, 1, 0]]))
 
 
-class Applies(SilentOperator):
+class Applies(Operator):
     """A person who puts what is asked for on a sensor that reads 5 % too much, and 0.4 more."""
 
     def __init__(self, hal: stand_in.Bench) -> None:
@@ -84,7 +84,7 @@ def test_a_meter_is_read_where_the_device_measures_no_flow() -> None:
     device = LoopbackDevice(hal)
     client = Client(device, device.clock)
     client.hello()
-    bench = Bench(client, device.clock, DEFAULT, SilentOperator())
+    bench = Bench(client, device.clock, DEFAULT, Operator())
     shown = iter((228.0, 456.0, 240.0))
     part = measure(
         bench, "valve", lung=LUNG, reference=(10.0, 20.0, 10.0), ask=lambda question: next(shown)
@@ -144,7 +144,7 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
 
 
 def test_a_part_that_was_not_confirmed_is_not_measured(line: Line) -> None:
-    class Refuses(SilentOperator):
+    class Refuses(Operator):
         def confirm(self, question: str) -> bool:
             return False
 

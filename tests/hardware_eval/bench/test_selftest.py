@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from hardware_eval.bench import selftest as selftest_module
-from hardware_eval.bench.collect import collect
+from hardware_eval.bench.drive import collect
 from hardware_eval.bench.identity import measured_lung
-from hardware_eval.bench.loop import Bench, SilentOperator
+from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.selftest import LIMITS, Driven, selftest, span_finding
-from hardware_eval.emulation.faults import Fault, FaultKind, LineFaultKind
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.electronics import Fault, FaultKind, LineFaultKind
+from hardware_eval.emulation.emulator import LoopbackDevice
 from ventbench.base.errors import InputError
 
 from .test_identity import probed
@@ -212,7 +212,7 @@ def test_exploring_stops_when_nothing_can_be_trusted(
     hal.faults = (Fault(FaultKind.DISCONNECTED, device.clock.now()),)
     told: list[str] = []
 
-    class Listens(SilentOperator):
+    class Listens(Operator):
         def tell(self, text: str) -> None:
             told.append(text)
 

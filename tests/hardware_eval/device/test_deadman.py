@@ -17,7 +17,7 @@ from hardware_eval.device import deadman
 from hardware_eval.device.deadman import BOUND, DEADMAN, Deadman, SupervisedHal
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings, Identity, Sample
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Flag, Mode
 from tests.hardware_eval.stand_in import Bench

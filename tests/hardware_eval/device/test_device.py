@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hardware_eval.device.program import OLDEST_SEEN, PERIOD, SENSOR_TIMEOUT, DeviceSettings
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import Client, RefusedError
 from hardware_eval.wire.messages import (
     Command,

@@ -23,8 +23,7 @@ from hardware_eval.device import __main__ as board
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves
-from hardware_eval.wire.client import Client
-from hardware_eval.wire.link import Link
+from hardware_eval.wire.client import Client, Link
 from hardware_eval.wire.messages import PROTOCOL_VERSION, Hello, Mode, Packet, encode
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
@@ -241,8 +240,6 @@ def test_missing_packages_and_hardware_say_what_to_do(
         PvpValves(configuration)
     assert board.main(["--config", str(configuration), "--vent"]) == 2
     assert "pip install" in capsys.readouterr().err
-    assert board.main(["--config", "x.toml", "--listen", "here"]) == 2
-    assert "HOST:PORT" in capsys.readouterr().err
 
 
 def test_a_limit_outside_the_sensors_range_is_refused(
@@ -260,8 +257,18 @@ def test_the_board_vents_once(configuration: Path, hardware: SimpleNamespace) ->
 
 
 def test_the_board_serves_one_host_after_another() -> None:
-    """Over TCP, as `--listen`: what the board does when a host hangs up."""
-    open_line, server = board.tcp_line("127.0.0.1", 0)
+    """What the board does when a host hangs up."""
+    server = socket.create_server(("127.0.0.1", 0))
+    server.setblocking(False)
+
+    def open_line() -> int | None:
+        try:
+            connection, _ = server.accept()
+        except BlockingIOError:
+            return None
+        connection.setblocking(False)
+        return connection.detach()
+
     bench = Bench()
     service = DeviceService(bench, DeviceSettings(), time.monotonic())
     stop = threading.Event()
@@ -292,11 +299,6 @@ def test_a_serial_line_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
     assert os.read(master, 10) == b"\0x\0"
     for descriptor in (line, master, slave):
         os.close(descriptor)
-
-
-def test_a_taken_address_is_told() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InputError, match="listen"):
-        board.tcp_line("127.0.0.1", taken.getsockname()[1])
 
 
 #: The ventilator's two packages, as files that a process of its own imports.

@@ -23,11 +23,10 @@ import pytest
 from hardware_eval.device import deadman
 from hardware_eval.device.deadman import MONOSTABLE
 from hardware_eval.device.program import Sample
-from hardware_eval.emulation import electronics
+from hardware_eval.emulation import electronics, simulated
 from hardware_eval.emulation.electronics import Electronics
-from hardware_eval.emulation.loopback import LoopbackDevice
-from hardware_eval.wire.client import Client, LinkError, RefusedError
-from hardware_eval.wire.link import Link
+from hardware_eval.emulation.emulator import LoopbackDevice
+from hardware_eval.wire.client import Client, Link, LinkError, RefusedError
 from hardware_eval.wire.messages import Mode
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
@@ -56,7 +55,7 @@ def test_a_log_that_cannot_be_written_is_told(
     here.send({"begun": 0.0, "normally_open": True, "monostable": MONOSTABLE, "log": log})
     monkeypatch.setattr("sys.argv", ["", *(str(os.dup(x.fileno())) for x in (there, wire))])
     with pins, wire, there, here:
-        electronics._main()
+        simulated._main()
         with pytest.raises(InputError, match=r"nowhere/log\.csv"):
             electronics.introduced(here)
 

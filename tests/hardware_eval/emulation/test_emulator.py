@@ -17,11 +17,12 @@ import serial
 
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.emulation import emulator as emulator_module
-from hardware_eval.emulation.electronics import emulated_lung
 from hardware_eval.emulation.emulator import Emulator, tell
+from hardware_eval.emulation.simulated import emulated_lung
 from hardware_eval.wire.client import (
     Client,
     DisconnectedError,
+    Link,
     LinkError,
     NoAnswerError,
     PortBusyError,
@@ -29,7 +30,6 @@ from hardware_eval.wire.client import (
     PortMissingError,
     RefusedError,
 )
-from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError

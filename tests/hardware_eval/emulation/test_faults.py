@@ -8,8 +8,8 @@ from typing import Any
 import flax.struct
 import pytest
 
-from hardware_eval.emulation.faults import Fault, FaultKind, Line, LineFaultKind, parse
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.electronics import Fault, FaultKind, LineFaultKind, parse
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.wire.client import Client, DisconnectedError, NoAnswerError
 from hardware_eval.wire.messages import Capability, Flag, Mode
@@ -172,8 +172,8 @@ def test_a_frozen_lung_breathes_and_shows_its_flow() -> None:
     ],
 )
 def test_faults_of_the_line(kind: LineFaultKind, strength: float, times_out: bool) -> None:
-    line = Line()
-    device = LoopbackDevice(Bench(), line=line)
+    device = LoopbackDevice(Bench())
+    line = device.line
     client = Client(device, device.clock)
     client.hello()
     client.arm()

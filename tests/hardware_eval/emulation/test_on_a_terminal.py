@@ -24,12 +24,11 @@ from typer.testing import CliRunner
 
 from hardware_eval import cli
 from hardware_eval.device.program import DeviceSettings
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
-from hardware_eval.wire.client import Client, RefusedError
-from hardware_eval.wire.link import Link
+from hardware_eval.wire.client import Client, Link, RefusedError
 from hardware_eval.wire.messages import Capability, Flag, Mode
 from ventbench.board import record
 from ventbench.board.record import HardwareRecord

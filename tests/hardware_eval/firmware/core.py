@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from hardware_eval.device.program import DeviceSettings, Hal, Identity, Sample
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.messages import Mode, microseconds
 
 HERE = Path(__file__).parent

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from hardware_eval import cli
 from hardware_eval.device.program import DeviceService, DeviceSettings, Identity
-from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.wire.client import NoAnswerError
 from hardware_eval.wire.conformance import CLAUSES, NOT_TRIED, Clause, conformance

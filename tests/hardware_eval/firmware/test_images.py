@@ -27,9 +27,8 @@ from typer.testing import CliRunner
 from hardware_eval import cli, realtime
 from hardware_eval.emulation.emulator import Emulator
 from hardware_eval.emulation.firmware import Firmware, Order
-from hardware_eval.wire.client import Client, NoAnswerError, RefusedError
+from hardware_eval.wire.client import Client, Link, NoAnswerError, RefusedError
 from hardware_eval.wire.conformance import conformance
-from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Flag, Mode
 from tests.hardware_eval.firmware.core import FIRMWARE, tool
 from ventbench.base.errors import InputError
@@ -71,7 +70,7 @@ def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
     if image.suffix == ".elf":
         tool("qemu-system-arm")
     log = tmp_path / "electronics.csv"
-    about = {"lung": LUNG, "plant": "single_compartment", "conceal": None, "seal": None}
+    about = {"lung": LUNG, "plant": "single_compartment", "words": None, "seal": None}
     given = {**about, "faults": [], "log": log, "normally_open": True, "monostable": 0.09}
     firmware = Logged(image, given, time.monotonic())
     emulator = Emulator(firmware, link=tmp_path / "lung")
@@ -162,7 +161,7 @@ def test_the_watchdog_vents_when_the_host_falls_silent(device: tuple[Logged, Pat
     assert judged, "no breath was timed"
 
 
-class DeviceClock:
+class DeviceClock(realtime.RealClock):
     """The device's own clock, by its orders every 5 ms."""
 
     def __init__(self, firmware: Logged) -> None:

@@ -12,12 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from hardware_eval import cli
-from hardware_eval.bench.loop import SilentOperator
+from hardware_eval.bench.loop import Operator
 from hardware_eval.bench.plan import make_plan
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results import record as records
 from hardware_eval.results.evaluate import Line
-from hardware_eval.results.replay import recorded_breaths, replay
+from hardware_eval.results.record import recorded_breaths, replay
 from hardware_eval.results.trial import analyse
 from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, gate, record, store
@@ -40,7 +40,7 @@ def done(tmp_path_factory: pytest.TempPathFactory, shared_device: Any) -> ev.Eva
     plan = make_plan(["pid_best"], [LUNG], pips=PIPS, repeats=2, control_every=3)
     return ev.evaluate(
         [open_submission("pid_best")], Line(client, shared_device.clock),
-        tmp_path_factory.mktemp("bench"), SilentOperator(), plan=plan, sandbox=False, dry=False,
+        tmp_path_factory.mktemp("bench"), Operator(), plan=plan, sandbox=False, dry=False,
         operator_name="A. Person", notes="a note", rest=1.0,
     )  # fmt: skip
 
@@ -176,7 +176,7 @@ def test_a_record_without_its_log_says_where_to_look(path: Path, tmp_path: Path)
 
 
 def test_a_plan_that_is_not_finished_has_no_record(line: Line, tmp_path: Path) -> None:
-    class Refuses(SilentOperator):
+    class Refuses(Operator):
         def confirm(self, question: str) -> bool:
             return "raise PIP" not in question
 

@@ -508,7 +508,7 @@ def _missing_mechanism(
     affected = None
     if changes:
         model, path = recording_model, f"{name}.{changes[0]}"
-        at = place_of_change(model.evaluator, model.final_model, data, path)
+        at = place_of_change(model.evaluator, model.fit, data, path)
         values[changes[0]] = replace(values[changes[0]], value=at.value, ci95=(at.low, at.high))
         first = np.searchsorted(data.position, at).clip(max=len(breaths) - 1)
         now, low, high = (int(i) for i in breaths.breath_id[first])

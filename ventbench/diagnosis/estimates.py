@@ -10,7 +10,7 @@ import numpy as np
 
 from ventbench import mechanics
 from ventbench.diagnosis.conclusion import Conclusion, Swing, UnnamedEffect
-from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
+from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
@@ -48,8 +48,8 @@ _INPUTS = {
 }
 
 
-def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -> Fit:
-    """Fit the hypothesis of a conclusion to breaths, with covariance.
+def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -> FittedModel:
+    """Fit the hypothesis of a conclusion to breaths, with its uncertain shape parameters.
 
     Args:
         fitted: the concluded model, fitted to some of the breaths.
@@ -63,15 +63,10 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     for path in fitted.problem.unknowns.paths:
         if path != START and not ("." in path and varies_by_breath(path.rpartition(".")[0])):
             start[path] = float(np.median(fitted.column(path)))
-    for name in hypothesis.names:
-        for pair in mechanism(name).description.interchangeable:
-            first, second = (f"{name}.{parameter}" for parameter in pair)
-            if {first, second} <= set(start) and start[second] > start[first]:
-                start[first], start[second] = start[second], start[first]
     known = fitted.problem.data
     if len(np.unique(known.lung)) > 1:
         same = (partition.data.R[:, None] == known.R) & (partition.data.C[:, None] == known.C)
-        grouped = ("R", "C", *groups_by_label(known, hypothesis.paths))
+        grouped = [path for path in start if parameter(path).follows]
         start |= {path: fitted.column(path)[np.argmax(same, axis=1)] for path in grouped}
     if hypothesis.breath_terms:  # the efforts of each breath start where they are likeliest
         near = evaluator.fit(
@@ -79,21 +74,13 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
         )
         start |= {path: near.column(path) for path in near.problem.unknowns.paths}
     # Where rigs differ, gains that are the same in all breaths would be made up for by mechanisms.
-    by_breath = ("gain",) if evaluator.gain_sd else ()
-    neutral = float(np.log(parameter("gain").neutral))
-    start = {path: value for path, value in start.items() if path not in by_breath}
-    return fit(
-        partition.data,
-        hypothesis.names,
-        free=dict.fromkeys((*hypothesis.free, *free, *by_breath)),
-        fixed=dict(hypothesis.fixed),
-        start=start,
-        groups=groups_by_label(partition.data, hypothesis.paths)
-        | {path: np.arange(len(partition.data)) for path in by_breath},
-        prior={path: (neutral, evaluator.gain_sd) for path in by_breath},
-        noise=fitted.noise,
+    start.pop("gain", None)
+    found = fit(
+        partition.data, hypothesis.names, free=dict.fromkeys((*hypothesis.free, *free)),
+        fixed=dict(hypothesis.fixed), start=start, gain_sd=evaluator.gain_sd, noise=fitted.noise,
         predictor=partition.predictor,
-    )
+    )  # fmt: skip
+    return FittedModel(hypothesis.names, found.problem, found.minimum, hypothesis)
 
 
 def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:

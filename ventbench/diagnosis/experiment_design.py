@@ -10,14 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.diagnosis.findings import BreathRequest
-from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.fit import Fit
 from ventbench.system_id.predictor import START, Predictor
@@ -45,13 +43,8 @@ _VARIANTS, _MOST = 5, 100.0
 #: of the interruptions of an expiration, s.
 _INSPIRATION, _FAST, _SLOW, _HOLD, _SHUTTER = 1.0, 0.35, 1.5, 2.0, 0.16
 
-#: A hypothesis at its optimum, on the breaths recorded so far.
-Fitted: TypeAlias = FittedModel | Fit
 
-
-def request_breaths(
-    chosen: Fitted, alternatives: Sequence[Fitted], noise: Noise
-) -> BreathRequest | None:
+def request_breaths(chosen: Fit, alternatives: Sequence[Fit], noise: Noise) -> BreathRequest | None:
     """Find the breaths to record next.
 
     The value of a family of breaths, or of a mix of two, is the log-likelihood that is expected to
@@ -93,7 +86,7 @@ class Forecast:
     known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
 
 
-def values_of(fitted: Fitted, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
+def values_of(fitted: Fit, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
     """Physical values for new breaths, taken in turn from recorded ones, ``(m, P + 1)``.
 
     Args:
@@ -113,7 +106,7 @@ def values_of(fitted: Fitted, data: Data, lung: NDArray[np.intp], start: float) 
 
 
 def forecast(
-    fitted: Fitted, data: Data, predictor: Predictor, lung: NDArray[np.intp],
+    fitted: Fit, data: Data, predictor: Predictor, lung: NDArray[np.intp],
     start: float, noise: Noise,
 ) -> Forecast:  # fmt: skip
     """Predict new breaths with derivatives; for the arguments see :func:`values_of`."""
@@ -207,7 +200,7 @@ class _Design:
 
 
 def _best_on_lung(
-    chosen: Fitted, alternatives: Sequence[Fitted], noise: Noise,
+    chosen: Fit, alternatives: Sequence[Fit], noise: Noise,
     recorded_rows: NDArray[np.intp],
 ) -> _Design | None:  # fmt: skip
     """The best design on the lung of the recorded breaths ``here``."""
@@ -260,7 +253,7 @@ def _best(
 
 
 def _safe(
-    kinds: tuple[Family, ...], hypotheses: Sequence[Fitted], recorded: Data,
+    kinds: tuple[Family, ...], hypotheses: Sequence[Fit], recorded: Data,
     recorded_rows: NDArray[np.intp], start: float,
 ) -> tuple[Family, ...]:  # fmt: skip
     """Breaths that every hypothesis predicts within the pressure limits, weakened where needed."""
@@ -300,7 +293,7 @@ def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.int
     )  # fmt: skip
 
 
-def _worded(design: _Design, hypotheses: Sequence[Fitted], dt: float) -> BreathRequest:
+def _worded(design: _Design, hypotheses: Sequence[Fit], dt: float) -> BreathRequest:
     parts = [
         f"{len(members)} x {kind.title}"
         for kind, members in zip(design.families, design.members, strict=True)

@@ -135,8 +135,12 @@ class Contrast:
     known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
     noise: Noise  #: model of the measurement noise.
 
-    def nats(self, which: NDArray[np.intp]) -> float:
-        """Log-likelihood that the refitted hypothesis is expected to lose in some breaths."""
+    def refit(self, which: NDArray[np.intp]) -> tuple[float, Floats]:
+        """Log-likelihood that the refitted hypothesis is expected to lose in some breaths.
+
+        Returns:
+            Nats, and by how much the shared unknowns move, ``(s,)``.
+        """
         rows, difference = self.rows[which], self.difference[which]
         left, step = difference, np.zeros(len(self.known))
         for _ in range(_REFITS):
@@ -145,7 +149,7 @@ class Contrast:
             gradient = np.matmul(weighted, difference[:, :, None])[:, :, 0].sum(axis=0)
             step = np.linalg.solve(_regular(hessian), gradient)
             left = difference - np.einsum("msk,s->mk", rows, step)
-        return float(np.sum(self.noise.loss(left)) + 0.5 * step @ self.known @ step)
+        return float(np.sum(self.noise.loss(left)) + 0.5 * step @ self.known @ step), step
 
 
 def contrast(truth: Forecast, refitted: Forecast, noise: Noise) -> Contrast:
@@ -159,11 +163,20 @@ def contrast(truth: Forecast, refitted: Forecast, noise: Noise) -> Contrast:
     # The prior of a breath's own unknowns counts as further readings of them.
     before = np.broadcast_to(np.diag(np.sqrt(refitted.own_precision)), (count, extra, extra))
     own = np.concatenate([refitted.own, before], axis=2)
-    both = np.concatenate([rows, difference[:, None]], axis=1)
-    inner = np.matmul(own, own.swapaxes(1, 2))
-    share = np.linalg.solve(_regular(inner), np.matmul(own, both.swapaxes(1, 2)))
-    both = both - np.matmul(share.swapaxes(1, 2), own)
+    both = without_own(np.concatenate([rows, difference[:, None]], axis=1), own)
     return Contrast(both[:, -1], both[:, :-1], refitted.known, noise)
+
+
+def without_own(columns: Floats, own: Floats) -> Floats:
+    """What a refit of each breath's own unknowns leaves of whitened columns, ``(m, q, k)``.
+
+    Args:
+        columns: readings, or derivatives of these, ``(m, q, k)``.
+        own: derivatives by the breath's own unknowns, ``(m, o, k)``.
+    """
+    inner = np.matmul(own, own.swapaxes(1, 2))
+    share = np.linalg.solve(_regular(inner), np.matmul(own, columns.swapaxes(1, 2)))
+    return columns - np.matmul(share.swapaxes(1, 2), own)
 
 
 def _is_own(problem: Problem, column: int) -> bool:
@@ -246,7 +259,7 @@ def _best(
             for i, count in zip(chosen, counts, strict=True)
         )
         which = [firsts[i] + np.array(m, int) for i, m in zip(chosen, members, strict=True)]
-        nats = min(pair.nats(np.concatenate(which)) for pair in pairs)
+        nats = min(pair.refit(np.concatenate(which))[0] for pair in pairs)
         if best is None or nats > best.nats:
             best = _Design(nats, tuple(kinds[i] for i in chosen), members, lung)
     return best

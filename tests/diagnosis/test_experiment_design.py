@@ -70,7 +70,7 @@ def expected(truth, other, u_in, u_out):
     here = np.arange(len(data))
     simulator = Predictor(new, paths())
     one, two = (forecast(x, new, simulator, here, 5.0, NOISE) for x in (truth, other))
-    return contrast(one, two, NOISE).refit(np.arange(n))[0]
+    return contrast(one, two, NOISE).nats(np.arange(n))
 
 
 @pytest.mark.slow

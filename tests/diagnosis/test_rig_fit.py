@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.evaluator import fit, make_evaluator
+from ventbench.diagnosis.evaluator import make_evaluator
 from ventbench.diagnosis.hypothesis import Hypothesis, Partition, make_partition
 from ventbench.diagnosis.identification import split
 from ventbench.diagnosis.residual_analysis import open_loop_error
@@ -48,10 +48,10 @@ def test_strengths_a_rig_on_the_public_recordings(public_recordings):
         parts = [open_loop_error(breaths.pressure[i], pressure[i], judged[i]).mae for i in by_lung]
         return np.array([open_loop_error(breaths.pressure, pressure, judged).mae, *parts])
 
-    refit = errors(pressures(fit(partition, Hypothesis(), white)))
-    shared = fit(partition, Hypothesis(NAMES), white, tolerance=0.1)
+    refit = errors(pressures(evaluator.fit(Hypothesis(), white, partition=partition)))
+    shared = evaluator.fit(Hypothesis(NAMES), white, partition=partition)
     noise = robust_noise(shared.residual, partition.data.weight)
-    shared = fit(partition, Hypothesis(NAMES), noise, warm_start=shared, tolerance=0.1)
+    shared = evaluator.fit(Hypothesis(NAMES), noise, shared, partition=partition)
     own = fit_rigs(evaluator, shared, partition, rigs[uses.fitted])
     assert own is not None
     pooled, by_rig = errors(pressures(shared)), errors(own.pressures(data, rigs, first))

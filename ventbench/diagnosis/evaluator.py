@@ -1,9 +1,8 @@
 """Fits of hypotheses to a recording, and what held-out breaths say of them.
 
-:func:`fit` finds the maximum-likelihood parameters of a hypothesis on some breaths. An
-:class:`Evaluator` holds a recording that is split into training and held-out breaths; it fits
-hypotheses to the training breaths, computes their information criterion there, and evaluates them
-by the log-likelihood of the held-out breaths.
+An :class:`Evaluator` holds a recording that is split into training and held-out breaths; it finds
+the maximum-likelihood parameters of hypotheses on the training breaths, computes their information
+criterion there, and evaluates them by the log-likelihood of the held-out breaths.
 """
 
 from __future__ import annotations
@@ -40,72 +39,6 @@ from ventbench.system_id.problem import (
 )
 
 
-def fit(
-    partition: Partition,
-    hypothesis: Hypothesis,
-    noise: Noise,
-    *,
-    warm_start: FittedModel | None = None,
-    start: Mapping[str, ArrayLike] | None = None,
-    restart: bool = False,
-    gain_sd: float = 0.0,
-    tolerance: float | None = None,
-    iterations: int | None = None,
-    delay_rounds: int | None = None,
-    settings: SelectionConfig = DEFAULT,
-) -> FittedModel:
-    """Find the maximum-likelihood parameters of a hypothesis.
-
-    Args:
-        partition: the breaths.
-        hypothesis: the terms.
-        noise: model of the measurement noise.
-        warm_start: a model of the same breaths whose parameters the search starts from.
-        start: physical values to start from, by path; they precede those of ``warm_start``.
-        restart: True to look also for dead times and each breath's effort beyond the nearest
-            optimum.
-        gain_sd: prior standard deviation of the logarithm of each breath's valve gain; 0 if all
-            breaths have the same gain.
-        tolerance: expected fall of the cost, nats, at which the search ends; as in ``settings`` if
-            None.
-        iterations: most steps; as in ``settings`` if None.
-        delay_rounds: most times that it goes on from another dead time; as in ``settings`` if None.
-        settings: every threshold.
-    """
-    problem = make_problem(partition, hypothesis.paths, noise, dict(hypothesis.fixed), gain_sd)
-    known: dict[str, ArrayLike] = {}
-    if warm_start is not None:
-        known = {path: warm_start.column(path) for path in warm_start.problem.unknowns.paths}
-    x = problem.start(known | dict(start or {}))
-    low, high = problem.unknowns.bounds()
-    if restart:
-        x = delay_restarts(problem, x, settings)
-    before = () if warm_start is None else warm_start.names
-    x = breath_term(hypothesis.names).start(problem, x, before, refit=restart)
-    tolerance = settings.fit.tolerance if tolerance is None else tolerance
-    iterations = settings.fit.iterations if iterations is None else iterations
-    if start or warm_start is None or warm_start.hypothesis != hypothesis:  # else it was smoothed
-        x = problem.smoothed_start(x, tolerance=tolerance, iterations=iterations)
-    minimum = minimise(
-        problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations,
-        known=_known_minimum(problem, x, warm_start),
-    )  # fmt: skip
-    for _ in range(settings.fit.delay_rounds if delay_rounds is None else delay_rounds):
-        beyond = problem.at_likeliest_changes(minimum.x, settings.fit.delay_gain)
-        if beyond is None:  # a step may carry a dead time over a sample, and none leads back
-            beyond = problem.best_of_scan(minimum, _dead_times(problem), settings.fit.delay_gain)
-        if beyond is None:
-            break
-        other = minimise(
-            problem.cost, problem.normal, beyond, low, high, tolerance=tolerance,
-            iterations=iterations,
-        )  # fmt: skip
-        if other.cost >= minimum.cost:
-            break
-        minimum = other
-    return FittedModel(hypothesis.names, problem, minimum, hypothesis)
-
-
 def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFAULT) -> Floats:
     """Move each dead time to the value of its grid that is the likeliest, if it clearly is.
 
@@ -136,23 +69,16 @@ def _known_minimum(problem: Problem, x: Floats, earlier: FittedModel | None) -> 
     """
     if earlier is None or earlier.minimum.iterations == 0:
         return None
-    known, layout = earlier.problem, problem.unknowns
-    if known.predictor is not problem.predictor or known.noise != problem.noise:
-        return None
-    if known.data is not problem.data:  # the same breaths, less what acts in time
-        return None
-    if known.unknowns.paths != layout.paths or len(earlier.minimum.x) != len(x):
-        return None
-    pairs = (
-        (known.unknowns.index, layout.index),
-        (known.fixed, problem.fixed),
-        (known.mean, problem.mean),
-        (known.precision, problem.precision),
-    )
-    if not all(np.array_equal(before, now) for before, now in pairs):
-        return None
+    known, layout = earlier.problem, earlier.problem.unknowns
+    same = known.predictor is problem.predictor and known.noise == problem.noise
+    same &= known.data is problem.data  # the same breaths, less what acts in time
+    same &= layout.paths == problem.unknowns.paths
+    same &= np.array_equal(layout.index, problem.unknowns.index)
+    for name in ("fixed", "mean", "precision"):
+        same &= np.array_equal(getattr(known, name), getattr(problem, name))
     # A value and its logarithm differ in the last digit.
-    return earlier.minimum if np.allclose(earlier.minimum.x, x, rtol=1e-12, atol=1e-12) else None
+    same = same and np.allclose(earlier.minimum.x, x, rtol=1e-12, atol=1e-12)
+    return earlier.minimum if same else None
 
 
 def _best_delay(problem: Problem, x: Floats, path: str, settings: SelectionConfig) -> Floats:
@@ -209,15 +135,54 @@ class Evaluator:
         partition: Partition | None = None,
         restart: bool = False,
         iterations: int | None = None,
-        tolerance: float | None = None,
-        delay_rounds: int | None = None,
     ) -> FittedModel:
-        """Fit a hypothesis to the training breaths, or to ``partition``; see :func:`fit`."""
-        return fit(
-            partition or self.training, hypothesis, noise, warm_start=warm_start, start=start,
-            restart=restart, gain_sd=self.gain_sd, tolerance=tolerance, iterations=iterations,
-            delay_rounds=delay_rounds, settings=self.settings,
-        )  # fmt: skip
+        """Find the maximum-likelihood parameters of a hypothesis.
+
+        Args:
+            hypothesis: the terms.
+            noise: model of the measurement noise.
+            warm_start: a model of the same breaths whose parameters the search starts from.
+            start: physical values to start from, by path; they precede those of ``warm_start``.
+            partition: the breaths; the training breaths if None.
+            restart: True to look also for dead times and each breath's effort beyond the nearest
+                optimum.
+            iterations: most steps; as in the settings if None.
+        """
+        settings, partition = self.settings.fit, partition or self.training
+        iterations = settings.iterations if iterations is None else iterations
+        fixed = dict(hypothesis.fixed)
+        problem = make_problem(partition, hypothesis.paths, noise, fixed, self.gain_sd)
+        known: dict[str, ArrayLike] = {}
+        if warm_start is not None:
+            known = {path: warm_start.column(path) for path in warm_start.problem.unknowns.paths}
+        x = problem.start(known | dict(start or {}))
+        if restart:
+            x = delay_restarts(problem, x, self.settings)
+        before = () if warm_start is None else warm_start.names
+        x = breath_term(hypothesis.names).start(problem, x, before, refit=restart)
+        smoothed = warm_start is not None and warm_start.hypothesis == hypothesis
+        if start or not smoothed:
+            x = problem.smoothed_start(x, tolerance=settings.tolerance, iterations=iterations)
+        low, high = problem.unknowns.bounds()
+
+        def search(x: Floats, known: Minimum | None = None) -> Minimum:
+            return minimise(
+                problem.cost, problem.normal, x, low, high, tolerance=settings.tolerance,
+                iterations=iterations, known=known,
+            )  # fmt: skip
+
+        minimum = search(x, _known_minimum(problem, x, warm_start))
+        for _ in range(settings.delay_rounds):
+            beyond = problem.at_likeliest_changes(minimum.x, settings.delay_gain)
+            if beyond is None:  # a step may carry a dead time over a sample, and none leads back
+                beyond = problem.best_of_scan(minimum, _dead_times(problem), settings.delay_gain)
+            if beyond is None:
+                break
+            other = search(beyond)
+            if other.cost >= minimum.cost:
+                break
+            minimum = other
+        return FittedModel(hypothesis.names, problem, minimum, hypothesis)
 
     @cached_property
     def for_ranking(self) -> Evaluator:

@@ -135,12 +135,12 @@ class Contrast:
     known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
     noise: Noise  #: model of the measurement noise.
 
-    def refit(self, which: NDArray[np.intp]) -> tuple[float, Floats]:
-        """Log-likelihood that the refitted hypothesis is expected to lose in some breaths.
+    def nats(self, which: NDArray[np.intp]) -> float:
+        """Log-likelihood that the refitted hypothesis is expected to lose in some breaths."""
+        return self.refit(which)[0]
 
-        Returns:
-            Nats, and by how much the shared unknowns move, ``(s,)``.
-        """
+    def refit(self, which: NDArray[np.intp]) -> tuple[float, Floats]:
+        """The same, and by how much the refit moves the shared unknowns, ``(s,)``."""
         rows, difference = self.rows[which], self.difference[which]
         left, step = difference, np.zeros(len(self.known))
         for _ in range(_REFITS):
@@ -259,7 +259,7 @@ def _best(
             for i, count in zip(chosen, counts, strict=True)
         )
         which = [firsts[i] + np.array(m, int) for i, m in zip(chosen, members, strict=True)]
-        nats = min(pair.refit(np.concatenate(which))[0] for pair in pairs)
+        nats = min(pair.nats(np.concatenate(which)) for pair in pairs)
         if best is None or nats > best.nats:
             best = _Design(nats, tuple(kinds[i] for i in chosen), members, lung)
     return best

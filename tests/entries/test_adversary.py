@@ -18,7 +18,7 @@ from ventbench.entries.errors import Failure
 from ventbench.entries.folder import as_submission
 from ventbench.entries.runner import InProcessRunner
 from ventbench.physics.parameters import VALVE_GAIN
-from ventbench.plants.population import NAMES, to_vector
+from ventbench.plants.hybrid import NAMES, to_vector
 from ventbench.plants.rigs import load_rigs
 from ventbench.task.stressors import STRESSORS, stressor
 

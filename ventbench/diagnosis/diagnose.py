@@ -478,8 +478,8 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
             notes = [note for each in lungs for note in each.notes]
             return tuple(each.match for each in lungs), notes
         except InputError as error:
-            return estimates.lung_matches(fit), [f"R and C are from pressure alone: {error}."]
-    return estimates.lung_matches(fit), []
+            return mechanics.match_labels(fit), [f"R and C are from pressure alone: {error}."]
+    return mechanics.match_labels(fit), []
 
 
 def _missing_mechanism(

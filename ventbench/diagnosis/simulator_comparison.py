@@ -178,13 +178,13 @@ def with_sensor_noise(
         noise: model of the recording's noise.
         seed: seed of the noise.
     """
+    from scipy import signal  # here, as it takes long to import
+
     rng = np.random.default_rng(seed)
     sigma, ar = noise.sigma[0], noise.ar[0]
     fresh = rng.normal(0.0, sigma * np.sqrt(1.0 - ar**2), response.shape)
-    coloured = np.zeros_like(fresh)
-    coloured[:, 0] = rng.normal(0.0, sigma, len(fresh))
-    for k in range(1, fresh.shape[1]):
-        coloured[:, k] = ar * coloured[:, k - 1] + fresh[:, k]
+    fresh[:, 0] = rng.normal(0.0, sigma, len(fresh))
+    coloured = signal.lfilter([1.0], [1.0, -ar], fresh)
     return data.with_pressure(np.nan_to_num(response) + coloured)
 
 

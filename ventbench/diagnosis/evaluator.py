@@ -51,8 +51,18 @@ def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFA
         x: point in the coordinates of its unknowns, ``(U,)``.
         settings: every threshold.
     """
+    predictor, noise = problem.predictor, problem.noise
     for path in _dead_times(problem):
-        x = _best_delay(problem, x, path, settings)
+        linear = linearise(problem, x, clip=np.inf)
+        least = float(np.sum(noise.loss(linear.residual))) - settings.fit.delay_gain
+        for value in parameter_of(path).scan:
+            trial = linear.values.copy()
+            trial[:, predictor.names.index(path)] = value
+            left = linear.residual + linear.template(predictor.predict(trial))
+            loss = float(np.sum(noise.loss(left)))
+            if loss < least:
+                x, least = x.copy(), loss
+                x[problem.unknowns.of(path)] = parameter_of(path).coordinate(value)
     return x
 
 
@@ -79,22 +89,6 @@ def _known_minimum(problem: Problem, x: Floats, earlier: FittedModel | None) -> 
     # A value and its logarithm differ in the last digit.
     same = same and np.allclose(earlier.minimum.x, x, rtol=1e-12, atol=1e-12)
     return earlier.minimum if same else None
-
-
-def _best_delay(problem: Problem, x: Floats, path: str, settings: SelectionConfig) -> Floats:
-    linear = linearise(problem, x, clip=np.inf)
-    column = problem.predictor.names.index(path)
-    loss = float(np.sum(problem.noise.loss(linear.residual)))
-    best, least = x, loss - settings.fit.delay_gain
-    for value in parameter_of(path).scan:
-        trial = linear.values.copy()
-        trial[:, column] = value
-        left = linear.residual + linear.template(problem.predictor.predict(trial))
-        loss = float(np.sum(problem.noise.loss(left)))
-        if loss < least:
-            best, least = x.copy(), loss
-            best[problem.unknowns.of(path)] = parameter_of(path).coordinate(value)
-    return best
 
 
 @dataclass(frozen=True, eq=False)

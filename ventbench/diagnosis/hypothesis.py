@@ -10,7 +10,7 @@ change gains after a refit, without doing one.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -88,19 +88,18 @@ def linearise(problem: Problem, x: Floats, *, clip: float = 4.0) -> Linearisatio
     counts = [len(np.unique(layout.index[:, k])) for k in range(len(layout.paths))]
     breath |= np.array([count == len(white) and count > 1 for count in counts])
     own = _orthonormal(rows[:, breath])
-    values = problem.values(x)
-    partial = Linearisation(problem, values, residual, white, own, np.zeros((0, white.size)))
+    linear = Linearisation(
+        problem, problem.values(x), problem.predict(x), white, own, np.zeros((0, white.size))
+    )
     columns = []
     for k in np.flatnonzero(~breath):
-        left = partial.without_own(rows[:, [k]])[:, 0]
+        left = linear.without_own(rows[:, [k]])[:, 0]
         for unknown in np.unique(layout.index[:, k]):
             columns.append(np.where((layout.index[:, k] == unknown)[:, None], left, 0.0).ravel())
-    shared = partial.shared_basis
     if columns:
-        shared = _orthonormal(np.asarray(columns)[None])[0]
-    whole = Linearisation(problem, values, problem.predict(x), white, own, shared)
-    clean = whole.without_shared(whole.without_own(white[:, None]))[:, 0]
-    return Linearisation(problem, values, whole.prediction, clean, own, shared)
+        linear = replace(linear, shared_basis=_orthonormal(np.asarray(columns)[None])[0])
+    clean = linear.without_shared(linear.without_own(white[:, None]))[:, 0]
+    return replace(linear, residual=clean)
 
 
 #: Eigenvalues of a projection below this share of the largest count as zero.

@@ -30,7 +30,10 @@ def bent() -> Linear:
     evaluator = small.split(
         small.made(small.effect("turbulent_resistance", quadratic=1.0), noise=0.1)
     )
-    base = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-6, iterations=30)
+    exact = dataclasses.replace(evaluator.settings.fit, tolerance=1e-6, iterations=30)
+    settings = dataclasses.replace(evaluator.settings, fit=exact)
+    evaluator = dataclasses.replace(evaluator, settings=settings)
+    base = evaluator.fit(Hypothesis(), NOISE)
     return Linear(evaluator, base, linearise(base.problem, base.minimum.x, clip=np.inf))
 
 
@@ -92,9 +95,7 @@ def test_gain_is_the_decrease_of_the_cost_after_a_refit(bent):
     template = bent.place.template(seen)
     power = np.sum(template**2)
     share = -np.sum(bent.place.residual * template) / power  # the best multiple
-    refitted = bent.evaluator.fit(
-        Hypothesis(("turbulent_resistance",)), NOISE, bent.base, tolerance=1e-6, iterations=30
-    )
+    refitted = bent.evaluator.fit(Hypothesis(("turbulent_resistance",)), NOISE, bent.base)
     fallen = bent.base.minimum.cost - refitted.minimum.cost
     assert fallen > 8.0
     assert 0.5 * share**2 * power == pytest.approx(fallen, rel=0.1)

@@ -16,7 +16,7 @@ from ventbench.entries.adversary import EDGE, RIG, _Bench, adversary
 from ventbench.entries.cells import InProcessRunner, PlantError, ProtocolRun
 from ventbench.entries.folder import as_submission
 from ventbench.physics.mechanism import VALVE_GAIN
-from ventbench.plants.population import NAMES, to_vector
+from ventbench.plants.hybrid import NAMES, to_vector
 from ventbench.plants.rigs import load_rigs
 from ventbench.sandbox.child.cell import Failure
 from ventbench.task.stressors import STRESSORS, stressor

@@ -12,8 +12,15 @@ from scipy.stats import binom
 
 from ventbench.base import compilation
 from ventbench.base.errors import InputError
-from ventbench.plants import frozen, population
-from ventbench.plants.population import FLOW, NAMES, from_vector, to_vector
+from ventbench.plants import frozen
+from ventbench.plants.hybrid import (
+    DIRECTION_SUM,
+    FLOW,
+    NAMES,
+    from_vector,
+    load_population,
+    to_vector,
+)
 from ventbench.plants.rigs import load_rigs
 from ventbench.task import draws, protocol
 from ventbench.task.lungs import LUNGS
@@ -40,7 +47,7 @@ def test_whatever_is_drawn_is_a_rig():
     rig = from_vector(numbers, np)
     for name in ("R", "K2", "E", "slopes", "valve_delay", "valve_lag", "sensor_lag", "conductance"):
         assert np.all(getattr(rig, name) > 0.0)
-    assert np.all(rig.direction.sum(axis=-1) > -population.DIRECTION_SUM)
+    assert np.all(rig.direction.sum(axis=-1) > -DIRECTION_SUM)
     assert np.all(1.0 + np.cumsum(rig.stiffening, axis=-1) > 0.0)
 
 
@@ -132,7 +139,7 @@ def test_tuning_sees_training_rigs_alone():
 
 def test_what_is_no_population_is_refused(tmp_path):
     with pytest.raises(InputError, match="not a population"):
-        population.load(tmp_path / "missing.npz")
+        load_population(tmp_path / "missing.npz")
     np.savez(tmp_path / "other.npz", mean=np.zeros((2, 3)), factor=np.zeros((2, 3, 3)))
     with pytest.raises(InputError, match="3"):
-        population.load(tmp_path / "other.npz")
+        load_population(tmp_path / "other.npz")

@@ -10,22 +10,18 @@ from tests.physics import cases
 from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
 from ventbench.physics import library, parameter, paths, strength_path
-from ventbench.system_id import (
-    START,
-    Noise,
-    Predictor,
-    fit,
-    interval,
-    make_data,
-    refit_breath_parameters,
-)
+from ventbench.system_id import START, Noise, Predictor, fit, interval, make_data
 from ventbench.task.rollouts import open_loop
 
 BREATHS, NOISE = 8, 0.2
-#: Efforts in some of the breaths: amplitude, cmH2O, and onset, s.
-EFFORTS = {1: (5.0, 0.25), 2: (3.0, 1.1), 4: (6.0, 0.4), 6: (-3.0, 0.2)}
 #: Which only one breath in a few carries, or whose likelihood is no parabola.
 APART = {"patient_effort", "valve_delay"}
+
+
+def bic(fitted):
+    """Bayesian information criterion."""
+    count = fitted.problem.data.weight.sum()
+    return len(fitted.minimum.x) * np.log(count) - 2.0 * fitted.log_likelihood.sum()
 
 
 def within(fitted, path, truth, slack=1.0):
@@ -50,7 +46,7 @@ def test_recovers_its_parameters(name):
     assert all(within(found, path, value, 1.6) for path, value in truth.items())
     # It is needed: without it the data are far less likely.
     without = fit(data)
-    assert without.bic > found.bic + 6.0
+    assert bic(without) > bic(found) + 6.0
 
 
 def test_gas_that_rings_is_found_in_full():
@@ -74,56 +70,30 @@ def test_dead_time_has_a_profile():
     assert found.problem.noise.sigma[0] == pytest.approx(NOISE, abs=0.03)
 
 
-def test_efforts_are_found_breath_by_breath():
-    def each(i):
-        if i not in EFFORTS:
-            return {}
-        amplitude, onset = EFFORTS[i]
-        return {"patient_effort": {"amplitude": amplitude, "onset": onset, "duration": 0.9}}
-
-    breaths = cases.recording(BREATHS, {}, noise=NOISE, seed=3, each=each)
-    found = fit(make_data(breaths), ["patient_effort"])
-    truth = np.array([EFFORTS.get(i, (0.0, 0.0))[0] for i in range(BREATHS)])
-    amplitude = found.value("patient_effort.amplitude")
-    np.testing.assert_allclose(amplitude, truth, atol=0.6)
-    onset = found.value("patient_effort.onset")
-    for i, (_, seconds) in EFFORTS.items():
-        assert onset[i] == pytest.approx(seconds, abs=0.06)
-    assert found.value("patient_effort.duration")[0] == pytest.approx(0.9, abs=0.06)
-
-
 @pytest.mark.parametrize(
     "name", ["valve_lag", "leak", "circuit_compliance", "turbulent_resistance"]
 )
 def test_finds_nothing_in_nothing(name):
     data = make_data(cases.recording(BREATHS, {}, noise=NOISE, seed=11))
     without, found = fit(data), fit(data, [name])
-    assert found.bic > without.bic
+    assert bic(found) > bic(without)
     low, _ = found.ci95(strength_path(name))[0]
     assert low == 0.0
     assert not np.any(np.isnan(found.covariance))
 
 
 @pytest.mark.slow
-def test_several_at_once_and_held_out():
+def test_several_at_once():
     m = {
         "valve_lag": {"tau": 0.05},
         "turbulent_resistance": {"quadratic": 8.0},
         "viscoelasticity": {"ratio": 0.4, "time": 0.8},
         "exhalation_valve_delay": {"opening": 0.05},
     }
-    data = make_data(cases.recording(24, m, noise=NOISE, seed=5))
-    train, test = data.select(slice(0, 16)), data.select(slice(16, 24))
-    found, base = fit(train, m), fit(train)
+    found = fit(make_data(cases.recording(16, m, noise=NOISE, seed=5)), m)
     for owner, own in m.items():
         for name, value in own.items():
             assert within(found, f"{owner}.{name}", value, 2.0), (owner, name)
-    unseen = refit_breath_parameters(found, test)
-    assert unseen.problem.unknowns.paths == (START,)
-    np.testing.assert_allclose(unseen.column("R"), found.value("R")[0])
-    assert np.sqrt(np.mean(unseen.residual**2)) < 1.1 * NOISE
-    gain = unseen.log_likelihood.sum() - refit_breath_parameters(base, test).log_likelihood.sum()
-    assert gain > 100.0
 
 
 def test_answers_of_a_simulator_and_the_fitted_plant():
@@ -147,7 +117,7 @@ def test_answers_of_a_simulator_and_the_fitted_plant():
 
 
 @pytest.mark.slow
-def test_flow_and_groups_and_priors():
+def test_flow_and_gains_and_their_prior():
     """Two lungs, one valve; flow pins the gain, which pressure alone leaves to the prior."""
     one = cases.recording(4, {}, noise=NOISE, R=10.0, C=25.0, gain=20.0, seed=1)
     two = cases.recording(4, {}, noise=NOISE, R=30.0, C=15.0, gain=20.0, seed=2)
@@ -163,10 +133,11 @@ def test_flow_and_groups_and_priors():
     np.testing.assert_allclose(found.value("C"), [25.0, 15.0], rtol=0.05)
     np.testing.assert_allclose(found.value("gain"), 20.0, rtol=0.02)
     assert found.problem.noise.sigma[1] == pytest.approx(20.0, rel=0.15)
-    apart = fit(
-        data, free=["gain"], groups={"R_ex": data.lung}, prior={"gain": (np.log(20.0), 0.01)}
-    )
-    assert len(apart.value("R_ex")) == 2
+    apart = fit(data, gain_sd=0.5)  # one of each breath
+    assert apart.value("gain").shape == (8,)
+    np.testing.assert_allclose(apart.value("gain"), 20.0, rtol=0.05)
+    pinned = fit(data, gain_sd=1e-3)
+    np.testing.assert_allclose(pinned.value("gain"), parameter("gain").neutral, rtol=0.01)
 
 
 def test_shared_simulator_and_fixed_values():

@@ -206,7 +206,7 @@ def _base_model(
 
     base = fit_open_loop(evaluator, conclusion.base, recording_model.final, settings, label=True)
     refit = recording_model.pressures(base, data, first)
-    final = recording_model.final_model
+    final = recording_model.fit
     after, notes = recording_model.pressures(final, data, first), []
     model = final
     if not final.hypothesis.breath_terms:

@@ -470,8 +470,8 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
             notes = [note for each in lungs for note in each.notes]
             return tuple(each.match for each in lungs), notes
         except InputError as error:
-            return estimates.lung_matches(fit), [f"R and C are from pressure alone: {error}."]
-    return estimates.lung_matches(fit), []
+            return mechanics.match_labels(fit), [f"R and C are from pressure alone: {error}."]
+    return mechanics.match_labels(fit), []
 
 
 def _missing_mechanism(
@@ -500,7 +500,7 @@ def _missing_mechanism(
     affected = None
     if changes:
         model, path = recording_model, f"{name}.{changes[0]}"
-        at = place_of_change(model.evaluator, model.final_model, data, path)
+        at = place_of_change(model.evaluator, model.fit, data, path)
         values[changes[0]] = replace(values[changes[0]], value=at.value, ci95=(at.low, at.high))
         first = np.searchsorted(data.position, at).clip(max=len(breaths) - 1)
         now, low, high = (int(i) for i in breaths.breath_id[first])

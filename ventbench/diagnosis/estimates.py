@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ventbench import mechanics
 from ventbench.diagnosis.conclusion import Conclusion, Swing, UnnamedEffect
-from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
+from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
-from ventbench.mechanics.labels import Estimate, LungMatch
+from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import (
     library,
     mechanism,
@@ -26,8 +25,8 @@ from ventbench.physics.catalogue import (
 from ventbench.physics.characteristics import characteristic
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS, BasisTerm
 from ventbench.system_id import ConfidenceInterval, Fit, fit, interval, profile_interval
-from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.data import Floats
+from ventbench.system_id.predictor import START
 from ventbench.task.interfaces import Plant
 
 #: Share of a parameter that the equations of the library miss, as a standard deviation. Lags, dead
@@ -47,8 +46,8 @@ _INPUTS = {
 }
 
 
-def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -> Fit:
-    """Fit the hypothesis of a conclusion to breaths, with covariance.
+def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -> FittedModel:
+    """Fit the hypothesis of a conclusion to breaths, with its uncertain shape parameters.
 
     Args:
         fitted: the concluded model, fitted to some of the breaths.
@@ -58,41 +57,27 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     hypothesis = fitted.hypothesis
     own = [path for path in paths(hypothesis.names) if "." in path]
     free = [path for path in own if parameter(path).uncertain]
+    data, known = partition.data, fitted.problem.data
+    same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
     start: dict[str, Any] = {}
     for path in fitted.problem.unknowns.paths:
         if path != START and not ("." in path and varies_by_breath(path.rpartition(".")[0])):
-            start[path] = float(np.median(fitted.column(path)))
-    for name in hypothesis.names:
-        for pair in mechanism(name).description.interchangeable:
-            first, second = (f"{name}.{parameter}" for parameter in pair)
-            if {first, second} <= set(start) and start[second] > start[first]:
-                start[first], start[second] = start[second], start[first]
-    known = fitted.problem.data
-    if len(np.unique(known.lung)) > 1:
-        same = (partition.data.R[:, None] == known.R) & (partition.data.C[:, None] == known.C)
-        grouped = ("R", "C", *groups_by_label(known, hypothesis.paths))
-        start |= {path: fitted.column(path)[np.argmax(same, axis=1)] for path in grouped}
+            column = fitted.column(path)
+            by_label = parameter(path).follows is not None
+            start[path] = column[np.argmax(same, axis=1)] if by_label else float(np.median(column))
     if hypothesis.breath_terms:  # the efforts of each breath start where they are likeliest
         near = evaluator.fit(
             hypothesis, fitted.noise, start=start, partition=partition, restart=True
         )
         start |= {path: near.column(path) for path in near.problem.unknowns.paths}
     # Where rigs differ, gains that are the same in all breaths would be made up for by mechanisms.
-    by_breath = ("gain",) if evaluator.gain_sd else ()
-    neutral = float(np.log(parameter("gain").neutral))
-    start = {path: value for path, value in start.items() if path not in by_breath}
-    return fit(
-        partition.data,
-        hypothesis.names,
-        free=dict.fromkeys((*hypothesis.free, *free, *by_breath)),
-        fixed=dict(hypothesis.fixed),
-        start=start,
-        groups=groups_by_label(partition.data, hypothesis.paths)
-        | {path: np.arange(len(partition.data)) for path in by_breath},
-        prior={path: (neutral, evaluator.gain_sd) for path in by_breath},
-        noise=fitted.noise,
+    start.pop("gain", None)
+    found = fit(
+        data, hypothesis.names, free=dict.fromkeys((*hypothesis.free, *free)),
+        fixed=dict(hypothesis.fixed), start=start, gain_sd=evaluator.gain_sd, noise=fitted.noise,
         predictor=partition.predictor,
-    )
+    )  # fmt: skip
+    return FittedModel(hypothesis.names, found.problem, found.minimum, hypothesis)
 
 
 def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
@@ -182,26 +167,6 @@ def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
     return ConfidenceInterval(ends.value, *profile_interval(fitted, path, group))
 
 
-def lung_matches(fitted: Fit) -> tuple[LungMatch, ...]:
-    """Fitted R and C of each lung, and whether its label can be right.
-
-    The label is judged by :func:`~ventbench.mechanics.match_labels`, at the flow of its definition.
-    """
-    matches = []
-    for group, match in enumerate(mechanics.match_labels(fitted)):
-        ends = {path: fitted.ci95(path)[group] for path in ("R", "C")}
-        matches.append(
-            replace(
-                match,
-                fitted_R=float(fitted.value("R")[group]),
-                fitted_C=float(fitted.value("C")[group]),
-                ci95_R=(float(ends["R"][0]), float(ends["R"][1])),
-                ci95_C=(float(ends["C"][0]), float(ends["C"][1])),
-            )
-        )
-    return tuple(matches)
-
-
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     """The plant of each lung, by label; it answers as :meth:`Evaluator.predict` does.
 
@@ -209,20 +174,10 @@ def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
         fitted: the model, fitted to any breaths of the lungs.
         evaluator: evaluator with which it was fitted.
     """
-    partition = evaluator.training
-    return _by_label(
-        partition.data,
-        partition.predictor,
-        fitted.names,
-        evaluator.transferred_values(fitted, partition),
-    )
-
-
-def _by_label(
-    data: Data, predictor: Predictor, mechanisms: tuple[str, ...], values: Floats
-) -> dict[str, Plant]:
+    data, predictor = evaluator.training.data, evaluator.training.predictor
+    values = evaluator.transferred_values(fitted, evaluator.training)
     own = [name for name in library() if varies_by_breath(name)]
-    names = [path for path in paths(mechanisms) if path.rpartition(".")[0] not in own]
+    names = [path for path in paths(fitted.names) if path.rpartition(".")[0] not in own]
     names.remove("position")
     columns = [predictor.names.index(name) for name in names]
     result: dict[str, Plant] = {}

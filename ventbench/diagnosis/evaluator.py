@@ -1,9 +1,8 @@
 """Fits of hypotheses to a recording, and what held-out breaths say of them.
 
-:func:`fit` finds the maximum-likelihood parameters of a hypothesis on some breaths. An
-:class:`Evaluator` holds a recording that is split into training and held-out breaths; it fits
-hypotheses to the training breaths, computes their information criterion there, and evaluates them
-by the log-likelihood of the held-out breaths.
+An :class:`Evaluator` holds a recording that is split into training and held-out breaths; it finds
+the maximum-likelihood parameters of hypotheses on the training breaths, computes their information
+criterion there, and evaluates them by the log-likelihood of the held-out breaths.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
@@ -28,132 +27,16 @@ from ventbench.diagnosis.hypothesis import (
 )
 from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
-from ventbench.physics.catalogue import library, mechanism
-from ventbench.system_id import problem as problems
+from ventbench.physics.catalogue import library
 from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.predictor import START
-from ventbench.system_id.problem import Problem, make_unknowns, parameter_of
-
-
-def fit(
-    partition: Partition,
-    hypothesis: Hypothesis,
-    noise: Noise,
-    *,
-    warm_start: FittedModel | None = None,
-    start: Mapping[str, ArrayLike] | None = None,
-    restart: bool = False,
-    gain_sd: float = 0.0,
-    tolerance: float | None = None,
-    iterations: int | None = None,
-    delay_rounds: int | None = None,
-    settings: SelectionConfig = DEFAULT,
-) -> FittedModel:
-    """Find the maximum-likelihood parameters of a hypothesis.
-
-    Args:
-        partition: the breaths.
-        hypothesis: the terms.
-        noise: model of the measurement noise.
-        warm_start: a model of the same breaths whose parameters the search starts from.
-        start: physical values to start from, by path; they precede those of ``warm_start``.
-        restart: True to look also for dead times and each breath's effort beyond the nearest
-            optimum.
-        gain_sd: prior standard deviation of the logarithm of each breath's valve gain; 0 if all
-            breaths have the same gain.
-        tolerance: expected fall of the cost, nats, at which the search ends; as in ``settings`` if
-            None.
-        iterations: most steps; as in ``settings`` if None.
-        delay_rounds: most times that it goes on from another dead time; as in ``settings`` if None.
-        settings: every threshold.
-    """
-    extra = ("gain",) if gain_sd else ()
-    paths = tuple(dict.fromkeys((*hypothesis.paths, *extra)))
-    problem = make_problem(partition, paths, noise, dict(hypothesis.fixed), gain_sd)
-    layout = problem.unknowns
-    columns = (*partition.predictor.names, START)
-    first = {p: problem.fixed[:, columns.index(p)] for p in layout.paths if "." not in p}
-    first |= {p: parameter_of(p).mild for p in layout.paths if "." in p}
-    before: tuple[str, ...] = ()
-    if warm_start is not None:
-        before = warm_start.names
-        known = set(warm_start.problem.unknowns.paths)
-        first |= {p: warm_start.column(p) for p in layout.paths if p in known}
-    first |= {p: value for p, value in (start or {}).items() if p in layout.paths}
-    for name in hypothesis.names:
-        for pair in mechanism(name).description.interchangeable:
-            one, other = (f"{name}.{short}" for short in pair)
-            if {one, other} <= set(first) and np.all(np.less(first[one], first[other])):
-                first[one], first[other] = first[other], first[one]
-    low, high = layout.bounds()
-    x = layout.pack(first)
-    if restart:
-        x = delay_restarts(problem, x, settings)
-    x = breath_term(hypothesis.names).start(problem, x, before, refit=restart)
-    tolerance = settings.fit.tolerance if tolerance is None else tolerance
-    iterations = settings.fit.iterations if iterations is None else iterations
-    if start or warm_start is None or warm_start.hypothesis != hypothesis:  # else it was smoothed
-        x = problem.smoothed_start(x, tolerance=tolerance, iterations=iterations)
-    minimum = minimise(
-        problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations,
-        known=_known_minimum(problem, x, warm_start),
-    )  # fmt: skip
-    for _ in range(settings.fit.delay_rounds if delay_rounds is None else delay_rounds):
-        beyond = problem.at_likeliest_changes(minimum.x, settings.fit.delay_gain)
-        if beyond is None:
-            beyond = _beyond_the_cliff(problem, minimum, settings)
-        if beyond is None:
-            break
-        other = minimise(
-            problem.cost, problem.normal, beyond, low, high, tolerance=tolerance,
-            iterations=iterations,
-        )  # fmt: skip
-        if other.cost >= minimum.cost:
-            break
-        minimum = other
-    return FittedModel(hypothesis, problem, minimum, float(problem.log_likelihood(minimum.x).sum()))
-
-
-def make_problem(
-    partition: Partition,
-    paths: tuple[str, ...],
-    noise: Noise,
-    fixed: Mapping[str, ArrayLike],
-    gain_sd: float,
-) -> Problem:
-    """Lay out the unknowns of a fit.
-
-    Args:
-        partition: the breaths.
-        paths: parameters that are fitted.
-        noise: model of the measurement noise.
-        fixed: values of others, by path; those that are not given are neutral.
-        gain_sd: prior standard deviation of the logarithm of each breath's valve gain, or 0.
-    """
-    data = partition.data
-    groups = {"gain": np.arange(len(data))} if gain_sd else {}
-    groups |= groups_by_label(data, paths)
-    layout = make_unknowns(data, paths, groups)
-    base = problems.parameter_values(data, partition.predictor.names, fixed)
-    neutral = float(np.log(parameter_of("gain").neutral))
-    mean, precision = layout.prior({"gain": (neutral, gain_sd)} if gain_sd else {})
-    return Problem(data, partition.predictor, layout, base, noise, mean, precision)
-
-
-def groups_by_label(data: Data, paths: tuple[str, ...]) -> dict[str, Ints]:
-    """Group the breaths by R or C for the parameters that depend on that label.
-
-    Returns:
-        For each such path, the group of each breath, ``(n,)``.
-    """
-    groups = {}
-    for path in paths:
-        follows = parameter_of(path).follows if "." in path else None
-        if follows:
-            label = data.R if follows == "R" else data.C
-            groups[path] = np.unique(label, return_inverse=True)[1].reshape(-1)
-    return groups
+from ventbench.system_id.problem import (
+    Problem,
+    make_problem,
+    parameter_of,
+    parameter_values,
+)
 
 
 def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFAULT) -> Floats:
@@ -168,11 +51,25 @@ def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFA
         x: point in the coordinates of its unknowns, ``(U,)``.
         settings: every threshold.
     """
-    for path in problem.unknowns.paths:
-        parameter = parameter_of(path)
-        if parameter.kinked and parameter.scan:
-            x = _best_delay(problem, x, path, settings)
+    predictor, noise = problem.predictor, problem.noise
+    for path in _dead_times(problem):
+        linear = linearise(problem, x, clip=np.inf)
+        least = float(np.sum(noise.loss(linear.residual))) - settings.fit.delay_gain
+        for value in parameter_of(path).scan:
+            trial = linear.values.copy()
+            trial[:, predictor.names.index(path)] = value
+            left = linear.residual + linear.template(predictor.predict(trial))
+            loss = float(np.sum(noise.loss(left)))
+            if loss < least:
+                x, least = x.copy(), loss
+                x[problem.unknowns.of(path)] = parameter_of(path).coordinate(value)
     return x
+
+
+def _dead_times(problem: Problem) -> tuple[str, ...]:
+    """Free dead times, of which other values may be likelier."""
+    about = {path: parameter_of(path) for path in problem.unknowns.paths}
+    return tuple(path for path, each in about.items() if each.kinked and each.scan)
 
 
 def _known_minimum(problem: Problem, x: Floats, earlier: FittedModel | None) -> Minimum | None:
@@ -182,62 +79,16 @@ def _known_minimum(problem: Problem, x: Floats, earlier: FittedModel | None) -> 
     """
     if earlier is None or earlier.minimum.iterations == 0:
         return None
-    known, layout = earlier.problem, problem.unknowns
-    if known.predictor is not problem.predictor or known.noise != problem.noise:
-        return None
-    if known.data is not problem.data:  # the same breaths, less what acts in time
-        return None
-    if known.unknowns.paths != layout.paths or len(earlier.minimum.x) != len(x):
-        return None
-    pairs = (
-        (known.unknowns.index, layout.index),
-        (known.fixed, problem.fixed),
-        (known.mean, problem.mean),
-        (known.precision, problem.precision),
-    )
-    if not all(np.array_equal(before, now) for before, now in pairs):
-        return None
+    known, layout = earlier.problem, earlier.problem.unknowns
+    same = known.predictor is problem.predictor and known.noise == problem.noise
+    same &= known.data is problem.data  # the same breaths, less what acts in time
+    same &= layout.paths == problem.unknowns.paths
+    same &= np.array_equal(layout.index, problem.unknowns.index)
+    for name in ("fixed", "mean", "precision"):
+        same &= np.array_equal(getattr(known, name), getattr(problem, name))
     # A value and its logarithm differ in the last digit.
-    return earlier.minimum if np.allclose(earlier.minimum.x, x, rtol=1e-12, atol=1e-12) else None
-
-
-def _beyond_the_cliff(
-    problem: Problem, minimum: Minimum, settings: SelectionConfig
-) -> Floats | None:
-    """A point with another dead time and clearly lower cost, all else as it is; None if none has.
-
-    A step of a search may carry a dead time over a sample, and no later step brings it back: from a
-    delay of 90 ms, with the other parameters still off, a search ended at 126 ms.
-    """
-    best, least = None, minimum.cost - settings.fit.delay_gain
-    for path in problem.unknowns.paths:
-        about = parameter_of(path)
-        if not (about.kinked and about.scan):
-            continue
-        own = problem.unknowns.of(path)
-        trials = np.repeat(minimum.x[None], len(about.scan), axis=0)
-        for trial, value in zip(trials, about.scan, strict=True):
-            trial[own] = about.coordinate(value)
-        for trial, cost in zip(trials, problem.costs(trials), strict=True):
-            if cost < least:
-                best, least = trial, float(cost)
-    return best
-
-
-def _best_delay(problem: Problem, x: Floats, path: str, settings: SelectionConfig) -> Floats:
-    linear = linearise(problem, x, clip=np.inf)
-    column = problem.predictor.names.index(path)
-    loss = float(np.sum(problem.noise.loss(linear.residual)))
-    best, least = x, loss - settings.fit.delay_gain
-    for value in parameter_of(path).scan:
-        trial = linear.values.copy()
-        trial[:, column] = value
-        left = linear.residual + linear.template(problem.predictor.predict(trial))
-        loss = float(np.sum(problem.noise.loss(left)))
-        if loss < least:
-            best, least = x.copy(), loss
-            best[problem.unknowns.of(path)] = parameter_of(path).coordinate(value)
-    return best
+    same = same and np.allclose(earlier.minimum.x, x, rtol=1e-12, atol=1e-12)
+    return earlier.minimum if same else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,15 +129,54 @@ class Evaluator:
         partition: Partition | None = None,
         restart: bool = False,
         iterations: int | None = None,
-        tolerance: float | None = None,
-        delay_rounds: int | None = None,
     ) -> FittedModel:
-        """Fit a hypothesis to the training breaths, or to ``partition``; see :func:`fit`."""
-        return fit(
-            partition or self.training, hypothesis, noise, warm_start=warm_start, start=start,
-            restart=restart, gain_sd=self.gain_sd, tolerance=tolerance, iterations=iterations,
-            delay_rounds=delay_rounds, settings=self.settings,
-        )  # fmt: skip
+        """Find the maximum-likelihood parameters of a hypothesis.
+
+        Args:
+            hypothesis: the terms.
+            noise: model of the measurement noise.
+            warm_start: a model of the same breaths whose parameters the search starts from.
+            start: physical values to start from, by path; they precede those of ``warm_start``.
+            partition: the breaths; the training breaths if None.
+            restart: True to look also for dead times and each breath's effort beyond the nearest
+                optimum.
+            iterations: most steps; as in the settings if None.
+        """
+        settings, partition = self.settings.fit, partition or self.training
+        iterations = settings.iterations if iterations is None else iterations
+        fixed = dict(hypothesis.fixed)
+        problem = make_problem(partition, hypothesis.paths, noise, fixed, self.gain_sd)
+        known: dict[str, ArrayLike] = {}
+        if warm_start is not None:
+            known = {path: warm_start.column(path) for path in warm_start.problem.unknowns.paths}
+        x = problem.start(known | dict(start or {}))
+        if restart:
+            x = delay_restarts(problem, x, self.settings)
+        before = () if warm_start is None else warm_start.names
+        x = breath_term(hypothesis.names).start(problem, x, before, refit=restart)
+        smoothed = warm_start is not None and warm_start.hypothesis == hypothesis
+        if start or not smoothed:
+            x = problem.smoothed_start(x, tolerance=settings.tolerance, iterations=iterations)
+        low, high = problem.unknowns.bounds()
+
+        def search(x: Floats, known: Minimum | None = None) -> Minimum:
+            return minimise(
+                problem.cost, problem.normal, x, low, high, tolerance=settings.tolerance,
+                iterations=iterations, known=known,
+            )  # fmt: skip
+
+        minimum = search(x, _known_minimum(problem, x, warm_start))
+        for _ in range(settings.delay_rounds):
+            beyond = problem.at_likeliest_changes(minimum.x, settings.delay_gain)
+            if beyond is None:  # a step may carry a dead time over a sample, and none leads back
+                beyond = problem.best_of_scan(minimum, _dead_times(problem), settings.delay_gain)
+            if beyond is None:
+                break
+            other = search(beyond)
+            if other.cost >= minimum.cost:
+                break
+            minimum = other
+        return FittedModel(hypothesis.names, problem, minimum, hypothesis)
 
     @cached_property
     def for_ranking(self) -> Evaluator:
@@ -337,7 +227,7 @@ class Evaluator:
             fitted: a model of the training breaths.
         """
         count = float(self.training.data.weight.sum())
-        penalty = fitted.shared_count * float(np.log(count))
+        penalty = int(fitted.problem.unknowns.shared.sum()) * float(np.log(count))
         breaths = float(self.breath_term(fitted).marginal_log_likelihood(fitted).sum())
         return penalty - 2.0 * (breaths + self.label_log_density(fitted))
 
@@ -382,14 +272,10 @@ class Evaluator:
             The problem without patient effort, and its unknowns.
         """
         partition, settings = partition or self.held_out, self.settings.fit
-        own = (START, "gain") if self.gain_sd else (START,)
         fixed = self.transferred(fitted, partition)
-        problem = make_problem(partition, own, fitted.noise, fixed, self.gain_sd)
-        columns, layout = (*partition.predictor.names, START), problem.unknowns
-        first = {p: problem.fixed[:, columns.index(p)] for p in own}
-        low, high = layout.bounds()
+        problem = make_problem(partition, (START,), fitted.noise, fixed, self.gain_sd)
         minimum = minimise(
-            problem.cost, problem.normal, layout.pack(first), low, high,
+            problem.cost, problem.normal, problem.start({}), *problem.unknowns.bounds(),
             tolerance=settings.breath_tolerance, iterations=settings.breath_iterations,
         )  # fmt: skip
         return problem, minimum.x
@@ -407,7 +293,7 @@ class Evaluator:
         """
         data, known = partition.data, fitted.problem.data
         names = fitted.problem.predictor.names
-        values = problems.parameter_values(data, partition.predictor.names, {})
+        values = parameter_values(data, partition.predictor.names, {})
         same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
@@ -502,7 +388,8 @@ def fit_with_noise(
     for _ in range(settings.noise_rounds):
         noise = estimate_noise(fitted)
         again = evaluator.fit(hypothesis, noise, fitted, restart=True)
-        gained = again.log_likelihood - fitted.log_likelihood_at(noise)
+        before = noise.log_likelihood(fitted.residual, fitted.problem.data.weight)
+        gained = again.log_likelihood.sum() - before.sum()
         fitted = again if gained > 0 else evaluator.fit(hypothesis, noise, fitted)
         if gained < settings.noise_gain:
             break

@@ -402,7 +402,7 @@ class _Search:
         """The base model with the labels' R and C: lags of 0.1 s take R to nothing."""
         return self.evaluator.fit(
             Hypothesis(), noise, None, {"R": self.data.R, "C": self.data.C},
-            partition=Partition(self.data, self.predictor), iterations=0, delay_rounds=0,
+            partition=Partition(self.data, self.predictor), iterations=0,
         )  # fmt: skip
 
     def attempt(self, around: Simulated, noise: Noise, terms: Set, start: FittedModel) -> None:

@@ -10,14 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.diagnosis.findings import BreathRequest
-from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.fit import Fit
 from ventbench.system_id.predictor import START, Predictor
@@ -45,13 +43,8 @@ _VARIANTS, _MOST = 5, 100.0
 #: of the interruptions of an expiration, s.
 _INSPIRATION, _FAST, _SLOW, _HOLD, _SHUTTER = 1.0, 0.35, 1.5, 2.0, 0.16
 
-#: A hypothesis at its optimum, on the breaths recorded so far.
-Fitted: TypeAlias = FittedModel | Fit
 
-
-def request_breaths(
-    chosen: Fitted, alternatives: Sequence[Fitted], noise: Noise
-) -> BreathRequest | None:
+def request_breaths(chosen: Fit, alternatives: Sequence[Fit], noise: Noise) -> BreathRequest | None:
     """Find the breaths to record next.
 
     The value of a family of breaths, or of a mix of two, is the log-likelihood that is expected to
@@ -89,7 +82,7 @@ class Forecast:
     known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
 
 
-def values_of(fitted: Fitted, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
+def values_of(fitted: Fit, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
     """Physical values for new breaths, taken in turn from recorded ones, ``(m, P + 1)``.
 
     Args:
@@ -109,7 +102,7 @@ def values_of(fitted: Fitted, data: Data, lung: NDArray[np.intp], start: float) 
 
 
 def forecast(
-    fitted: Fitted, data: Data, predictor: Predictor, lung: NDArray[np.intp],
+    fitted: Fit, data: Data, predictor: Predictor, lung: NDArray[np.intp],
     start: float, noise: Noise,
 ) -> Forecast:  # fmt: skip
     """Predict new breaths with derivatives; for the arguments see :func:`values_of`."""
@@ -140,6 +133,10 @@ class Contrast:
 
     def nats(self, which: NDArray[np.intp]) -> float:
         """Log-likelihood that the refitted hypothesis is expected to lose in some breaths."""
+        return self.refit(which)[0]
+
+    def refit(self, which: NDArray[np.intp]) -> tuple[float, Floats]:
+        """The same, and by how much the refit moves the shared unknowns, ``(s,)``."""
         rows, difference = self.rows[which], self.difference[which]
         left, step = difference, np.zeros(len(self.known))
         for _ in range(_REFITS):
@@ -148,7 +145,7 @@ class Contrast:
             gradient = np.matmul(weighted, difference[:, :, None])[:, :, 0].sum(axis=0)
             step = np.linalg.solve(_regular(hessian), gradient)
             left = difference - np.einsum("msk,s->mk", rows, step)
-        return float(np.sum(self.noise.loss(left)) + 0.5 * step @ self.known @ step)
+        return float(np.sum(self.noise.loss(left)) + 0.5 * step @ self.known @ step), step
 
 
 def contrast(truth: Forecast, refitted: Forecast, noise: Noise) -> Contrast:
@@ -162,11 +159,20 @@ def contrast(truth: Forecast, refitted: Forecast, noise: Noise) -> Contrast:
     # The prior of a breath's own unknowns counts as further readings of them.
     before = np.broadcast_to(np.diag(np.sqrt(refitted.own_precision)), (count, extra, extra))
     own = np.concatenate([refitted.own, before], axis=2)
-    both = np.concatenate([rows, difference[:, None]], axis=1)
-    inner = np.matmul(own, own.swapaxes(1, 2))
-    share = np.linalg.solve(_regular(inner), np.matmul(own, both.swapaxes(1, 2)))
-    both = both - np.matmul(share.swapaxes(1, 2), own)
+    both = without_own(np.concatenate([rows, difference[:, None]], axis=1), own)
     return Contrast(both[:, -1], both[:, :-1], refitted.known, noise)
+
+
+def without_own(columns: Floats, own: Floats) -> Floats:
+    """What a refit of each breath's own unknowns leaves of whitened columns, ``(m, q, k)``.
+
+    Args:
+        columns: readings, or derivatives of these, ``(m, q, k)``.
+        own: derivatives by the breath's own unknowns, ``(m, o, k)``.
+    """
+    inner = np.matmul(own, own.swapaxes(1, 2))
+    share = np.linalg.solve(_regular(inner), np.matmul(own, columns.swapaxes(1, 2)))
+    return columns - np.matmul(share.swapaxes(1, 2), own)
 
 
 def _is_own(problem: Problem, column: int) -> bool:
@@ -202,7 +208,7 @@ class _Design:
 
 
 def _best_on_lung(
-    chosen: Fitted, alternatives: Sequence[Fitted], noise: Noise,
+    chosen: Fit, alternatives: Sequence[Fit], noise: Noise,
     recorded_rows: NDArray[np.intp],
 ) -> _Design | None:  # fmt: skip
     """The best design on the lung of the recorded breaths ``here``."""
@@ -254,7 +260,7 @@ def _best(kinds: tuple[Family, ...], pairs: Sequence[Contrast], lung: Lung) -> _
 
 
 def _safe(
-    kinds: tuple[Family, ...], hypotheses: Sequence[Fitted], recorded: Data,
+    kinds: tuple[Family, ...], hypotheses: Sequence[Fit], recorded: Data,
     recorded_rows: NDArray[np.intp], start: float,
 ) -> tuple[Family, ...]:  # fmt: skip
     """Breaths that every hypothesis predicts within the pressure limits, weakened where needed."""
@@ -294,7 +300,7 @@ def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.int
     )  # fmt: skip
 
 
-def _worded(design: _Design, hypotheses: Sequence[Fitted], dt: float) -> BreathRequest:
+def _worded(design: _Design, hypotheses: Sequence[Fit], dt: float) -> BreathRequest:
     parts = [f"{len(members)} x {kind.title}" for kind, members in design.picks]
     u_in = np.concatenate([kind.u_in[members] for kind, members in design.picks])
     u_out = np.concatenate([kind.u_out[members] for kind, members in design.picks])

@@ -10,7 +10,7 @@ change gains after a refit, without doing one.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,10 +24,10 @@ from ventbench.physics.catalogue import (
     paths,
     strength_path,
 )
-from ventbench.system_id.data import Data, Floats, Noise
-from ventbench.system_id.levenberg_marquardt import Minimum
-from ventbench.system_id.predictor import START, Predictor
-from ventbench.system_id.problem import Problem, free_paths
+from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.fit import Fit
+from ventbench.system_id.predictor import Predictor
+from ventbench.system_id.problem import Partition, Problem, free_paths
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,19 +88,18 @@ def linearise(problem: Problem, x: Floats, *, clip: float = 4.0) -> Linearisatio
     counts = [len(np.unique(layout.index[:, k])) for k in range(len(layout.paths))]
     breath |= np.array([count == len(white) and count > 1 for count in counts])
     own = _orthonormal(rows[:, breath])
-    values = problem.values(x)
-    partial = Linearisation(problem, values, residual, white, own, np.zeros((0, white.size)))
+    linear = Linearisation(
+        problem, problem.values(x), problem.predict(x), white, own, np.zeros((0, white.size))
+    )
     columns = []
     for k in np.flatnonzero(~breath):
-        left = partial.without_own(rows[:, [k]])[:, 0]
+        left = linear.without_own(rows[:, [k]])[:, 0]
         for unknown in np.unique(layout.index[:, k]):
             columns.append(np.where((layout.index[:, k] == unknown)[:, None], left, 0.0).ravel())
-    shared = partial.shared_basis
     if columns:
-        shared = _orthonormal(np.asarray(columns)[None])[0]
-    whole = Linearisation(problem, values, problem.predict(x), white, own, shared)
-    clean = whole.without_shared(whole.without_own(white[:, None]))[:, 0]
-    return Linearisation(problem, values, whole.prediction, clean, own, shared)
+        linear = replace(linear, shared_basis=_orthonormal(np.asarray(columns)[None])[0])
+    clean = linear.without_shared(linear.without_own(white[:, None]))[:, 0]
+    return replace(linear, residual=clean)
 
 
 #: Eigenvalues of a projection below this share of the largest count as zero.
@@ -179,14 +178,6 @@ def all_parameter_paths(
     return paths((*kept, *intermittent(), *(basis_terms() if chosen is None else chosen)))
 
 
-@dataclass(frozen=True, eq=False)
-class Partition:
-    """Breaths, such as the training breaths, with the predictor of their readings."""
-
-    data: Data
-    predictor: Predictor
-
-
 def make_partition(
     data: Data, names: tuple[str, ...], settings: SelectionConfig = DEFAULT
 ) -> Partition:
@@ -201,24 +192,10 @@ def make_partition(
 
 
 @dataclass(frozen=True, eq=False)
-class FittedModel:
+class FittedModel(Fit):
     """A hypothesis at its maximum-likelihood parameters."""
 
     hypothesis: Hypothesis  #: the terms.
-    problem: Problem  #: data, noise and unknowns of the fit.
-    minimum: Minimum  #: minimum of the problem's cost.
-    log_likelihood: float  #: log-likelihood of all its breaths, nats.
-    _residual_without: dict[str, Floats] = field(init=False, repr=False, default_factory=dict)
-
-    @cached_property
-    def values(self) -> Floats:
-        """Physical values of all parameters and of the start, ``(n, P + 1)``."""
-        return self.problem.values(self.minimum.x)
-
-    @cached_property
-    def residual(self) -> Floats:
-        """Simulated minus measured, ``(n, c, T)``."""
-        return self.problem.residual(self.minimum.x)
 
     @cached_property
     def jacobian(self) -> tuple[Floats, Floats]:
@@ -227,31 +204,6 @@ class FittedModel:
 
     def residual_without(self, name: str) -> Floats:
         """Residual with the strength of one mechanism set to zero, ``(n, c, T)``."""
-        if name not in self._residual_without:
-            values = self.values.copy()
-            values[:, self.problem.predictor.names.index(strength_path(name))] = 0.0
-            self._residual_without[name] = self.problem.residual_of(values)
-        return self._residual_without[name]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The hypothesis's terms."""
-        return self.hypothesis.names
-
-    @property
-    def noise(self) -> Noise:
-        """Noise that was assumed in the fit."""
-        return self.problem.noise
-
-    @property
-    def shared_count(self) -> int:
-        """Number of unknowns that several breaths share."""
-        return int(self.problem.unknowns.shared.sum())
-
-    def column(self, path: str) -> Floats:
-        """Physical value of one parameter in each breath, ``(n,)``."""
-        return self.values[:, (*self.problem.predictor.names, START).index(path)]
-
-    def log_likelihood_at(self, noise: Noise) -> float:
-        """Log-likelihood of the residuals under another noise, nats."""
-        return float(noise.log_likelihood(self.residual, self.problem.data.weight).sum())
+        values = self.values.copy()
+        values[:, self.problem.predictor.names.index(strength_path(name))] = 0.0
+        return self.problem.residual_of(values)

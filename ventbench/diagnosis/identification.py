@@ -16,7 +16,7 @@ from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name, without_term
-from ventbench.diagnosis.evaluator import Evaluator, make_evaluator, make_problem
+from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
     Partition,
@@ -31,7 +31,7 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import START, ConfidenceInterval, Fit, likely_places
 from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import minimise
-from ventbench.system_id.problem import parameter_of
+from ventbench.system_id.problem import make_problem, parameter_of
 from ventbench.task.interfaces import Plant
 
 #: A breath needs more inspiratory samples with a pressure than these.
@@ -167,15 +167,8 @@ class IdentifiedModel:
 
     evaluator: Evaluator  #: evaluator of the breaths.
     conclusion: Conclusion  #: base model, mechanisms and nonparametric term that the breaths need.
-    fit: Fit  #: final fit of the conclusion, with intervals.
+    fit: FittedModel  #: final fit of the conclusion, which reports show.
     final: Partition  #: breaths of the final fit, with a predictor of the conclusion's parameters.
-
-    @property
-    def final_model(self) -> FittedModel:
-        """The conclusion with the parameters of the final fit, which reports show."""
-        hypothesis, fit = self.conclusion.full.hypothesis, self.fit
-        likelihood = float(fit.log_likelihood.sum())
-        return FittedModel(hypothesis, fit.problem, fit.minimum, likelihood)
 
     def pressures(self, fitted: FittedModel, data: Data, first: Floats | None = None) -> Floats:
         """Open-loop pressures of a model for the commands of n breaths, cmH2O, ``(n, T)``.
@@ -297,9 +290,9 @@ def place_of_change(
     starts, about = [], parameter_of(path)
     for place in (about.high, about.low):  # all breaths before, and after
         fixed[path] = np.full(len(data), place)
-        side = make_problem(partition, (START,), fitted.noise, fixed, 0.0)
-        first = side.unknowns.pack({START: side.fixed[:, -1]})
-        starts.append(minimise(side.cost, side.normal, first, *side.unknowns.bounds()).x)
+        side = make_problem(partition, (START,), fitted.noise, fixed)
+        bounds = side.unknowns.bounds()
+        starts.append(minimise(side.cost, side.normal, side.start({}), *bounds).x)
     places, costs = side.change_costs(starts[0], path, after=starts[1])
     return likely_places(places, costs, float(places[np.argmin(costs)]))
 

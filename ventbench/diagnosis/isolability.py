@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.base.errors import InputError, InputTypeError
-from ventbench.diagnosis.experiment_design import Rig, families
+from ventbench.diagnosis.experiment_design import Contrast, Rig, families, without_own
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.mechanism import REFITTED
@@ -35,9 +35,6 @@ SENSORS = ("pressure", "flow")
 
 #: Share of the other parameters of a mechanism by which they are moved for their derivatives.
 _STEP = 0.1
-
-#: Share of a diagonal below which a direction is taken to be absorbed.
-_RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -137,15 +134,16 @@ def isolability(
     ]
     every = [*planned, *(breath for _, breath in further)]
     data = _data(every, len(planned), label.R, label.C, samples)
-    sigma = {"pressure": Noise().sigma[0], "flow": Noise().sigma[1]} | dict(noise or {})
-    now = _Space(data, chosen, sensors, sigma)
-    both = now if "flow" in sensors else _Space(data, chosen, (*sensors, "flow"), sigma)
+    sigma = dict(zip(SENSORS, Noise().sigma, strict=True)) | dict(noise or {})
+    white = Noise((sigma["pressure"], sigma["flow"]), tail=np.inf)
+    now = _Responses(data, chosen, sensors, white)
+    both = now if "flow" in sensors else _Responses(data, chosen, SENSORS, white)
     plan = list(range(len(planned)))
     detectable = {name: now.worth(name, plan) for name in chosen}
     seen = [name for name in chosen if detectable[name] >= threshold]
     nats = {pair: now.apart(*pair, plan) for pair in combinations(seen, 2)}
 
-    def remedy(measure: Callable[[_Space, list[int]], float]) -> tuple[str | None, float]:
+    def remedy(measure: Callable[[_Responses, list[int]], float]) -> tuple[str | None, float]:
         options = [
             (f"one breath: {title}", measure(now, [*plan, len(planned) + k]))
             for k, (title, _) in enumerate(further)
@@ -186,11 +184,11 @@ def _data(breaths: Sequence[Controls], planned: int, R: float, C: float, samples
     return Data(u_in, u_out, dt, np.zeros((n, 2, samples)), weight, R * ones, C * ones, position)
 
 
-class _Space:
-    """Inner products, breath by breath, of all changes of the response that are compared."""
+class _Responses:
+    """Changes of the response by each mechanism, and what a refit of the rest leaves of them."""
 
     def __init__(
-        self, data: Data, names: Sequence[str], sensors: Sequence[str], sigma: Mapping[str, float]
+        self, data: Data, names: Sequence[str], sensors: Sequence[str], noise: Noise
     ) -> None:
         simulator = Predictor(data, paths(tuple(names)))
         start = np.full(len(data), protocol.PEEP)
@@ -198,8 +196,6 @@ class _Space:
         first, slopes = simulator.derivatives(
             values, tuple((*simulator.names, START).index(path) for path in (*REFITTED, START))
         )
-        scale = np.array([float(sensor in sensors) / sigma[sensor] for sensor in SENSORS])
-        metric = data.weight * scale[:, None]
         columns = [slopes[:, k] for k in range(len(REFITTED))]
         self._of: dict[str, list[int]] = {}
         for name in names:
@@ -212,40 +208,33 @@ class _Space:
             changes = [moved[0] - first, *(each - moved[0] for each in moved[1:])]
             self._of[name] = list(range(len(columns), len(columns) + len(changes)))
             columns += changes
-        white = np.stack([column * metric for column in columns], axis=1)
+        weight = data.weight * np.array([[sensor in sensors] for sensor in SENSORS])
+        white = noise.whiten(np.stack([*columns, slopes[:, -1]], axis=1), weight)
         white = white.reshape(*white.shape[:2], -1)
-        own = (slopes[:, -1] * metric).reshape(len(data), 1, -1)
-        own = own / np.maximum(np.linalg.norm(own, axis=2, keepdims=True), 1e-12)
-        white = white - np.matmul(white, own.swapaxes(1, 2)) * own
-        self._gram = np.matmul(white, white.swapaxes(1, 2))
+        self._columns, self._noise = without_own(white[:, :-1], white[:, -1:]), noise
 
     def worth(self, name: str, breaths: Sequence[int]) -> float:
         """Nats that a mechanism is worth after a refit."""
-        return 0.5 * self._left(self._of[name][0], [], breaths)[0]
+        return self._refit(name, [], breaths)[0]
 
     def apart(self, one: str, other: str, breaths: Sequence[int]) -> float:
         """Nats by which two mechanisms are told apart, in the worse of both directions."""
         return min(self._against(one, other, breaths), self._against(other, one, breaths))
 
     def _against(self, true: str, rival: str, breaths: Sequence[int]) -> float:
-        target = self._of[true][0]
-        left, weights = self._left(target, self._of[rival], breaths)
+        nats, weights = self._refit(true, self._of[rival], breaths)
         strength = mechanism(rival).description.strength
         one_sided = not strength.low < strength.neutral < strength.high
-        return self.worth(true, breaths) if one_sided and weights[0] < 0.0 else 0.5 * left
+        return self.worth(true, breaths) if one_sided and weights[0] < 0.0 else nats
 
-    def _left(
-        self, target: int, rivals: Sequence[int], breaths: Sequence[int]
+    def _refit(
+        self, name: str, rivals: Sequence[int], breaths: Sequence[int]
     ) -> tuple[float, Floats]:
-        """Squared length of a change after others are refitted, and the weights of the rivals."""
-        gram = self._gram[list(breaths)].sum(axis=0)
-        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        gram = gram / np.outer(size, size)
-        others = [*rivals, *range(len(REFITTED))]
-        inner = gram[np.ix_(others, others)] + _RIDGE * np.eye(len(others))
-        weights = np.linalg.solve(inner, gram[others, target])
-        left = float(gram[target, target] - gram[others, target] @ weights)
-        return max(left, 0.0) * float(size[target]) ** 2, weights
+        """Nats of a mechanism after rivals are refitted too, and the weights of these first."""
+        rows = [*rivals, *range(len(REFITTED))]
+        known = np.zeros((len(rows), len(rows)))  # nothing is recorded yet
+        change = self._columns[:, self._of[name][0]]
+        return Contrast(change, self._columns[:, rows], known, self._noise).refit(np.array(breaths))
 
 
 def _mild(name: str) -> dict[str, float]:

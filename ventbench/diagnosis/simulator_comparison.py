@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, groups_by_label
+from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, identify
 from ventbench.diagnosis.settings import DEFAULT
@@ -24,9 +24,9 @@ from ventbench.diagnosis.validation import (
     passes_heldout_test,
 )
 from ventbench.physics.catalogue import mechanism, strength_path
-from ventbench.system_id import Fit, fit
+from ventbench.system_id import fit
 from ventbench.system_id.data import Data, Noise
-from ventbench.system_id.problem import free_paths, parameter_of
+from ventbench.system_id.problem import free_paths
 
 
 def identify_both(
@@ -178,13 +178,13 @@ def with_sensor_noise(
         noise: model of the recording's noise.
         seed: seed of the noise.
     """
+    from scipy import signal  # here, as it takes long to import
+
     rng = np.random.default_rng(seed)
     sigma, ar = noise.sigma[0], noise.ar[0]
     fresh = rng.normal(0.0, sigma * np.sqrt(1.0 - ar**2), response.shape)
-    coloured = np.zeros_like(fresh)
-    coloured[:, 0] = rng.normal(0.0, sigma, len(fresh))
-    for k in range(1, fresh.shape[1]):
-        coloured[:, k] = ar * coloured[:, k - 1] + fresh[:, k]
+    fresh[:, 0] = rng.normal(0.0, sigma, len(fresh))
+    coloured = signal.lfilter([1.0], [1.0, -ar], fresh)
     return data.with_pressure(np.nan_to_num(response) + coloured)
 
 
@@ -274,34 +274,32 @@ def refit_at_simulator_parameters(
     )
     test = evaluator.settings.held_out_test
 
-    def fit_with(names: Sequence[str]) -> tuple[Fit, FittedModel]:
+    def fit_with(names: Sequence[str]) -> FittedModel:
         asked = (*names, *term)
         hypothesis = _combined(full.hypothesis, own.hypothesis, asked)
-        result = _fit_beside(evaluator, hypothesis, asked, full, own)
-        likelihood = float(result.problem.log_likelihood(result.minimum.x).sum())
-        return result, FittedModel(hypothesis, result.problem, result.minimum, likelihood)
+        return _fit_beside(evaluator, hypothesis, asked, full, own)
 
     score = evaluator.held_out_log_likelihood
-    names, (result, fitted) = tuple(missing), fit_with(missing)
+    names, fitted = tuple(missing), fit_with(missing)
     refitted = evaluator.fit(full.hypothesis, full.noise, full)
     if passes_heldout_test(score(refitted) - score(fitted), test):
         return None
-    nothing = score(fit_with(())[1])
+    nothing = score(fit_with(()))
     while names:
         # A mechanism that only compensated another R or C is idle beside the simulator's own.
-        fewer = [(name, *fit_with([other for other in names if other != name])) for name in names]
-        lost = [score(fitted) - score(less) for _, _, less in fewer]
+        fewer = [fit_with([other for other in names if other != name]) for name in names]
+        lost = [score(fitted) - score(less) for less in fewer]
         least = int(np.argmin([nats.sum() for nats in lost]))
-        name, result_without, without = fewer[least]
+        name = names[least]
         whole = float((score(fitted) - nothing).sum())
         negligible = is_faint(fitted, own, name, test.negligible_strength)
         negligible &= bool(lost[least].sum() < test.negligible_share * whole)
         if passes_heldout_test(lost[least], test) and not negligible:
             break
-        result, fitted = result_without, without
+        fitted = fewer[least]
         names = tuple(other for other in names if other != name)
     conclusion = replace(recording_model.conclusion, full=fitted)
-    return IdentifiedModel(evaluator, conclusion, result, evaluator.training), names
+    return IdentifiedModel(evaluator, conclusion, fitted, evaluator.training), names
 
 
 def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> bool:
@@ -313,7 +311,7 @@ def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> 
 def _noiseless_fit(
     simulator_model: IdentifiedModel, own: Data, held: Bools,
     recording_model: IdentifiedModel,
-) -> Fit:  # fmt: skip
+) -> FittedModel:  # fmt: skip
     """Fit of the simulator's model to its own pressures, without noise or unmodelled part.
 
     The values are those of the model; their intervals are what such breaths tell of them.
@@ -351,27 +349,19 @@ def _fit_beside(
     asked: tuple[str, ...],
     full: FittedModel,
     own: FittedModel,
-) -> Fit:
+) -> FittedModel:
     """Fit the parameters of the mechanisms asked for; all others stay at the simulator's values."""
     partition = evaluator.training
     free = [p for p in (*free_paths(asked), *hypothesis.free) if p.rpartition(".")[0] in asked]
     values = evaluator.transferred(own, partition)
     fixed: dict[str, ArrayLike] = {p: x for p, x in values.items() if p not in free}
     given = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in asked}
-    by_breath = ("gain",) if evaluator.gain_sd else ()
-    neutral = float(np.log(parameter_of("gain").neutral))
-    return fit(
-        partition.data,
-        hypothesis.names,
-        free=(*free, *by_breath),
-        fixed={p: x for p, x in (fixed | given).items() if p not in by_breath},
-        start={p: float(np.median(full.column(p))) for p in free},
-        groups=groups_by_label(partition.data, tuple(free))
-        | {p: np.arange(len(partition.data)) for p in by_breath},
-        prior={p: (neutral, evaluator.gain_sd) for p in by_breath},
-        noise=full.noise,
-        predictor=partition.predictor,
-    )
+    found = fit(
+        partition.data, hypothesis.names, free=free, fixed=fixed | given,
+        start={p: float(np.median(full.column(p))) for p in free}, gain_sd=evaluator.gain_sd,
+        noise=full.noise, predictor=partition.predictor,
+    )  # fmt: skip
+    return FittedModel(hypothesis.names, found.problem, found.minimum, hypothesis)
 
 
 def _wider(recording: Evaluator, simulator: Evaluator) -> Evaluator:

@@ -33,7 +33,7 @@ from ventbench.entries.scoring import enter
 from ventbench.physics.catalogue import parameter
 from ventbench.plants.catalog import Given
 from ventbench.plants.corrected import stressed_plants
-from ventbench.plants.population import NAMES, from_vector
+from ventbench.plants.hybrid import NAMES, from_vector
 from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.task import protocol
 from ventbench.task.environment import nominal_scenario

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from ventbench.task.lungs import RECORDED_LUNGS, Lung
@@ -159,27 +159,28 @@ def tolerance_text() -> str:
 
 
 def match_labels(fit: Fit) -> tuple[LungMatch, ...]:
-    """Compare each lung of a fit to pressure alone with its label.
+    """Fitted R and C of each lung of a fit to pressure alone, and whether its label can be right.
 
-    The unknown gain of the valve scales R and 1/C by a common factor of up to 1.2.
+    The label is judged at the flow of its definition. The unknown gain of the valve scales R and
+    1/C by a common factor of up to 1.2.
     """
     data, matches = fit.problem.data, []
     quadratics = fit.column("turbulent_resistance.quadratic")
     for group in range(int(data.lung.max()) + 1):
         breath = int((data.lung == group).argmax())
-        R, C = (float(fit.value(path)[group]) for path in ("R", "C"))
-        ends = [[float(end) for end in fit.ci95(path)[group]] for path in ("R", "C")]
+        values = {path: float(fit.value(path)[group]) for path in ("R", "C")}
+        ends = {path: tuple(fit.ci95(path)[group].tolist()) for path in ("R", "C")}
+        R = Estimate(values["R"], "cmH2O/(L/s)", ends["R"])
         quadratic = float(quadratics[breath])
 
-        def resistance(
-            flow: float, R: float = R, quadratic: float = quadratic, ci95: list[float] = ends[0]
-        ) -> Estimate:
+        def resistance(flow: float, R: Estimate = R, quadratic: float = quadratic) -> Estimate:
             more = quadratic * flow
-            return Estimate(R + more, "cmH2O/(L/s)", (ci95[0] + more, ci95[1] + more))
+            return Estimate(R.value + more, R.unit, (R.ci95[0] + more, R.ci95[1] + more))
 
-        compliance = Estimate(C, "mL/cmH2O", (ends[1][0], ends[1][1]))
+        compliance = Estimate(values["C"], "mL/cmH2O", ends["C"])
         label = Lung(float(data.R[breath]), float(data.C[breath]))
-        matches.append(match_label(label, resistance, compliance, "pressure", GAIN))
+        match = match_label(label, resistance, compliance, "pressure", GAIN)
+        matches.append(replace(match, fitted_R=R.value, ci95_R=R.ci95))
     return tuple(matches)
 
 

@@ -22,10 +22,8 @@ from ventbench.base import files
 from ventbench.base.arrays import Bools, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.files import data_path
-from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.hybrid import Hybrid, RigPopulation, load_population
 from ventbench.plants.plant_files import load_plant
-from ventbench.plants.population import RigPopulation
-from ventbench.plants.population import load as load_population
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.identity import Fingerprints, fingerprints, match, repetitions

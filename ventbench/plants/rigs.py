@@ -11,7 +11,7 @@ import numpy as np
 
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
-from ventbench.plants.population import RigPopulation
+from ventbench.plants.hybrid import RigPopulation
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
 from ventbench.task.draws import Draws

@@ -10,7 +10,6 @@ from ventbench.system_id.fit import fit as fit
 from ventbench.system_id.fit import interval as interval
 from ventbench.system_id.fit import likely_places as likely_places
 from ventbench.system_id.fit import profile_interval as profile_interval
-from ventbench.system_id.fit import refit_breath_parameters as refit_breath_parameters
 from ventbench.system_id.predictor import START as START
 from ventbench.system_id.predictor import Predictor as Predictor
 from ventbench.system_id.problem import Unknowns as Unknowns

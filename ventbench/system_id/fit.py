@@ -5,9 +5,9 @@ Where the cost is no parabola, intervals are by profile likelihood.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from itertools import product
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -20,11 +20,11 @@ from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import (
+    Partition,
     Problem,
     free_paths,
-    make_unknowns,
+    make_problem,
     parameter_of,
-    parameter_values,
 )
 
 #: Steps of a search before other starts are tried, most rounds of trying, and nats by which another
@@ -43,21 +43,53 @@ _LEVERAGE = 0.98
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of a fit."""
+    """A hypothesis at the parameters that a fit found."""
 
     names: tuple[str, ...]  #: mechanisms of the hypothesis.
     problem: Problem  #: the problem with the estimated or given noise.
     minimum: Minimum  #: minimum of its cost.
-    values: Floats  #: physical values of all columns of the predictor, ``(n, P + 1)``.
-    residual: Floats  #: predicted minus measured, ``(n, c, T)``.
-    log_likelihood: Floats  #: log-likelihood of each breath, ``(n,)``.
-    covariance: Floats  #: covariance of the unknowns in coordinates, ``(U, U)``.
 
     @property
-    def bic(self) -> float:
-        """Bayesian information criterion, with the number of measured samples; less is better."""
-        count = float(self.problem.data.weight.sum())
-        return -2.0 * float(self.log_likelihood.sum()) + len(self.minimum.x) * np.log(count)
+    def noise(self) -> Noise:
+        """Estimated or given noise."""
+        return self.problem.noise
+
+    @cached_property
+    def values(self) -> Floats:
+        """Physical values of all parameters and of the start, ``(n, P + 1)``."""
+        return self.problem.values(self.minimum.x)
+
+    @cached_property
+    def residual(self) -> Floats:
+        """Predicted minus measured, ``(n, c, T)``."""
+        return self.problem.residual_of(self.values)
+
+    @cached_property
+    def log_likelihood(self) -> Floats:
+        """Log-likelihood of each breath, nats, ``(n,)``."""
+        return self.noise.log_likelihood(self.residual, self.problem.data.weight)
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Covariance of the unknowns in coordinates, ``(U, U)``.
+
+        The inverse Hessian is valid if noise and model are right. The sandwich estimate, which uses
+        the spread of the breaths' gradients, is valid if the breaths are independent, whatever
+        happens within them (coloured noise, an effect that the model lacks). Each unknown has the
+        larger of the two variances; the correlations are those of the inverse Hessian.
+        """
+        hessian, index = self.minimum.hessian, self.problem.unknowns.index
+        floor = 1e-9 * np.maximum(np.diag(hessian), 1e-9)
+        bread = np.asarray(np.linalg.inv(hessian + np.diag(floor)), np.float64)
+        own = np.array([len(np.unique(column)) == len(index) for column in index.T])
+        common = np.unique(index[:, ~own])
+        if len(index) - len(common) < _ENOUGH:
+            return bread
+        inner = bread[np.ix_(common, common)]
+        sandwich = _sandwich(self.problem, self.minimum, own, common, inner)
+        grown = np.ones(len(bread))
+        grown[common] = np.sqrt(np.maximum(sandwich / np.diag(bread)[common], 1.0))
+        return np.asarray(bread * np.outer(grown, grown), np.float64)
 
     @property
     def freedom(self) -> int:
@@ -97,14 +129,12 @@ class Fit:
 def fit(
     data: Data, mechanisms: Iterable[str] = (), *, free: Iterable[str] = (),
     fixed: Mapping[str, ArrayLike] | None = None, start: Mapping[str, ArrayLike] | None = None,
-    groups: Mapping[str, ArrayLike] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None, noise: Noise | None = None,
-    predictor: Predictor | None = None, iterations: int = 40,
+    gain_sd: float = 0.0, noise: Noise | None = None, predictor: Predictor | None = None,
+    iterations: int = 40,
 ) -> Fit:  # fmt: skip
     """Fit a hypothesis: R, C, R_ex, PEEP, starting pressures and parameters of mechanisms.
 
-    Mechanisms start at their mild strength, because some have little slope at zero. Parameters with
-    several known minima are searched from several starts.
+    Shared parameters with several known minima are searched from several starts.
 
     Args:
         data: data from :func:`~ventbench.system_id.data.make_data`.
@@ -112,9 +142,8 @@ def fit(
         free: further free paths, such as ``gain`` or ``leak.exponent``.
         fixed: physical values of paths that stay fixed, a number or one for each breath.
         start: physical values to start from.
-        groups: which breaths share a parameter; see
-            :func:`~ventbench.system_id.problem.make_unknowns`.
-        prior: prior mean and standard deviation in coordinates, by path.
+        gain_sd: prior standard deviation of the logarithm of each breath's valve gain, which is
+            then fitted too; 0 if all breaths have the same gain.
         noise: measurement noise; estimated from the residuals if not given.
         predictor: predictor of the same data with all parameters, to avoid padding the data again.
         iterations: most steps of each search.
@@ -126,45 +155,13 @@ def fit(
     if predictor is None:
         terms = [name for name in mechanisms if name not in library()]
         predictor = Predictor(data, paths((*library(), *terms)))
-    layout = make_unknowns(
-        data, (p for p in dict.fromkeys((*free_paths(mechanisms), *free)) if p not in fixed), groups
-    )
-    base = parameter_values(data, predictor.names, fixed)
-    mean, precision = layout.prior(prior or {})
-    problem = Problem(data, predictor, layout, base, noise or Noise(), mean, precision)
-    order = (*predictor.names, START)
-    first = {p: base[:, order.index(p)] for p in layout.paths if "." not in p}
-    first |= {p: parameter_of(p).mild for p in layout.paths if "." in p}
-    first |= {p: value for p, value in start.items() if p in layout.paths}
-    minimum = _search(problem, layout.pack(first), set(start), iterations)
+    chosen = (p for p in dict.fromkeys((*free_paths(mechanisms), *free)) if p not in fixed)
+    problem = make_problem(Partition(data, predictor), chosen, noise or Noise(), fixed, gain_sd)
+    minimum = _search(problem, start, iterations)
     for _ in range(2 if noise is None else 0):
         problem = replace(problem, noise=robust_noise(problem.residual(minimum.x), data.weight))
         minimum = _descend(problem, minimum.x, iterations)
-    residual = problem.residual(minimum.x)
-    return Fit(
-        mechanisms, problem, minimum, problem.values(minimum.x), residual,
-        problem.noise.log_likelihood(residual, data.weight), covariance(problem, minimum),
-    )  # fmt: skip
-
-
-def refit_breath_parameters(fitted: Fit, data: Data, *, free: Iterable[str] = ()) -> Fit:
-    """Evaluate a fit on other breaths, to which parameters of scope ``breath`` are fitted alone.
-
-    Its shared parameters stay, those of the same label where it has several, but for ``free``.
-    """
-    layout, names = fitted.problem.unknowns, fitted.problem.predictor.names
-    own = {p for p in layout.paths if parameter_of(p).scope == "breath"} | set(free) | {"position"}
-    fixed = {name: _label_mean(fitted, data, name) for name in names if name not in own}
-    return fit(data, fitted.names, free=free, fixed=fixed, noise=fitted.problem.noise)
-
-
-def _label_mean(fitted: Fit, data: Data, path: str) -> Floats:
-    """Mean of a parameter over fitted breaths with the same label, or over all if it is new."""
-    known, column = fitted.problem.data, fitted.column(path)
-    same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
-    same |= ~same.any(axis=1, keepdims=True)
-    parameter = parameter_of(path)  # rounding must not carry a value at its bound beyond it
-    return np.clip(same @ column / same.sum(axis=1), parameter.low, parameter.high)
+    return Fit(mechanisms, problem, minimum)
 
 
 def _descend(problem: Problem, x: Floats, iterations: int) -> Minimum:
@@ -174,20 +171,16 @@ def _descend(problem: Problem, x: Floats, iterations: int) -> Minimum:
     return minimise(problem.cost, problem.normal, x, low, high, iterations=iterations)
 
 
-def _search(problem: Problem, x: Floats, given: Set[str], iterations: int) -> Minimum:
-    """Search from ``x``, then try the values of ``Parameter.scan`` with all else as minimum.
+def _search(problem: Problem, start: Mapping[str, ArrayLike], iterations: int) -> Minimum:
+    """Search from given values, then try the values of ``Parameter.scan`` with all else as minimum.
 
-    The search continues from a value that is better, for all breaths or, if each breath has its own
-    value, for one breath. Paths whose start the caller gave are not scanned.
+    The search continues from a value that is better. Paths whose start is given are not scanned.
     """
-    scanned = {p: parameter_of(p) for p in problem.unknowns.paths if parameter_of(p).scan}
-    scanned = {p: parameter for p, parameter in scanned.items() if p not in given}
-    shared = [p for p, parameter in scanned.items() if parameter.scope == "shared"]
-    own = [p for p, parameter in scanned.items() if parameter.scope == "breath"]
-    minimum = _descend(problem, x, _FIRST_STEPS if scanned else iterations)
+    free = {path: parameter_of(path) for path in problem.unknowns.paths if path not in start}
+    scanned = [path for path, about in free.items() if about.scan and about.scope == "shared"]
+    minimum = _descend(problem, problem.start(start), _FIRST_STEPS if scanned else iterations)
     for _ in range(_ROUNDS if scanned else 0):
-        better = _other_values(problem, minimum, shared)
-        better = _other_breaths(problem, minimum.x if better is None else better, own, better)
+        better = problem.best_of_scan(minimum, scanned, _BETTER)
         if better is None:
             break
         minimum = _descend(problem, better, iterations)
@@ -195,63 +188,6 @@ def _search(problem: Problem, x: Floats, given: Set[str], iterations: int) -> Mi
     if moved is None and minimum.converged:
         return minimum
     return _descend(problem, minimum.x if moved is None else moved, iterations)
-
-
-def _other_values(problem: Problem, minimum: Minimum, paths: Sequence[str]) -> Floats | None:
-    """Return a point with another value of one shared parameter and lower cost, or None."""
-    best, reached = None, minimum.cost - _BETTER
-    for path in paths:
-        for value in parameter_of(path).scan:
-            trial = minimum.x.copy()
-            trial[problem.unknowns.of(path)] = parameter_of(path).coordinate(value)
-            cost = problem.cost(trial)
-            if cost < reached:
-                best, reached = trial, cost
-    return best
-
-
-def _other_breaths(
-    problem: Problem, x: Floats, own: Sequence[str], otherwise: Floats | None
-) -> Floats | None:
-    """Return a point at which some breaths have a higher likelihood, or ``otherwise``."""
-    if not own:
-        return otherwise
-    layout = problem.unknowns
-    columns = [layout.paths.index(path) for path in own]
-    best, reached = x.copy(), problem.log_likelihood(x) + _BETTER
-    known = reached.copy()
-    for values in product(*(parameter_of(path).scan for path in own)):
-        trial = x.copy()
-        for path, value in zip(own, values, strict=True):
-            trial[layout.of(path)] = parameter_of(path).coordinate(value)
-        likelihood = problem.log_likelihood(trial)
-        won = np.flatnonzero(likelihood > reached)
-        reached[won] = likelihood[won]
-        for column in columns:
-            index = layout.index[won, column]
-            best[index] = trial[index]
-    return best if np.any(reached > known) else otherwise
-
-
-def covariance(problem: Problem, minimum: Minimum) -> Floats:
-    """Covariance of the unknowns in coordinates, ``(U, U)``.
-
-    The inverse Hessian is valid if noise and model are right. The sandwich estimate, which uses the
-    spread of the breaths' gradients, is valid if the breaths are independent, whatever happens
-    within them (coloured noise, an effect that the model lacks). Each unknown has the larger of the
-    two variances; the correlations are those of the inverse Hessian.
-    """
-    floor = 1e-9 * np.maximum(np.diag(minimum.hessian), 1e-9)
-    bread = np.asarray(np.linalg.inv(minimum.hessian + np.diag(floor)), np.float64)
-    index = problem.unknowns.index
-    own = np.array([len(np.unique(column)) == len(index) for column in index.T])
-    common = np.unique(index[:, ~own])
-    if len(index) - len(common) < _ENOUGH:
-        return bread
-    sandwich = _sandwich(problem, minimum, own, common, bread[np.ix_(common, common)])
-    grown = np.ones(len(bread))
-    grown[common] = np.sqrt(np.maximum(sandwich / np.diag(bread)[common], 1.0))
-    return np.asarray(bread * np.outer(grown, grown), np.float64)
 
 
 def _sandwich(

@@ -14,7 +14,7 @@ from ventbench.base.errors import InputError
 from ventbench.physics.catalogue import mechanism, parameter, paths, strength_path
 from ventbench.physics.mechanism import REFITTED, Parameter
 from ventbench.system_id.data import Data, Noise
-from ventbench.system_id.levenberg_marquardt import minimise
+from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.predictor import START, Predictor, needs_small_steps
 
 #: The starting pressure of a breath as a parameter.
@@ -74,17 +74,18 @@ class Unknowns:
         low, high = np.array(pairs, float).reshape(-1, 2)[self.path_of].T.copy()
         return low, high
 
-    def prior(self, given: Mapping[str, tuple[float, float]]) -> tuple[Floats, Floats]:
+    def prior(self, gain_sd: float = 0.0) -> tuple[Floats, Floats]:
         """Prior means and precisions (1 / variance) in coordinates, ``(U,)``; precision 0 if none.
 
         A parameter other than the strength has its own prior, because no data bear on it while the
-        effect is off. So does a strength with a ``spread``.
+        effect is off. So does a strength with a ``spread``, and the valve's gain if the standard
+        deviation of its logarithm is given.
         """
         mean, precision = np.zeros(len(self.path_of)), np.zeros(len(self.path_of))
         for path in self.paths:
             owner = path.rpartition(".")[0]
-            if path in given:
-                centre, width = given[path]
+            if path == "gain" and gain_sd:
+                centre, width = float(np.log(parameter_of(path).neutral)), gain_sd
             elif owner and (path != strength_path(owner) or parameter(path).spread is not None):
                 centre, width = parameter(path).prior()
             else:
@@ -118,8 +119,8 @@ def make_unknowns(
     """Lay out the unknowns of a fit with free parameters of some paths.
 
     Groups are breaths that share a parameter, by its path, as whole numbers ``(n,)``. By default, R
-    and C belong to the lung, a parameter of scope ``breath`` to the breath, and all others are
-    shared by all breaths.
+    and C belong to the lung, a parameter that follows R or C to that label, a parameter of scope
+    ``breath`` to the breath, and all others are shared by all breaths.
 
     Raises:
         InputError: if a group does not fit the data, or a parameter appears twice.
@@ -133,6 +134,8 @@ def make_unknowns(
         default = np.arange(len(data)) if parameter.scope == "breath" else np.zeros(len(data), int)
         if path in ("R", "C"):
             default = data.lung
+        elif parameter.follows:
+            default = data.R if parameter.follows == "R" else data.C
         group = np.asarray(groups.get(path, default))
         if group.shape != (len(data),):
             raise InputError(f"groups of {path}: {group.shape} for {len(data)} breaths")
@@ -140,6 +143,14 @@ def make_unknowns(
         index.append(len(path_of) + place.reshape(-1))
         path_of += [column] * len(kinds)
     return Unknowns(paths, np.stack(index, axis=1), np.asarray(path_of))
+
+
+@dataclass(frozen=True, eq=False)
+class Partition:
+    """Breaths, such as the training breaths, with the predictor of their readings."""
+
+    data: Data
+    predictor: Predictor
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +241,50 @@ class Problem:
         np.add.at(hessian, (index[:, :, None], index[:, None, :]), curvature)
         return cost, gradient, hessian
 
+    def start(self, given: Mapping[str, ArrayLike]) -> Floats:
+        """Unknowns to start a search from, ``(U,)``.
+
+        Mechanisms start at their mild strength, because some have little slope at zero. Of two
+        parameters of a mechanism that may change places, the larger comes first.
+
+        Args:
+            given: physical values to start from instead, by path, a number or one for each breath;
+                paths that are not free are passed over.
+        """
+        paths = self.unknowns.paths
+        first: dict[str, ArrayLike] = {
+            path: parameter_of(path).mild if "." in path else self.fixed[:, column]
+            for path, column in zip(paths, self.columns, strict=True)
+        }
+        first |= {path: value for path, value in given.items() if path in first}
+        for name in dict.fromkeys(path.rpartition(".")[0] for path in paths if "." in path):
+            for pair in mechanism(name).description.interchangeable:
+                one, other = (f"{name}.{short}" for short in pair)
+                if {one, other} <= first.keys() and np.all(np.less(first[one], first[other])):
+                    first[one], first[other] = first[other], first[one]
+        return self.unknowns.pack(first)
+
+    def best_of_scan(self, minimum: Minimum, paths: Iterable[str], least: float) -> Floats | None:
+        """The likeliest point with another value of one parameter, all else as in a minimum.
+
+        Args:
+            minimum: the minimum.
+            paths: parameters whose values of ``scan`` are tried.
+            least: nats by which the point must be better.
+
+        Returns:
+            None if no point is.
+        """
+        best, lowest = None, minimum.cost - least
+        for path in paths:
+            about = parameter_of(path)
+            trials = np.repeat(minimum.x[None], len(about.scan), axis=0)
+            trials[:, self.unknowns.of(path)] = about.coordinate(about.scan)[:, None]
+            for trial, cost in zip(trials, self.costs(trials), strict=True):
+                if cost < lowest:
+                    best, lowest = trial, float(cost)
+        return best
+
     def smoothed_start(self, x: Floats, *, tolerance: float = 1e-3, iterations: int = 40) -> Floats:
         """Where a search should start: ``x``, or a better point that larger steps lead to.
 
@@ -306,6 +361,33 @@ class Problem:
         prior = 0.5 * np.sum(self.precision * (x - self.mean) ** 2)
         cost = float(np.sum(self.noise.loss(white)) + prior)
         return cost if np.isfinite(cost) else np.inf
+
+
+def make_problem(
+    partition: Partition,
+    paths: Iterable[str],
+    noise: Noise,
+    fixed: Mapping[str, ArrayLike],
+    gain_sd: float = 0.0,
+) -> Problem:
+    """Lay out the problem of a fit.
+
+    Args:
+        partition: the breaths.
+        paths: parameters that are fitted.
+        noise: model of the measurement noise.
+        fixed: values of others, by path; those that are not given are neutral.
+        gain_sd: prior standard deviation of the logarithm of each breath's valve gain, which is
+            then fitted too; 0 if all breaths have the same gain.
+
+    Raises:
+        InputError: if a path is unknown or a value outside its bounds.
+    """
+    data, names = partition.data, partition.predictor.names
+    groups = {"gain": np.arange(len(data))} if gain_sd else {}
+    layout = make_unknowns(data, dict.fromkeys((*paths, *groups)), groups)
+    values = parameter_values(data, names, fixed)
+    return Problem(data, partition.predictor, layout, values, noise, *layout.prior(gain_sd))
 
 
 def parameter_values(data: Data, names: tuple[str, ...], given: Mapping[str, ArrayLike]) -> Floats:

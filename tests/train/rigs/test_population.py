@@ -11,7 +11,7 @@ import pytest
 
 from ventbench.base import compilation
 from ventbench.plants import frozen
-from ventbench.plants.population import LUNG, NAMES, from_vector, to_vector
+from ventbench.plants.hybrid import LUNG, NAMES, from_vector, to_vector
 from ventbench.train.rigs.data import InspirationData
 from ventbench.train.rigs.fit import simulate
 from ventbench.train.rigs.parameters import Groups

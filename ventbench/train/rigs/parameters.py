@@ -20,8 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.plants.hybrid import ELASTIC_KNOTS, PLAYS, VALVE_KNOTS, Hybrid
-from ventbench.plants.population import DIRECTION_SUM
+from ventbench.plants.hybrid import DIRECTION_SUM, ELASTIC_KNOTS, PLAYS, VALVE_KNOTS, Hybrid
 from ventbench.task.lungs import Lung
 
 #: Kinds of rig that share parameters.

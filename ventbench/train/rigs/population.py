@@ -1,7 +1,7 @@
 """Fit of the population of rigs to recordings, and the check that holds it to account.
 
 Around its fitted plant each session's inspirations are linearised in all numbers of a rig
-(:data:`ventbench.plants.population.NAMES`) and in each breath's own gain and start, which are then
+(:data:`ventbench.plants.hybrid.NAMES`) and in each breath's own gain and start, which are then
 integrated out. What is left says what the session knows of its rig, with its error; the mixed model
 of :mod:`ventbench.train.rigs.random_effects` makes a population of it. The linearisation is renewed
 a few times around the rigs that result.
@@ -24,9 +24,16 @@ from jax import Array
 
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Bools, Floats, Ints
-from ventbench.plants import frozen, population
-from ventbench.plants.hybrid import Hybrid
-from ventbench.plants.population import LUNG, NAMES, RigPopulation, from_vector, to_vector
+from ventbench.plants import frozen
+from ventbench.plants.hybrid import (
+    LUNG,
+    NAMES,
+    Hybrid,
+    RigPopulation,
+    from_vector,
+    save_population,
+    to_vector,
+)
 from ventbench.task.draws import GAIN_QUANTILES
 from ventbench.train.rigs import random_effects
 from ventbench.train.rigs.data import InspirationData, inspirations, load_rig_recordings
@@ -333,7 +340,7 @@ def train_population(
 def _write(fitted: FittedPopulation, known: frozen.Frozen) -> None:
     """Write the population, its check and its hash into the folder of simulators."""
     folder = known.folder
-    population.save(fitted.of_lungs(known.lung_ids, UNRECORDED_SLOPE), folder / frozen.POPULATION)
+    save_population(fitted.of_lungs(known.lung_ids, UNRECORDED_SLOPE), folder / frozen.POPULATION)
     sd = np.sqrt(fitted.population.covariance.diagonal())
     levels = np.linspace(0.0, 1.0, len(GAIN_QUANTILES))
     about = {

@@ -267,10 +267,10 @@ def _train(
         return (optax.apply_updates(layers, updates), state), loss
 
     layers = network.general, network.boundary
-    (layers, _), losses = jax.lax.scan(
+    ((general, boundary), _), losses = jax.lax.scan(
         update, (layers, adam.init(layers)), jnp.arange(config.steps)
     )
-    return Network(*layers, network.scales, network.windows), losses
+    return Network(general, boundary, network.scales, network.windows), losses
 
 
 def fit(

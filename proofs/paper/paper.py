@@ -27,7 +27,7 @@ from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.train import pid_grid
+from ventbench.train import pid_search
 
 #: File of stored results.
 STORED = Path(__file__).with_name("stored.json")
@@ -79,9 +79,9 @@ def reproduce_paper(
         tell("errors by horizon", 0.0)
         kept["horizon"] = simulators.measure_horizon(Path(recordings) / MEASURED)
     tell("PID grid", 0.1)
-    tried = pid_grid.paper_gains() if gains is None else gains
-    error = pid_grid.errors(official.plants, tried)
-    grid = pid_grid.PIDGrid(LUNG_IDS, protocol.PIPS, tried, error)
+    tried = pid_search.paper_gains() if gains is None else gains
+    error = pid_search.errors(official.plants, tried)
+    grid = pid_search.PIDGrid(LUNG_IDS, protocol.PIPS, tried, error)
     with executor(workers) as pool:
         jobs = dict(ENTRIES)
         scored: dict[str, tuple[Floats, Floats]] = {}

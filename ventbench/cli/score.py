@@ -1,12 +1,18 @@
-"""``ventbench score``, ``transfer``, ``new`` and ``check``: work on submissions."""
+"""``ventbench score``, ``transfer``, ``new``, ``check``: work on submissions; and limits of scores.
+
+The limits are the bounds of any controller (``headroom``), and how little missing physics is too
+much (``stressors``, ``adversary``).
+"""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ventbench.base import files
 from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     Entries,
@@ -20,10 +26,12 @@ from ventbench.cli.options import (
     claim_out,
     emit,
     known_entries,
+    known_lungs,
     notes,
     of_each_entry,
     table_of,
     told,
+    waiting,
 )
 
 if TYPE_CHECKING:
@@ -240,8 +248,6 @@ def transfer(
 
     Example: `ventbench transfer pid_best residual_mlp --json transfer.json`
     """
-    from rich.text import Text
-
     from ventbench.entries import scoring as transfers
     from ventbench.entries.folder import open_submission
     from ventbench.entries.runner import runner_of
@@ -259,17 +265,13 @@ def transfer(
     plants = results[0]["groups"]
     columns = ("entry", *(f"{group}\n{plants[group]['plants']} plants" for group in plants))
     errors = [[result["groups"][group]["error_cmH2O"] for group in plants] for result in results]
-    best = [
-        min((x for x in own if x is not None), default=None) for own in zip(*errors, strict=True)
-    ]
-    rows = []
-    for result, own in zip(results, errors, strict=True):
-        texts = ("-" if value is None else f"{value:.3f}" for value in own)
-        cells = (
-            Text(text, "bold") if value == least else text
-            for text, value, least in zip(texts, own, best, strict=True)
+    rows = [
+        (
+            f"{result['name']}, {result['track']}",
+            *("-" if value is None else f"{value:.3f}" for value in own),
         )
-        rows.append((f"{result['name']}, {result['track']}", *cells))
+        for result, own in zip(results, errors, strict=True)
+    ]
     title = "Mean |pressure - target| on rigs, cmH2O (lower is better)"
     told({"entries": results}, json).print(table_of(title, columns, rows))
 
@@ -338,4 +340,165 @@ def check(
         raise typer.Exit(1)
 
 
-COMMANDS = (score, transfer, new, check)
+#: Cells of the second optimiser: every so many of all.
+_EVERY = 31
+
+
+def headroom(
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File of the reference errors.")] = Path(
+        "runs/bounds-v2.npz"
+    ),
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Check a file instead of making one: its commands must attain its errors, and a "
+            "second optimiser must find nothing better.",
+        ),
+    ] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    json: JsonFile = None,
+) -> None:
+    """Compute the best attainable error and the best PID of every cell of the development draws.
+
+    Commands are optimised for each cell with everything known; the best PID of a lung is searched
+    for without a grid's edge, on the rigs of the training. Takes minutes; the same command
+    continues.
+
+    Example: `ventbench headroom --check data/bounds-v2.npz`
+    """
+    import numpy as np
+
+    from ventbench.base.executor import executor
+    from ventbench.entries import reference as references
+    from ventbench.plants.rigs import load_rigs
+    from ventbench.task import draws, protocol
+    from ventbench.train.pid_search import best_pids
+
+    rigs = load_rigs()
+    drawn = rigs.draws(draws.COUNT)
+    plants, cells = rigs.cells(drawn, protocol.PIPS)
+    about = references.settings(rigs.about, drawn.about())
+    if check is not None:
+        computed = references.load(check)
+        references.reference_of(rigs.about, drawn.about(), computed)
+        result = references.checked(computed, plants, cells, every=_EVERY)
+        console = told(result, json)
+        for key, value in result.items():
+            console.print(f"{key}: {value}")
+        if not result["sound"]:
+            raise typer.Exit(1)
+        return
+    parts = out.with_suffix(".parts")
+    with bar("best PID of each lung") as progress:
+        pids = best_pids(rigs, progress=progress)
+    with bar("best attainable") as progress, executor(workers, scheduler) as pool:
+        computed = references.compute(
+            plants, cells, pids.gains, about, folder=parts, pool=pool, progress=progress
+        )
+    sha256 = computed.save(out)
+    shutil.rmtree(parts)  # they are in the file now
+    summary = {
+        "file": str(out),
+        "sha256": sha256,
+        "gains": computed.gains.tolist(),
+        "searches": pids.search_gains.tolist(),
+        "search_errors": pids.search_errors.tolist(),
+        "searches_agree": pids.agree.tolist(),
+        "distance": np.round(computed.attainable - computed.lower, 6).tolist(),
+        "attainable": float(computed.attainable.mean()),
+        "lower": float(computed.lower.mean()),
+        "pid": float(computed.pid.mean()),
+        "largest_gap": float(np.max(computed.attainable - computed.lower)),
+    }
+    told(summary, json).print(
+        f"wrote {out}\nmean over cells, first step left out: best attainable "
+        f"{summary['attainable']:.3f} cmH2O (at least {summary['lower']:.3f}), best PID "
+        f"{summary['pid']:.3f}\nSHA-256 {sha256}",
+        soft_wrap=True,
+    )
+
+
+def stressors(json: JsonFile = None) -> None:
+    """List the stressors, which are missing physics, and their strengths.
+
+    Example: `ventbench stressors`
+    """
+    import dataclasses
+
+    from ventbench.task.stressors import PAIRS, STRESSORS, VERSION
+
+    rows = []
+    for line in STRESSORS:
+        strengths = (f"{value:.3g}" for value in (line.mild, line.strong))
+        how = {"add": "", "scale": " (factor)", "label": " (label)"}[line.rule]
+        rows.append((line.category, line.name, line.title, line.strength + how, *strengths))
+    columns = ("category", "stressor", "what happens", "changes", "mild", "strong")
+    lines, pairs = [dataclasses.asdict(x) for x in STRESSORS], [list(pair) for pair in PAIRS]
+    console = told({"version": VERSION, "stressors": lines, "pairs": pairs}, json)
+    console.print(table_of(f"Stressors, version {VERSION}", columns, rows, left=columns[:4]))
+    console.print("Pairs, both mild: " + ", ".join(" + ".join(pair) for pair in PAIRS))
+
+
+def adversary(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="SUBMISSION",
+            help="Folder or name of a bundled submission.",
+            autocompletion=known_entries,
+        ),
+    ],
+    lung: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Lung to search on; may be repeated. Default: all.", autocompletion=known_lungs
+        ),
+    ] = None,
+    stressor: Annotated[
+        list[str] | None,
+        typer.Option(help="Stressor that may act; may be repeated. Default: all, and the rig."),
+    ] = None,
+    track: OneTrack = None,
+    plant: PlantName = "frozen",
+    in_process: InProcess = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", callback=claim_out, help="Write adversary.json and adversary.txt here."
+        ),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Search for the mildest plausible physics that makes a controller unsafe.
+
+    Severity 0 is the rig in the middle of the population, 1 the end of the range: a stressor at its
+    strong strength, or a rig three standard deviations away; what acts together adds as squares.
+    The exit code is 1 if something unsafe was found.
+
+    Example: `ventbench adversary pid_robust --lung R5C10`
+    """
+    from dataclasses import asdict
+
+    from ventbench.base import compilation
+    from ventbench.entries.adversary import adversary as search
+
+    compilation.keep()
+    with waiting(f"searching for what makes {name} unsafe"):
+        found = search(
+            name, simulator=plant, track=track, lungs=lung or (), stressors=stressor or (),
+            sandbox=not in_process,
+        )  # fmt: skip
+    values = {"submission": name, "lungs": [asdict(one) for one in found]}
+    text = "\n".join(line for one in found for line in one.lines())
+    emit(values, json)
+    typer.echo(text, err=str(json) == "-")
+    if out is not None:
+        files.write_json(out / "adversary.json", values)
+        files.write_text(out / "adversary.txt", text + "\n")
+    if any(one.severity is not None for one in found):
+        raise typer.Exit(1)
+
+
+COMMANDS = (score, transfer, new, check, headroom, stressors, adversary)

@@ -11,7 +11,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import require
 
 if TYPE_CHECKING:
-    from ventbench.train.pid_grid import PIDGrid
+    from ventbench.train.pid_search import PIDGrid
 
 #: Values of D that are shown beside the best one, %/cmH2O.
 SLICES = (0.0, 0.3, 1.0, 3.0, 10.0)

@@ -37,9 +37,9 @@ from ventbench.task import environment as env
 from ventbench.task.environment import Scenario, nominal_scenario
 from ventbench.task.interfaces import Controller, Plant
 from ventbench.task.metrics.score import run_error
-from ventbench.train.pid_grid import tune_pid
+from ventbench.train.pid_search import tune_pid
 from ventbench.train.plants import ALL, TrainedControllers, check_names, plants_to_train_on
-from ventbench.train.rl import episodes
+from ventbench.train.rl import environment
 from ventbench.train.rl.train import fresh_error
 
 
@@ -393,7 +393,7 @@ def train_residual(
                     checkpoint=_checkpoint(out, name, seed),
                     progress=lambda *how_far, about_it=about_it: progress(about_it, how_far),
                 )  # fmt: skip
-                lungs_of = episodes.Lungs(plants, jnp.asarray(weights))
+                lungs_of = environment.Lungs(plants, jnp.asarray(weights))
                 fresh.append(float(_fresh(lungs_of, each[seed][name])))
         chosen = seeds[int(np.argmin(fresh))]
         controllers[name] = each[chosen][name]

@@ -40,7 +40,7 @@ from ventbench.task.environment import nominal_scenario
 from ventbench.task.interfaces import Controller, Plant
 from ventbench.task.lungs import lung
 from ventbench.task.metrics.score import run_error
-from ventbench.train import pid_grid
+from ventbench.train import pid_search
 from ventbench.train.exploration import ExplorationRanges, SimulatedVentilator, explore
 from ventbench.train.residual import ResidualConfig, train_residual
 from ventbench.train.rigs.fit import FitConfig
@@ -102,7 +102,7 @@ def record(plant: Plant, path: Path, breaths: int, seed: int = 0) -> recordings.
 
 def gains() -> Floats:
     """Return the paper's gains without derivative part, %/cmH2O, shape ``(400, 3)``."""
-    grid = pid_grid.paper_gains()
+    grid = pid_search.paper_gains()
     return grid[grid[:, 2] == 0.0]
 
 
@@ -126,7 +126,7 @@ def tuned_on(simulator: Any, plant: Plant) -> dict[str, Any]:
     Returns:
         Gains, and errors on the simulator (``promised``) and on the rig, cmH2O.
     """
-    grid, _ = pid_grid.tune_pid([LUNG], simulator=simulator, gains=gains(), draws=0)
+    grid, _ = pid_search.tune_pid([LUNG], simulator=simulator, gains=gains(), draws=0)
     best, promised = grid.best(LUNG)
     nominal, drawn = errors(PID(*best), plant)
     return {"gains": list(best), "promised": promised, "rig": nominal, "draws": drawn.tolist()}

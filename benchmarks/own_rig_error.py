@@ -37,8 +37,7 @@ from ventbench.train.rigs.data import (
     inspirations,
     load_rig_recordings,
 )
-from ventbench.train.rigs.fit import FitConfig, Noise, fit, simulate
-from ventbench.train.rigs.parameters import Scales, centre, plants
+from ventbench.train.rigs.fit import FitConfig, Noise, Scales, centre, fit, plants, simulate
 from ventbench.train.rigs.train import UNRECORDED_SLOPE
 
 #: Mean open-loop errors of the paper's networks, cmH2O, in the order of the lungs.

@@ -24,7 +24,7 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS, LUNGS
-from ventbench.train import pid_grid
+from ventbench.train import pid_search
 
 #: Best gains P, I on the physical lung (paper, appendix); D is 0.
 PAPER = {
@@ -39,9 +39,9 @@ PAPER = {
 
 def timed(plants: Any, gains: np.ndarray) -> tuple[np.ndarray, float]:
     """Return errors, cmH2O, and steps/s without compilation."""
-    pid_grid.errors(jax.tree.map(lambda x: x[:1], plants), gains[: pid_grid.BATCH])
+    pid_search.errors(jax.tree.map(lambda x: x[:1], plants), gains[: pid_search.BATCH])
     started = time.perf_counter()
-    error = pid_grid.errors(plants, gains)
+    error = pid_search.errors(plants, gains)
     return error, error.size * protocol.INSPIRATION_STEPS / (time.perf_counter() - started)
 
 
@@ -49,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    gains = pid_grid.paper_gains()
+    gains = pid_search.paper_gains()
     error, rate = timed(frozen.load().plants, gains)
     _, textbook = timed(stack([single_compartment(lung) for lung in LUNGS]), gains)
 

@@ -14,7 +14,7 @@ from flax import linen as nn
 
 from ventbench.base.files import write_json
 from ventbench.train.rl import environment
-from ventbench.train.rl.episodes import advantages
+from ventbench.train.rl.environment import advantages
 from ventbench.train.rl.learners import clipped_loss, log_probability
 
 ITERATIONS = int(sys.argv[1]) if len(sys.argv) > 1 else 500

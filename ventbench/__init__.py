@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from ventbench.task.interfaces import Task as Task
     from ventbench.task.lungs import LUNGS as LUNGS
     from ventbench.task.lungs import Lung as Lung
-    from ventbench.train.pid_grid import tune_pid as tune_pid
+    from ventbench.train.pid_search import tune_pid as tune_pid
     from ventbench.train.residual import train_residual as train_residual
     from ventbench.train.rigs.train import train_rigs as train_rigs
     from ventbench.train.rl.train import train_dqn as train_dqn
@@ -89,7 +89,7 @@ _SOURCES = {
     "train_ppo": ("train.rl.train", "train_ppo"),
     "train_residual": ("train.residual", "train_residual"),
     "train_rigs": ("train.rigs.train", "train_rigs"),
-    "tune_pid": ("train.pid_grid", "tune_pid"),
+    "tune_pid": ("train.pid_search", "tune_pid"),
 }
 
 __all__ = sorted((*_SOURCES, "__version__"))  # pyright: ignore[reportUnsupportedDunderAll]

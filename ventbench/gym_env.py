@@ -34,8 +34,7 @@ from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.train.plants import plants_to_train_on
 from ventbench.train.rl import environment
-from ventbench.train.rl.environment import STEPS
-from ventbench.train.rl.episodes import Lungs
+from ventbench.train.rl.environment import STEPS, Lungs
 
 Floats = NDArray[np.float32]
 

@@ -23,7 +23,7 @@ from ventbench.plants.rigs import Rigs
 from ventbench.task import environment, protocol, rollouts
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import score as metric
-from ventbench.train import pid_grid
+from ventbench.train import pid_search
 
 AnyFloats = NDArray[np.floating]
 
@@ -39,7 +39,7 @@ COMPARABLE = 5.0
 EXAMPLE, EXAMPLE_PIP = "R20C20", 20.0
 
 
-def best_gains(grid: pid_grid.PIDGrid) -> Section:
+def best_gains(grid: pid_search.PIDGrid) -> Section:
     """The grid of PIDs (the paper's table 2); ``ventbench tune pid`` draws it."""
     rows: list[tuple[Cell, ...]] = []
     without = grid.gains[:, 2] == 0.0
@@ -82,12 +82,12 @@ def best_gains(grid: pid_grid.PIDGrid) -> Section:
 def beyond_the_grid(rigs: Rigs) -> Section:
     """P above the end of the grid (the paper's appendix A.2)."""
     rigs = rigs.of_training
-    drawn = rigs.draws(4, seed=pid_grid.TUNING_SEED, name=pid_grid.TUNING)
+    drawn = rigs.draws(4, seed=pid_search.TUNING_SEED, name=pid_search.TUNING)
     names = tuple(lung.id for lung in rigs.lungs)
     gains = np.array([(*pair, 0.0) for pair in itertools.product(BEYOND, BEYOND_I)])
     error = np.stack(
         [
-            pid_grid.drawn_errors(rigs, drawn, k, gains).mean(axis=-1)
+            pid_search.drawn_errors(rigs, drawn, k, gains).mean(axis=-1)
             .reshape(len(BEYOND), -1).min(axis=1)
             for k in range(len(names))
         ]
@@ -111,7 +111,7 @@ def beyond_the_grid(rigs: Rigs) -> Section:
     )  # fmt: skip
 
 
-def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -> Section:
+def example(official: frozen.Frozen, grid: pid_search.PIDGrid, residual: Floats) -> Section:
     """Trajectories of P-only, I-only, PID and residual (the paper's figures 2, 4 and 9).
 
     Args:
@@ -175,7 +175,7 @@ def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -
     )  # fmt: skip
 
 
-def performance(grid: pid_grid.PIDGrid, residual: Floats) -> Section:
+def performance(grid: pid_search.PIDGrid, residual: Floats) -> Section:
     """Residual network against the best PID of each lung (the paper's figure 7).
 
     Args:
@@ -208,7 +208,7 @@ def performance(grid: pid_grid.PIDGrid, residual: Floats) -> Section:
     )  # fmt: skip
 
 
-def robustness(grid: pid_grid.PIDGrid, own: Floats, residual: Floats) -> Section:
+def robustness(grid: pid_search.PIDGrid, own: Floats, residual: Floats) -> Section:
     """One controller for all lungs against one PID for all (the paper's figure 8).
 
     Args:

@@ -26,7 +26,7 @@ from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.train import pid_grid
+from ventbench.train import pid_search
 
 #: File of stored results.
 STORED = Path(__file__).with_name("stored.json")
@@ -68,9 +68,9 @@ def reproduce_paper(
         progress("errors by horizon", 0.0)
         kept["horizon"] = simulators.measure_horizon(Path(recordings) / MEASURED, kept["horizon"])
     progress("PID grid", 0.1)
-    gains = pid_grid.paper_gains()
-    error = pid_grid.errors(official.plants, gains)
-    grid = pid_grid.PIDGrid(LUNG_IDS, protocol.PIPS, gains, error)
+    gains = pid_search.paper_gains()
+    error = pid_search.errors(official.plants, gains)
+    grid = pid_search.PIDGrid(LUNG_IDS, protocol.PIPS, gains, error)
     with executor(workers) as pool:
         scored: dict[str, tuple[Floats, Floats]] = {}
         for name, result in results(pool, _scored, ENTRIES):

@@ -24,7 +24,7 @@ from ventbench.task import protocol, rollouts
 from ventbench.task.interfaces import Controller
 from ventbench.task.lungs import LUNGS
 from ventbench.task.metrics.score import run_error
-from ventbench.train import pid_grid
+from ventbench.train import pid_search
 from ventbench.train.residual import ResidualConfig, fit
 
 #: Published draws to score on.
@@ -138,8 +138,8 @@ def compare(
 
 def best_single(simulators: frozen.Frozen) -> Gains:
     """P, I, D of the paper's grid with the lowest mean error over the six lungs."""
-    grid = pid_grid.paper_gains()
-    error = pid_grid.errors(simulators.plants, grid).mean(axis=(0, 2))
+    grid = pid_search.paper_gains()
+    error = pid_search.errors(simulators.plants, grid).mean(axis=(0, 2))
     P, I, D = (float(gain) for gain in grid[int(np.argmin(error))])  # noqa: E741
     return P, I, D
 

@@ -5,27 +5,25 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from ventbench import simulation
+from proofs.studies import stitched
+from proofs.studies.stitched import Architecture, Training
 from ventbench.base import files
 from ventbench.base.executor import InProcess, executor
 from ventbench.base.resume import WorkFolder, kept_results
-from ventbench.plants.learned import Architecture
-from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings import Breaths, join, load
+from ventbench.simulation import mean_errors
 from ventbench.task.lungs import LUNG_IDS, RECORDED_LUNGS
 from ventbench.task.metrics import bootstrap
-from ventbench.train.learned import LearnedConfig, fit
 from ventbench.train.rigs.data import assign_folds
 
 #: Name of the variant that all others are compared with.
@@ -64,7 +62,7 @@ def compare(
     out: Path,
     *,
     base: Architecture = ARCHITECTURE,
-    config: LearnedConfig | None = None,
+    config: Training | None = None,
     members: int = MEMBERS,
     only: Sequence[str] | None = None,
     workers: int = 0,
@@ -92,11 +90,10 @@ def compare(
         InputError: if a recording is malformed, or ``out`` is of other trainings.
         OSError: if a file cannot be read or written.
     """
-    config = config or LearnedConfig()
+    config = config or Training()
     measured, reconstructed = load(folder / MEASURED), load(folder / RECONSTRUCTED)
     data = measured, reconstructed, assign_folds(measured, count=members, seed=SEED)
-    scored = np.isin(measured.lung_ids, LUNG_IDS)
-    judged, fold = measured.select(scored), data[-1][scored]
+    judged = measured.select(np.isin(measured.lung_ids, LUNG_IDS))
     hashes = {name: files.sha256(folder / name) for name in (MEASURED, RECONSTRUCTED)}
     chosen = {k: v for k, v in variants(base).items() if only is None or k in (BASE, *only)}
     about = {
@@ -105,10 +102,7 @@ def compare(
     }  # fmt: skip
     work = WorkFolder((out / "rows").resolve(), about)
     parts = {name.replace(" ", "-"): name for name in chosen}
-    jobs = {
-        part: (data, judged, fold, chosen[name], config, members, work.checkpoint(part))
-        for part, name in parts.items()
-    }
+    jobs = {part: (data, chosen[name], config, members) for part, name in parts.items()}
     finish(
         work, _judged, jobs, workers=workers,
         progress=lambda part, share: progress(parts[part], share),
@@ -152,60 +146,29 @@ def stored(breaths: pd.DataFrame) -> dict[str, Any]:
 
 
 def _judged(
-    data: TrainingData, judged: Breaths, fold: np.ndarray,
-    architecture: Architecture, config: LearnedConfig, members: int, checkpoint: Path,
-    tell: Tell | None,
-) -> list[float]:  # fmt: skip
-    """Train the networks of an architecture; errors as of :func:`_errors`."""
-    nets = _nets(data, architecture, config, members, checkpoint, tell or (lambda share: None))
-    return _errors(nets, judged, fold).tolist()
+    data: TrainingData, shape: Architecture, config: Training, members: int, tell: Tell | None
+) -> list[float]:
+    """Open-loop error of each scored breath by the network that has not seen it, cmH2O, ``(n,)``.
 
-
-def _train(
-    data: TrainingData, lung: str, number: int, architecture: Architecture,
-    config: LearnedConfig, checkpoint: Path,
-) -> Any:  # fmt: skip
-    """Train network ``number`` of a lung: its member does not see the fold of its own number."""
+    Each lung has a network a fold, which does not see the breaths of the fold.
+    """
     measured, reconstructed, fold = data
-    own = (measured.lung_ids == lung) & (fold != number // len(RECORDED_LUNGS))
-    breaths = [measured.select(own), reconstructed.select(reconstructed.lung_ids == lung)]
-    weights = (1.0, RECONSTRUCTED_WEIGHT)
-    both = join(breaths)
-    return fit(
-        both.u_in, both.u_out, both.dt, both.pressure, architecture=architecture, config=config,
-        seed=number, checkpoint=checkpoint,
-        weight=np.concatenate([np.full(len(b), w) for b, w in zip(breaths, weights, strict=True)]),
-    )  # fmt: skip
-
-
-def _nets(
-    data: TrainingData, architecture: Architecture, config: LearnedConfig,
-    count: int, checkpoint: Path, tell: Tell,
-) -> Any:  # fmt: skip
-    """Networks of the scored lungs, leaves ``(members, 6, ...)``."""
+    scored = np.isin(measured.lung_ids, LUNG_IDS)
+    judged = measured.select(scored)
+    error = np.full(len(judged), np.nan)
     ids = [lung.id for lung in RECORDED_LUNGS]
-    members = []
-    for member in range(count):
-        nets = []
-        for name in LUNG_IDS:
-            at = ids.index(name)
-            number = member * len(ids) + at
-            nets.append(_train(data, name, number, architecture, config, checkpoint))
-            tell((member + len(nets) / len(LUNG_IDS)) / count)
-        members.append(jax.tree.map(lambda *leaves: np.stack(leaves), *nets))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *members)
-
-
-def _errors(nets: Any, breaths: Breaths, fold: np.ndarray) -> np.ndarray:
-    """Open-loop error of each breath by the network that has not seen it, cmH2O, ``(n,)``."""
-    of = {int(k): int(f) for k, f in zip(breaths.breath_id, fold, strict=True)}
-
-    def plants_for(some: Breaths) -> VmappedPlant:
-        at = np.array([LUNG_IDS.index(name) for name in some.lung_ids.tolist()])
-        member = np.array([of[int(k)] for k in some.breath_id])
-        return VmappedPlant(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), nets))
-
-    return simulation.open_loop_errors(plants_for, breaths)
+    for member, (at, name) in itertools.product(range(members), enumerate(LUNG_IDS)):
+        seen = (measured.lung_ids == name) & (fold != member)
+        breaths = [measured.select(seen), reconstructed.select(reconstructed.lung_ids == name)]
+        weight = np.repeat([1.0, RECONSTRUCTED_WEIGHT], [len(part) for part in breaths])
+        seed = member * len(ids) + ids.index(name)
+        network = stitched.fit(join(breaths), weight, shape, config, seed)
+        simulated = stitched.simulate(network, judged.pressure[:, 0], judged.u_in, judged.dt)
+        unseen = (judged.lung_ids == name) & (fold[scored] == member)
+        error[unseen] = mean_errors(np.asarray(simulated), judged)[unseen]
+        if tell is not None:
+            tell((member + (at + 1) / len(LUNG_IDS)) / members)
+    return error.tolist()
 
 
 #: Called with what is trained and the share of all that is done.

@@ -23,8 +23,8 @@ from ventbench.plants import frozen
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS, Lung
 from ventbench.task.metrics import bootstrap
-from ventbench.train import pid_grid
-from ventbench.train.rl import episodes
+from ventbench.train import pid_search
+from ventbench.train.rl import environment
 from ventbench.train.rl.learners import PolicyGradient
 from ventbench.train.rl.train import METHODS, Method, method_for, train
 
@@ -198,7 +198,7 @@ def sample_efficiency(
     single = jax.tree.map(lambda leaf: leaf[at : at + 1], simulators.plants)
     lungs = jax.tree.map(
         lambda leaf: np.repeat(leaf[None], len(seeds), axis=0),
-        episodes.Lungs(
+        environment.Lungs(
             jax.tree.map(lambda leaf: leaf[None], single), jnp.ones((1, len(protocol.PIPS)))
         ),
     )
@@ -217,7 +217,7 @@ def sample_efficiency(
         curves.append(
             LearningCurve(name, trained.episodes, seconds, trained.compile_seconds, scores)
         )
-    grid = pid_grid.errors(single, pid_grid.paper_gains())[0].mean(axis=-1)
+    grid = pid_search.errors(single, pid_search.paper_gains())[0].mean(axis=-1)
     study = SampleStudy(lung.id, tuple(curves), float(curves[0].scores[0, 0]), float(grid.min()))
     files.write_text(out / "samples.csv", study.points().to_csv(index=False))
     files.write_text(out / "summary.csv", study.summary().to_csv(index=False))

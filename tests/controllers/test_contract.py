@@ -15,7 +15,7 @@ import pytest
 from jax import Array
 
 from ventbench.base.compilation import float64
-from ventbench.controllers import residual, rl_policy
+from ventbench.controllers import residual
 from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.task import protocol
@@ -42,16 +42,16 @@ def _script() -> Controller:
 
 
 def _policy(kind: type, outputs: int) -> Controller:
-    network = rl_policy.TanhNetwork((8,), outputs, first=0.2)
-    return kind(rl_policy.init_parameters(network, jax.random.key(1)), network)
+    network = residual.TanhNetwork((8,), outputs, first=0.2)
+    return kind(residual.init_parameters(network, jax.random.key(1)), network)
 
 
 #: Makes a controller of each family, in the precision that is in force.
 CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "pid": lambda: PID(2.0, 4.0, 0.3),
     "residual": _residual,
-    "gaussian_policy": lambda: _policy(rl_policy.GaussianPolicy, 1),
-    "greedy_policy": lambda: _policy(rl_policy.GreedyPolicy, len(rl_policy.CHOICES)),
+    "gaussian_policy": lambda: _policy(residual.GaussianPolicy, 1),
+    "greedy_policy": lambda: _policy(residual.GreedyPolicy, len(residual.CHOICES)),
     "script": _script,
 }
 

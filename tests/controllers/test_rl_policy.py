@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from ventbench.base import compilation
-from ventbench.controllers.rl_policy import (
+from ventbench.controllers.residual import (
     CHOICES,
     GaussianPolicy,
     GreedyPolicy,
     TanhNetwork,
     init_parameters,
-    save_weights,
+    save_policies,
 )
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
@@ -61,7 +61,7 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
     folder = tmp_path / name
     shutil.copytree(HERE / name, folder, ignore=shutil.ignore_patterns("__pycache__"))
     made = make(name)
-    save_weights(folder / "weights.npz", made)
+    save_policies(folder / "weights.npz", made)
     with compilation.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
         rigs = Rigs(LUNGS, plants)

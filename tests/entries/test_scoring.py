@@ -17,8 +17,6 @@ from ventbench.entries import cells
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
 from ventbench.entries.scoring import run_protocol, score
-from ventbench.physics import mechanism, physics
-from ventbench.plants.plant_files import save_plants
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
@@ -497,29 +495,6 @@ def test_one_command_scores_every_track_that_an_entry_enters(make, tmp_path):
         assert entry["lungs"] == scored(entry["track"])["lungs"]
         kept = json.loads((out / entry["name"] / entry["track"] / "score.json").read_text())
         assert kept["score"] == entry["score"]
-
-
-def test_a_score_on_a_corrected_simulator_has_the_given_one_beside_it(tmp_path):
-    """The title of the mechanism says why; the figures are those of two runs by themselves."""
-    path = tmp_path / "corrected.json"
-    slow = {"valve_delay": {"delay": 0.06}}
-    plants = {name: physics(lung(name), slow) for name in ("R5C20", "R20C50")}
-    save_plants(path, plants, {"corrected": "physics", "mechanisms": ["valve_delay"]})
-    words = ["score", "pid_robust", "--in-process", "--plant", str(path), "--json", "-"]
-    ended = CliRunner().invoke(app, words)
-    assert ended.exit_code == 0, ended.output
-    values = json.loads(ended.stdout)
-    alone = {x: score("pid_robust", simulator=x, sandbox=False) for x in ("physics", str(path))}
-    given = alone["physics"].summary()["score_cmH2O"]
-    assert values["given"]["lungs"] == {name: pytest.approx(given[name]) for name in plants}
-    assert values["given"]["score"] == pytest.approx(given[list(plants)].mean())
-    assert values["score"] == pytest.approx(alone[str(path)].score)
-    assert values["score"] > values["given"]["score"] + 0.1, "late valves are harder"
-    said = " ".join(ended.stderr.split())
-    assert mechanism("valve_delay").description.title in said
-    assert f"ventbench tune pid --plant {path}" in said
-    difference = values["score"] - values["given"]["score"]
-    assert f"({difference:+.3f})" in said
 
 
 def test_a_folder_runs_in_the_sandbox_unless_told_otherwise(make, two_lungs):

@@ -30,7 +30,6 @@ from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.corrected import Corrected
-from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.plant_files import FAMILIES, PlantFamily, save_plants
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
@@ -38,9 +37,6 @@ from ventbench.task import protocol, waveform
 from ventbench.task.interfaces import Plant, Signals
 from ventbench.task.lungs import LUNG_IDS, Lung, lung
 from ventbench.task.rollouts import open_loop
-
-SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
-SELU = Architecture(width=24, depth=4, boundaries=0, activation="selu")
 
 #: The two ends of the scored settings.
 STIFF_AND_SOFT = ("R5C10", "R20C50")
@@ -68,10 +64,6 @@ EXAMPLES = {
     "physics": {"R5C10": partial(bent, "R5C10")},
     "corrected": {"R20C50": partial(corrected, "R20C50")},
     "hybrid": {name: partial(official, name) for name in STIFF_AND_SOFT},
-    "learned": {
-        "tanh": lambda: learned(jax.random.key(0), SMALL),
-        "selu": lambda: learned(jax.random.key(1), SELU),
-    },
 }
 
 
@@ -88,7 +80,7 @@ def cases(families: Mapping[str, PlantFamily]) -> dict[str, Callable[[], Any]]:
 
 
 PLANTS = cases(FAMILIES)
-TEXTBOOK = [name for name in PLANTS if not name.startswith(("hybrid", "learned"))]
+TEXTBOOK = [name for name in PLANTS if not name.startswith("hybrid")]
 FROZEN = [name for name in PLANTS if name.startswith("hybrid")]
 PHYSICS = TEXTBOOK + FROZEN
 #: Commands that hold PEEP while the expiratory valve is open, %: in the recordings, and so in what
@@ -267,11 +259,6 @@ def test_nominal_variation_changes_nothing(name):
 def test_a_larger_gain_gives_more_pressure(name):
     plant, one = PLANTS[name](), jnp.asarray(1.0)
     u_in = np.full((1, T), 12.0)
-    if name.startswith("learned"):  # untrained: a larger flow is a larger R and 1 / C
-        scale = jnp.asarray(1.2)
-        wanted = pressures(plant.vary(scale, 1.0 / scale), u_in)
-        np.testing.assert_allclose(pressures(plant.vary(one, one, scale), u_in), wanted, rtol=1e-5)
-        return
     more = pressures(plant.vary(one, one, jnp.asarray(1.2)), u_in)
     assert np.all(more[..., 10] > pressures(plant, u_in)[..., 10] + 0.3)
 
@@ -281,7 +268,7 @@ def test_its_parameters_are_physics_that_answer_alike(name):
     plant = PLANTS[name]()
     known = plant.parameters()
     if known is None:
-        assert name.startswith(("learned", "two_balloon"))
+        assert name.startswith("two_balloon")
         return
     u_in = np.where(np.arange(T) < 20, 18.0, 12.0)
     said = physics(lung("R5C10")).having(**known)

@@ -18,18 +18,15 @@ from ventbench.entries.cells import InProcessRunner
 from ventbench.physics import physics
 from ventbench.plants import frozen, plant_files
 from ventbench.plants.corrected import Corrected
-from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.plant_files import load_plant, load_plants, save_plant, save_plants
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, stack_heterogeneous, take
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.task.lungs import LUNGS, lung
 
-SMALL = Architecture(pressures=3, controls=4, width=8, depth=2, boundaries=1, boundary_width=4)
 PLANTS = {
     "SingleCompartment": lambda: stack([single_compartment(lung) for lung in LUNGS]),
     "TwoBalloon": lambda: two_balloon(LUNGS[0]),
-    "Learned": lambda: learned(jax.random.key(0), SMALL),
     "Hybrid": lambda: frozen.load().ensemble,
     "Corrected": lambda: Corrected(
         single_compartment(LUNGS[0]), physics(LUNGS[0], {"valve_lag": {"tau": 0.04}}),
@@ -56,7 +53,7 @@ def test_back_to_the_bit_with_dtype_shape_and_type(kind, tmp_path):
 def test_every_family_is_tried():
     families = {family.plant.__name__ for family in plant_files.FAMILIES.values()}
     assert families == set(PLANTS)
-    for name in (*families, "Boundary", "MLP"):  # parts of a learned plant, and so in its file
+    for name in families:
         assert plant_files.stored_type(name).__name__ == name
 
 

@@ -1,4 +1,4 @@
-"""Simulators in plain Python and NumPy: functions of any signature, classes, objects, messages."""
+"""Simulators in plain Python and NumPy: functions, classes, objects, messages."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def by_names(u_in, u_out, dt, *, R, C, initial_pressure):
     return initial_pressure + R * u_in / 100.0 + C * dt
 
 
-def short(u, v, h):
-    return 5.0 + u
+def short(u_in):
+    return 5.0 + u_in
 
 
 def of_time_and_flow(time, u_in, flow=None):
@@ -150,7 +150,8 @@ class TwoPressures:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (lambda u, v, h, valve: u, "needs valve, which a diagnosis does not have"),
+        (lambda u_in, dt, valve: u_in, "needs valve, which a diagnosis does not have"),
+        (lambda u, v, h: u, r"needs u, v, h, .* called as f\(u_in, u_out, dt"),
         (NoStep, "is a class without `step`"),
         (OddStep, r"step takes 1 arguments; step\(u_in, u_out, dt\) is wanted"),
         (ForgetsReset(), "from breath to breath; give it reset"),

@@ -13,8 +13,8 @@ from ventbench.plants.hybrid import RELIEF, RELIEF_ROOM, Hybrid
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS, RECORDED_LUNGS
 from ventbench.task.rollouts import open_loop
+from ventbench.train.rigs.fit import LAMINAR_SHARE
 from ventbench.train.rigs.label_test import label_tests
-from ventbench.train.rigs.parameters import LAMINAR_SHARE
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from ventbench.base import compilation
 from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
 from ventbench.physics import physics
-from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.stacking import (
     VmappedPlant,
@@ -29,17 +27,16 @@ from ventbench.task.rollouts import open_loop
 
 single_compartments = partial(nominal_plants, single_compartment)
 two_balloons = partial(nominal_plants, two_balloon)
-SMALL = Architecture(pressures=3, controls=4, width=8, depth=2, boundaries=1, boundary_width=4)
 N, T = 3, 12
 
 
 @pytest.mark.parametrize(
     "plants",
     [
-        stack([learned(jax.random.key(i), SMALL) for i in range(N)]),
+        stack([two_balloon(lung) for lung in LUNGS[:N]]),
         stack([single_compartment(lung) for lung in LUNGS[:N]]),
     ],
-    ids=["networks", "textbook"],
+    ids=["balloons", "textbook"],
 )
 def test_each_row_has_its_own_plant(plants):
     rng = np.random.default_rng(0)

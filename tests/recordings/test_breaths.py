@@ -170,10 +170,6 @@ def test_padding_and_inferred_times_are_written_as_they_were_read(rows, write_cs
     again = (tmp_path / "again.csv").read_text().splitlines()
     assert len(again) == 17
     assert again[-1].split(",")[4] == ""
-    write(breaths, tmp_path / "filled.csv", blank_inferred=False)
-    filled = load(tmp_path / "filled.csv", pad=True)
-    assert not filled.time_inferred.any()
-    np.testing.assert_array_equal(filled.time, breaths.time)
 
 
 def test_what_cannot_be_written(make, tmp_path):
@@ -220,6 +216,10 @@ def test_joined_breaths_are_in_order_and_without_a_source(make):
         assert not getattr(both, name).flags.writeable
     assert both.lung_ids.tolist() == [*one.lung_ids, *two.lung_ids]
     assert (both.source, both.sha256, both.flow, both.volume) == (None, None, None, None)
+    twice = join([one, one])
+    assert one.flow is not None
+    assert twice.flow is not None
+    np.testing.assert_array_equal(twice.flow, np.concatenate([one.flow, one.flow]))
     assert both.notes == ("first", "second", "third")
 
 
@@ -231,11 +231,14 @@ def test_join_of_one_recording_leaves_it_as_it_is(make):
     assert one.source == "a.csv"
 
 
-def test_join_refuses_nothing_and_unequal_lengths(make):
+def test_joined_breaths_of_unequal_lengths_are_padded(make):
+    long, short = make(2), make(2, samples=6)
+    both = join([long, short])
+    assert both.valid.sum(axis=1).tolist() == [8, 8, 6, 6]
+    np.testing.assert_array_equal(both.pressure[2:, :6], short.pressure)
+    np.testing.assert_array_equal(both.u_in[:2], long.u_in)
     with pytest.raises(InputError, match="no recordings to join"):
         join([])
-    with pytest.raises(InputError, match=r"breaths of \[6, 8\] samples.*cut them to 6 samples"):
-        join([make(2), make(2, samples=6)])
 
 
 def test_a_folder_is_a_session_whose_recordings_are_joined(make, tmp_path):

@@ -15,7 +15,7 @@ from ventbench.recordings import Breaths, make_breaths
 from ventbench.task.lungs import RECORDED_LUNGS, Lung
 from ventbench.task.rollouts import open_loop
 from ventbench.train.rigs.data import groups_of
-from ventbench.train.rigs.parameters import Pooled, centre, plants
+from ventbench.train.rigs.fit import Pooled, centre, plants
 
 SAMPLES, INSPIRATORY = 45, 30
 

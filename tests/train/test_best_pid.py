@@ -8,8 +8,8 @@ import pytest
 from ventbench.entries.reference import PID_GAINS
 from ventbench.plants.rigs import load_rigs
 from ventbench.task.draws import COUNT
-from ventbench.train import best_pid
-from ventbench.train.pid_grid import drawn_errors
+from ventbench.train import pid_search
+from ventbench.train.pid_search import drawn_errors
 
 
 @pytest.mark.slow
@@ -22,7 +22,7 @@ def test_no_neighbour_of_the_published_gains_and_no_pid_of_the_paper_is_better()
     for lung, gains in enumerate(np.array(PID_GAINS)):
         tried = np.concatenate([gains[None], gains * corners, paper])
         errors = drawn_errors(rigs, drawn, lung, tried).mean(axis=-1)
-        assert errors[0] <= errors.min() + best_pid.AGREEMENT, lung
+        assert errors[0] <= errors.min() + pid_search.AGREEMENT, lung
 
 
 def test_a_search_finds_what_it_is_told_of(monkeypatch):
@@ -33,11 +33,11 @@ def test_a_search_finds_what_it_is_told_of(monkeypatch):
         away = np.log(np.maximum(np.asarray(gains, float), 1e-9)) - optimum
         return np.sum(away**2, axis=-1)[..., None]
 
-    monkeypatch.setattr(best_pid, "drawn_errors", errors)
-    found = best_pid.best_pids(load_rigs(), drawn=load_rigs().of_training.draws(1))
+    monkeypatch.setattr(pid_search, "drawn_errors", errors)
+    found = pid_search.best_pids(load_rigs(), drawn=load_rigs().of_training.draws(1))
     assert found.agree.all()
     np.testing.assert_allclose(np.log(found.gains), np.tile(optimum, (6, 1)), atol=0.03)
-    result = best_pid.tune_beyond(["R5C10", "R20C50"], draws=1)
+    result = pid_search.tune_beyond(["R5C10", "R20C50"], draws=1)
     assert list(result["lungs"]) == ["R5C10", "R20C50"]
     for entry in (*result["lungs"].values(), result["single"]):
         np.testing.assert_allclose(np.log(entry["gains"]), optimum, atol=0.03)

@@ -25,8 +25,8 @@ from ventbench.task import draws, protocol, rollouts
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.lungs import LUNG_IDS, LUNGS
 from ventbench.task.metrics.score import run_error
-from ventbench.train import pid_grid
-from ventbench.train.pid_grid import PIDGrid
+from ventbench.train import pid_search
+from ventbench.train.pid_search import PIDGrid
 from ventbench.train.plants import plants_to_train_on
 
 GAINS = np.array([(p, i, d) for p in (0.0, 2.0, 5.0) for i in (0.0, 4.0) for d in (0.0, 1.0)])
@@ -35,7 +35,7 @@ PLANTS = {lung.id: single_compartment(lung) for lung in LUNGS[:3]}
 
 @pytest.fixture(scope="module")
 def whole() -> PIDGrid:
-    error = pid_grid.errors(stack(list(PLANTS.values())), GAINS)
+    error = pid_search.errors(stack(list(PLANTS.values())), GAINS)
     return PIDGrid(tuple(PLANTS), protocol.PIPS, GAINS, error)
 
 
@@ -69,7 +69,7 @@ def test_the_picture_has_a_row_a_lung_and_one_for_all(whole):
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(pid_grid, "paper_gains", lambda: GAINS)
+    monkeypatch.setattr(pid_search, "paper_gains", lambda: GAINS)
 
 
 def test_the_command_writes_table_plot_and_result(small, tmp_path):
@@ -86,7 +86,7 @@ def test_the_command_writes_table_plot_and_result(small, tmp_path):
     weights, totals = plants_to_train_on().weights, np.zeros(len(GAINS))
     for k, name in enumerate(LUNG_IDS):
         rigs = list(official.training_rigs[k])
-        each = pid_grid.errors(jax.tree.map(lambda x, r=rigs: x[0, r], official.members), GAINS)
+        each = pid_search.errors(jax.tree.map(lambda x, r=rigs: x[0, r], official.members), GAINS)
         error = each.mean(axis=0)
         best = int(np.argmin(error @ weights[k]))
         assert result["lungs"][name]["gains"] == list(GAINS[best])
@@ -113,7 +113,7 @@ def test_the_command_wants_to_know_which_lungs(which, tmp_path):
 
 
 def test_the_papers_values():
-    gains = pid_grid.paper_gains()
+    gains = pid_search.paper_gains()
     assert gains.shape == (8000, 3)
     for column in gains.T:
         expected = [*np.arange(10) / 10, *range(1, 11)]
@@ -136,15 +136,16 @@ def test_an_error_is_that_of_the_scored_run():
             ]
             for lung in range(2)
         ]
-    found = pid_grid.errors(plants, gains)
+    found = pid_search.errors(plants, gains)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
 
 
-def test_the_last_batch_may_be_short():
+def test_the_last_batch_may_be_short(monkeypatch):
     plants = stack([single_compartment(LUNGS[0])])
     gains = np.array([(p, 1.0, 0.0) for p in range(5)], float)
-    whole = pid_grid.errors(plants, gains)
-    np.testing.assert_allclose(pid_grid.errors(plants, gains, batch=2), whole, 1e-6)
+    whole = pid_search.errors(plants, gains)
+    monkeypatch.setattr(pid_search, "BATCH", 2)
+    np.testing.assert_allclose(pid_search.errors(plants, gains), whole, 1e-6)
 
 
 #: Two good PIDs and a bad one.
@@ -154,21 +155,21 @@ PIDS = np.array([(2.0, 4.0, 0.0), (5.0, 5.0, 0.0), (0.0, 0.1, 0.0)])
 @pytest.mark.slow
 def test_gains_are_tuned_on_draws_of_their_own():
     told = []
-    grid, result = pid_grid.tune_pid(gains=PIDS, draws=2, progress=lambda *x: told.append(x))
+    grid, result = pid_search.tune_pid(gains=PIDS, draws=2, progress=lambda *x: told.append(x))
     assert told[-1] == (6 * 3 * 6, 6 * 3 * 6)
     assert grid.lungs == tuple(result["lungs"]) == LUNG_IDS
     good = [list(gains) for gains in PIDS[:2]]
     assert all(entry["gains"] in good for entry in result["lungs"].values())
     assert result["single"]["gains"] in good
     assert result["draws"] == 2
-    assert pid_grid.TUNING_SEED != draws.DEVELOPMENT_SEED
+    assert pid_search.TUNING_SEED != draws.DEVELOPMENT_SEED
 
 
 @pytest.mark.slow
 def test_an_error_on_draws_is_that_of_the_scorer():
     rigs = load_rigs("single_compartment")
-    drawn = draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=pid_grid.TUNING_SEED, n=1)
-    found = pid_grid.drawn_errors(rigs, drawn, 2, PIDS[:1])
+    drawn = draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=pid_search.TUNING_SEED, n=1)
+    found = pid_search.drawn_errors(rigs, drawn, 2, PIDS[:1])
 
     class Controller:
         def reset(self, task):

@@ -33,8 +33,8 @@ from ventbench.task import draws, protocol, rollouts
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.lungs import LUNG_IDS, LUNGS
 from ventbench.task.metrics.score import run_error
-from ventbench.train import pid_grid
-from ventbench.train.pid_grid import tune_pid
+from ventbench.train import pid_search
+from ventbench.train.pid_search import tune_pid
 from ventbench.train.plants import ALL, plants_to_train_on
 from ventbench.train.residual import (
     CHUNK,
@@ -283,7 +283,7 @@ PIDS = np.array([(2.0, 4.0, 0.0), (5.0, 5.0, 0.0)])
 
 @pytest.mark.slow
 def test_the_command_trains_and_tells(monkeypatch, tmp_path):
-    monkeypatch.setattr(pid_grid, "paper_gains", lambda: PIDS)
+    monkeypatch.setattr(pid_search, "paper_gains", lambda: PIDS)
     arguments = ["train", "residual", "--lung", "R20C50", "--updates", "3", "--members", "1"]
     run = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path), "--json", "-"])
     assert run.exit_code == 0, run.output

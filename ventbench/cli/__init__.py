@@ -16,16 +16,16 @@ from ventbench.cli import (
     score,
     simulators,
     train,
-    tune,
 )
 
 app = options.program("ventbench", "A benchmark for the control of mechanical ventilators.")
 
-for _module in (score, tune, simulators, diagnose):
+for _module in (score, simulators, diagnose):
     for _command in _module.COMMANDS:
         app.command(_command.__name__.replace("_", "-"))(_command)
 app.command()(doctor.doctor)
-for _module in (tune, train, board, round, data):
+app.add_typer(train.tune)
+for _module in (train, board, round, data):
     app.add_typer(_module.app)
 
 

@@ -1,13 +1,18 @@
-"""``ventbench score``, ``transfer``, ``new`` and ``check``: work on submissions."""
+"""``ventbench score``, ``transfer``, ``new``, ``check``: work on submissions; and limits of scores.
+
+The limits are the bounds of any controller (``headroom``), and how little missing physics is too
+much (``stressors``, ``adversary``).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ventbench.base import files
 from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     Entries,
@@ -21,10 +26,12 @@ from ventbench.cli.options import (
     claim_out,
     emit,
     known_entries,
+    known_lungs,
     notes,
     of_each_entry,
     table_of,
     told,
+    waiting,
 )
 
 if TYPE_CHECKING:
@@ -99,8 +106,7 @@ def score(
     on the reference rig of each lung; lower is better. With `--draws 20` the ranked score stands
     beside it: normalised, on all rigs of each lung, and the score under missing physics. Each
     controller runs in sandboxed processes that have no access to the simulators. With another
-    `--plant` the lungs are those of that plant, and the score is not official; beside a score on a
-    `corrected.json` stands that on the simulator that was corrected. Several controllers
+    `--plant` the lungs are those of that plant, and the score is not official. Several controllers
     are scored in turn, or at the same time with `--workers` or `--scheduler`.
 
     Example: `ventbench score submissions/pid_best --json score.json`
@@ -112,7 +118,6 @@ def score(
     from ventbench.entries.folder import open_submission
     from ventbench.entries.runs import DRAWS
     from ventbench.plants.catalog import load_simulators
-    from ventbench.plants.catalog import names as simulator_names
 
     if record is not None and (draws < 20 or stress not in (None, 0, DRAWS)):
         raise InputError(f"--record needs all published draws: add --draws 20 --stress {DRAWS}")
@@ -126,7 +131,7 @@ def score(
         raise InputError(f"two submissions have the same name: {', '.join(sorted(entries))}")
     if record is not None and plant != "frozen":
         raise InputError("--record needs the official simulators: leave out --plant")
-    tested = load_simulators(plant)  # whatever is wrong with it is told before anything runs
+    load_simulators(plant)  # whatever is wrong with it is told before anything runs
     if stress and track is None:
         track = "robustness"
     if stress is None:
@@ -141,36 +146,12 @@ def score(
     work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process)
     scores = of_each_entry("scoring", work, jobs, workers, scheduler)
     results = [result.to_json() for result in scores]
-    given = str(tested.origin.get("corrected", ""))
-    if given in simulator_names():
-        before = partial(_run, simulator=given, draws=0, sandbox=not in_process)
-        what = f"scoring on {given}, which was corrected,"
-        unstressed = [(entry, each, 0) for entry, each, _ in jobs]
-        for values, other in zip(
-            results, of_each_entry(what, before, unstressed, workers, scheduler), strict=True
-        ):
-            values["given"] = _given(given, other.to_json(), values)
     console = told(results[0] if len(results) == 1 else {"submissions": results}, json)
-    console.print(_table(results))
-    if given in simulator_names():
-        console.print(_corrected_table(results))
-        _why_corrected(console, tested.origin, given, plant)
-    if all(entry["normalised"] is not None for entry in results):
-        console.print(_normalised_table(results))
-    if any(values["stress"] for values in results):
-        console.print(_stress_table([values["stress"] for values in results if values["stress"]]))
-        _compare(console, scores)
-    because = dict.fromkeys(reason for result in scores for reason in result.not_official_because)
-    if because:
-        typer.secho(f"These scores are not official: {', '.join(because)}.", fg="yellow", err=True)
-    failures = [
-        failure
-        for result in scores
-        for failures in (result.failures, result.stressed.failures if result.stressed else ())
-        for failure in failures[:3]
-    ]
-    for failure in failures:
-        typer.secho(failure.message, fg="red", err=True)
+    for result in scores:
+        console.print(str(result), soft_wrap=True, markup=False, highlight=False)
+    if len(scores) > 1 or draws:
+        console.print(_table(results))
+    _compare(console, scores)
     if out is not None:
         for path in _keep(out, scores, report):
             console.print(f"wrote {path}", soft_wrap=True)
@@ -181,7 +162,7 @@ def score(
         drafts = [create.create(result, frozen.load()) for result in scores]
         for path in [draft.save(record) for draft in drafts]:
             console.print(f"wrote {path}", soft_wrap=True)
-    if failures:
+    if any(result.failed for result in scores):
         raise typer.Exit(1)
 
 
@@ -194,142 +175,45 @@ def _run(
     return scoring.score(entry, track=track, stress=stress, progress=progress, **options)
 
 
-def _shown(value: float | None, digits: int = 3) -> str:
-    return "failed" if value is None else f"{value:.{digits}f}"
+def _table(results: list[dict[str, Any]]) -> Table:
+    """Scores side by side, a row each, with their 95 % intervals."""
 
-
-def _by_lung(
-    title: str, scores: list[dict[str, Any]], cell: Callable[[dict[str, Any], str], str],
-    total: Callable[[dict[str, Any]], str],
-) -> Table:  # fmt: skip
-    """Return a table with a row for each lung and the mean, and a column for each submission."""
-    columns = ("lung", *(f"{entry['name']}\n{entry['track']}" for entry in scores))
-    rows = ((lung, *(cell(entry, lung) for entry in scores)) for lung in scores[0]["lungs"])
-    table = table_of(title, columns, rows)
-    table.add_section()
-    table.add_row("mean", *map(total, scores), style="bold")
-    return table
-
-
-def _add_interval(table: Table, drawn: list[dict[str, Any]], digits: int = 3) -> None:
-    limits = ("..".join(_shown(limit, digits) for limit in own["ci95"]) for own in drawn)
-    table.add_row("95 % interval", *limits)
-
-
-def _table(scores: list[dict[str, Any]]) -> Table:
-    """Return the paper's scores."""
-    table = _by_lung(
-        "Mean |pressure - target|, cmH2O (lower is better)", scores,
-        lambda entry, lung: _shown(entry["lungs"][lung]["score"]),
-        lambda entry: _shown(entry["score"]),
-    )  # fmt: skip
-    if scores[0]["draws"]:
-        drawn = [entry["draws"] for entry in scores]
-        table.add_row("mean of the draws", *(_shown(own["score"]) for own in drawn))
-        _add_interval(table, drawn)
-    return table
-
-
-def _given(name: str, before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
-    """Score on the simulators that were corrected, on the lungs of the corrected ones."""
-    lungs = {lung: before["lungs"].get(lung, {"score": None})["score"] for lung in after["lungs"]}
-    known = None not in lungs.values()
-    score = sum(filter(None, lungs.values())) / len(lungs) if known else None
-    return {"simulators": name, "score": score, "lungs": lungs}
-
-
-def _corrected_table(results: list[dict[str, Any]]) -> Table:
-    """Return each entry's score before and after the correction."""
-
-    def cells(given: float | None, corrected: float | None) -> str:
-        if given is None or corrected is None:
+    def shown(values: dict[str, Any] | None, digits: int) -> str:
+        if values is None:
+            return "-"
+        if values["score"] is None:
             return "failed"
-        return f"{given:.3f} -> {corrected:.3f} ({corrected - given:+.3f})"
+        low, high = values.get("ci95", (None, None))
+        interval = "" if low is None or high is None else f" {low:.{digits}f}..{high:.{digits}f}"
+        return f"{values['score']:.{digits}f}{interval}"
 
-    name = results[0]["given"]["simulators"]
-    return _by_lung(
-        f"From {name}, the given simulator, to the corrected one, cmH2O", results,
-        lambda entry, lung: cells(entry["given"]["lungs"][lung], entry["lungs"][lung]["score"]),
-        lambda entry: cells(entry["given"]["score"], entry["score"]),
+    rows = []
+    for values in results:
+        normalised, stress = values["normalised"], values["stress"]
+        ranked = normalised and (normalised["draws"] or {"score": normalised["nominal"]})
+        survived = "-" if stress is None else f"{100 * stress['survived']:.1f} %"
+        scores = (shown(values, 3), shown(values["draws"], 3), shown(ranked, 1), shown(stress, 3))
+        rows.append((f"{values['name']}, {values['track']}", *scores, survived))
+    return table_of(
+        "Mean |pressure - target|, cmH2O (lower is better)",
+        ("entry", "nominal", "draws", "normalised", "missing physics", "survived"), rows,
+        caption="normalised: 0 = best attainable, 100 = best PID",
     )  # fmt: skip
-
-
-def _why_corrected(console: Console, origin: Mapping[str, Any], given: str, plant: str) -> None:
-    """Say why the scores differ, and what to do."""
-    from ventbench.physics.catalogue import everything
-
-    known = everything()
-    titles = [
-        known[name].description.title if name in known else name
-        for name in origin.get("mechanisms", ())
-    ]
-    lacks = ", ".join(titles) or "what its refitted parameters and unnamed term stand for"
-    console.print(
-        f"They differ because {given} lacks what the recording has: {lacks}. A controller that was "
-        f"tuned on {given} does not know it: tune on the corrected simulator, "
-        f"`ventbench tune pid --plant {plant}`.",
-        soft_wrap=True,  # the command can be copied
-    )
-
-
-def _normalised_table(scores: list[dict[str, Any]]) -> Table:
-    """Return the normalised scores."""
-
-    def mean(values: dict[str, Any]) -> str:
-        own = values["normalised"]
-        return _shown((own["draws"] or {"score": own["nominal"]})["score"], 1)
-
-    over = "over the draws" if scores[0]["draws"] else "nominal"
-    table = _by_lung(
-        f"Normalised score, {over}: 0 = best attainable, 100 = best PID", scores,
-        lambda entry, lung: mean(entry["lungs"][lung]), mean,
-    )  # fmt: skip
-    if scores[0]["draws"]:
-        _add_interval(table, [entry["normalised"]["draws"] for entry in scores], 1)
-    return table
-
-
-def _stress_table(scores: list[dict[str, Any]]) -> Table:
-    """Return a table of scores under missing physics: figures, then a row for each category."""
-    title = "Missing physics: mean |airway pressure - PIP|, cmH2O (lower is better)"
-    table = table_of(title, ("", *(entry["name"] for entry in scores)))
-    for column in table.columns[1:]:
-        column.overflow = "fold"
-    table.add_row("all stressors", *(_shown(entry["score"]) for entry in scores), style="bold")
-    if None not in scores[0]["ci95"]:
-        _add_interval(table, scores, 2)
-
-    def add(name: str, text: Callable[[dict[str, Any]], str]) -> None:
-        table.add_row(name, *map(text, scores))
-
-    add("without stressors", lambda e: _shown(e["unstressed"]))
-    add("runs survived", lambda e: f"{100 * e['survived']:.1f} %")
-    add("unsafe runs", lambda e: f"{e['unsafe_runs']} of {e['stressed_runs']}")
-    add("longest above PIP + 15 %, mean, s", lambda e: _shown(e["above_alarm_s"], 2))
-    add("worst", lambda e: f"{_shown(e['worst_error'], 2)}\n{e['worst_condition']}")
-    table.add_section()
-    for category in scores[0]["categories"]:
-        each = [entry["categories"][category] for entry in scores]
-        shown = (
-            f"{_shown(e['error_cmH2O'], 2)}, {100 * e['survived']:.0f} % survived" for e in each
-        )
-        table.add_row(category, *shown)
-    return table
 
 
 def _compare(console: Console, scores: list[Score]) -> None:
     """Paired differences under missing physics to the first entry."""
     import math
 
-    first, *others = [score for score in scores if score.stressed is not None]
-    assert first.stressed is not None
-    for score in others:
-        assert score.stressed is not None
-        difference, (low, high) = score.stressed.difference(first.stressed)
+    stressed = [(score.submission.manifest.name, score.stressed) for score in scores]
+    found = [(name, runs) for name, runs in stressed if runs is not None]
+    for name, runs in found[1:]:
+        first, base = found[0]
+        difference, (low, high) = runs.difference(base)
         if math.isfinite(difference):
             console.print(
-                f"{score.submission.manifest.name} less {first.submission.manifest.name}: "
-                f"{difference:+.3f} cmH2O, paired 95 % interval {low:+.3f}..{high:+.3f}"
+                f"{name} less {first}: {difference:+.3f} cmH2O, paired 95 % interval "
+                f"{low:+.3f}..{high:+.3f}"
             )
 
 
@@ -364,8 +248,6 @@ def transfer(
 
     Example: `ventbench transfer pid_best residual_mlp --json transfer.json`
     """
-    from rich.text import Text
-
     from ventbench.entries import scoring as transfers
     from ventbench.entries.cells import runner_of
     from ventbench.entries.folder import open_submission
@@ -383,17 +265,13 @@ def transfer(
     plants = results[0]["groups"]
     columns = ("entry", *(f"{group}\n{plants[group]['plants']} plants" for group in plants))
     errors = [[result["groups"][group]["error_cmH2O"] for group in plants] for result in results]
-    best = [
-        min((x for x in own if x is not None), default=None) for own in zip(*errors, strict=True)
-    ]
-    rows = []
-    for result, own in zip(results, errors, strict=True):
-        texts = ("-" if value is None else f"{value:.3f}" for value in own)
-        cells = (
-            Text(text, "bold") if value == least else text
-            for text, value, least in zip(texts, own, best, strict=True)
+    rows = [
+        (
+            f"{result['name']}, {result['track']}",
+            *("-" if value is None else f"{value:.3f}" for value in own),
         )
-        rows.append((f"{result['name']}, {result['track']}", *cells))
+        for result, own in zip(results, errors, strict=True)
+    ]
     title = "Mean |pressure - target| on rigs, cmH2O (lower is better)"
     told({"entries": results}, json).print(table_of(title, columns, rows))
 
@@ -462,4 +340,165 @@ def check(
         raise typer.Exit(1)
 
 
-COMMANDS = (score, transfer, new, check)
+#: Cells of the second optimiser: every so many of all.
+_EVERY = 31
+
+
+def headroom(
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File of the reference errors.")] = Path(
+        "runs/bounds-v2.npz"
+    ),
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Check a file instead of making one: its commands must attain its errors, and a "
+            "second optimiser must find nothing better.",
+        ),
+    ] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    json: JsonFile = None,
+) -> None:
+    """Compute the best attainable error and the best PID of every cell of the development draws.
+
+    Commands are optimised for each cell with everything known; the best PID of a lung is searched
+    for without a grid's edge, on the rigs of the training. Takes minutes; the same command
+    continues.
+
+    Example: `ventbench headroom --check data/bounds-v2.npz`
+    """
+    import numpy as np
+
+    from ventbench.base.executor import executor
+    from ventbench.entries import reference as references
+    from ventbench.plants.rigs import load_rigs
+    from ventbench.task import draws, protocol
+    from ventbench.train.pid_search import best_pids
+
+    rigs = load_rigs()
+    drawn = rigs.draws(draws.COUNT)
+    plants, cells = rigs.cells(drawn, protocol.PIPS)
+    about = references.settings(rigs.about, drawn.about())
+    if check is not None:
+        computed = references.load(check)
+        references.reference_of(rigs.about, drawn.about(), computed)
+        result = references.checked(computed, plants, cells, every=_EVERY)
+        console = told(result, json)
+        for key, value in result.items():
+            console.print(f"{key}: {value}")
+        if not result["sound"]:
+            raise typer.Exit(1)
+        return
+    parts = out.with_suffix(".parts")
+    with bar("best PID of each lung") as progress:
+        pids = best_pids(rigs, progress=progress)
+    with bar("best attainable") as progress, executor(workers, scheduler) as pool:
+        computed = references.compute(
+            plants, cells, pids.gains, about, folder=parts, pool=pool, progress=progress
+        )
+    sha256 = computed.save(out)
+    shutil.rmtree(parts)  # they are in the file now
+    summary = {
+        "file": str(out),
+        "sha256": sha256,
+        "gains": computed.gains.tolist(),
+        "searches": pids.search_gains.tolist(),
+        "search_errors": pids.search_errors.tolist(),
+        "searches_agree": pids.agree.tolist(),
+        "distance": np.round(computed.attainable - computed.lower, 6).tolist(),
+        "attainable": float(computed.attainable.mean()),
+        "lower": float(computed.lower.mean()),
+        "pid": float(computed.pid.mean()),
+        "largest_gap": float(np.max(computed.attainable - computed.lower)),
+    }
+    told(summary, json).print(
+        f"wrote {out}\nmean over cells, first step left out: best attainable "
+        f"{summary['attainable']:.3f} cmH2O (at least {summary['lower']:.3f}), best PID "
+        f"{summary['pid']:.3f}\nSHA-256 {sha256}",
+        soft_wrap=True,
+    )
+
+
+def stressors(json: JsonFile = None) -> None:
+    """List the stressors, which are missing physics, and their strengths.
+
+    Example: `ventbench stressors`
+    """
+    import dataclasses
+
+    from ventbench.task.stressors import PAIRS, STRESSORS, VERSION
+
+    rows = []
+    for line in STRESSORS:
+        strengths = (f"{value:.3g}" for value in (line.mild, line.strong))
+        how = {"add": "", "scale": " (factor)", "label": " (label)"}[line.rule]
+        rows.append((line.category, line.name, line.title, line.strength + how, *strengths))
+    columns = ("category", "stressor", "what happens", "changes", "mild", "strong")
+    lines, pairs = [dataclasses.asdict(x) for x in STRESSORS], [list(pair) for pair in PAIRS]
+    console = told({"version": VERSION, "stressors": lines, "pairs": pairs}, json)
+    console.print(table_of(f"Stressors, version {VERSION}", columns, rows, left=columns[:4]))
+    console.print("Pairs, both mild: " + ", ".join(" + ".join(pair) for pair in PAIRS))
+
+
+def adversary(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="SUBMISSION",
+            help="Folder or name of a bundled submission.",
+            autocompletion=known_entries,
+        ),
+    ],
+    lung: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Lung to search on; may be repeated. Default: all.", autocompletion=known_lungs
+        ),
+    ] = None,
+    stressor: Annotated[
+        list[str] | None,
+        typer.Option(help="Stressor that may act; may be repeated. Default: all, and the rig."),
+    ] = None,
+    track: OneTrack = None,
+    plant: PlantName = "frozen",
+    in_process: InProcess = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", callback=claim_out, help="Write adversary.json and adversary.txt here."
+        ),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Search for the mildest plausible physics that makes a controller unsafe.
+
+    Severity 0 is the rig in the middle of the population, 1 the end of the range: a stressor at its
+    strong strength, or a rig three standard deviations away; what acts together adds as squares.
+    The exit code is 1 if something unsafe was found.
+
+    Example: `ventbench adversary pid_robust --lung R5C10`
+    """
+    from dataclasses import asdict
+
+    from ventbench.base import compilation
+    from ventbench.entries.adversary import adversary as search
+
+    compilation.keep()
+    with waiting(f"searching for what makes {name} unsafe"):
+        found = search(
+            name, simulator=plant, track=track, lungs=lung or (), stressors=stressor or (),
+            sandbox=not in_process,
+        )  # fmt: skip
+    values = {"submission": name, "lungs": [asdict(one) for one in found]}
+    text = "\n".join(line for one in found for line in one.lines())
+    emit(values, json)
+    typer.echo(text, err=str(json) == "-")
+    if out is not None:
+        files.write_json(out / "adversary.json", values)
+        files.write_text(out / "adversary.txt", text + "\n")
+    if any(one.severity is not None for one in found):
+        raise typer.Exit(1)
+
+
+COMMANDS = (score, transfer, new, check, headroom, stressors, adversary)

@@ -1,4 +1,4 @@
-"""``ventbench train``: simulators, and controllers that correct a PID."""
+"""``ventbench train`` and ``tune``: simulators, controllers that correct a PID, gains of PIDs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     JsonFile,
@@ -23,6 +24,7 @@ from ventbench.cli.options import (
 )
 
 app = typer.Typer(name="train", help="Train simulators and controllers.", no_args_is_help=True)
+tune = typer.Typer(name="tune", help="Search for the gains of a controller.", no_args_is_help=True)
 
 Lung = Annotated[
     str | None,
@@ -260,3 +262,106 @@ def _trained(about: dict[str, Any]) -> Any:
         f"{about['method']}: mean |pressure - target|, cmH2O", columns, rows,
         caption="Fresh cells: new deviations, drawn like the published draws.",
     )  # fmt: skip
+
+
+PLOT = "grid.png"
+
+
+@tune.callback()
+def _group() -> None:
+    pass
+
+
+@tune.command()
+def pid(
+    lung: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LUNG", help="Only this lung, such as R20C50.", autocompletion=known_lungs
+        ),
+    ] = None,
+    every: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="All six lungs: the best gains of each, and the best single set."
+        ),
+    ] = False,
+    robust: Annotated[
+        bool, typer.Option("--robust", help="All six lungs: only the best single set.")
+    ] = False,
+    out: Annotated[
+        Path,
+        typer.Option(metavar="DIR", callback=claim_out, help="Folder for table, plot and result."),
+    ] = Path("runs/pid"),
+    plant: PlantName = "frozen",
+    draws: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=20,
+            help="Draws with noise and deviations that decide among the 100 best; 0 to decide "
+            "without noise, as in the paper.",
+        ),
+    ] = 20,
+    beyond: Annotated[
+        bool,
+        typer.Option("--beyond", help="Search on draws without the grid: gains have no edge."),
+    ] = False,
+    json: JsonFile = None,
+) -> None:
+    """Simulate the paper's 8,000 PIDs at six PIPs on the frozen simulators or others.
+
+    P, I and D each take the values 0, 0.1, ..., 0.9, 1, 2, ..., 10 %/cmH2O. On the frozen
+    simulators a lung has all its rigs but the held-out one. The 100 best without noise also run on
+    draws that are for tuning alone, and the best there win.
+
+    Example: `ventbench tune pid --all --out runs/pid`
+    """
+    from ventbench.train.pid_search import RESULT, TABLE, tune_beyond, tune_pid
+
+    if (lung is not None) + every + robust != 1:
+        raise InputError("give exactly one of --lung LUNG, --all and --robust")
+    names = None if lung is None else (lung,)
+    with bar("PIDs") as progress:
+        if beyond:
+            result = tune_beyond(
+                names, draws=draws, each=not robust, single=lung is None, simulator=plant,
+                progress=progress,
+            )  # fmt: skip
+            files.write_json(out / RESULT, result)
+            written = [RESULT]
+        else:
+            grid, result = tune_pid(
+                names, out, draws=draws, each=not robust, simulator=plant, progress=progress
+            )
+            written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
+    console = told(result, json)
+    console.print(_gains_table(result))
+    for name in written:
+        console.print(f"wrote {out / name}", soft_wrap=True)
+
+
+def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
+    """Draw the picture if matplotlib is installed."""
+    from ventbench.pages.report import gain_map_png
+
+    try:
+        picture = gain_map_png(grid, each=each, single=single)
+    except InputError as error:
+        typer.echo(f"no plot: {error}", err=True)
+        return []
+    files.write_bytes(path, picture)
+    return [path.name]
+
+
+def _gains_table(result: dict[str, Any]) -> Any:
+    def row(name: str, entry: dict[str, Any]) -> tuple[str, ...]:
+        return name, *(f"{gain:g}" for gain in entry["gains"]), f"{entry['error']:.3f}"
+
+    rows = (row(name, entry) for name, entry in result.get("lungs", {}).items())
+    title = "Best PID gains; mean |pressure - target|, cmH2O"
+    table = table_of(title, ("lung", "P", "I", "D", "error"), rows)
+    if "single" in result:
+        table.add_section()
+        table.add_row(*row("all six", result["single"]), style="bold")
+    return table

@@ -48,7 +48,7 @@ TOLERANCE = 0.1 * metric.LEAST_HEADROOM
 MAX_BYTES = 20_000_000
 
 #: P, I and D of the best PID of each lung, %/cmH2O: the 100 of rounds. What
-#: :func:`ventbench.train.best_pid.best_pids` finds on the rigs of the training.
+#: :func:`ventbench.train.pid_search.best_pids` finds on the rigs of the training.
 PID_GAINS = (
     (10.6, 0.065, 26.2),
     (29.1, 0.332, 0.119),

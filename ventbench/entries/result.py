@@ -119,6 +119,11 @@ class Score:
         return tuple(self.runs.failures)
 
     @property
+    def failed(self) -> tuple[CellFailure, ...]:
+        """What failed in any run, those under missing physics last."""
+        return (*self.failures, *(self.stressed.failures if self.stressed else ()))
+
+    @property
     def rig_draws(self) -> Draws | None:
         """The draws; None without draws."""
         return self.protocol.drawn
@@ -256,8 +261,8 @@ class Score:
 
     def _said(self) -> list[str]:
         """Headline, failures, and the headline of the stressed runs."""
-        failures = [failure.message for failure in self.failures[:_FAILURES_SHOWN]]
-        more = len(self.failures) - len(failures)
+        failures = [failure.message for failure in self.failed[:_FAILURES_SHOWN]]
+        more = len(self.failed) - len(failures)
         said = [*failures, *([f"... {more} more"] * (more > 0))]
         if (runs := self.stressed) is not None:
             low, high = runs.interval(runs.by_lung_and_draw)

@@ -24,7 +24,7 @@ from ventbench.task.lungs import lung as parse_lung
 from ventbench.trajectories import Trajectories
 
 if TYPE_CHECKING:
-    from ventbench.train.pid_grid import PIDGrid
+    from ventbench.train.pid_search import PIDGrid
 
 
 def write_rerun(path: Path | str, runs: Sequence[Trajectories]) -> Path:

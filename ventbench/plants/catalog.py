@@ -39,7 +39,7 @@ from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.plant_files import FAMILIES, load_plants
-from ventbench.plants.simulators import PythonSimulator, Simulators, is_jax_plant, python_simulator
+from ventbench.plants.simulators import Simulators, is_jax_plant, python_simulator
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
@@ -134,15 +134,15 @@ def _python_by_lung(given: Mapping[str, Any], name: str, sha256: str | None = No
         label = lung(key)
         by_lung[label.R, label.C] = python_simulator(value, f"{name}, lung {key}")
 
-    def run(arguments: dict[str, Any]) -> ArrayLike:
+    def run(arguments: Mapping[str, Any]) -> ArrayLike:
         label = arguments["R"], arguments["C"]
         if label not in by_lung:
             known = ", ".join(lung(key).id for key in given)
             raise InputError(f"{name} have no such lung; they have {known}")
-        return by_lung[label].run(arguments)
+        return by_lung[label](arguments)
 
     about = _about("function", sha256, function=name, lungs=sorted(given))
-    return Simulators("function", name, about, sha256=sha256, _function=PythonSimulator(name, run))
+    return Simulators("function", name, about, sha256=sha256, _function=run)
 
 
 def _about(kind: str, sha256: str | None, **more: Any) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from ventbench.base.errors import InputError
 from ventbench.physics.model import Physics
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.hybrid import Hybrid
-from ventbench.plants.learned import MLP, Boundary, Learned
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.two_balloon import TwoBalloon, two_balloon
 from ventbench.task.interfaces import Plant
@@ -37,10 +36,9 @@ class PlantFamily:
     #: makes the plant of a lung at its label, if labels are all it needs. The family then has a
     #: name for ``--plant`` and goes through the contract tests of physics plants.
     for_lung: Callable[[Lung], Plant] | None = None
-    parts: tuple[type, ...] = ()  #: further classes in its files.
 
 
-#: By the name that ``--plant`` takes. ``physics`` and the learned ones are more than one line, see
+#: By the name that ``--plant`` takes. ``physics`` and ``frozen`` are more than one line, see
 #: :mod:`ventbench.plants.catalog`.
 FAMILIES: dict[str, PlantFamily] = {
     "single_compartment": PlantFamily(SingleCompartment, single_compartment),
@@ -48,7 +46,6 @@ FAMILIES: dict[str, PlantFamily] = {
     "physics": PlantFamily(Physics),
     "corrected": PlantFamily(Corrected),
     "hybrid": PlantFamily(Hybrid),
-    "learned": PlantFamily(Learned, parts=(Boundary, MLP)),
 }
 
 #: Names of fields in plant files, by class and field, where they differ from the attribute's.
@@ -63,12 +60,7 @@ def stored_type(name: str) -> type:
     Raises:
         KeyError: if there is no plant family with such a class.
     """
-    types = {
-        kind.__name__: kind
-        for family in FAMILIES.values()
-        for kind in (family.plant, *family.parts)
-    }
-    return types[name]
+    return {family.plant.__name__: family.plant for family in FAMILIES.values()}[name]
 
 
 FORMAT = "ventbench-plants-1"

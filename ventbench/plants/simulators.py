@@ -5,7 +5,7 @@ One that others wrote in plain Python or NumPy may be
 - a function ``f(u_in, u_out, dt, *, R, C, initial_pressure)`` that returns the pressures, cmH2O,
   ``(T,)``, at samples with commands of %, 0/1, and times to the next sample, s, ``(T,)``, for the
   label R, cmH2O/(L/s), C, mL/cmH2O, and the first pressure; it may leave out what it does not need,
-  and may also ask for ``time``, s, or ``flow``, mL/s, by name;
+  and may also ask for ``time``, s, or ``flow``, mL/s. It gets them by these names;
 - a class or an object with ``init(pressure)`` and ``step(state, u_in, u_out, dt)``, which returns
   the next state and the pressure, all of them numbers;
 - a class or an object with ``step(u_in, u_out, dt)``, which returns the pressure and keeps its
@@ -252,12 +252,12 @@ class Simulators:
         self, function: PythonSimulator, u_in: Floats, u_out: Floats, dt: Floats, label: Lung,
         start: float, what: str, flow: Floats | None = None,
     ) -> Floats:  # fmt: skip
+        commands = {"u_in": u_in, "u_out": u_out, "dt": dt}
+        given: dict[str, Any] = {key: np.array(column, float) for key, column in commands.items()}
+        given |= {"R": label.R, "C": label.C, "initial_pressure": float(start), "flow": flow}
+        given["time"] = np.concatenate([[0.0], np.cumsum(given["dt"])[:-1]])
         try:
-            answer = function(
-                np.array(u_in, float), np.array(u_out, float), np.array(dt, float),
-                R=label.R, C=label.C, initial_pressure=float(start), flow=flow,
-            )  # fmt: skip
-            pressure = np.asarray(answer, float)
+            pressure = np.asarray(function(given), float)
         except InputError as error:
             raise InputError(f"{what} of lung {label}: {error}") from error
         except Exception as error:
@@ -274,13 +274,13 @@ class Simulators:
         return pressure
 
 
-#: What a simulator may ask for, in the order of arguments that have other names.
+#: What a simulator may ask for, by name.
 _ARGUMENTS = ("u_in", "u_out", "dt", "R", "C", "initial_pressure", "time", "flow")
 
-#: Arguments that a function must not leave out under other names.
-_COMMANDS = 3
-
 _SIGNATURE = "f(u_in, u_out, dt, *, R, C, initial_pressure)"
+
+#: Takes what is known of one breath by the names of :data:`_ARGUMENTS`; pressures, cmH2O.
+PythonSimulator = Callable[[Mapping[str, Any]], ArrayLike]
 
 
 def is_jax_plant(value: object) -> bool:
@@ -291,26 +291,6 @@ def is_jax_plant(value: object) -> bool:
     return not (len(leaves) == 1 and leaves[0] is value)
 
 
-@dataclass(frozen=True)
-class PythonSimulator:
-    """A simulator of one breath's commands, in the form that the resolver of simulators calls."""
-
-    name: str  #: what messages call it.
-    #: takes the arguments of :data:`_ARGUMENTS` by name.
-    run: Callable[[dict[str, Any]], ArrayLike]
-
-    def __call__(
-        self, u_in: Floats, u_out: Floats, dt: Floats, /, *, R: float, C: float,
-        initial_pressure: float, flow: Floats | None = None,
-    ) -> ArrayLike:  # fmt: skip
-        """Simulate one breath; see the module. ``flow`` is the recorded one, where there is one."""
-        time = np.concatenate([[0.0], np.cumsum(dt)[:-1]])
-        return self.run(
-            {"u_in": u_in, "u_out": u_out, "dt": dt, "R": R, "C": C,
-             "initial_pressure": initial_pressure, "time": time, "flow": flow}
-        )  # fmt: skip
-
-
 def python_simulator(value: Any, name: str) -> PythonSimulator:
     """Adapt a function, a class or an object, see the module; messages call it by the name.
 
@@ -318,75 +298,50 @@ def python_simulator(value: Any, name: str) -> PythonSimulator:
         InputError: if it cannot be called as any of them.
     """
     if hasattr(value, "step"):
-        return PythonSimulator(name, _stepping(value, name))
+        return _stepping(value, name)
     if isinstance(value, type):
         raise InputError(
             f"{name} is a class without `step`; give it step(u_in, u_out, dt), which returns the "
             "pressure, or init(pressure) and step(state, u_in, u_out, dt)"
         )
-    return PythonSimulator(name, _call_of(value, name))
+    return _call_of(value, name)
 
 
-def _call_of(function: Callable[..., Any], name: str) -> Callable[[dict[str, Any]], Any]:
-    """Return how to call a function: with what it asks for, by name or in order."""
+def _call_of(function: Callable[..., Any], name: str) -> PythonSimulator:
+    """Return how to call a function: with those of :data:`_ARGUMENTS` that it names."""
     try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):  # a function in C tells no signature
-        return lambda given: function(
-            *(given[key] for key in _ARGUMENTS[:_COMMANDS]),
-            **{key: given[key] for key in ("R", "C", "initial_pressure")},
-        )
-    ordered = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    any_name = any(p.kind is p.VAR_KEYWORD for p in parameters)
-    any_number = any(p.kind is p.VAR_POSITIONAL for p in parameters)
-    named = [p.name for p in parameters if p.name in _ARGUMENTS and p.kind is not p.POSITIONAL_ONLY]
-    # The first three stand for the commands, whatever their names, unless those are known names.
-    by_order = any_number and not ordered
-    if not by_order:
-        by_order = any(p.name not in _ARGUMENTS for p in ordered[:_COMMANDS]) and (
-            len(ordered) >= _COMMANDS
-        )
-    in_order = ordered[:_COMMANDS] if by_order else []
-    names = [key for key in named if key not in {p.name for p in in_order}]
-    needed = [
-        p.name
-        for p in parameters
-        if p.default is p.empty
-        and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
-        and p not in in_order
-        and p.name not in names
-    ]
-    if needed:
+        parameters = inspect.signature(function).parameters
+    except (TypeError, ValueError) as error:  # a function in C
+        raise InputError(f"{name} tells no signature; wrap it in a {_SIGNATURE}") from error
+    needed = {
+        key
+        for key, p in parameters.items()
+        if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+    }
+    by_name = {key for key, p in parameters.items() if p.kind is not p.POSITIONAL_ONLY}
+    names = by_name & set(_ARGUMENTS)
+    if unknown := [key for key in parameters if key in needed - names]:
         raise InputError(
-            f"{name} needs {', '.join(needed)}, which a diagnosis does not have; simulators are "
-            f"called as {_SIGNATURE}, and may also ask for time (s) and flow (mL/s) by name"
+            f"{name} needs {', '.join(unknown)}, which a diagnosis does not have; simulators are "
+            f"called as {_SIGNATURE}, by these names, and may also ask for time (s) and flow (mL/s)"
         )
-    if any_name:
-        names += [key for key in ("R", "C", "initial_pressure") if key not in names]
-        if not by_order:
-            names += [key for key in _ARGUMENTS[:_COMMANDS] if key not in names]
 
-    def call(given: dict[str, Any]) -> Any:
-        if "flow" in names and given["flow"] is None and _is_needed(parameters, "flow"):
+    def call(given: Mapping[str, Any]) -> Any:
+        if "flow" in needed and given["flow"] is None:
             raise InputError(f"{name} asks for flow, which the recording does not have")
-        first = [given[key] for key in _ARGUMENTS[:_COMMANDS]] if by_order else []
-        return function(*first, **{key: given[key] for key in names})
+        return function(**{key: given[key] for key in names})
 
     return call
 
 
-def _is_needed(parameters: list[inspect.Parameter], name: str) -> bool:
-    return any(p.name == name and p.default is p.empty for p in parameters)
-
-
-def _stepping(value: Any, name: str) -> Callable[[dict[str, Any]], Floats]:
+def _stepping(value: Any, name: str) -> PythonSimulator:
     """Return how to run a simulator sample by sample."""
     make = _call_with_labels(value, f"{name}()") if isinstance(value, type) else lambda given: value
     owner = value if isinstance(value, type) else type(value)
     has_init = hasattr(value, "init")
     wanted = "step(state, u_in, u_out, dt)" if has_init else "step(u_in, u_out, dt)"
     count = _positional(owner, "step")
-    if count is not None and count != (4 if has_init else _COMMANDS):
+    if count is not None and count != (4 if has_init else 3):
         raise InputError(f"{name}: step takes {count} arguments; {wanted} is wanted")
     if not has_init and not hasattr(value, "reset") and not isinstance(value, type):
         raise InputError(
@@ -394,7 +349,7 @@ def _stepping(value: Any, name: str) -> Callable[[dict[str, Any]], Floats]:
             "breath; give it reset(initial_pressure), or give the class"
         )
 
-    def run(given: dict[str, Any]) -> Floats:
+    def run(given: Mapping[str, Any]) -> Floats:
         simulator = make(given)
         pressures = np.empty(len(given["u_in"]))
         pressures[0] = start = given["initial_pressure"]
@@ -431,7 +386,9 @@ def _positional(owner: type, method: str) -> int | None:
     return len(needed) - (0 if static else 1)
 
 
-def _call_with_labels(function: Callable[..., Any], name: str) -> Callable[[dict[str, Any]], Any]:
+def _call_with_labels(
+    function: Callable[..., Any], name: str
+) -> Callable[[Mapping[str, Any]], Any]:
     """Call a class or ``reset`` with those of R, C and the first pressure that it takes."""
     try:
         parameters = list(inspect.signature(function).parameters.values())

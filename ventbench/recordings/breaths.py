@@ -102,13 +102,12 @@ class Breaths:
         """One row a sample in the public schema, which :func:`ventbench.load_recording` takes."""
         import pandas as pd
 
-        return pd.DataFrame(self.columns(blank_inferred=True))
+        return pd.DataFrame(self.columns())
 
-    def columns(self, *, blank_inferred: bool) -> dict[str, NDArray[Any]]:
+    def columns(self) -> dict[str, NDArray[Any]]:
         """Columns of the public schema, one value a sample; NaN for times that were inferred."""
-        lengths, time = self.valid.sum(axis=1), self.time
-        if blank_inferred:
-            time = np.where(self.time_inferred[:, None], np.nan, time)
+        lengths = self.valid.sum(axis=1)
+        time = np.where(self.time_inferred[:, None], np.nan, self.time)
         columns = {"id": np.arange(1, 1 + int(lengths.sum()))}
         columns |= {
             name: np.repeat(getattr(self, name), lengths) for name in ("breath_id", "R", "C")
@@ -290,41 +289,45 @@ def make_breaths(
     return arranged(np.full(len(ids), times.shape[1]), times.ravel(), flat, **labels)
 
 
-#: Arrays that every recording has.
-_ALWAYS = (
-    "breath_id", "R", "C", "time", "dt", "u_in", "u_out", "pressure", "valid", "time_inferred",
-)  # fmt: skip
-
-
 def join(parts: Sequence[Breaths]) -> Breaths:
-    """Join recordings of equally many samples a breath; ids may occur twice.
+    """Join recordings; short breaths are padded, and ids may occur twice.
 
-    Flow, volume, ``source`` and ``sha256`` are left out.
+    Flow and volume are kept where all have them; ``source`` and ``sha256`` are left out.
 
     Raises:
-        InputError: if there is nothing to join, or the numbers of samples differ.
+        InputError: if there is nothing to join.
     """
     if not parts:
         raise InputError("there are no recordings to join")
-    lengths = sorted({part.pressure.shape[1] for part in parts})
-    if len(lengths) > 1:
-        raise InputError(
-            f"recordings with breaths of {lengths} samples cannot be joined; cut them to "
-            f"{lengths[0]} samples, or use one at a time"
-        )
-    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ALWAYS}
-    notes = tuple(note for part in parts for note in part.notes)
-    return replace(
-        parts[0], **arrays, flow=None, volume=None, source=None, sha256=None, notes=notes
+
+    def together(name: str, *, samples: bool) -> np.ndarray:
+        each = [getattr(part, name) for part in parts]
+        if samples:
+            each = [values[part.valid] for values, part in zip(each, parts, strict=True)]
+        return np.concatenate(each)
+
+    labels = ("breath_id", "R", "C", "time_inferred")
+    signals = [
+        name
+        for name in ("u_in", "u_out", "pressure", *OPTIONAL)
+        if all(getattr(part, name) is not None for part in parts)
+    ]
+    rest: dict[str, Any] = {name: together(name, samples=False) for name in labels}
+    return arranged(
+        np.concatenate([part.valid.sum(axis=1) for part in parts]),
+        together("time", samples=True),
+        {name: together(name, samples=True) for name in signals},
+        notes=tuple(note for part in parts for note in part.notes),
+        **rest,
     )
 
 
-def write(breaths: Breaths, path: str | os.PathLike[str], *, blank_inferred: bool = True) -> None:
+def write(breaths: Breaths, path: str | os.PathLike[str]) -> None:
     """Write breaths to CSV, gzipped CSV or Parquet, by the ending of the name.
 
     Numbers read back exactly. Padding is left out; NaN is written blank. The same breaths give the
     same bytes. An existing file is replaced, a missing folder made. Inferred times are written
-    blank, as they were read, so that nobody takes them for measurements; or else the estimates.
+    blank, as they were read, so that nobody takes them for measurements.
 
     Raises:
         InputError: if there are no breaths, or the name has another ending.
@@ -335,7 +338,7 @@ def write(breaths: Breaths, path: str | os.PathLike[str], *, blank_inferred: boo
         raise InputError(f"{name}: there are no breaths to write")
     if not name.endswith((".csv", ".csv.gz", ".parquet", ".pq")):
         raise InputError(f"{name}: the name must end in .csv, .csv.gz, .parquet or .pq")
-    table = _table(breaths, blank_inferred)
+    table = _table(breaths)
     form = _write_parquet if name.endswith((".parquet", ".pq")) else _write_csv
     form = _write_packed if name.endswith(".gz") else form
     write_atomically(Path(path), lambda out: form(table, out))
@@ -359,11 +362,11 @@ def _write_packed(table: pa.Table, stream: IO[bytes]) -> None:
         _write_csv(table, cast("IO[bytes]", packed))
 
 
-def _table(breaths: Breaths, blank_inferred: bool) -> pa.Table:
+def _table(breaths: Breaths) -> pa.Table:
     """Columns of the schema with their units; labels that are whole numbers are written as such."""
     import pyarrow as pa
 
-    columns = breaths.columns(blank_inferred=blank_inferred)
+    columns = breaths.columns()
     kinds = {"id": pa.int64(), "breath_id": pa.int64(), "u_out": pa.int8()}
     for name in ("R", "C"):
         if (columns[name] == np.round(columns[name])).all():

@@ -37,9 +37,9 @@ from ventbench.task import environment as env
 from ventbench.task.environment import Scenario, nominal_scenario
 from ventbench.task.interfaces import Controller, Plant
 from ventbench.task.metrics.score import run_error
-from ventbench.train.pid_grid import tune_pid
+from ventbench.train.pid_search import tune_pid
 from ventbench.train.plants import ALL, TrainedControllers, check_names, plants_to_train_on
-from ventbench.train.rl import episodes
+from ventbench.train.rl import environment
 from ventbench.train.rl.train import fresh_error
 
 
@@ -173,10 +173,6 @@ def objective(
     return total / jnp.mean(breath)
 
 
-#: Called with the number of updates done, the number of all updates, and the mean loss since the
-#: last call, cmH2O.
-FitProgress = Callable[[int, int, float], None]
-
 #: Updates compiled into one scan; a checkpoint or a Ctrl-C falls between two of them.
 CHUNK = 50
 
@@ -192,7 +188,7 @@ def optimiser(
     )
 
 
-def chunk(
+def _chunk(
     update: Callable[[Any, Array], tuple[Any, Array]], carry: Any, first: Array, updates: int
 ) -> tuple[Any, Array]:
     """:data:`CHUNK` updates from number ``first`` on, none beyond the last; state and mean loss."""
@@ -205,33 +201,6 @@ def chunk(
     carry, losses = jax.lax.scan(inside, carry, numbers)
     counted = numbers < updates
     return carry, jnp.sum(losses * counted) / jnp.maximum(jnp.sum(counted), 1)
-
-
-def run_chunks(
-    advance: Callable[[Any, Array], tuple[Any, Array]],
-    carry: Any,
-    updates: int,
-    stored: Checkpoint,
-    progress: FitProgress | None,
-) -> Any:
-    """Make all updates, a :func:`chunk` at a time, from the stored state on; the last state.
-
-    Raises:
-        FloatingPointError: if the loss is not finite; the checkpoint stays at the last good one.
-    """
-    carry, first = stored.restore(carry)
-    while first < updates:
-        new, loss = advance(carry, jnp.asarray(first))
-        loss = float(loss)
-        if not np.isfinite(loss):
-            raise FloatingPointError(
-                f"training diverged between updates {first} and {first + CHUNK}"
-            )
-        carry, first = new, min(first + CHUNK, updates)
-        stored.save(carry, first)
-        if progress is not None:
-            progress(first, updates, loss)
-    return carry
 
 
 @partial(jax.jit, static_argnames="config")
@@ -272,7 +241,7 @@ def _advance(
         updates, state = adam.update(gradient, state, layers)
         return (optax.apply_updates(layers, updates), state), mean
 
-    return chunk(update, carry, first, config.updates)
+    return _chunk(update, carry, first, config.updates)
 
 
 def fit(
@@ -282,7 +251,7 @@ def fit(
     config: ResidualConfig | None = None,
     seed: int = 0,
     checkpoint: Path | None = None,
-    progress: FitProgress | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
     keep: bool = False,
     weights: ArrayLike | None = None,
 ) -> Residual:
@@ -299,7 +268,8 @@ def fit(
         seed: seed of the weights and the random deviations.
         checkpoint: file that the training is saved to every ``CHUNK`` updates and resumed from;
             deleted at the end.
-        progress: called after every ``CHUNK`` updates.
+        progress: called after every ``CHUNK`` updates with the number of those done, of all, and
+            the mean loss since the last call, cmH2O.
         keep: leave the checkpoint, so that a finished training is read from it.
         weights: weight of each lung's error at each PIP, shape ``(lungs, P)``; 1 if not given.
 
@@ -332,10 +302,18 @@ def fit(
         "simulators": fingerprint(plants), "weights": fingerprint(weights),
     }  # fmt: skip
     stored = Checkpoint(checkpoint, settings)
-    carry = run_chunks(
-        lambda carry, first: _advance(carry, like, plants, key, first, weights, config),
-        carry, config.updates, stored, progress,
-    )  # fmt: skip
+    carry, first = stored.restore(carry)
+    while first < config.updates:
+        new, loss = _advance(carry, like, plants, key, jnp.asarray(first), weights, config)
+        loss = float(loss)
+        if not np.isfinite(loss):
+            raise FloatingPointError(
+                f"training diverged between updates {first} and {first + CHUNK}"
+            )
+        carry, first = new, min(first + CHUNK, config.updates)
+        stored.save(carry, first)
+        if progress is not None:
+            progress(first, config.updates, loss)
     if not keep:
         stored.delete()
     return controller.replace(layers=carry[0])  # type: ignore[attr-defined]
@@ -415,7 +393,7 @@ def train_residual(
                     checkpoint=_checkpoint(out, name, seed),
                     progress=lambda *how_far, about_it=about_it: progress(about_it, how_far),
                 )  # fmt: skip
-                lungs_of = episodes.Lungs(plants, jnp.asarray(weights))
+                lungs_of = environment.Lungs(plants, jnp.asarray(weights))
                 fresh.append(float(_fresh(lungs_of, each[seed][name])))
         chosen = seeds[int(np.argmin(fresh))]
         controllers[name] = each[chosen][name]

@@ -16,7 +16,7 @@ from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.train.pid_grid import PIDGrid
+from ventbench.train.pid_search import PIDGrid
 
 GAINS = np.array([(2.0, 0.0, 0.0), *published.BEST_PID.values(), (0.0, 4.0, 0.0), (5.0, 10.0, 1.0)])
 

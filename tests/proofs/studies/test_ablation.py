@@ -16,14 +16,13 @@ from typer.testing import CliRunner
 from proofs.__main__ import app
 from proofs.paper.paper import load_stored
 from proofs.studies import controllers, networks
+from proofs.studies.stitched import Architecture, Training
 from tests.train.conftest import synthetic
 from ventbench.base.errors import InputError
-from ventbench.plants.learned import Architecture
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.recordings import write
 from ventbench.task.lungs import LUNGS
-from ventbench.train.learned import LearnedConfig
 from ventbench.train.residual import ResidualConfig
 
 SMALL = ResidualConfig(
@@ -144,7 +143,7 @@ def test_networks_of_another_process_are_those_of_this_one(tmp_path):
 
     def compare(out: str, workers: int) -> pd.DataFrame:
         return networks.compare(
-            folder, tmp_path / out, base=TINY, config=LearnedConfig(steps=1, batch=2), members=2,
+            folder, tmp_path / out, base=TINY, config=Training(steps=1, batch=2), members=2,
             only=[], workers=workers,
         )  # fmt: skip
 
@@ -162,7 +161,7 @@ def test_networks_are_compared(tmp_path):
 
     def compare() -> pd.DataFrame:
         return networks.compare(
-            folder, out, base=TINY, config=LearnedConfig(steps=2, batch=2), members=2,
+            folder, out, base=TINY, config=Training(steps=2, batch=2), members=2,
             only=["H_p 1"],
             progress=lambda *x: told.append(x),
         )  # fmt: skip

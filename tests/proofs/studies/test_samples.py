@@ -16,9 +16,9 @@ from proofs.paper import controller_sections
 from proofs.paper.paper import load_stored
 from proofs.studies import samples
 from proofs.studies.samples import LearningCurve, SampleStudy
-from ventbench.controllers.rl_policy import GAINS
+from ventbench.controllers.residual import GAINS
 from ventbench.plants import frozen
-from ventbench.train import pid_grid
+from ventbench.train import pid_search
 
 RNG = np.random.default_rng(1)
 
@@ -116,7 +116,7 @@ def test_study_samples(tmp_path):
     points = pd.read_csv(tmp_path / "samples.csv")
     start = points[(points.method == "ppo") & (points.episodes == 0)]
     plant = jax.tree.map(lambda leaf: leaf[-1:], frozen.load().plants)  # R20C50
-    corrected = pid_grid.errors(plant, np.array([GAINS], float))[0].mean()
+    corrected = pid_search.errors(plant, np.array([GAINS], float))[0].mean()
     assert start["iqm"].item() == pytest.approx(corrected, abs=2e-3)
     assert (tmp_path / "study-samples.png").stat().st_size < 300_000
     again = CliRunner().invoke(app, asked)

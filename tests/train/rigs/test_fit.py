@@ -16,8 +16,15 @@ from ventbench.plants.stacking import open_loop_breaths
 from ventbench.recordings import join
 from ventbench.task.lungs import RECORDED_LUNGS, lung
 from ventbench.train.rigs.data import SAMPLES, groups_of, inspirations, whole_breaths
-from ventbench.train.rigs.fit import CHUNK, EXPIRATORY_WIDTHS, FitConfig, fit, fit_expiration
-from ventbench.train.rigs.parameters import centre, plants
+from ventbench.train.rigs.fit import (
+    CHUNK,
+    EXPIRATORY_WIDTHS,
+    FitConfig,
+    centre,
+    fit,
+    fit_expiration,
+    plants,
+)
 
 THREE = tuple(lung(name) for name in ("R5C10", "R20C20", "R20C50"))
 CONFIG = FitConfig(iterations=5 * CHUNK)

@@ -19,7 +19,7 @@ from ventbench.plants.sessions import Session, Sessions, find
 from ventbench.recordings import Breaths, join, make_breaths
 from ventbench.task.lungs import lung
 from ventbench.train.rigs.data import groups_of_sessions, inspirations
-from ventbench.train.rigs.fit import FitConfig, fit
+from ventbench.train.rigs.fit import FitConfig, centre, fit, plants
 from ventbench.train.rigs.label_test import (
     APPARATUS,
     REFERENCE_FLOW,
@@ -28,7 +28,6 @@ from ventbench.train.rigs.label_test import (
     label_gain,
     label_tests,
 )
-from ventbench.train.rigs.parameters import centre, plants
 from ventbench.train.rigs.train import choose_rigs
 
 #: Laws of a test lung's resistor: an orifice, what was measured, the largest laminar share.

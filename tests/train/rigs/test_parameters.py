@@ -13,7 +13,7 @@ from scipy import stats
 from ventbench.base.compilation import float64
 from ventbench.plants.hybrid import Hybrid
 from ventbench.task.lungs import Lung
-from ventbench.train.rigs.parameters import (
+from ventbench.train.rigs.fit import (
     DIRECTION_SUM,
     SHEET_FLOW,
     TAIL,

@@ -12,9 +12,8 @@ import pytest
 from ventbench.base import compilation
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import LUNG, NAMES, from_vector, to_vector
-from ventbench.train.rigs.data import InspirationData
+from ventbench.train.rigs.data import Groups, InspirationData
 from ventbench.train.rigs.fit import simulate
-from ventbench.train.rigs.parameters import Groups
 from ventbench.train.rigs.population import _scatter, design_of, fit_population, scales
 
 

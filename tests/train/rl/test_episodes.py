@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from ventbench.base import compilation
-from ventbench.controllers import rl_policy
+from ventbench.controllers import residual
 from ventbench.controllers.pid import PID
-from ventbench.controllers.residual import Residual
-from ventbench.controllers.rl_policy import GaussianPolicy, TanhNetwork, init_parameters
+from ventbench.controllers.residual import GaussianPolicy, Residual, TanhNetwork, init_parameters
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
-from ventbench.task import draws, environment, protocol, rollouts
+from ventbench.task import draws, protocol, rollouts
+from ventbench.task import environment as env
 from ventbench.task.interfaces import Observation
 from ventbench.task.lungs import LUNGS, Lung
 from ventbench.task.metrics.score import run_error
-from ventbench.train.rl import episodes
+from ventbench.train.rl import environment
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +28,12 @@ def lungs():
 
 @pytest.fixture(scope="module")
 def all_lungs(lungs):
-    return episodes.Lungs(jax.tree.map(lambda x: x[None], lungs), jnp.ones((6, 6)))
+    return environment.Lungs(jax.tree.map(lambda x: x[None], lungs), jnp.ones((6, 6)))
 
 
 @pytest.fixture(scope="module")
 def cells(all_lungs):
-    return episodes.draw(jax.random.key(3), all_lungs, 1200).cells
+    return environment.draw(jax.random.key(3), all_lungs, 1200).cells
 
 
 def test_deviations_have_the_distributions_of_the_draws(cells):
@@ -59,9 +59,9 @@ def test_deviations_have_the_distributions_of_the_draws(cells):
 
 
 def test_nominal_cells_are_the_protocols(lungs):
-    lung = episodes.Lungs(jax.tree.map(lambda x: x[None, :1], lungs), jnp.ones((1, 6)))
-    found = episodes.draw(jax.random.key(0), lung, 6, vary=False).cells
-    wanted = environment.nominal_scenario(protocol.PIPS)
+    lung = environment.Lungs(jax.tree.map(lambda x: x[None, :1], lungs), jnp.ones((1, 6)))
+    found = environment.draw(jax.random.key(0), lung, 6, vary=False).cells
+    wanted = env.nominal_scenario(protocol.PIPS)
     for name in ("pip", "peep", "start", "dt", "r_scale", "c_scale", "delay", "quantum"):
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-6)
     assert not np.any(found.noise)
@@ -69,12 +69,12 @@ def test_nominal_cells_are_the_protocols(lungs):
 
 def test_the_pid_inside_the_features_is_the_pid(lungs):
     with compilation.float64():
-        cells = environment.nominal_scenario(np.asarray(protocol.PIPS))
+        cells = env.nominal_scenario(np.asarray(protocol.PIPS))
         network = TanhNetwork((4,), 1)
         untrained = GaussianPolicy(init_parameters(network, jax.random.key(0)), network)
         lung = jax.tree.map(lambda x: x[2], lungs)
         found, _ = rollouts.closed_loop(lung, untrained, cells)
-        wanted, _ = rollouts.closed_loop(lung, PID(*rl_policy.GAINS), cells)
+        wanted, _ = rollouts.closed_loop(lung, PID(*residual.GAINS), cells)
     # Its command is cut to the valve's range before the correction, of zero here, is added.
     cut = np.clip(wanted.requested, 0.0, protocol.U_MAX)
     np.testing.assert_allclose(found.requested, cut, atol=1e-9)
@@ -82,13 +82,13 @@ def test_the_pid_inside_the_features_is_the_pid(lungs):
 
 
 def test_the_features_are_those_of_the_residual_controller():
-    network = Residual(PID(*rl_policy.GAINS), ())
-    assert rl_policy.FEATURES == 30
+    network = Residual(PID(*residual.GAINS), ())
+    assert residual.FEATURES == 30
     seen = Observation(
         jnp.asarray(0.0), jnp.asarray(0.03), jnp.asarray(5.0), jnp.asarray(20.0),
         jnp.full((10,), 15.0), jnp.asarray(5.0),
     )  # fmt: skip
-    _, found, base = rl_policy.features(rl_policy.init_features(()), seen)
+    _, found, base = residual.features(residual.init_features(()), seen)
     _, wanted, asked = network.features(network.init(()), seen)
     np.testing.assert_array_equal(found, wanted)
     a = 0.03 / 0.53
@@ -99,18 +99,18 @@ def test_the_features_are_those_of_the_residual_controller():
 def test_rewards_and_errors_are_the_scores(lungs):
     weights = jnp.ones((1, 6))
     lung = jax.tree.map(lambda x: jnp.asarray(x[None, 2:3], jnp.float32), lungs)
-    drawn = episodes.draw(jax.random.key(0), episodes.Lungs(lung, weights), 6, vary=False)
-    pid = PID(*rl_policy.GAINS)
-    _, _, rewards = episodes.roll(drawn, lambda k, x, base: (base, None), jax.random.key(1))
+    drawn = environment.draw(jax.random.key(0), environment.Lungs(lung, weights), 6, vary=False)
+    pid = PID(*residual.GAINS)
+    _, _, rewards = environment.roll(drawn, lambda k, x, base: (base, None), jax.random.key(1))
     start = np.asarray(drawn.cells.pip - drawn.cells.start)
     each = rewards.sum(axis=0).reshape(3, 6)  # without noise all breaths are alike
     np.testing.assert_allclose(each[0], each[2], rtol=1e-4)
-    from_rewards = (start - episodes.REWARD_SCALE * each[1]) / 34
-    errors = episodes.errors(drawn, pid)
+    from_rewards = (start - environment.REWARD_SCALE * each[1]) / 34
+    errors = environment.errors(drawn, pid)
     run, _ = rollouts.closed_loop(
         jax.tree.map(lambda x: x[2], lungs),
         pid,
-        environment.nominal_scenario(np.asarray(protocol.PIPS)),
+        env.nominal_scenario(np.asarray(protocol.PIPS)),
     )
     wanted = run_error(run.pressure, np.asarray(protocol.PIPS)[:, None, None])
     np.testing.assert_allclose(errors, wanted, rtol=1e-4)
@@ -124,11 +124,11 @@ def rig_lungs():
         first = stack([single_compartment(lung) for lung in LUNGS[:2]])
         second = stack([single_compartment(Lung(2 * lung.R, lung.C)) for lung in LUNGS[:2]])
         weights = jnp.arange(12.0).reshape(2, 6) + 1.0
-        return episodes.Lungs(stack([first, second]), weights)
+        return environment.Lungs(stack([first, second]), weights)
 
 
 def test_episodes_on_rigs_have_any_plant_their_weight_and_the_ranges_of_the_draws(rig_lungs):
-    drawn = episodes.draw(jax.random.key(2), rig_lungs, 480)
+    drawn = environment.draw(jax.random.key(2), rig_lungs, 480)
     lung, pip = np.arange(480) % 2, np.arange(480) // 2 % 6
     np.testing.assert_array_equal(drawn.weight, 6 * lung + pip + 1)
     ratio = np.asarray(drawn.plants.R) / np.array([lung.R for lung in LUNGS[:2]])[lung]
@@ -138,7 +138,7 @@ def test_episodes_on_rigs_have_any_plant_their_weight_and_the_ranges_of_the_draw
     assert low <= drawn.cells.r_scale.min() < 0.85
     assert 1.15 < drawn.cells.r_scale.max() <= high
     assert drawn.cells.noise.shape == (480, 3, 34)
-    nominal = episodes.draw(jax.random.key(2), rig_lungs, 12, vary=False)
+    nominal = environment.draw(jax.random.key(2), rig_lungs, 12, vary=False)
     np.testing.assert_array_equal(nominal.plants.R, np.tile(rig_lungs.plants.R[0], 6))
     assert not np.any(nominal.cells.noise)
 
@@ -147,23 +147,23 @@ def test_three_breaths_remember_the_one_before_and_score_as_the_protocol(rig_lun
     """Rewards and errors against the scorer's loop, with a policy that looks back."""
     network = TanhNetwork((4,), 1, first=0.5)
     policy = GaussianPolicy(init_parameters(network, jax.random.key(1)), network)
-    drawn = episodes.draw(jax.random.key(3), rig_lungs, 4)
+    drawn = environment.draw(jax.random.key(3), rig_lungs, 4)
 
     def act(key, x, base):
         mean = jnp.asarray(network.apply(policy.parameters, x))[..., 0]
-        return base + rl_policy.SCALE * mean, x[..., 0]
+        return base + residual.SCALE * mean, x[..., 0]
 
-    x, kept, rewards = episodes.roll(drawn, act, jax.random.key(1))
-    assert x.shape == (episodes.STEPS, 12, rl_policy.FEATURES)
+    x, kept, rewards = environment.roll(drawn, act, jax.random.key(1))
+    assert x.shape == (environment.MOVES, 12, residual.FEATURES)
     np.testing.assert_array_equal(kept, x[..., 0])
-    before = np.asarray(x).reshape(episodes.STEPS, 3, 4, -1)[..., 8:14]
+    before = np.asarray(x).reshape(environment.MOVES, 3, 4, -1)[..., 8:14]
     assert not before[:, 0].any()
     assert before[:, 1:].any()
     found, _ = rollouts.closed_loop(drawn.plants, policy, drawn.cells)
     error = np.abs(np.asarray(found.pressure) - np.asarray(drawn.cells.pip)[:, None, None])
     weighted = error * np.asarray(drawn.weight)[:, None, None]
     wanted = -weighted[..., 1:].transpose(2, 1, 0)
-    given = np.asarray(rewards).reshape(episodes.STEPS, 3, 4) * episodes.REWARD_SCALE
+    given = np.asarray(rewards).reshape(environment.MOVES, 3, 4) * environment.REWARD_SCALE
     np.testing.assert_allclose(given, wanted, rtol=2e-3, atol=2e-3)
     scored = weighted[:, protocol.SCORED_BREATHS].mean(axis=(1, 2))
-    np.testing.assert_allclose(episodes.errors(drawn, policy), scored, rtol=1e-3)
+    np.testing.assert_allclose(environment.errors(drawn, policy), scored, rtol=1e-3)

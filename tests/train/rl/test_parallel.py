@@ -21,7 +21,7 @@ from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.task.lungs import LUNGS
-from ventbench.train.rl import episodes
+from ventbench.train.rl import environment
 from ventbench.train.rl import train as parallel
 from ventbench.train.rl.learners import DQN, PPO, PolicyGradient
 
@@ -61,7 +61,7 @@ class RandomWalk:
 def lungs(index: int) -> Any:
     """One plant of one lung for two runs, leaves ``(2, 1, 1)``."""
     single = stack([stack([single_compartment(LUNGS[index])])])
-    made = episodes.Lungs(single, jnp.ones((1, 6)))
+    made = environment.Lungs(single, jnp.ones((1, 6)))
     return jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), made)
 
 
@@ -157,7 +157,7 @@ def test_ppo_and_dqn_improve_on_the_pid(method):
 
 
 def test_the_replay_holds_the_last_breaths_and_their_following_features(iterations):
-    steps, breaths = episodes.STEPS, SMALL_DQN.breaths
+    steps, breaths = environment.MOVES, SMALL_DQN.breaths
     count = breaths * steps
     first = iterations["dqn"](SMALL_DQN.init(jax.random.key(0)), plant(0))
     replay = jax.tree.map(np.asarray, first.replay)

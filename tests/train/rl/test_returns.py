@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.train.rl import episodes, learners
+from ventbench.train.rl import environment, learners
 
 RNG = np.random.default_rng(0)
 REWARDS, VALUES = RNG.normal(size=(7, 3)), RNG.normal(size=(7, 3))
 
 
 def test_discounted_is_a_geometric_sum():
-    found = episodes.discounted(jnp.asarray(REWARDS), 0.9)
+    found = environment.discounted(jnp.asarray(REWARDS), 0.9)
     wanted = [sum(0.9**k * REWARDS[t + k] for k in range(7 - t)) for t in range(7)]
     np.testing.assert_allclose(found, wanted, rtol=1e-5)
 
@@ -23,14 +23,14 @@ def test_advantages_are_weighted_sums_of_one_step_errors(trace):
     following = np.vstack([VALUES[1:], np.zeros((1, 3))])
     errors = REWARDS + 0.9 * following - VALUES
     wanted = [sum((0.9 * trace) ** k * errors[t + k] for k in range(7 - t)) for t in range(7)]
-    found = episodes.advantages(jnp.asarray(REWARDS), jnp.asarray(VALUES), 0.9, trace)
+    found = environment.advantages(jnp.asarray(REWARDS), jnp.asarray(VALUES), 0.9, trace)
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
 
 
 def test_advantages_with_full_trace_are_returns_minus_values():
     rewards, values = jnp.asarray(REWARDS), jnp.asarray(VALUES)
-    found = episodes.advantages(rewards, values, 0.9, 1.0)
-    wanted = episodes.discounted(rewards, 0.9) - values
+    found = environment.advantages(rewards, values, 0.9, 1.0)
+    wanted = environment.discounted(rewards, 0.9) - values
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
 
 
@@ -38,7 +38,7 @@ def test_double_q_takes_the_targets_value_of_the_online_choice():
     online = jnp.array([[1.0, 3.0, 2.0], [5.0, 4.0, 0.0]])
     target = jnp.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])
     reward, discount = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.0])
-    found = episodes.double_q_target(reward, discount, online, target)
+    found = environment.double_q_target(reward, discount, online, target)
     np.testing.assert_allclose(found, [1.0 + 0.5 * 20.0, 2.0])
 
 

@@ -12,7 +12,7 @@ from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.train.plants import NETWORKS
-from ventbench.train.rl import episodes
+from ventbench.train.rl import environment
 from ventbench.train.rl.train import METHODS, _groups, method_for
 
 
@@ -47,7 +47,7 @@ def test_networks_of_one_lung_and_of_all_are_trained_apart():
 def test_published_settings_fit_their_lungs(name, lungs):
     found = method_for(name, lungs)
     assert found.breaths % lungs == 0
-    steps = found.breaths * episodes.STEPS * 7
+    steps = found.breaths * environment.MOVES * 7
     assert method_for(name, lungs, steps + 10).iterations == 7
 
 

@@ -20,7 +20,6 @@ from ventbench.plants.sessions import Sessions
 from ventbench.recordings import Breaths, RecordingError, join, load
 from ventbench.recordings.identity import repetitions
 from ventbench.task.lungs import Lung, lung
-from ventbench.train.rigs.parameters import Groups
 
 _SUFFIXES = (".csv", ".csv.gz", ".parquet")
 
@@ -137,6 +136,15 @@ def _other_schema(error: RecordingError) -> bool:
 
 #: Samples of an inspiration that are used; the longest in the recordings has 32.
 SAMPLES = 33
+
+
+@flax.struct.dataclass
+class Groups:
+    """Setting, kind of rig and session of each breath, as indices, shape ``(n,)``."""
+
+    lung: Array
+    rig: Array
+    session: Array
 
 
 @flax.struct.dataclass

@@ -5,7 +5,7 @@ those of the fit, so is C, and a resistor whose drop was read at a flow has it a
 flow. A common error of all gains is therefore no error of any pressure, and comparing sessions with
 each other cannot show it. What tells the gain is the resistor: its label says which flow makes its
 drop. Test lungs have parabolic resistors, which have their labelled resistance at
-:data:`~ventbench.train.rigs.parameters.LABEL_FLOW` and less below, by a law between that of an
+:data:`~ventbench.train.rigs.fit.LABEL_FLOW` and less below, by a law between that of an
 orifice and one with a laminar share. With the gain that follows, C must be near its label whatever
 the law. Where it is not under one of them, or where the drop is so small that tubes could make it,
 the label cannot be told, and the session is not called label-true.
@@ -32,9 +32,8 @@ from ventbench.base.arrays import Floats, Ints
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.sessions import Sessions
 from ventbench.task.lungs import Lung
-from ventbench.train.rigs.data import InspirationData
-from ventbench.train.rigs.fit import simulate
-from ventbench.train.rigs.parameters import LABEL_FLOW, Groups, Pooled, Scales, plants
+from ventbench.train.rigs.data import Groups, InspirationData
+from ventbench.train.rigs.fit import LABEL_FLOW, Pooled, Scales, plants, simulate
 
 #: Largest deviation of R and C from the label, as a share of it. Half of it may be left open by
 #: the fit and by what lies between sensor and lung.

@@ -48,18 +48,22 @@ from ventbench.train.rigs.data import (
     load_rig_recordings,
     whole_breaths,
 )
-from ventbench.train.rigs.fit import FitConfig, Fitted, Noise, fit, fit_expiration
-from ventbench.train.rigs.label_test import LabelTest, label_errors, label_tests
-from ventbench.train.rigs.parameters import (
+from ventbench.train.rigs.fit import (
     LAMINAR_SHARE,
     SHEET_FLOW,
     Centre,
+    FitConfig,
+    Fitted,
+    Noise,
     Pooled,
     Scales,
     centre,
+    fit,
+    fit_expiration,
     full_flow,
     plants,
 )
+from ventbench.train.rigs.label_test import LabelTest, label_errors, label_tests
 
 #: Called with what is being done and the share of all that is done, 0..1.
 Progress = Callable[[str, float], None]

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from ventbench.controllers import rl_policy
-from ventbench.controllers.rl_policy import (
+from ventbench.controllers import residual
+from ventbench.controllers.residual import (
     CHOICES,
     SCALE,
     GaussianPolicy,
@@ -25,7 +25,7 @@ from ventbench.controllers.rl_policy import (
     Parameters,
     TanhNetwork,
 )
-from ventbench.train.rl import episodes
+from ventbench.train.rl import environment
 
 
 @flax.struct.dataclass
@@ -60,20 +60,20 @@ class PolicyGradient:
     def init(self, key: Array) -> State:
         """Return the state at the start of a training."""
         network_key, key = jax.random.split(key)
-        parameters = rl_policy.init_parameters(self.network, network_key)
+        parameters = residual.init_parameters(self.network, network_key)
         return State(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
 
-    def iterate(self, state: State, plants: episodes.Lungs) -> State:
+    def iterate(self, state: State, plants: environment.Lungs) -> State:
         """One update on lungs."""
         cells_key, roll_key, key = jax.random.split(state.key, 3)
-        drawn = episodes.of_iteration(cells_key, plants, self.breaths, state.iteration)
+        drawn = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
 
         def loss(parameters: Parameters) -> Array:
             def act(key: Array, x: Array, base: Array) -> tuple[Array, None]:
                 mean: Array = self.network.apply(parameters, x)  # type: ignore[assignment]
                 return base + SCALE * mean[..., 0], None
 
-            return -jnp.mean(episodes.roll(drawn, act, roll_key)[2])
+            return -jnp.mean(environment.roll(drawn, act, roll_key)[2])
 
         gradient = jax.grad(loss)(state.parameters)
         updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.parameters)
@@ -141,13 +141,13 @@ class PPO:
         """Return the state at the start of a training."""
         actor_key, critic_key, key = jax.random.split(key, 3)
         parameters = {
-            "actor": rl_policy.init_parameters(self.network, actor_key),
-            "critic": rl_policy.init_parameters(self._critic, critic_key),
+            "actor": residual.init_parameters(self.network, actor_key),
+            "critic": residual.init_parameters(self._critic, critic_key),
             "log_spread": jnp.log(jnp.asarray(self.spread)),
         }
         return State(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
 
-    def iterate(self, state: State, plants: episodes.Lungs) -> State:
+    def iterate(self, state: State, plants: environment.Lungs) -> State:
         """Collect breaths on lungs and learn from them."""
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         batch = self._collect(state, plants, collect_key)
@@ -173,10 +173,10 @@ class PPO:
     def _value(self, parameters: Any, x: Array) -> Array:
         return self._critic.apply(parameters["critic"], x)[..., 0]  # type: ignore[index]
 
-    def _collect(self, state: State, plants: episodes.Lungs, key: Array) -> PPOBatch:
+    def _collect(self, state: State, plants: environment.Lungs, key: Array) -> PPOBatch:
         parameters = state.parameters
         cells_key, roll_key = jax.random.split(key)
-        drawn = episodes.of_iteration(cells_key, plants, self.breaths, state.iteration)
+        drawn = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
 
         def act(key: Array, x: Array, base: Array) -> tuple[Array, tuple[Array, Array]]:
             mean = self._mean(parameters, x)
@@ -184,9 +184,9 @@ class PPO:
             action = mean + jnp.exp(log_spread) * jax.random.normal(key, mean.shape)
             return base + SCALE * action, (action, log_probability(action, mean, log_spread))
 
-        x, (action, before), rewards = episodes.roll(drawn, act, roll_key)
+        x, (action, before), rewards = environment.roll(drawn, act, roll_key)
         value = self._value(parameters, x)
-        advantage = episodes.advantages(rewards, value, self.discount, self.trace)
+        advantage = environment.advantages(rewards, value, self.discount, self.trace)
         batch = PPOBatch(x, action, before, advantage, value)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
 
@@ -262,26 +262,26 @@ class DQN:
     def init(self, key: Array) -> DQNState:
         """Return the state at the start of a training."""
         network_key, key = jax.random.split(key)
-        parameters = rl_policy.init_parameters(self.network, network_key)
-        size = self.memory * episodes.STEPS
-        seen, zero = jnp.zeros((size, rl_policy.FEATURES)), jnp.zeros((size,))
+        parameters = residual.init_parameters(self.network, network_key)
+        size = self.memory * environment.MOVES
+        seen, zero = jnp.zeros((size, residual.FEATURES)), jnp.zeros((size,))
         replay = Replay(seen, jnp.zeros((size,), jnp.int32), zero, zero, seen)
         iteration = jnp.zeros((), jnp.int32)
         optimiser = self._optimiser.init(parameters)
         return DQNState(parameters, parameters, optimiser, replay, key, iteration)
 
-    def iterate(self, state: DQNState, plants: episodes.Lungs) -> DQNState:
+    def iterate(self, state: DQNState, plants: environment.Lungs) -> DQNState:
         """Collect breaths on lungs and learn from the replay."""
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         new = self._collect(state, plants, collect_key)
-        count = self.breaths * episodes.STEPS
+        count = self.breaths * environment.MOVES
         first = state.iteration % (self.memory // self.breaths) * count
         replay = jax.tree.map(
             lambda old, some: jax.lax.dynamic_update_slice_in_dim(old, some, first, 0),
             state.replay,
             new,
         )
-        known = jnp.minimum((state.iteration + 1) * count, self.memory * episodes.STEPS)
+        known = jnp.minimum((state.iteration + 1) * count, self.memory * environment.MOVES)
 
         def update(carry: Any, key: Array) -> tuple[Any, None]:
             rows = jax.random.randint(key, (self.batch,), 0, known)
@@ -299,9 +299,9 @@ class DQN:
     def _values(self, parameters: Any, x: Array) -> Array:
         return self.network.apply(parameters, x)  # type: ignore[return-value]
 
-    def _collect(self, state: DQNState, plants: episodes.Lungs, key: Array) -> Replay:
+    def _collect(self, state: DQNState, plants: environment.Lungs, key: Array) -> Replay:
         cells_key, roll_key = jax.random.split(key)
-        drawn = episodes.of_iteration(cells_key, plants, self.breaths, state.iteration)
+        drawn = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
         start, end = self.explore
         progress = jnp.minimum(state.iteration / (self.explored * self.iterations), 1.0)
         share = start + (end - start) * progress
@@ -314,22 +314,22 @@ class DQN:
             choice = jnp.where(explore, random, greedy)
             return base + jnp.asarray(CHOICES, base.dtype)[choice], choice
 
-        x, choice, rewards = episodes.roll(drawn, act, roll_key)
-        following = jnp.arange(episodes.STEPS) + 1
-        discount = jnp.where(following < episodes.STEPS, self.discount, 0.0)
+        x, choice, rewards = environment.roll(drawn, act, roll_key)
+        following = jnp.arange(environment.MOVES) + 1
+        discount = jnp.where(following < environment.MOVES, self.discount, 0.0)
         replay = Replay(
             x,
             choice.astype(jnp.int32),
             rewards,
             jnp.broadcast_to(discount[:, None], rewards.shape),
-            x[jnp.minimum(following, episodes.STEPS - 1)],
+            x[jnp.minimum(following, environment.MOVES - 1)],
         )
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), replay)
 
     def _update(self, carry: Any, part: Replay) -> Any:
         online, target, optimiser = carry
         after = [self._values(p, part.following) for p in (online, target)]
-        wanted = episodes.double_q_target(part.reward, part.discount, *after)
+        wanted = environment.double_q_target(part.reward, part.discount, *after)
 
         def loss(parameters: Parameters) -> Array:
             values = self._values(parameters, part.features)

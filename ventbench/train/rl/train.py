@@ -23,7 +23,7 @@ from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.resume import Checkpoint, fingerprint
-from ventbench.controllers import rl_policy
+from ventbench.controllers import residual
 from ventbench.controllers.pid import PID
 from ventbench.plants.catalog import Given
 from ventbench.task import protocol
@@ -35,7 +35,7 @@ from ventbench.train.plants import (
     check_names,
     plants_to_train_on,
 )
-from ventbench.train.rl import episodes
+from ventbench.train.rl import environment
 from ventbench.train.rl.learners import DQN, PPO, PolicyGradient
 
 #: Settings of a way of learning: hashable, static in ``jit``; their methods are pure.
@@ -77,7 +77,7 @@ class TrainedPolicies:
     compile_seconds: float
 
 
-def nominal_error(lungs: episodes.Lungs, policy: Any) -> Array:
+def nominal_error(lungs: environment.Lungs, policy: Any) -> Array:
     """Score without noise of a policy on the nominal plants of lungs, cmH2O.
 
     The mean over lungs and PIPs, without weights.
@@ -86,22 +86,24 @@ def nominal_error(lungs: episodes.Lungs, policy: Any) -> Array:
     which = jnp.arange(len(pips)) % lungs.count
     cells = nominal_scenario(pips)
     each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], lungs.nominal)
-    drawn = episodes.Episodes(each, cells, jnp.ones(len(pips)))
-    return jnp.mean(episodes.errors(drawn, policy))
+    drawn = environment.Episodes(each, cells, jnp.ones(len(pips)))
+    return jnp.mean(environment.errors(drawn, policy))
 
 
-def fresh_error(lungs: episodes.Lungs, policy: Any) -> Array:
+def fresh_error(lungs: environment.Lungs, policy: Any) -> Array:
     """Error of a policy on fresh cells of its lungs, weighted as in the training, cmH2O."""
     count = VALIDATION_CELLS * lungs.count
     key = jax.random.key(VALIDATION_SEED)
-    return jnp.mean(episodes.errors(episodes.draw(key, lungs, count), policy))
+    return jnp.mean(environment.errors(environment.draw(key, lungs, count), policy))
 
 
 @partial(jax.jit, static_argnames=("method", "count"))
-def _advance(method: Method, runs: _Run, plants: episodes.Lungs, count: int) -> tuple[_Run, Array]:
+def _advance(
+    method: Method, runs: _Run, plants: environment.Lungs, count: int
+) -> tuple[_Run, Array]:
     """``count`` iterations of each run, then both errors, shape ``(R, 2)``."""
 
-    def advance(run: _Run, plant: episodes.Lungs) -> tuple[_Run, Array]:
+    def advance(run: _Run, plant: environment.Lungs) -> tuple[_Run, Array]:
         def iterate(state: Any, _: None) -> tuple[Any, None]:
             return method.iterate(state, plant), None
 
@@ -117,7 +119,7 @@ def _advance(method: Method, runs: _Run, plants: episodes.Lungs, count: int) -> 
 
 
 def _start(
-    method: Method, seeds: Sequence[int], plants: episodes.Lungs
+    method: Method, seeds: Sequence[int], plants: environment.Lungs
 ) -> tuple[_Run, NDArray[np.float32]]:
     numbers = jnp.asarray(np.asarray(seeds, np.uint32))
     keys = jax.vmap(jax.random.key)(numbers)
@@ -129,7 +131,7 @@ def _start(
 
 def train(
     method: Method,
-    plants: episodes.Lungs,
+    plants: environment.Lungs,
     seeds: Sequence[int],
     *,
     chunk: int,
@@ -307,11 +309,11 @@ def method_for(name: str, lungs: int, steps: int | None = None) -> Method:
 def _shortened(method: Method, name: str, steps: int | None) -> Method:
     if steps is None:
         return method
-    iterations = steps // (method.breaths * episodes.STEPS)
+    iterations = steps // (method.breaths * environment.MOVES)
     if iterations < 1:
         raise InputError(
             f"{steps} steps are less than one iteration of {name}, "
-            f"{method.breaths} breaths of {episodes.STEPS} steps"
+            f"{method.breaths} breaths of {environment.MOVES} steps"
         )
     return replace(method, iterations=iterations)
 
@@ -380,16 +382,16 @@ def _train(
         "jax": jax.__version__,
         "seconds": round(time.perf_counter() - began, 1),
     }
-    rl_policy.save_weights(out / "weights.npz", policies)
+    residual.save_policies(out / "weights.npz", policies)
     for seed in seeds if len(seeds) > 1 else ():
-        rl_policy.save_weights(out / f"weights-{seed}.npz", each[seed])
+        residual.save_policies(out / f"weights-{seed}.npz", each[seed])
     files.write_json(out / "training.json", result)
     for checkpoint in checkpoints:
         checkpoint.unlink(missing_ok=True)
     return TrainedControllers(policies, result, out)
 
 
-def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> episodes.Lungs:
+def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> environment.Lungs:
     """Lungs of each run, an axis of R in front: the seeds of a network in a row."""
     known = list(trained_on.names)
     if ALL in group.names:
@@ -399,14 +401,14 @@ def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> episodes.Lu
     plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, where], trained_on.plants)
     # (plants, runs, lungs, ...) -> (runs, plants, lungs, ...)
     plants = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), plants)
-    return episodes.Lungs(plants, jnp.asarray(trained_on.weights[where]))
+    return environment.Lungs(plants, jnp.asarray(trained_on.weights[where]))
 
 
-def _pid_errors(lungs: episodes.Lungs) -> list[float]:
+def _pid_errors(lungs: environment.Lungs) -> list[float]:
     """Nominal error of the PID that is corrected, on the lungs of each run, cmH2O."""
     with compilation.float32():
         lungs = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), lungs)
-        pid = PID(*rl_policy.GAINS)
+        pid = PID(*residual.GAINS)
         errors = jax.jit(jax.vmap(lambda own: nominal_error(own, pid)))(lungs)
         return [float(error) for error in errors]
 

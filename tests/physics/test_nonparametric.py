@@ -97,7 +97,7 @@ def test_components_are_complete_and_outside_the_library():
 
 def test_coefficients_tend_to_zero_and_strengths_of_the_library_do_not(bench):
     layout = make_unknowns(bench.data, free_paths(("leak", "recoil_shape")))
-    _, precision = layout.prior({})
+    _, precision = layout.prior()
     assert np.all(precision[layout.of("leak.conductance")] == 0.0)
     for k in range(1, 6):
         path = f"recoil_shape.c{k}"

@@ -22,12 +22,12 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
+from proofs.challenge.contract import PUBLISHED
 from proofs.challenge.figures import calibration_error, interval
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.judge import FLOOR, JudgedCase
 from proofs.challenge.reveal import reveal
 from proofs.challenge.truth import is_right
-from proofs.challenge.vocabulary import PUBLISHED
 from proofs.diagnosers.ventbench import CALIBRATION, Calibration, hypotheses
 
 #: Folds of cases, and draws of what happens by chance.

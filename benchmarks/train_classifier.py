@@ -29,12 +29,12 @@ import optax
 
 from hardware_eval.emulation.cases import random_generator
 from proofs import code_version
+from proofs.challenge.contract import TERMS
 from proofs.challenge.first import rig
 from proofs.challenge.generators import generator
 from proofs.challenge.make import record_within_limits
 from proofs.challenge.stranger import laboratory
 from proofs.challenge.truth import concealed
-from proofs.challenge.vocabulary import TERMS
 from proofs.diagnosers.classifier import WEIGHTS, summaries
 from ventbench.base.errors import InputError
 

@@ -3,17 +3,20 @@
 The folder of a case holds ``recording.csv`` (withheld breaths have commands and no pressures) and
 ``case.json``, a :class:`Question`. The answer is an :class:`Answer`. ``docs/diagnosers.md`` tells
 both to those who write a diagnoser.
+
+``vocabulary.toml`` is published: what may be missing, where it acts, its parameters. A *term* of an
+answer is a name of it, or ``unknown:PLACE`` for an effect without a name.
 """
 
 from __future__ import annotations
 
 import math
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from proofs.challenge.vocabulary import PARAMETERS, PUBLISHED, TERMS
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, write
@@ -37,6 +40,40 @@ _ROUNDING = 1e-3
 
 #: Most hypotheses, most terms of one, and largest pressure, cmH2O.
 _HYPOTHESES, _TERMS, _PRESSURE = 500, 8, 1000.0
+
+
+class Name(msgspec.Struct, frozen=True):
+    """A name of the vocabulary."""
+
+    place: str  #: where it acts, one of :data:`PLACES`.
+    meaning: str  #: in words.
+    parameters: dict[str, str]  #: unit of each parameter, the strength first.
+
+
+#: The vocabulary as JSON values, as every case holds it.
+PUBLISHED: dict[str, Any] = tomllib.loads(
+    Path(__file__).with_name("vocabulary.toml").read_text("utf-8")
+)
+
+#: Parts of the rig, from the supply to the log.
+PLACES: tuple[str, ...] = tuple(PUBLISHED["places"])
+
+VOCABULARY: dict[str, Name] = msgspec.convert(PUBLISHED["names"], dict[str, Name])
+
+#: Prefix of a term without a name.
+UNKNOWN = "unknown:"
+
+TERMS: frozenset[str] = frozenset(VOCABULARY) | {UNKNOWN + place for place in PLACES}
+
+#: Paths of the parameters that an answer may give.
+PARAMETERS: frozenset[str] = frozenset({"R", "C"}) | {
+    f"{name}.{key}" for name, about in VOCABULARY.items() for key in about.parameters
+}
+
+
+def place_of(term: str) -> str:
+    """Where a term acts."""
+    return term.removeprefix(UNKNOWN) if term.startswith(UNKNOWN) else VOCABULARY[term].place
 
 
 class AnswerError(InputError):

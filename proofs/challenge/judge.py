@@ -13,11 +13,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from proofs.challenge.contract import Answer
+from proofs.challenge.contract import UNKNOWN, Answer, place_of
 from proofs.challenge.folder import Withheld
 from proofs.challenge.questions import DrawnCase, Kind
 from proofs.challenge.truth import Concealed, concealed, is_right, true_values
-from proofs.challenge.vocabulary import UNKNOWN, place_of
 from ventbench.recordings.breaths import Breaths
 
 #: Least probability of the truth that the log score counts, so that no single case decides.

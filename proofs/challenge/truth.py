@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hardware_eval.emulation.cases import EFFECTS, NOMINAL_GAIN, Case, Effect
+from proofs.challenge.contract import PARAMETERS, TERMS, UNKNOWN, place_of
 from proofs.challenge.detectability import LIMIT
 from proofs.challenge.faults.effects import FaultsCase
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger import effects as stranger
-from proofs.challenge.vocabulary import PARAMETERS, TERMS, UNKNOWN, place_of
 
 #: Terms that are right for an effect that the first generator's library does not have.
 _OUTSIDE: dict[str, set[str]] = {

@@ -10,6 +10,7 @@ import pytest
 
 from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.answer import answer
+from proofs.challenge.contract import PUBLISHED, TERMS, VOCABULARY
 from proofs.challenge.faults import laboratory
 from proofs.challenge.faults.effects import FaultsCase
 from proofs.challenge.first.rig import record
@@ -17,7 +18,6 @@ from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.make import make
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Limits, built_in, find
-from proofs.challenge.vocabulary import PUBLISHED, TERMS, VOCABULARY
 from proofs.diagnosers import classifier, forward_search, lisdd
 from proofs.diagnosers.common import Templates
 from proofs.diagnosers.gaussian_process import _Process

@@ -12,9 +12,8 @@ import msgspec
 import pytest
 
 from proofs.challenge import contract
-from proofs.challenge.contract import AnswerError, decode
+from proofs.challenge.contract import PLACES, TERMS, VOCABULARY, AnswerError, decode
 from proofs.challenge.run import Limits, find, run
-from proofs.challenge.vocabulary import PLACES, TERMS, VOCABULARY
 
 from .truths import SAMPLES, WITHHELD, answer, recording
 

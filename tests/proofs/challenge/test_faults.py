@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from hardware_eval.emulation.cases import Base, Effect
+from proofs.challenge.contract import PARAMETERS, VOCABULARY
 from proofs.challenge.detectability import LIMIT, log_likelihood_loss
 from proofs.challenge.faults.effects import FAULTS, PARTIAL, SHARES, FaultsCase
 from proofs.challenge.faults.laboratory import active, record, replay
 from proofs.challenge.folder import decode_answers, encode_answers
 from proofs.challenge.generators import FAULTS as GENERATOR
 from proofs.challenge.truth import true_values
-from proofs.challenge.vocabulary import PARAMETERS, VOCABULARY
 from ventbench.base.errors import InputError
 
 QUIET = FaultsCase(

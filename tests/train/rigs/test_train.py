@@ -119,7 +119,10 @@ def test_the_lung_is_what_it_was(trained):
     (test,) = [t for t in simulators.manifest["label_tests"] if t["session"] == 0]
     assert test["C"] == pytest.approx(OWN.C, rel=0.1)
     about = simulators.lungs()[OWN.id]
-    assert about["label_test"] == "passed"
+    # Tubes of 1 cmH2O/(L/s) are a ninth of its resistance, and leave the valve's gain as open.
+    assert about["label_test"] == "cannot be told"
+    assert "reason" not in test
+    assert "to 11 % only" in test["doubt"]
     assert about["own_rig_median_mae"] < 0.8
 
 

@@ -176,7 +176,7 @@ def _run(
 
 
 def _table(results: list[dict[str, Any]]) -> Table:
-    """Scores side by side, a row each, with their 95 % intervals."""
+    """Scores side by side, a row each, with their 95 % intervals; no columns of ``-`` alone."""
 
     def shown(values: dict[str, Any] | None, digits: int) -> str:
         if values is None:
@@ -194,9 +194,11 @@ def _table(results: list[dict[str, Any]]) -> Table:
         survived = "-" if stress is None else f"{100 * stress['survived']:.1f} %"
         scores = (shown(values, 3), shown(values["draws"], 3), shown(ranked, 1), shown(stress, 3))
         rows.append((f"{values['name']}, {values['track']}", *scores, survived))
+    names = ("entry", "nominal", "draws", "normalised", "missing physics", "survived")
+    some = [k for k in range(len(names)) if any(row[k] != "-" for row in rows)]
     return table_of(
         "Mean |pressure - target|, cmH2O (lower is better)",
-        ("entry", "nominal", "draws", "normalised", "missing physics", "survived"), rows,
+        [names[k] for k in some], [[row[k] for k in some] for row in rows],
         caption="normalised: 0 = best attainable, 100 = best PID",
     )  # fmt: skip
 

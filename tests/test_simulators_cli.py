@@ -77,7 +77,7 @@ def test_lungs_lists_the_six_with_their_errors():
 
 
 def test_many_breaths_are_each_simulated_alone(tmp_path):
-    """Of two lungs and unequal lengths; what is written is a recording and a --plant."""
+    """Of two lungs and unequal lengths; what is written is a recording, and answers for another."""
     rng = np.random.default_rng(0)
     rows, path, out = (
         ["breath_id,R,C,time_step,u_in,u_out"],
@@ -103,8 +103,12 @@ def test_many_breaths_are_each_simulated_alone(tmp_path):
         np.testing.assert_allclose(breaths.pressure[index, :length], wanted, atol=2e-3)
     printed = run("simulate", "--controls", path, "--plant", "physics")
     assert printed.splitlines()[0] == out.read_text().splitlines()[0]
-    report = ventbench.open_loop(ventbench.load_recording(out, pad=True), str(out))
-    assert report.lungs["R5C20"]["mae"] == 0.0
+    recording = ventbench.load_recording(out, pad=True)
+    with pytest.raises(InputError, match="is the recording itself; it has no column simulated"):
+        ventbench.open_loop(recording, str(out))
+    answers = tmp_path / "answers.csv"
+    answers.write_text(out.read_text().replace(",pressure", ",simulated", 1))
+    assert ventbench.open_loop(recording, str(answers)).lungs["R5C20"]["mae"] == 0.0
     (tmp_path / "bare.csv").write_text("breath_id,u_in\n1,5\n1,6\n2,7\n2,8\n")
     assert "name the lung" in run("simulate", "--controls", tmp_path / "bare.csv", code=2)
     text = run("simulate", "--controls", tmp_path / "bare.csv", "--lung", "R20C50")

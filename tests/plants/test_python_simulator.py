@@ -150,7 +150,7 @@ class TwoPressures:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (lambda u_in, dt, valve: u_in, "needs valve, which a diagnosis does not have"),
+        (lambda u_in, dt, valve: u_in, "needs valve, which no simulator is given"),
         (lambda u, v, h: u, r"needs u, v, h, .* called as f\(u_in, u_out, dt"),
         (NoStep, "is a class without `step`"),
         (OddStep, r"step takes 1 arguments; step\(u_in, u_out, dt\) is wanted"),

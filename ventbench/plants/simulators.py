@@ -322,7 +322,7 @@ def _call_of(function: Callable[..., Any], name: str) -> PythonSimulator:
     names = by_name & set(_ARGUMENTS)
     if unknown := [key for key in parameters if key in needed - names]:
         raise InputError(
-            f"{name} needs {', '.join(unknown)}, which a diagnosis does not have; simulators are "
+            f"{name} needs {', '.join(unknown)}, which no simulator is given; simulators are "
             f"called as {_SIGNATURE}, by these names, and may also ask for time (s) and flow (mL/s)"
         )
 

@@ -77,8 +77,10 @@ def tell(what: str, scores: list[float], believed: list[tuple[float, float]]) ->
     drawn = np.broadcast_to(values, (DRAWS, *values.shape)).copy()
     drawn[..., 1] = rng.uniform(size=drawn.shape[:2]) < values[:, 0]
     chance = float(calibration_error(drawn).mean())
-    print(f"{what}: log score {np.mean(scores):.2f} ({low:.2f} to {high:.2f}), ECE {error:.3f} "
-          f"({span[0]:.3f} to {span[1]:.3f}), by chance {chance:.3f}")  # fmt: skip
+    print(
+        f"{what}: log score {np.mean(scores):.2f} ({low:.2f} to {high:.2f}), ECE {error:.3f} "
+        f"({span[0]:.3f} to {span[1]:.3f}), by chance {chance:.3f}"
+    )
 
 
 def main() -> None:
@@ -93,10 +95,14 @@ def main() -> None:
         folder = ChallengeFolder(path)
         answers = folder.answers("ventbench")
         judged = reveal([folder], [seed], "ventbench").cases
-        cases += [(answers[n]["answer"]["notes"], c) for (_, n), c in judged.items()
-                  if not c.problem]  # fmt: skip
-    tell("as answered", [c.log_score for _, c in cases],
-         [(c.confidence, float(c.isolation > 0.0)) for _, c in cases])  # fmt: skip
+        cases += [
+            (answers[n]["answer"]["notes"], c) for (_, n), c in judged.items() if not c.problem
+        ]
+    tell(
+        "as answered",
+        [c.log_score for _, c in cases],
+        [(c.confidence, float(c.isolation > 0.0)) for _, c in cases],
+    )
     groups = np.random.default_rng(0).permutation(len(cases)) % FOLDS
     apart: list[dict[frozenset[str], float]] = [{} for _ in cases]
     for fold in range(FOLDS):

@@ -36,10 +36,12 @@ def markdown() -> str:
         limits = f"[{row['normalised_low']:.1f}, {row['normalised_high']:.1f}]"
         stress = row["stress_cmH2O"]
         told = (
-            [f"{row['score_cmH2O']:.3f}"] if row["track"] == "performance"
+            [f"{row['score_cmH2O']:.3f}"]
+            if row["track"] == "performance"
             else [f"{stress:.2f}", f"{100 * row['stress_survived']:.0f} %"]
-            if math.isfinite(stress) else ["", ""]
-        )  # fmt: skip
+            if math.isfinite(stress)
+            else ["", ""]
+        )
         score = f"**{row['normalised']:.1f}** {limits}"
         cells.setdefault(row["name"], {})[row["track"]] = [score, ranks, *told]
     lines = [titles, ["---"] * len(titles)]

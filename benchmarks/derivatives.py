@@ -37,12 +37,17 @@ def breaths() -> Breaths:
     steps = np.random.default_rng(0).uniform(0.0, 60.0, (BREATHS, SAMPLES // 4))
     inspired = np.arange(SAMPLES) < SAMPLES // 2
     return Breaths(
-        breath_id=np.arange(BREATHS), R=np.full(BREATHS, 20.0), C=np.full(BREATHS, 20.0),
-        time=np.broadcast_to(DT * np.arange(SAMPLES), shape), dt=np.full(shape, DT),
+        breath_id=np.arange(BREATHS),
+        R=np.full(BREATHS, 20.0),
+        C=np.full(BREATHS, 20.0),
+        time=np.broadcast_to(DT * np.arange(SAMPLES), shape),
+        dt=np.full(shape, DT),
         u_in=np.where(inspired, np.repeat(steps, 4, axis=1), 0.0),
-        u_out=np.broadcast_to(~inspired, shape).astype(np.int8), pressure=np.full(shape, 5.0),
-        valid=np.ones(shape, bool), time_inferred=np.zeros(BREATHS, bool),
-    )  # fmt: skip
+        u_out=np.broadcast_to(~inspired, shape).astype(np.int8),
+        pressure=np.full(shape, 5.0),
+        valid=np.ones(shape, bool),
+        time_inferred=np.zeros(BREATHS, bool),
+    )
 
 
 def with_usual_options(predictor: Predictor, values: np.ndarray) -> Callable[[], object]:

@@ -52,10 +52,16 @@ def opened(workers: int, cluster: bool) -> Iterator[Executor]:
     import distributed
 
     local: Any = distributed.LocalCluster
-    with local(
-        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
-        host="127.0.0.1",
-    ) as started, executor(0, started.scheduler_address) as pool:  # fmt: skip
+    with (
+        local(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            host="127.0.0.1",
+        ) as started,
+        executor(0, started.scheduler_address) as pool,
+    ):
         yield pool
 
 

@@ -43,16 +43,25 @@ from ventbench.base import files
 #: The lung must be vented within this time of a death, s: watchdog, deadman, monostable, age of the
 #: readings, each with what their processes need to wake up.
 LIMITS = {
-    "host": 0.100, "device": 0.060, "stopped": 0.060, "deadman": 0.100, "both": 0.100,
-    "bus": 0.070, "supply": 0.010,
-}  # fmt: skip
+    "host": 0.100,
+    "device": 0.060,
+    "stopped": 0.060,
+    "deadman": 0.100,
+    "both": 0.100,
+    "bus": 0.070,
+    "supply": 0.010,
+}
 
 #: What the table calls them.
 TITLES = {
-    "host": "host killed", "device": "program killed", "stopped": "program stopped",
-    "deadman": "deadman killed", "both": "both stopped", "bus": "sensor's bus blocked",
+    "host": "host killed",
+    "device": "program killed",
+    "stopped": "program stopped",
+    "deadman": "deadman killed",
+    "both": "both stopped",
+    "bus": "sensor's bus blocked",
     "supply": "supply lost",
-}  # fmt: skip
+}
 
 #: A host runs for a random time in this range before it is killed, s.
 LIFE = (0.05, 0.5)
@@ -97,10 +106,22 @@ class EmulatedDevice:
         self.link, self.control = folder / "lung", folder / "control"
         self.valves, self.program = folder / "valves.csv", folder / "program.csv"
         self._command = [
-            sys.executable, "-m", "hardware_eval", "emulate", "--plant", "single_compartment",
-            "--link", str(self.link), "--control", str(self.control), "--electronics",
-            str(self.valves), "--log", str(self.program), *extra,
-        ]  # fmt: skip
+            sys.executable,
+            "-m",
+            "hardware_eval",
+            "emulate",
+            "--plant",
+            "single_compartment",
+            "--link",
+            str(self.link),
+            "--control",
+            str(self.control),
+            "--electronics",
+            str(self.valves),
+            "--log",
+            str(self.program),
+            *extra,
+        ]
         self._start()
 
     def _start(self) -> None:
@@ -260,13 +281,18 @@ def deaths(
     late = sum(part for _, part in parts)
     milliseconds = 1e3 * np.array([delay for delay, _ in delays])
     return {
-        "death": death, "valve": "open" if normally_open else "closed", "kills": kills,
-        "vents": not unvented, "bound_ms": 1e3 * LIMITS[death],
+        "death": death,
+        "valve": "open" if normally_open else "closed",
+        "kills": kills,
+        "vents": not unvented,
+        "bound_ms": 1e3 * LIMITS[death],
         "within": int(np.sum(milliseconds <= 1e3 * LIMITS[death])),
-        "median_ms": float(np.median(milliseconds)), "worst_ms": float(milliseconds.max()),
-        "held_up": int(sum(held for _, held in delays)), "not_counted": late,
+        "median_ms": float(np.median(milliseconds)),
+        "worst_ms": float(milliseconds.max()),
+        "held_up": int(sum(held for _, held in delays)),
+        "not_counted": late,
         "delays_ms": sorted(milliseconds.round(2).tolist()),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

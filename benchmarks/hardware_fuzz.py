@@ -38,10 +38,23 @@ IDENTITY = Identity("fuzz", bytes(8), bytes(32), Capability.NONE)
 
 #: What happens to a frame, and how often; "none" are the intact ones.
 DAMAGES = (
-    "none", "flip one bit", "flip many bits", "cut", "drop a byte", "insert a byte", "twice",
-    "old frame again", "swapped with the next", "garbage before", "long garbage before",
-    "another session", "wrong check", "wrong length", "unknown kind", "joined by a lost zero",
-)  # fmt: skip
+    "none",
+    "flip one bit",
+    "flip many bits",
+    "cut",
+    "drop a byte",
+    "insert a byte",
+    "twice",
+    "old frame again",
+    "swapped with the next",
+    "garbage before",
+    "long garbage before",
+    "another session",
+    "wrong check",
+    "wrong length",
+    "unknown kind",
+    "joined by a lost zero",
+)
 SHARES = np.array([0.40] + [0.04] * (len(DAMAGES) - 1))
 
 

@@ -42,9 +42,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="figures as JSON")
     arguments = parser.parse_args()
     command = [
-        sys.executable, "-m", "hardware_eval", "emulate", "--lung", arguments.lung,
-        "--plant", arguments.plant,
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "hardware_eval",
+        "emulate",
+        "--lung",
+        arguments.lung,
+        "--plant",
+        arguments.plant,
+    ]
     emulator = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert emulator.stdout is not None
     client = Client(Link(emulator.stdout.readline().strip()))
@@ -108,8 +114,10 @@ def main() -> None:
         "load": [round(x, 1) for x in (*loads, os.getloadavg()[0])],
     }
     print(f"{steps} steps of {1e3 * protocol.DT:.0f} ms ({arguments.minutes:g} minutes)")
-    print(f"begun within {1e3 * ON_TIME_S:.0f} ms of their deadline: "
-          f"{100 * figures['within_2_ms']:.3f} %, {figures['lost']} lost")  # fmt: skip
+    print(
+        f"begun within {1e3 * ON_TIME_S:.0f} ms of their deadline: "
+        f"{100 * figures['within_2_ms']:.3f} %, {figures['lost']} lost"
+    )
     print(f"latest {figures['latest_ms']} ms, 99.9 % {figures['p99_9_ms']} ms")
     print(
         f"round trip: median {figures['round_trip_median_ms']} ms, longest "
@@ -125,8 +133,10 @@ def main() -> None:
         )
     print(f"device: {counters}")
     print(f"emulator: {told.strip().splitlines()[-1]}")
-    print(f"load of the machine, least to most: {min(figures['load'])} to {max(figures['load'])} "
-          f"on {os.cpu_count()} processors; real-time priority: {granted}")  # fmt: skip
+    print(
+        f"load of the machine, least to most: {min(figures['load'])} to {max(figures['load'])} "
+        f"on {os.cpu_count()} processors; real-time priority: {granted}"
+    )
     if arguments.json:
         arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
 

@@ -57,8 +57,10 @@ CREEP, CREEP_TIME = (0.04, 0.08), (0.5, 1.8)
 #: Parts of the self-test that could find it; all if not here.
 ALL = selftest.PARTS
 PARTS_OF = {
-    CREEPS: ("sensor", "leak"), LEAKS: ("sensor", "leak"), STUCK: ("sensor", "sweep"),
-}  # fmt: skip
+    CREEPS: ("sensor", "leak"),
+    LEAKS: ("sensor", "leak"),
+    STUCK: ("sensor", "sweep"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,18 +99,26 @@ def draw(settings: Sequence[str], fault: str, rng: np.random.Generator) -> Mount
     parabolic = (rng.uniform(size=n) < 0.5) & np.array([x.R < 50.0 for x in lungs])
     gain = NOMINAL_GAIN * rng.uniform(0.9, 1.1, n) * (fault != STUCK)
     values: dict[str, Any] = {
-        "R": np.where(parabolic, 0.5, R), "C": C, "R_ex": rng.uniform(4.0, 7.0, n),
-        "peep": rng.uniform(4.5, 5.5, n), "gain": gain,
-    }  # fmt: skip
+        "R": np.where(parabolic, 0.5, R),
+        "C": C,
+        "R_ex": rng.uniform(4.0, 7.0, n),
+        "peep": rng.uniform(4.5, 5.5, n),
+        "gain": gain,
+    }
     sensor = SENSORS.get(fault, 1.0)
     leak = LEAK / np.sqrt(20.0) if fault == LEAKS else 0.0
     creep = rng.uniform(*CREEP, n) * (fault in (CREEPS, LEAKS))
     return Mounted(
-        Base(**values), np.where(parabolic, R, 0.0), np.full(n, leak), creep,
-        rng.uniform(*CREEP_TIME, n), np.full(n, sensor),
-        1.0 + FLOW_GAIN * rng.standard_normal(n), rng.uniform(0.1, 0.3, n),
+        Base(**values),
+        np.where(parabolic, R, 0.0),
+        np.full(n, leak),
+        creep,
+        rng.uniform(*CREEP_TIME, n),
+        np.full(n, sensor),
+        1.0 + FLOW_GAIN * rng.standard_normal(n),
+        rng.uniform(0.1, 0.3, n),
         rng.integers(0, FINE, n),
-    )  # fmt: skip
+    )
 
 
 def driven(
@@ -144,9 +154,14 @@ def driven(
 
 
 def _program(
-    rig: Rig, mounted: Mounted, make: Any, steps: int, pip: float, label: str,
+    rig: Rig,
+    mounted: Mounted,
+    make: Any,
+    steps: int,
+    pip: float,
+    label: str,
     rng: np.random.Generator,
-) -> tuple[Floats, list[tuple[str, ...]]]:  # fmt: skip
+) -> tuple[Floats, list[tuple[str, ...]]]:
     """Columns of :class:`Driven`, ``(7, T, n)``, and the trips of each lung."""
     n, zeros = len(mounted.noise), np.zeros(len(mounted.noise))
     commands = [make() for _ in range(n)]

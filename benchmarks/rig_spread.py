@@ -53,15 +53,21 @@ def main() -> None:
         "resistance at 0.5 L/s": (resistance, np.asarray(cells.r_scale), True),
         "compliance": (compliance, np.asarray(cells.c_scale), True),
         f"flow of the valve at {COMMAND:g} %": (
-            valve_flow(np.asarray(members.slopes, float)), ones, True,
+            valve_flow(np.asarray(members.slopes, float)),
+            ones,
+            True,
         ),
         "control interval": (
-            np.broadcast_to(interval, resistance.shape), np.asarray(cells.dt) / protocol.DT, True,
+            np.broadcast_to(interval, resistance.shape),
+            np.asarray(cells.dt) / protocol.DT,
+            True,
         ),
         "dead time and lag of the valve, ms": (
-            dead, 1e3 * protocol.DT * np.asarray(cells.delay), False,
+            dead,
+            1e3 * protocol.DT * np.asarray(cells.delay),
+            False,
         ),
-    }  # fmt: skip
+    }
     print(
         "| standard deviation | between fitted rigs of a lung | deviations drawn | all of a draw |"
     )

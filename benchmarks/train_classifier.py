@@ -116,11 +116,13 @@ def main() -> None:
     frequency = y.mean(axis=0).clip(1e-3)
     alone = -(y * np.log(frequency) + (1 - y) * np.log1p(-frequency)).sum(axis=1).mean()
     about = {
-        "code": code_version(), "recordings": counts, "seed": SEED,
+        "code": code_version(),
+        "recordings": counts,
+        "seed": SEED,
         "processor seconds": round(time.process_time() - began),
         "log loss of terms left out, nats": [round(each["loss"], 3) for each in found],
         "by frequencies alone": round(float(alone), 3),
-    }  # fmt: skip
+    }
     plain: dict[str, Any] = {
         name: np.stack([np.asarray(each[name], np.float32) for each in found])
         for name in ("w1", "b1", "w2", "b2")

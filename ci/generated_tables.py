@@ -19,8 +19,10 @@ def commands() -> str:
     from ventbench import cli
 
     programs = {
-        "ventbench": cli.app, "ventbench-hardware": hardware.app, "python -m proofs": proofs.app,
-    }  # fmt: skip
+        "ventbench": cli.app,
+        "ventbench-hardware": hardware.app,
+        "python -m proofs": proofs.app,
+    }
     lines = ["| command | what it does | example |", "|---|---|---|"]
     for program, app in programs.items():
         for name, command in _leaves(program, typer.main.get_command(app)):

@@ -232,9 +232,8 @@ def _entry_problems(files: list[TreeEntry]) -> list[str]:
         return [f"the folder has {len(names)} files; at most {MAX_FILES} are accepted"]
     problems = []
     for mode, _, path in files:
-        for wrong in (_MODE_PROBLEMS.get(mode, f"has mode {mode}"), path_problem(path)):
-            if wrong:
-                problems.append(f"{path} {wrong}")
+        mode_and_path = (_MODE_PROBLEMS.get(mode, f"has mode {mode}"), path_problem(path))
+        problems.extend(f"{path} {wrong}" for wrong in mode_and_path if wrong)
         advice = kind_problem(path)
         if advice:
             problems.append(f"{path} is of a kind that is not accepted; {advice}")

@@ -148,9 +148,15 @@ def run(
         begun = ev.begun_plan(out)
         seed = secrets.randbits(32) if begun is None else int(begun["seed"])
     plan = make_plan(
-        [x.manifest.name for x in entries], lung, track=track, pips=chosen, repeats=repeats,
-        control_every=control_every, perturbations=perturb or (), seed=seed,
-    )  # fmt: skip
+        [x.manifest.name for x in entries],
+        lung,
+        track=track,
+        pips=chosen,
+        repeats=repeats,
+        control_every=control_every,
+        perturbations=perturb or (),
+        seed=seed,
+    )
     settings = SafetySettings(largest_u_in=largest_u_in, largest_rise=largest_rise)
     shows = [show_bars, *([RerunView(rerun).breath] if rerun else [])]
     left_out = chosen_parts(skip or ())
@@ -167,12 +173,22 @@ def run(
         calibrated = calibration_of(line, calibration)
         masked = Blind(person, plan)
         done = ev.evaluate(
-            entries, line, out, masked if blind else person, plan=plan,
+            entries,
+            line,
+            out,
+            masked if blind else person,
+            plan=plan,
             shows=[masked.hiding(show) for show in shows] if blind else shows,
-            sandbox=not in_process, dry=dry_run, before_lung=before_lung, settings=settings,
-            operator_name=operator, notes=notes, rest=rest, calibration=calibrated,
+            sandbox=not in_process,
+            dry=dry_run,
+            before_lung=before_lung,
+            settings=settings,
+            operator_name=operator,
+            notes=notes,
+            rest=rest,
+            calibration=calibrated,
             fallback=FALLBACK if fallback else None,
-        )  # fmt: skip
+        )
     reason = masked.hidden(done.reason) if blind else done.reason
     emit(
         {
@@ -372,10 +388,15 @@ def collect(
             raise typer.Exit(1)
         with bar("exploring") as exploring:
             done = run_collection(
-                bench, label, breaths, out, seed=seed, ease=ease,
+                bench,
+                label,
+                breaths,
+                out,
+                seed=seed,
+                ease=ease,
                 about={"device": ev.device_about(line)},
                 progress=lambda number: exploring(number, breaths),
-            )  # fmt: skip
+            )
     count = len(done.breaths)
     emit({"breaths": count, "recording": str(done.recording), "stopped": done.stopped}, json)
     to = told(json)
@@ -412,9 +433,13 @@ def demo(
 
     to = told(json)
     done = run_demo(
-        conceal, out, breaths=breaths, simulator=plant, sandbox=not in_process,
+        conceal,
+        out,
+        breaths=breaths,
+        simulator=plant,
+        sandbox=not in_process,
         tell=lambda text: print(text, file=to, flush=True),
-    )  # fmt: skip
+    )
     emit(done.as_dict(), json)
     print(f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}", file=to)
     if not done.better:

@@ -363,11 +363,20 @@ def demo(
     found = "named" if effect.name in named else "not named"
     step("The seal is opened", f"{truth}, {effect.strength}: {found}")
     done = Demo(
-        words, lung, commitment, simulated, measured, diagnosis.verdict, named, mae,
-        replanned.error, retuned,
+        words,
+        lung,
+        commitment,
+        simulated,
+        measured,
+        diagnosis.verdict,
+        named,
+        mae,
+        replanned.error,
+        retuned,
         {"name": effect.name, "strength": effect.strength, "parameters": dict(effect.parameters)},
-        tuple(steps), time.perf_counter() - began,
-    )  # fmt: skip
+        tuple(steps),
+        time.perf_counter() - began,
+    )
     files.write_json(out / "demo.json", done.as_dict())
     return done
 
@@ -402,9 +411,17 @@ def errors_on(
     """
     plan = make_plan([entry.name], [lung], pips=pips, repeats=1, control_every=0)
     done = ev.evaluate(
-        [open_submission(str(entry))], line, out, Operator(), plan=plan, sandbox=sandbox,
-        dry=False, operator_name="ventbench-hardware demo", notes="emulated lung", rest=_REST,
-    )  # fmt: skip
+        [open_submission(str(entry))],
+        line,
+        out,
+        Operator(),
+        plan=plan,
+        sandbox=sandbox,
+        dry=False,
+        operator_name="ventbench-hardware demo",
+        notes="emulated lung",
+        rest=_REST,
+    )
     if not done.complete:
         raise InputError(f"{entry.name} did not finish its plan: {done.reason}")
     errors = dict.fromkeys(pips, float("inf"))

@@ -83,10 +83,13 @@ def _wrong_answers(result: Judged) -> list[str]:
         )
         truths.setdefault(full_answer(case), []).append(truth or "nothing")
     return [
-        "", f"Answers that are not right ({len(wrong)} of {len(result.cases)}):", "",
-        "| answer | truth |", "|---|---|",
+        "",
+        f"Answers that are not right ({len(wrong)} of {len(result.cases)}):",
+        "",
+        "| answer | truth |",
+        "|---|---|",
         *(f"| {answer} | {'; '.join(given)} |" for answer, given in sorted(truths.items())),
-    ]  # fmt: skip
+    ]
 
 
 def _commands(tables: Mapping[str, Sequence[Draw]], diagnosers: Sequence[str]) -> list[str]:

@@ -94,10 +94,16 @@ class Round:
 
 
 def freeze(
-    folder: Path, diagnosers: Iterable[str], worlds: Mapping[str, int], *, delay_s: int = 600,
-    seconds: float = 300.0, kind: Kind | Literal["all"] = "all", chain: Chain = QUICKNET,
+    folder: Path,
+    diagnosers: Iterable[str],
+    worlds: Mapping[str, int],
+    *,
+    delay_s: int = 600,
+    seconds: float = 300.0,
+    kind: Kind | Literal["all"] = "all",
+    chain: Chain = QUICKNET,
     now: datetime | None = None,
-) -> Round:  # fmt: skip
+) -> Round:
     """Take the hashes of the code and of all diagnosers; later changes do not count.
 
     Args:
@@ -174,9 +180,11 @@ def _drawn(own: Round, content: bytes, label: str) -> Round:
 
 
 def play(
-    own: Round, *, jobs: int = 1,
+    own: Round,
+    *,
+    jobs: int = 1,
     tell: Callable[..., None] = lambda what, done, count: None,
-) -> Board:  # fmt: skip
+) -> Board:
     """Make the cases, let all answer, judge, and write the board; what is finished is kept.
 
     Args:
@@ -199,8 +207,15 @@ def play(
     limits = Limits(own.frozen.seconds)
     for folder, (world, count) in zip(folders, own.frozen.worlds.items(), strict=True):
         if not folder.sealed.exists():
-            make(own.seed, folder.path, own.frozen.kind, count, jobs=jobs, source=world,
-                 progress=partial(tell, f"make {world}", count=count))  # fmt: skip
+            make(
+                own.seed,
+                folder.path,
+                own.frozen.kind,
+                count,
+                jobs=jobs,
+                source=world,
+                progress=partial(tell, f"make {world}", count=count),
+            )
         for name in own.frozen.diagnosers:
             tell_this = partial(tell, f"{name}, {world}")
             answer(folder, own.diagnoser(name), limits=limits, jobs=jobs, progress=tell_this)

@@ -66,16 +66,18 @@ class Controller:
 LINES = (
     ("task/metrics/score.py", '    "swings":', '    "top_cmH2O": lambda s: s.pressure.max(-1),'),
     (
-        "plants/plant_files.py", '    "hybrid":',
+        "plants/plant_files.py",
+        '    "hybrid":',
         '    "balloon": PlantFamily(Balloon, lambda lung: Balloon(lung.C)),',
     ),
     ("plants/plant_files.py", "import jax\n", "from ventbench.plants.balloon import Balloon"),
     (
-        "board/frames.py", '    Column(("created",)',
+        "board/frames.py",
+        '    Column(("created",)',
         '    Column(("letters",), lambda x: len(x.row.record.name), "of the name"),',
     ),
     ("entries/manifest.py", '    "other":', '    "bang": "All or nothing.",'),
-)  # fmt: skip
+)
 FILES = {
     "plants/balloon.py": PLANT,
     "physics/mechanisms/chimney.py": MECHANISM,

@@ -31,13 +31,25 @@ REFERENCES: Final = ("#d277b8", "#b58a5a", "#8fb6c9", "#c9b84f")
 SCORED: Final = "#12a073"
 
 _LIGHT = {
-    "ground": "#fff", "ink": INK, "quiet": QUIET, "line": LINE, "soft": SOFT, "band": BAND,
-    "good": "#00704f", "bad": "#a8410b",
-}  # fmt: skip
+    "ground": "#fff",
+    "ink": INK,
+    "quiet": QUIET,
+    "line": LINE,
+    "soft": SOFT,
+    "band": BAND,
+    "good": "#00704f",
+    "bad": "#a8410b",
+}
 _DARK = {
-    "ground": "#111418", "ink": "#e9ecef", "quiet": "#a2abb5", "line": "#333a42",
-    "soft": "#1a1f25", "band": "#1d232a", "good": "#52cba4", "bad": "#ffa266",
-}  # fmt: skip
+    "ground": "#111418",
+    "ink": "#e9ecef",
+    "quiet": "#a2abb5",
+    "line": "#333a42",
+    "soft": "#1a1f25",
+    "band": "#1d232a",
+    "good": "#52cba4",
+    "bad": "#ffa266",
+}
 
 
 def rgb(color: str) -> tuple[int, int, int]:

@@ -362,9 +362,11 @@ class OpenLoopReport:
 
 
 def open_loop(
-    breaths: Breaths | Path | str | pd.DataFrame, simulator: Given = "frozen",
-    *, progress: Callable[[int, int], object] | None = None,
-) -> OpenLoopReport:  # fmt: skip
+    breaths: Breaths | Path | str | pd.DataFrame,
+    simulator: Given = "frozen",
+    *,
+    progress: Callable[[int, int], object] | None = None,
+) -> OpenLoopReport:
     """Measure how far simulators stray from recorded breaths under the recorded commands.
 
     The error of a breath is the mean |simulated - recorded| pressure over its inspiratory samples,

@@ -44,9 +44,14 @@ STALE = 30.0
 
 #: What can be calibrated, and the units of reference and reading.
 PARTS = {
-    "zero": ("cmH2O", "cmH2O"), "span": ("cmH2O", "cmH2O"), "peep": ("cmH2O", "cmH2O"),
-    "valve": ("%", "mL/s"), "flow": ("mL/s", "mL/s"), "leak": ("s", "cmH2O"), "lung": ("", ""),
-}  # fmt: skip
+    "zero": ("cmH2O", "cmH2O"),
+    "span": ("cmH2O", "cmH2O"),
+    "peep": ("cmH2O", "cmH2O"),
+    "valve": ("%", "mL/s"),
+    "flow": ("mL/s", "mL/s"),
+    "leak": ("s", "cmH2O"),
+    "lung": ("", ""),
+}
 
 #: Openings of the valve, %, upwards; downwards they are the same.
 OPENINGS = (5.0, 10.0, 20.0, 30.0, 40.0)
@@ -136,8 +141,9 @@ class Part:
     @property
     def fit(self) -> Fit:
         """The line through it."""
-        return fit(*(np.array(x, float) for x in (self.reference, self.reading, self.error,
-                                                   self.above)))  # fmt: skip
+        return fit(
+            *(np.array(x, float) for x in (self.reference, self.reading, self.error, self.above))
+        )
 
     def __str__(self) -> str:
         if self.kind == "lung":
@@ -213,8 +219,11 @@ def measure(
             raise InputError(f"{kind}: not confirmed; nothing was measured")
 
     if kind in ("zero", "peep"):
-        confirmed("open the sensor's tube to air. Is it open?" if kind == "zero"
-                  else f"set the lung to {lung}, PEEP valve as in use. Does it rest?")  # fmt: skip
+        confirmed(
+            "open the sensor's tube to air. Is it open?"
+            if kind == "zero"
+            else f"set the lung to {lung}, PEEP valve as in use. Does it rest?"
+        )
         level = reference[0] if reference else 0.0
         rows = [_mean(_vented(bench, _READINGS)[0], _PRESSURE_ERROR) for _ in range(_MEANS)]
         points = [(0.0, value - level, error) for value, error in rows]
@@ -237,8 +246,11 @@ def measure(
         by_hand = not has_flow
         if by_hand and ask is None:
             raise InputError("valve: the device measures no flow, and nobody is there to read it")
-        confirmed(f"set the lung to {lung} and connect it. Is it set?" if has_flow
-                  else "flow meter at the valve, tube open, no lung. Is it so?")  # fmt: skip
+        confirmed(
+            f"set the lung to {lung} and connect it. Is it set?"
+            if has_flow
+            else "flow meter at the valve, tube open, no lung. Is it so?"
+        )
         points = []
         for opening, above in zip(openings, _above(openings), strict=True):
             if has_flow:
@@ -321,8 +333,9 @@ class Calibration:
         parts = {}
         for kind, part in self.parts.items():
             line = part.fit
-            found = {name: vars(getattr(line, name)) for name in ("intercept", "slope",
-                                                                  "hysteresis")}  # fmt: skip
+            found = {
+                name: vars(getattr(line, name)) for name in ("intercept", "slope", "hysteresis")
+            }
             parts[kind] = {**vars(part), "units": PARTS[kind], **found, "residual": line.residual}
         content = {"format": FORMAT, "device": self.device, "parts": parts}
         return json.loads(json.dumps(files.json_values(content)))
@@ -391,11 +404,17 @@ def load(
         digest = content.pop("sha256")
         parts = {
             kind: Part(
-                kind, x["date"], tuple(x["reference"]), tuple(x["reading"]), tuple(x["error"]),
-                tuple(x["above"]), x["by_hand"], x.get("lung", ""),
+                kind,
+                x["date"],
+                tuple(x["reference"]),
+                tuple(x["reading"]),
+                tuple(x["error"]),
+                tuple(x["above"]),
+                x["by_hand"],
+                x.get("lung", ""),
             )
             for kind, x in content["parts"].items()
-        }  # fmt: skip
+        }
         dates = {kind: datetime.datetime.fromisoformat(x.date) for kind, x in parts.items()}
         own = content["device"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

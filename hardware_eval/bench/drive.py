@@ -241,10 +241,16 @@ class Collection:
 
 
 def collect(
-    bench: Bench, lung: str, count: int, out: Path, *, seed: int = 0,
-    ease: float = protocol.SAFETY_PRESSURE, about: dict[str, Any] | None = None,
+    bench: Bench,
+    lung: str,
+    count: int,
+    out: Path,
+    *,
+    seed: int = 0,
+    ease: float = protocol.SAFETY_PRESSURE,
+    about: dict[str, Any] | None = None,
     progress: Callable[[int], None] = lambda done: None,
-) -> Collection:  # fmt: skip
+) -> Collection:
     """Explore a lung at all PIPs in turn; a folder with breaths of the same seed is continued.
 
     Args:

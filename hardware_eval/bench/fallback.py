@@ -146,10 +146,16 @@ def step(
         command = answer
     episode = state.episode + 1 if active else 0
     return replace(
-        state, commands=(*state.commands, command), integral=integral, active=active, good=good,
-        taken=state.taken + active, outside=state.outside + outside, episode=episode,
+        state,
+        commands=(*state.commands, command),
+        integral=integral,
+        active=active,
+        good=good,
+        taken=state.taken + active,
+        outside=state.outside + outside,
+        episode=episode,
         longest=max(state.longest, episode),
-    ), command  # fmt: skip
+    ), command
 
 
 def _begun(
@@ -166,9 +172,12 @@ def _begun(
     if math.isfinite(pressure):
         residual = max(residual, pressure)
     return replace(
-        state, commands=(before,) * late, pressures=(), integral=0.0,
+        state,
+        commands=(before,) * late,
+        pressures=(),
+        integral=0.0,
         residual=residual + settings.noise,
-    )  # fmt: skip
+    )
 
 
 def _most(settings: FallbackSettings, lung: Lung) -> tuple[float, float, float]:

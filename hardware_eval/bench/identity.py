@@ -87,10 +87,15 @@ def identified(
         flows = [valve[0] * late[:, LAGS[-1] - lag :][:, :count] for lag in LAGS]
         wide = max(valve[0] / valve[1], valve[2] / valve[0]) if valve[1] > 0.0 else math.inf
     recorded = make_breaths(
-        np.arange(len(probes)) + 1, [label.R] * len(probes), [label.C] * len(probes),
-        time - time[:, :1], stacked("u_in"), stacked("u_out").astype(int), stacked("pressure"),
+        np.arange(len(probes)) + 1,
+        [label.R] * len(probes),
+        [label.C] * len(probes),
+        time - time[:, :1],
+        stacked("u_in"),
+        stacked("u_out").astype(int),
+        stacked("pressure"),
         flow=flows[0],
-    )  # fmt: skip
+    )
     try:
         each = [identify(replace(recorded, flow=flow))[0] for flow in flows]
     except InputError as error:

@@ -425,10 +425,20 @@ class _Loop:
         if self._disturbed:
             self._bench.operator.disturb(self._run.perturbation, False)
         return RunResult(
-            status, reason, self._safety.trips, tuple(self._breaths), self._late_answers,
-            self._limited, vented_after, held_up, self._asked, self._controller.longest_answer,
-            self._fallback.outside, self._fallback.taken, self._fallback.longest,
-        )  # fmt: skip
+            status,
+            reason,
+            self._safety.trips,
+            tuple(self._breaths),
+            self._late_answers,
+            self._limited,
+            vented_after,
+            held_up,
+            self._asked,
+            self._controller.longest_answer,
+            self._fallback.outside,
+            self._fallback.taken,
+            self._fallback.longest,
+        )
 
 
 _CAUSES = CAUSES & ~Flag.HOST_VENTED

@@ -37,9 +37,13 @@ CONTROL = "control_pid"
 
 #: The paper's best gains on the physical lung (P, I), %/cmH2O (table 2), with D = 0.
 CONTROL_GAINS = {
-    "R5C10": (10.0, 0.2), "R5C20": (10.0, 10.0), "R5C50": (10.0, 10.0),
-    "R20C10": (8.0, 1.0), "R20C20": (5.0, 10.0), "R20C50": (5.0, 10.0),
-}  # fmt: skip
+    "R5C10": (10.0, 0.2),
+    "R5C20": (10.0, 10.0),
+    "R5C50": (10.0, 10.0),
+    "R20C10": (8.0, 1.0),
+    "R20C20": (5.0, 10.0),
+    "R20C50": (5.0, 10.0),
+}
 
 #: PIP of the control, cmH2O: in the middle.
 CONTROL_PIP = 20.0
@@ -161,9 +165,16 @@ def make_plan(
         if control_every:
             add("control", CONTROL, lung, CONTROL_PIP, controls + 1)
     return Plan(
-        tuple(entries), track, mounted, rising, repeats, control_every, tuple(perturbations),
-        seed, tuple(runs),
-    )  # fmt: skip
+        tuple(entries),
+        track,
+        mounted,
+        rising,
+        repeats,
+        control_every,
+        tuple(perturbations),
+        seed,
+        tuple(runs),
+    )
 
 
 @dataclass(frozen=True)

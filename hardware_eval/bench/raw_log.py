@@ -139,12 +139,14 @@ def breaths(path: Path) -> list[LoggedBreath]:
             PlannedRun(
                 line["run"], line["kind"], line["entry"], line["lung"], line["pip"], line["repeat"]
             ),
-            line["attempt"], line["breath"], (line["run"], line["attempt"]) in finished,
+            line["attempt"],
+            line["breath"],
+            (line["run"], line["attempt"]) in finished,
             BreathLog.of_line(line),
         )
         for line in logged
         if line["type"] == "breath"
-    ]  # fmt: skip
+    ]
 
 
 def recording(path: Path, kinds: Sequence[str]) -> Breaths:
@@ -173,7 +175,12 @@ def recording(path: Path, kinds: Sequence[str]) -> Breaths:
 
     time, flow = stacked("time"), stacked("flow")
     return make_breaths(
-        np.arange(len(taken)) + 1, [x.R for x in labels], [x.C for x in labels],
-        time - time[:, :1], np.clip(stacked("u_in"), 0.0, 100.0), stacked("u_out"),
-        stacked("pressure"), flow=flow if np.isfinite(flow).all() else None,
-    )  # fmt: skip
+        np.arange(len(taken)) + 1,
+        [x.R for x in labels],
+        [x.C for x in labels],
+        time - time[:, :1],
+        np.clip(stacked("u_in"), 0.0, 100.0),
+        stacked("u_out"),
+        stacked("pressure"),
+        flow=flow if np.isfinite(flow).all() else None,
+    )

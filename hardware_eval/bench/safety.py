@@ -53,69 +53,111 @@ class SafetySettings:
 
     #: see the reasons of the checks themselves, also for those that follow.
     over_pressure: Check = Check(
-        protocol.SAFETY_MARGIN, "cmH2O above PIP", protocol.SAFETY_TIME, False,
+        protocol.SAFETY_MARGIN,
+        "cmH2O above PIP",
+        protocol.SAFETY_TIME,
+        False,
         "Protocol's safety gate: pressure above min(60, PIP + 15) for longer than 0.1 s.",
-    )  # fmt: skip
+    )
     peak_pressure: Check = Check(
-        protocol.SAFETY_PRESSURE + 5.0, "cmH2O", 0.0, False,
+        protocol.SAFETY_PRESSURE + 5.0,
+        "cmH2O",
+        0.0,
+        False,
         "One sample is enough: the device vents at 60 itself, so this means that it did not.",
-    )  # fmt: skip
+    )
     over_volume: Check = Check(
-        1.5, "times C (limit - PEEP)", 0.0, False,
+        1.5,
+        "times C (limit - PEEP)",
+        0.0,
+        False,
         "Volume that would take the labelled lung half beyond the pressure limit has gone in. "
         "Where no flow is measured, the valve's is taken and twice as much allowed, as a leak "
         "takes its part; never more than 2.5 L, more than a test lung holds.",
-    )  # fmt: skip
+    )
     disconnected: Check = Check(
-        0.12, "of V / C", 0.15, True,
+        0.12,
+        "of V / C",
+        0.15,
+        True,
         "The volume given should raise the pressure by V / C; less than this share of it says "
         "that the gas goes elsewhere. Counts once V / C exceeds 8 cmH2O.",
-    )  # fmt: skip
+    )
     software_delay: Check = Check(
-        0.100, "s late", 0.0, True,
+        0.100,
+        "s late",
+        0.0,
+        True,
         "Paper's override: the loop stood still so long that the device has vented by itself.",
-    )  # fmt: skip
+    )
     missed_deadlines: Check = Check(
-        0.010, "s late", 0.12, True,
+        0.010,
+        "s late",
+        0.12,
+        True,
         "A third of the control step; steps in a row that are so late no longer are 30 ms apart.",
-    )  # fmt: skip
+    )
     stuck_sensor: Check = Check(
-        8.0, "cmH2O of expected change", 0.15, True,
+        8.0,
+        "cmH2O of expected change",
+        0.15,
+        True,
         "The same reading to the last digit while the commands should have changed the pressure; "
         "or for 5 s at rest (PVP's alarm).",
-    )  # fmt: skip
+    )
     implausible_slope: Check = Check(
-        90.0, "cmH2O in a step", 0.0, True,
+        90.0,
+        "cmH2O in a step",
+        0.0,
+        True,
         "The fully open valve into the stiffest lung gives 53 cmH2O in 30 ms; more is no pressure.",
-    )  # fmt: skip
+    )
     no_reading: Check = Check(
-        0.0, "readings", 0.06, True,
+        0.0,
+        "readings",
+        0.06,
+        True,
         "Two steps without a number, or one outside -20..110 cmH2O: nothing can be controlled.",
-    )  # fmt: skip
+    )
     no_answer: Check = Check(
-        0.0, "answers", 0.06, True,
+        0.0,
+        "answers",
+        0.06,
+        True,
         "Two steps without an answer: the host is blind, and the device's watchdog is about to "
         "vent.",
-    )  # fmt: skip
+    )
     low_pressure: Check = Check(
-        1.0, "cmH2O", 0.5, True,
+        1.0,
+        "cmH2O",
+        0.5,
+        True,
         "Airway near ambient or below for half a second: PEEP is lost, or the sensor's tube is "
         "off.",
-    )  # fmt: skip
+    )
     expiratory_valve: Check = Check(
-        0.7, "of the pressure above PEEP", 0.15, True,
+        0.7,
+        "of the pressure above PEEP",
+        0.15,
+        True,
         "So much is left 0.6 s after the expiratory valve was told to open, and more than 4 cmH2O: "
         "it has not opened. The slowest lung leaves a fifth.",
-    )  # fmt: skip
+    )
     inspiratory_valve: Check = Check(
-        6.0, "cmH2O of rise", 0.06, True,
+        6.0,
+        "cmH2O of rise",
+        0.06,
+        True,
         "The pressure rises with both valves told to be closed: the inspiratory one has not "
         "closed.",
-    )  # fmt: skip
+    )
     applied_command: Check = Check(
-        2.0, "% apart", 0.1, True,
+        2.0,
+        "% apart",
+        0.1,
+        True,
         "The device reports a position of the valve that it was not told.",
-    )  # fmt: skip
+    )
     largest_u_in: float = protocol.U_MAX  #: commands are cut to this, %.
     #: largest rise of the command in one step, %; 100 for none, as in simulation.
     largest_rise: float = 100.0
@@ -157,8 +199,14 @@ class SafetySample(NamedTuple):
 
 
 #: Checks with an alarm of medium priority, in the words of IEC 60601-1-8; the others have high.
-MEDIUM = ("disconnected", "low_pressure", "no_answer", "software_delay", "missed_deadlines",
-          "applied_command")  # fmt: skip
+MEDIUM = (
+    "disconnected",
+    "low_pressure",
+    "no_answer",
+    "software_delay",
+    "missed_deadlines",
+    "applied_command",
+)
 
 #: Checks that blame the host or the line, not the lung, its tubes or its sensor.
 TIMING_CHECKS = frozenset({"no_answer", "software_delay", "missed_deadlines"})
@@ -240,11 +288,15 @@ def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> 
         if held >= check.duration - 1e-9 and name not in tripped:
             trips.append(
                 Trip(
-                    name, sample.time, held, value,
+                    name,
+                    sample.time,
+                    held,
+                    value,
                     f"{name.replace('_', ' ')}: {value:.3g} {check.unit}, the limit is "
-                    f"{check.threshold:g} for {check.duration:g} s", check.bench,
+                    f"{check.threshold:g} for {check.duration:g} s",
+                    check.bench,
                 )
-            )  # fmt: skip
+            )
     return replace(state, since=since, trips=tuple(trips), previous=sample)
 
 
@@ -340,7 +392,8 @@ def _values(
         "missed_deadlines": (sample.late, sample.late > settings.missed_deadlines.threshold),
         "stuck_sensor": (
             state.expected,
-            number and still > 0.0
+            number
+            and still > 0.0
             and (state.expected > settings.stuck_sensor.threshold or still > _STUCK_AT_REST_S),
         ),
         "implausible_slope": (jump, jump > settings.implausible_slope.threshold),
@@ -353,11 +406,9 @@ def _values(
             and pressure - protocol.PEEP > _LEAST_LEFT
             and left > settings.expiratory_valve.threshold,
         ),
-        "inspiratory_valve": (
-            climbed, settled and climbed > settings.inspiratory_valve.threshold
-        ),
+        "inspiratory_valve": (climbed, settled and climbed > settings.inspiratory_valve.threshold),
         "applied_command": (apart, apart > settings.applied_command.threshold),
-    }  # fmt: skip
+    }
 
 
 def limit_command(settings: SafetySettings, previous: float, wanted: float) -> tuple[float, bool]:

@@ -44,64 +44,98 @@ class Limit:
 
 LIMITS: dict[str, Limit] = {
     "sensor_zero": Limit(
-        protocol.PEEP - 1.5, protocol.PEEP + 1.5, "cmH2O",
+        protocol.PEEP - 1.5,
+        protocol.PEEP + 1.5,
+        "cmH2O",
         "A vented lung rests at PEEP; an offset would go into every score.",
     ),
     "sensor_noise": Limit(
-        0.0, 0.5, "cmH2O", "Standard deviation at rest; the recordings have 0.1 to 0.3.",
+        0.0,
+        0.5,
+        "cmH2O",
+        "Standard deviation at rest; the recordings have 0.1 to 0.3.",
     ),
     "leak": Limit(
-        -1.0, 1.0, "mL/s",
+        -1.0,
+        1.0,
+        "mL/s",
         "What a lung loses that is filled towards 20 cmH2O and closed. Counts where neither this "
         "nor the creep of rubber bellows explains the pressures, by 2.6 standard errors.",
     ),
     "valve_sweep": Limit(
-        1.0, 1.0, "of steps up",
+        1.0,
+        1.0,
+        "of steps up",
         "Each larger opening must give a quarter of the nominal valve's further rise at least, "
         "within 2.6 standard errors of the noise at rest, and the largest one a rise beyond them; "
         "else the valve sticks or is unplugged.",
     ),
     "valve_gain": Limit(
-        0.4, 2.0, "of nominal",
+        0.4,
+        2.0,
+        "of nominal",
         "Flow of the valve against 22.8 mL/s per %: measured, or what makes C the label's.",
     ),
     "resistance": Limit(
-        0.0, 3.0, "of label", "More is an occluded or pinched tube.",
+        0.0,
+        3.0,
+        "of label",
+        "More is an occluded or pinched tube.",
     ),
     "lung": Limit(
-        0.0, 1.15, "of the best lung's error",
+        0.0,
+        1.15,
+        "of the best lung's error",
         "Open-loop error of the label's frozen simulator against that of the lung that fits best; "
         "decides where R and C do not.",
     ),
     "identity": Limit(
-        1.0, 1.0, "label held",
+        1.0,
+        1.0,
+        "label held",
         "R and C by pressure and flow, measured or of a calibrated valve, with 95 % intervals: the "
         "label holds within the tolerance of test lungs. Simulators have no say in it.",
     ),
     "sensor_span": Limit(
-        0.99, 1.01, "of calibrated",
+        0.99,
+        1.01,
+        "of calibrated",
         "R and 1/C of the calibrated lung against those of its calibration: both are off as the "
         "pressure's span is, or the flow's. A lung repeats within 1 %; counts beyond 2.6 standard "
         "errors of the noise at rest.",
     ),
     "on_time": Limit(
-        0.98, 1.0, "of steps", "Share of steps that begin within 2 ms of their deadline.",
+        0.98,
+        1.0,
+        "of steps",
+        "Share of steps that begin within 2 ms of their deadline.",
     ),
     "latest_step": Limit(
-        0.0, 0.010, "s", "The latest step; a third of the control step.",
+        0.0,
+        0.010,
+        "s",
+        "The latest step; a third of the control step.",
     ),
     "round_trip": Limit(
-        0.0, 0.010, "s", "Median time from a message to its answer; two of them fit into a step.",
+        0.0,
+        0.010,
+        "s",
+        "Median time from a message to its answer; two of them fit into a step.",
     ),
     "interruptions": Limit(
-        0.0, math.inf, "parts repeated",
+        0.0,
+        math.inf,
+        "parts repeated",
         "A part that a busy host or a slow line ends, or of which a step is too late, says nothing "
         "of the lung and is repeated; ten times in a row are a no-go.",
     ),
     "safety": Limit(
-        0.0, 0.0, "trips", "No safety check may trip in a test this gentle.",
+        0.0,
+        0.0,
+        "trips",
+        "No safety check may trip in a test this gentle.",
     ),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -165,13 +199,17 @@ class Sheet:
             "errors": {lung: _number(error) for lung, error in self.errors.items()},
             "findings": [
                 {
-                    "name": x.name, "ok": x.ok, "value": _number(x.value), "unit": x.limit.unit,
-                    "limits": [x.limit.low, _number(x.limit.high)], "text": x.text,
+                    "name": x.name,
+                    "ok": x.ok,
+                    "value": _number(x.value),
+                    "unit": x.limit.unit,
+                    "limits": [x.limit.low, _number(x.limit.high)],
+                    "text": x.text,
                     "reason": x.limit.reason,
                 }
                 for x in self.findings
             ],
-        }  # fmt: skip
+        }
 
     def __str__(self) -> str:
         lines = [f"self-test of {self.lung}: {'GO' if self.go else 'NO-GO'}"]
@@ -265,10 +303,14 @@ def rest_before(lung: str) -> float:
 
 
 def selftest(
-    bench: Bench, lung: str, *, simulator: Any = "frozen",
-    valve: tuple[float, float, float] | None = None, known: KnownLung | None = None,
+    bench: Bench,
+    lung: str,
+    *,
+    simulator: Any = "frozen",
+    valve: tuple[float, float, float] | None = None,
+    known: KnownLung | None = None,
     skip: Collection[str] = (),
-) -> Sheet:  # fmt: skip
+) -> Sheet:
     """Test a bench with a mounted lung.
 
     Takes a minute; longer where host or line are held up, as a part that they end is repeated.
@@ -326,10 +368,14 @@ def selftest(
 
 
 def judge(
-    lung: str, driven: Mapping[str, Sequence[Driven]], *, simulator: Any = "frozen",
-    valve: tuple[float, float, float] | None = None, known: KnownLung | None = None,
+    lung: str,
+    driven: Mapping[str, Sequence[Driven]],
+    *,
+    simulator: Any = "frozen",
+    valve: tuple[float, float, float] | None = None,
+    known: KnownLung | None = None,
     skipped: tuple[str, ...] = (),
-) -> Sheet:  # fmt: skip
+) -> Sheet:
     """Judge what the programs of the parts brought; of the clock and the checks says nothing.
 
     Args:
@@ -478,9 +524,12 @@ def _errors(probes: list[Driven], simulator: Any) -> dict[str, float]:
         for probe in probes:
             dt = np.diff(probe.time, append=2 * probe.time[-1] - probe.time[-2])
             simulated = simulators.respond(
-                lung.id, probe.u_in[inspiration], probe.u_out[inspiration], dt[inspiration],
+                lung.id,
+                probe.u_in[inspiration],
+                probe.u_out[inspiration],
+                dt[inspiration],
                 initial_pressure=float(probe.pressure[0]),
-            )  # fmt: skip
+            )
             each.append(float(mae(probe.pressure[inspiration], simulated)))
         errors[lung.id] = float(np.mean(each))
     return errors

@@ -86,9 +86,14 @@ def run_plan(
 
 
 def _runs(
-    bench: Bench, plan: Plan, remaining: Sequence[PlannedRun], attempts: dict[int, int],
-    make_controller: MakeController, log: RawLog, before_lung: Callable[[str], Sheet | None],
-) -> str:  # fmt: skip
+    bench: Bench,
+    plan: Plan,
+    remaining: Sequence[PlannedRun],
+    attempts: dict[int, int],
+    make_controller: MakeController,
+    log: RawLog,
+    before_lung: Callable[[str], Sheet | None],
+) -> str:
     mounted, spoilt, held_up = "", 0, 0
     queue = list(remaining)
     while queue:
@@ -154,9 +159,13 @@ def _mount(bench: Bench, lung: str, log: RawLog, before_lung: Callable[[str], Sh
 
 
 def _one(
-    bench: Bench, run: PlannedRun, attempts: dict[int, int], make_controller: MakeController,
-    log: RawLog, place: tuple[int, int],
-) -> RunResult:  # fmt: skip
+    bench: Bench,
+    run: PlannedRun,
+    attempts: dict[int, int],
+    make_controller: MakeController,
+    log: RawLog,
+    place: tuple[int, int],
+) -> RunResult:
     done, total = place
     attempt = attempts.get(run.number, 0)
     attempts[run.number] = attempt + 1
@@ -178,9 +187,11 @@ def _one(
     with ThreadPoolExecutor(1, "log", initializer=take_priority) as writer:
         try:
             result = run_once(
-                bench, run, controller,
+                bench,
+                run,
+                controller,
                 on_breath=lambda index, breath: written.append(writer.submit(write, index, breath)),
-            )  # fmt: skip
+            )
         finally:
             controller.close()
     for each in written:

@@ -118,8 +118,9 @@ def start(
     near, far = socket.socketpair()
     process = Popen(
         [sys.executable, "-m", __name__, str(far.fileno()), valves, argument],
-        pass_fds=(far.fileno(), *keep), start_new_session=True,
-    )  # fmt: skip
+        pass_fds=(far.fileno(), *keep),
+        start_new_session=True,
+    )
     far.close()
     near.setblocking(False)
     return process, near

@@ -237,9 +237,15 @@ def _received(
 
     def reading(state: DeviceState) -> tuple[DeviceState, DeviceMessage]:
         return state, Reading(
-            sequence, sample.time, sample.pressure, sample.flow, state.u_in, state.u_out,
-            state.mode, _flags(state, sample),
-        )  # fmt: skip
+            sequence,
+            sample.time,
+            sample.pressure,
+            sample.flow,
+            state.u_in,
+            state.u_out,
+            state.mode,
+            _flags(state, sample),
+        )
 
     fresh = 0 < sequence - state.sequence <= SEQUENCE_WINDOW
     if isinstance(message, Vent):  # from whomever, and whenever: it is always safe
@@ -254,13 +260,22 @@ def _received(
         asked = message.pressure_limit
         limit = settings.pressure_limit if asked is None else min(asked, settings.pressure_limit)
         state = replace(
-            _vented(state, Flag.NONE), mode=Mode.READY, session=packet.session, sequence=sequence,
+            _vented(state, Flag.NONE),
+            mode=Mode.READY,
+            session=packet.session,
+            sequence=sequence,
             pressure_limit=limit,
-        )  # fmt: skip
+        )
         return state, Welcome(
-            PROTOCOL_VERSION, FIRMWARE, identity.capabilities, WATCHDOG, limit,
-            identity.device_id, identity.calibration, identity.name,
-        )  # fmt: skip
+            PROTOCOL_VERSION,
+            FIRMWARE,
+            identity.capabilities,
+            WATCHDOG,
+            limit,
+            identity.device_id,
+            identity.calibration,
+            identity.name,
+        )
     if packet.session != state.session:
         return refused(_counted(state, "session"), Reason.SESSION)
     if not fresh:
@@ -300,9 +315,11 @@ def _sampled(state: DeviceState, sample: Sample) -> DeviceState:
         return state
     same = bool(state.newest) and sample.pressure == state.newest[-1]
     return replace(
-        state, valid=taken, changed=state.changed if same else taken,
+        state,
+        valid=taken,
+        changed=state.changed if same else taken,
         newest=(*state.newest[1 - NOISE_WINDOW :], sample.pressure),
-    )  # fmt: skip
+    )
 
 
 def _dangers(identity: Identity, state: DeviceState, sample: Sample) -> Flag:

@@ -218,9 +218,13 @@ class PvpSensor:
             ) from error
         self._highest = min(self._configuration.highest_pressure, self._pressure(LAST))
         self.identity = Identity(
-            self._configuration.name, bytes.fromhex(self._configuration.device_id), calibration,
-            Capability.NONE, highest=self._highest, noisy=True,
-        )  # fmt: skip
+            self._configuration.name,
+            bytes.fromhex(self._configuration.device_id),
+            calibration,
+            Capability.NONE,
+            highest=self._highest,
+            noisy=True,
+        )
 
     def sample(self, now: float) -> Sample:
         """Median of three conversions; NaN if the converter does not answer."""

@@ -233,8 +233,9 @@ def switch_on(given: dict[str, Any]) -> tuple[subprocess.Popen[bytes], Connectio
     pins, wire = socket.socketpair()
     process = subprocess.Popen(
         [sys.executable, "-m", _PROCESS, str(there.fileno()), str(wire.fileno())],
-        pass_fds=(there.fileno(), wire.fileno()), start_new_session=True,
-    )  # fmt: skip
+        pass_fds=(there.fileno(), wire.fileno()),
+        start_new_session=True,
+    )
     there.close()
     wire.close()
     here.send(given)
@@ -332,9 +333,15 @@ class _Bus:
 
 
 def serve(
-    bus: Connection, wire: socket.socket, make: Callable[[], Hal], *, begun: float,
-    normally_open: bool, monostable: float, log: Path | None,
-) -> None:  # fmt: skip
+    bus: Connection,
+    wire: socket.socket,
+    make: Callable[[], Hal],
+    *,
+    begun: float,
+    normally_open: bool,
+    monostable: float,
+    log: Path | None,
+) -> None:
     """Be the electronics until program and deadman have hung up.
 
     Args:

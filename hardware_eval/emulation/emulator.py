@@ -166,10 +166,15 @@ class Emulator(Guard):
     """
 
     def __init__(
-        self, service: DeviceService | Firmware, *, link: Path | None = None,
-        control: Path | None = None, line_faults: Sequence[Fault] = (), log: Path | None = None,
+        self,
+        service: DeviceService | Firmware,
+        *,
+        link: Path | None = None,
+        control: Path | None = None,
+        line_faults: Sequence[Fault] = (),
+        log: Path | None = None,
         begun: float | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Open the terminal.
 
         Args:
@@ -329,24 +334,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--lung", default="R20C50", help="lung on the ventilator")
     add("--plant", default="frozen", help="simulator: a name, a file or module:function")
-    add("--conceal", metavar="WORDS", dest="words",
-        help="a lung with physics that the simulator lacks; the words determine it")  # fmt: skip
+    add(
+        "--conceal",
+        metavar="WORDS",
+        dest="words",
+        help="a lung with physics that the simulator lacks; the words determine it",
+    )
     add("--seal", type=Path, help="where the sealed answer of --conceal goes (JSON)")
     add("--link", type=Path, help="symbolic link to make to the terminal")
     add("--control", type=Path, help="control socket to make")
     add("--log", type=Path, help="CSV of every order of the program to the valves")
     add("--electronics", type=Path, help="CSV of everything that the valves do, and why")
-    add("--normally-closed", action="store_true",
-        help="the expiratory valve is closed without current, as PVP's own")  # fmt: skip
+    add(
+        "--normally-closed",
+        action="store_true",
+        help="the expiratory valve is closed without current, as PVP's own",
+    )
     add("--no-monostable", action="store_true", help="no monostable on the heartbeat pin")
     add("--fault", action="append", default=[], help="KIND@START[-END][:STRENGTH], repeatedly")
     add("--noise", type=float, default=0.0, help="sensor noise, cmH2O (SD)")
     add("--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O")
     add("--highest", type=float, default=math.inf, help="end of the sensor's range, cmH2O")
-    add("--realtime", action="store_true", help="refuse to run without real-time scheduling, "
-        "which is taken where it is granted")  # fmt: skip
-    add("--firmware", type=Path, metavar="FILE",
-        help="a program of hardware_eval/firmware as the device: .elf runs under QEMU")  # fmt: skip
+    add(
+        "--realtime",
+        action="store_true",
+        help="refuse to run without real-time scheduling, which is taken where it is granted",
+    )
+    add(
+        "--firmware",
+        type=Path,
+        metavar="FILE",
+        help="a program of hardware_eval/firmware as the device: .elf runs under QEMU",
+    )
     add("--pressure-limit", type=float, help="device's own limit, cmH2O")
     given = parser.parse_args(arguments)
     try:
@@ -365,10 +384,13 @@ def _emulate(given: argparse.Namespace) -> int:
     sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
     begun = time.monotonic()
     asked = {
-        **about, **sensor, "faults": [x for x in faults if isinstance(x.kind, FaultKind)],
-        "log": given.electronics, "normally_open": not given.normally_closed,
+        **about,
+        **sensor,
+        "faults": [x for x in faults if isinstance(x.kind, FaultKind)],
+        "log": given.electronics,
+        "normally_open": not given.normally_closed,
         "monostable": float("inf") if given.no_monostable else MONOSTABLE,
-    }  # fmt: skip
+    }
     hal: EmulatedHal | Firmware
     if given.firmware is None:
         hal = EmulatedHal(asked, lambda: time.monotonic() - begun, begun)
@@ -382,9 +404,13 @@ def _emulate(given: argparse.Namespace) -> int:
         else:
             service = DeviceService(hal, settings, time.monotonic() - begun)
         emulator = Emulator(
-            service, link=given.link, control=given.control, line_faults=line_faults,
-            log=given.log, begun=begun,
-        )  # fmt: skip
+            service,
+            link=given.link,
+            control=given.control,
+            line_faults=line_faults,
+            log=given.log,
+            begun=begun,
+        )
         reason = realtime.prefer()
         if given.realtime and reason:
             emulator.close()

@@ -93,9 +93,13 @@ class Firmware:
             raise
         endless = identity.highest > 327.0
         self._identity = _IDENTITY.pack(
-            b"I", identity.device_id, identity.calibration, identity.capabilities,
-            _ENDLESS if endless else round(PRESSURE_STEPS * identity.highest), identity.noisy,
-        )  # fmt: skip
+            b"I",
+            identity.device_id,
+            identity.calibration,
+            identity.capabilities,
+            _ENDLESS if endless else round(PRESSURE_STEPS * identity.highest),
+            identity.noisy,
+        )
 
     def start(self, wake: Callable[[], None]) -> None:
         """Start the image, which has the priority of the caller.
@@ -105,10 +109,13 @@ class Firmware:
         """
         host, bus = self._uart[1].fileno(), self._bus[1].fileno()
         self._image = subprocess.Popen(
-            [part.format(host=host, bus=bus) for part in self._command], stdin=host, stdout=host,
-            pass_fds=(host, bus), start_new_session=True,
+            [part.format(host=host, bus=bus) for part in self._command],
+            stdin=host,
+            stdout=host,
+            pass_fds=(host, bus),
+            start_new_session=True,
             env={**os.environ, "VENTILATOR_BUS": str(bus)},
-        )  # fmt: skip
+        )
         for line in (self._uart, self._bus):
             line[1].close()
         for work in (lambda: self._listen(wake), self._order, self._measure):
@@ -232,8 +239,11 @@ def _command(image: Path) -> list[str]:
         part
         for line in ("host", "bus")
         for part in (
-            "-chardev", f"socket,id={line},fd={{{line}}}", "-serial", f"chardev:{line}",
+            "-chardev",
+            f"socket,id={line},fd={{{line}}}",
+            "-serial",
+            f"chardev:{line}",
         )
-    ]  # fmt: skip
+    ]
     machine = ["-M", "mps2-an385", "-icount", "shift=5", "-display", "none", "-monitor", "none"]
     return [_EMULATOR, *machine, *lines, "-kernel", str(image)]

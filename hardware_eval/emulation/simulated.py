@@ -79,9 +79,16 @@ class SimulatedHal:
     """A plant as a ventilator; compiles the plant once, before any time passes."""
 
     def __init__(
-        self, plant: Plant, *, name: str = "simulated lung", faults: Sequence[Fault] = (),
-        noise: float = 0.0, quantum: float = 0.0, highest: float = math.inf, seed: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        plant: Plant,
+        *,
+        name: str = "simulated lung",
+        faults: Sequence[Fault] = (),
+        noise: float = 0.0,
+        quantum: float = 0.0,
+        highest: float = math.inf,
+        seed: int = 0,
+    ) -> None:
         """Put a lung at rest at PEEP on the ventilator.
 
         Args:

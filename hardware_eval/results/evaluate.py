@@ -215,13 +215,23 @@ def make_runner(sandbox: bool) -> Any:
 
 
 def evaluate(
-    submissions: Sequence[Submission], line: Line, out: Path, operator: Operator, *, plan: Plan,
-    shows: Sequence[Show] = (), sandbox: bool = True, dry: bool = True,
+    submissions: Sequence[Submission],
+    line: Line,
+    out: Path,
+    operator: Operator,
+    *,
+    plan: Plan,
+    shows: Sequence[Show] = (),
+    sandbox: bool = True,
+    dry: bool = True,
     before_lung: Callable[[Bench, str], Sheet | None] = lambda bench, lung: None,
-    settings: SafetySettings = DEFAULT, operator_name: str = "", notes: str = "",
-    rest: float = REST_S, calibration: Calibration | None = None,
+    settings: SafetySettings = DEFAULT,
+    operator_name: str = "",
+    notes: str = "",
+    rest: float = REST_S,
+    calibration: Calibration | None = None,
     fallback: FallbackSettings | None = None,
-) -> Evaluation:  # fmt: skip
+) -> Evaluation:
     """Run a plan, or what is left of it, and make the records once it is done.
 
     Args:

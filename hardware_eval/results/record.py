@@ -48,11 +48,15 @@ def plan_of(logged: list[dict[str, Any]], label: str) -> Plan:
         if line["type"] == "plan":
             given = line["plan"]
             return make_plan(
-                given["entries"], given["lungs"], track=given["track"],
-                pips=given["pips"], repeats=given["repeats"],
-                control_every=given["control_every"], perturbations=given["perturbations"],
+                given["entries"],
+                given["lungs"],
+                track=given["track"],
+                pips=given["pips"],
+                repeats=given["repeats"],
+                control_every=given["control_every"],
+                perturbations=given["perturbations"],
                 seed=given["seed"],
-            )  # fmt: skip
+            )
     raise InputError(f"{label} holds no plan: no session has begun")
 
 
@@ -189,16 +193,21 @@ def _scored(log: Path, name: str) -> dict[_Cell, list[BreathLog]]:
 
 
 def _tables(
-    plan: Plan, lungs: list[str], runs: Mapping[_Cell, list[BreathLog]],
-    logged: list[dict[str, Any]], name: str,
-) -> dict[str, Any]:  # fmt: skip
+    plan: Plan,
+    lungs: list[str],
+    runs: Mapping[_Cell, list[BreathLog]],
+    logged: list[dict[str, Any]],
+    name: str,
+) -> dict[str, Any]:
     """Errors, traces, stops and safety of every cell."""
     failed = {
         (line["lung"], line["pip"], line["repeat"]): line["reason"]
         for line in logged
-        if line["type"] == "run" and line["status"] == "failed"
-        and line["entry"] == name and line["kind"] == "scored"
-    }  # fmt: skip
+        if line["type"] == "run"
+        and line["status"] == "failed"
+        and line["entry"] == name
+        and line["kind"] == "scored"
+    }
     errors, pressures, commands = [], [], []
     stops, safe, peaks = [], [], []
     for lung in lungs:

@@ -171,9 +171,10 @@ def analyse(logs: Sequence[Path]) -> Trial:
     if len(mountings) < 2:
         missing.append("no interval mounted anew: it needs two lungs or sessions at least")
     both = [
-        name for name in measured
+        name
+        for name in measured
         if np.isfinite(measured[name]).all() and np.isfinite(simulated[name]).all()
-    ]  # fmt: skip
+    ]
     agrees: dict[str, Interval] = {}
     if len(both) > 1:
         agrees = agreement(
@@ -206,9 +207,14 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
     success = Interval(float(done.sum()) / errors.size, float(share.low), float(share.high))
     each = errors[0].size
     return EntryTrial(
-        score, gap, gaps, success,
-        {name: (int(n), each) for name, n in zip(mountings, done, strict=True)}, within, between,
-    )  # fmt: skip
+        score,
+        gap,
+        gaps,
+        success,
+        {name: (int(n), each) for name, n in zip(mountings, done, strict=True)},
+        within,
+        between,
+    )
 
 
 def _tables(logs: Sequence[Path]) -> tuple[dict[str, Floats], dict[str, Floats], list[str]]:

@@ -117,9 +117,13 @@ def _faulty(host: Probe) -> None:
 
 def _malformed(host: Probe) -> None:
     bodies = {
-        Kind.HELLO: 3, Kind.ARM: 0, Kind.COMMAND: 7, Kind.HEARTBEAT: 0, Kind.VENT: 0,
+        Kind.HELLO: 3,
+        Kind.ARM: 0,
+        Kind.COMMAND: 7,
+        Kind.HEARTBEAT: 0,
+        Kind.VENT: 0,
         Kind.STATISTICS: 0,
-    }  # fmt: skip
+    }
     header = host.session.to_bytes(4, "little") + (host.sequence + 9).to_bytes(4, "little")
     for kind, length in bodies.items():
         for wrong in {length + 1, max(length - 1, 1)} - {length}:
@@ -441,7 +445,7 @@ CLAUSES: tuple[tuple[str, Callable[[Probe], None]], ...] = (
     ("commands feed the watchdog (duty 2)", _feeds),
     ("readings carry the device's time (messages)", _time),
     ("answers come within 5 ms (duty 6)", _answers),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True, slots=True)

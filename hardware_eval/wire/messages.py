@@ -337,18 +337,29 @@ def _body(message: Message) -> bytes:
             return _COMMAND.pack(_scaled(u_in, U_IN_STEPS, 0, 65535), u_out, seen)
         case Welcome():
             name = message.name.encode()[:_NAME_BYTES]
-            return _WELCOME.pack(
-                message.version, *message.firmware, message.capabilities,
-                _scaled(message.watchdog, WATCHDOG_STEPS, 0, 65535),
-                _scaled(message.pressure_limit, PRESSURE_STEPS, 0, 65535),
-                message.device_id, message.calibration, len(name),
-            ) + name  # fmt: skip
+            return (
+                _WELCOME.pack(
+                    message.version,
+                    *message.firmware,
+                    message.capabilities,
+                    _scaled(message.watchdog, WATCHDOG_STEPS, 0, 65535),
+                    _scaled(message.pressure_limit, PRESSURE_STEPS, 0, 65535),
+                    message.device_id,
+                    message.calibration,
+                    len(name),
+                )
+                + name
+            )
         case Reading():
             return _READING.pack(
-                microseconds(message.time), fixed_point(message.pressure, PRESSURE_STEPS),
-                fixed_point(message.flow, FLOW_STEPS), _scaled(message.u_in, U_IN_STEPS, 0, 65535),
-                message.u_out, message.mode, message.flags,
-            )  # fmt: skip
+                microseconds(message.time),
+                fixed_point(message.pressure, PRESSURE_STEPS),
+                fixed_point(message.flow, FLOW_STEPS),
+                _scaled(message.u_in, U_IN_STEPS, 0, 65535),
+                message.u_out,
+                message.mode,
+                message.flags,
+            )
         case Refusal():
             return _REFUSAL.pack(message.reason, message.mode, message.flags)
         case Counters():
@@ -374,15 +385,27 @@ def _message(kind: Kind, sequence: int, body: bytes) -> Message:
                 raise ValueError(f"a name of {len(name)} bytes, announced were {length}")
             major, minor, patch = firmware
             return Welcome(
-                version, (major, minor, patch), Capability(capabilities), watchdog / WATCHDOG_STEPS,
-                limit / PRESSURE_STEPS, device_id, calibration, name.decode(),
-            )  # fmt: skip
+                version,
+                (major, minor, patch),
+                Capability(capabilities),
+                watchdog / WATCHDOG_STEPS,
+                limit / PRESSURE_STEPS,
+                device_id,
+                calibration,
+                name.decode(),
+            )
         case Kind.READING:
             time, pressure, flow, u_in, u_out, mode, flags = _READING.unpack(body)
             return Reading(
-                sequence, time / 1e6, _or_nan(pressure, PRESSURE_STEPS), _or_nan(flow, FLOW_STEPS),
-                u_in / U_IN_STEPS, u_out, Mode(mode), Flag(flags),
-            )  # fmt: skip
+                sequence,
+                time / 1e6,
+                _or_nan(pressure, PRESSURE_STEPS),
+                _or_nan(flow, FLOW_STEPS),
+                u_in / U_IN_STEPS,
+                u_out,
+                Mode(mode),
+                Flag(flags),
+            )
         case Kind.REFUSAL:
             reason, mode, flags = _REFUSAL.unpack(body)
             return Refusal(sequence, Reason(reason), Mode(mode), Flag(flags))

@@ -86,9 +86,13 @@ class Probe:
         return encode(Packet(self.session if session is None else session, number, message))
 
     def ask(
-        self, message: HostMessage, answer: type[_AnswerT], step: int = 1,
-        session: int | None = None, consumes: bool = True,
-    ) -> _AnswerT:  # fmt: skip
+        self,
+        message: HostMessage,
+        answer: type[_AnswerT],
+        step: int = 1,
+        session: int | None = None,
+        consumes: bool = True,
+    ) -> _AnswerT:
         """Send a message, and return its answer, which must be of a type."""
         header = self.session if session is None else session, self.sequence + step
         got = self.raw(self.frame(message, step, session))
@@ -106,9 +110,13 @@ class Probe:
         return got.message
 
     def refused(
-        self, message: HostMessage, reason: Reason, step: int = 1,
-        session: int | None = None, consumes: bool = True,
-    ) -> Refusal:  # fmt: skip
+        self,
+        message: HostMessage,
+        reason: Reason,
+        step: int = 1,
+        session: int | None = None,
+        consumes: bool = True,
+    ) -> Refusal:
         """Send what must be refused for a reason."""
         got = self.ask(message, Refusal, step, session, consumes)
         equal(f"{message.kind.name.lower()} refused for", got.reason.name, reason.name)

@@ -21,10 +21,14 @@ from ventbench.recordings.read import load
 
 
 def answer(
-    folder: ChallengeFolder, diagnoser: Diagnoser, *, limits: Limits | None = None, jobs: int = 1,
+    folder: ChallengeFolder,
+    diagnoser: Diagnoser,
+    *,
+    limits: Limits | None = None,
+    jobs: int = 1,
     only: tuple[str, ...] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> dict[str, str]:  # fmt: skip
+) -> dict[str, str]:
     """Answer all cases that have no answer yet; each answer is written as soon as it is there.
 
     A diagnoser that fails, or answers what is no answer, loses the case.

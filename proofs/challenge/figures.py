@@ -66,9 +66,12 @@ def largest(what: str, values: Sequence[float]) -> Figure:
 
 
 def mean(
-    what: str, values: Sequence[float], *, most: float | None = None,
+    what: str,
+    values: Sequence[float],
+    *,
+    most: float | None = None,
     of: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
-) -> Figure:  # fmt: skip
+) -> Figure:
     """Mean, or another statistic, with the interval that resampled cases give.
 
     Args:
@@ -131,8 +134,11 @@ def scores(cases: Sequence[JudgedCase]) -> list[Figure]:
         share("right part of the rig", (c.right_place for c in seen), least=0.90),
         share("right name and size", (c.right and _size_is_right(c) for c in seen), least=0.80),
         mean("harm of wrong names", [c.harm for c in cases]),
-        share("a confident wrong name",
-              (any(p > CONFIDENT for p in c.wrong.values()) for c in cases), most=0.03),
+        share(
+            "a confident wrong name",
+            (any(p > CONFIDENT for p in c.wrong.values()) for c in cases),
+            most=0.03,
+        ),
         mean("localisation F1, where an effect acts in part", parts),  # type: ignore[arg-type]
         mean("withheld inspirations, error, cmH2O", [c.inspiration for c in cases]),
         mean("withheld expirations, error, cmH2O", [c.expiration for c in cases]),
@@ -140,7 +146,7 @@ def scores(cases: Sequence[JudgedCase]) -> list[Figure]:
         mean("processor seconds, mean", [c.seconds for c in cases]),
         largest("processor seconds, longest", [c.seconds for c in cases]),
         largest("memory, MiB, most", [c.peak for c in cases]),
-    ]  # fmt: skip
+    ]
 
 
 def _size_is_right(case: JudgedCase) -> bool:
@@ -165,23 +171,34 @@ def by_kind(cases: Sequence[JudgedCase]) -> list[Figure]:
         share("strong: right name and nothing else", (c.right for c in strong), least=0.98),
         share("mild: right name and nothing else", (c.right for c in mild), least=0.94),
         share("mild: a wrong name", (bool(c.false) for c in mild), most=0.02),
-        share("below the detection limit: silence or the right answer",
-              (c.right for c in under), least=0.99),
+        share(
+            "below the detection limit: silence or the right answer",
+            (c.right for c in under),
+            least=0.99,
+        ),
         share("nothing missing: false names", (bool(c.named) for c in null), most=0.0),
         share("nothing missing: said so", (c.silent for c in null)),
-        share("outside the library: right place or equivalent name",
-              (c.right for c in outside), least=0.90),
-        share("library effect called unknown",
-              (bool(c.answered) and not c.named for c in seen + form), most=0.05),
+        share(
+            "outside the library: right place or equivalent name",
+            (c.right for c in outside),
+            least=0.90,
+        ),
+        share(
+            "library effect called unknown",
+            (bool(c.answered) and not c.named for c in seen + form),
+            most=0.05,
+        ),
         share("other form: right name and no other", (c.right for c in form), least=0.90),
         share("pair: both and only both", (c.right for c in pair), least=0.90),
-        share("four: terms found",
-              (bool(c.answered & effect.terms) for c in four for effect in c.truth if effect.seen),
-              least=0.90),
+        share(
+            "four: terms found",
+            (bool(c.answered & effect.terms) for c in four for effect in c.truth if effect.seen),
+            least=0.90,
+        ),
         mean("four: spurious names a case", [len(c.false) for c in four], most=0.25),
         share("masked: right name and nothing else", (c.right for c in masked)),
         share("masked: a wrong name", (bool(c.false) for c in masked)),
-    ]  # fmt: skip
+    ]
 
 
 def _parameters(cases: Sequence[JudgedCase]) -> list[Figure]:
@@ -189,13 +206,22 @@ def _parameters(cases: Sequence[JudgedCase]) -> list[Figure]:
     named = [estimate for estimate in every if "." in estimate.path]
     lungs = [estimate for estimate in every if "." not in estimate.path]
     return [
-        mean("parameters: median relative error", [e.error for e in named], most=0.10,
-             of=lambda errors: np.median(errors, axis=1)),
-        share("parameters: 95 % intervals that hold the truth", (e.covered for e in named),
-              least=0.92, most=0.98),
-        share("R and C, nothing missing: intervals that hold the truth",
-              (e.covered for e in lungs)),
-    ]  # fmt: skip
+        mean(
+            "parameters: median relative error",
+            [e.error for e in named],
+            most=0.10,
+            of=lambda errors: np.median(errors, axis=1),
+        ),
+        share(
+            "parameters: 95 % intervals that hold the truth",
+            (e.covered for e in named),
+            least=0.92,
+            most=0.98,
+        ),
+        share(
+            "R and C, nothing missing: intervals that hold the truth", (e.covered for e in lungs)
+        ),
+    ]
 
 
 def false_alarm(case: JudgedCase) -> bool | None:

@@ -23,8 +23,10 @@ _FORMAT = "ventbench-challenge-1"
 
 #: Class of the cases of each generator.
 _CASES: dict[str, type[Case]] = {
-    "first": Case, "stranger": StrangerCase, "faults": FaultsCase,
-}  # fmt: skip
+    "first": Case,
+    "stranger": StrangerCase,
+    "faults": FaultsCase,
+}
 
 
 class Withheld(msgspec.Struct, frozen=True):

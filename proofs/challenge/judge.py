@@ -139,9 +139,12 @@ class JudgedCase:
 
 
 def judge(
-    drawn: DrawnCase, nats: list[float], breaths: Breaths, withheld: Withheld,
+    drawn: DrawnCase,
+    nats: list[float],
+    breaths: Breaths,
+    withheld: Withheld,
     given: dict[str, Any],
-) -> JudgedCase:  # fmt: skip
+) -> JudgedCase:
     """Measure an answer.
 
     Args:
@@ -154,9 +157,11 @@ def judge(
     case, problem = drawn.case, given["problem"]
     answer = None if problem else msgspec.convert(given["answer"], Answer, strict=False)
     truth = concealed(drawn, nats)
-    hypotheses = {} if answer is None else {
-        frozenset(each.terms): each.probability for each in answer.hypotheses
-    }  # fmt: skip
+    hypotheses = (
+        {}
+        if answer is None
+        else {frozenset(each.terms): each.probability for each in answer.hypotheses}
+    )
     most = max(hypotheses.values(), default=0.0)
     leading = tuple(sorted((h for h, p in hypotheses.items() if p >= most - _EQUAL), key=sorted))
     right = {terms for terms in hypotheses if is_right(terms, truth)}

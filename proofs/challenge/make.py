@@ -40,10 +40,16 @@ Record = Callable[..., Breaths] | None
 
 
 def make(
-    secret: str, out: Path, kind: Kind | Literal["all"], count: int, *, jobs: int = 1,
-    source: str = "first", record: Record = None,
+    secret: str,
+    out: Path,
+    kind: Kind | Literal["all"],
+    count: int,
+    *,
+    jobs: int = 1,
+    source: str = "first",
+    record: Record = None,
     progress: Callable[[int], None] = lambda done: None,
-) -> str:  # fmt: skip
+) -> str:
     """Write a challenge.
 
     The same secret, kind, count and generator give the same bytes.
@@ -105,10 +111,17 @@ def _make_case(
     breaths = record_within_limits(secret, drawn, record=record)
     apart = np.isin(breaths.breath_id, withheld_breaths(secret, case))
     active = generator_of(case).active(case, breaths)
-    folder.keep(case.name, secret, Withheld(
-        {int(breaths.breath_id[k]): _readings(breaths, k) for k in np.flatnonzero(apart).tolist()},
-        None if active is None else _intervals(breaths, active),
-    ))  # fmt: skip
+    folder.keep(
+        case.name,
+        secret,
+        Withheld(
+            {
+                int(breaths.breath_id[k]): _readings(breaths, k)
+                for k in np.flatnonzero(apart).tolist()
+            },
+            None if active is None else _intervals(breaths, active),
+        ),
+    )
     blank = np.where(apart[:, None], np.nan, breaths.pressure)
     write(replace(breaths, pressure=blank), folder.recording(case.name))
     return [round(log_likelihood_loss(case, breaths, k), 1) for k in range(len(case.effects))]
@@ -139,9 +152,13 @@ def _intervals(breaths: Breaths, active: Flags) -> dict[int, tuple[tuple[float, 
 
 
 def record_within_limits(
-    secret: str, drawn: DrawnCase, *, usual: int = _USUAL_ATTEMPTS, gentle: int = _GENTLE_ATTEMPTS,
+    secret: str,
+    drawn: DrawnCase,
+    *,
+    usual: int = _USUAL_ATTEMPTS,
+    gentle: int = _GENTLE_ATTEMPTS,
     record: Record = None,
-) -> Breaths:  # fmt: skip
+) -> Breaths:
     """Record a case, repeatedly until the pressures are within the limits of a recording.
 
     Lungs that stiffen steeply leave the limits under all usual commands.

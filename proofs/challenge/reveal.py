@@ -56,11 +56,14 @@ class Judged:
             for (draw, _), case in self.cases.items()
         ]
         return {
-            "diagnoser": self.diagnoser, "generator": self.generator,
-            "draws": [asdict(draw) for draw in self.draws], "unanswered": list(self.unanswered),
+            "diagnoser": self.diagnoser,
+            "generator": self.generator,
+            "draws": [asdict(draw) for draw in self.draws],
+            "unanswered": list(self.unanswered),
             "figures": [asdict(figure) for figure in self.figures],
-            "versions": list(self.versions), "cases": cases,
-        }  # fmt: skip
+            "versions": list(self.versions),
+            "cases": cases,
+        }
 
 
 def reveal(folders: Sequence[ChallengeFolder], seeds: Sequence[str], diagnoser: str) -> Judged:

@@ -155,10 +155,14 @@ def run(diagnoser: Diagnoser, case: Path, limits: Limits) -> Outcome:
         given.chmod(0o755)
         Path(place).chmod(0o755)
         told = {
-            "function": diagnoser.function, "case": os.path.realpath(given), "path": sys.path,
-            "stranger": diagnoser.folder is not None, "preload": _preloaded(diagnoser.folder),
-            "seconds": max(1, round(limits.seconds)), "memory": round(limits.memory * 2**30),
-        }  # fmt: skip
+            "function": diagnoser.function,
+            "case": os.path.realpath(given),
+            "path": sys.path,
+            "stranger": diagnoser.folder is not None,
+            "preload": _preloaded(diagnoser.folder),
+            "seconds": max(1, round(limits.seconds)),
+            "memory": round(limits.memory * 2**30),
+        }
         return _collect(told, limits)
 
 
@@ -177,10 +181,13 @@ def _collect(told: dict[str, Any], limits: Limits) -> Outcome:
         process = subprocess.Popen(
             [sys.executable, "-c", "from proofs.challenge.run import child; child()", str(there)],
             # A stranger may write no file, and nobody listens to what he prints.
-            stdin=subprocess.PIPE, pass_fds=(there,), stderr=subprocess.STDOUT,
+            stdin=subprocess.PIPE,
+            pass_fds=(there,),
+            stderr=subprocess.STDOUT,
             stdout=subprocess.DEVNULL if told["stranger"] else errors,
-            env=environment, start_new_session=True,
-        )  # fmt: skip
+            env=environment,
+            start_new_session=True,
+        )
         os.close(there)
         late = threading.Timer(_PATIENCE * limits.seconds, _end, (process.pid,))
         late.start()
@@ -206,9 +213,12 @@ def _collect(told: dict[str, Any], limits: Limits) -> Outcome:
     )
     peak = usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     return Outcome(
-        b"" if problem else answer, problem, usage.ru_utime + usage.ru_stime, peak,
+        b"" if problem else answer,
+        problem,
+        usage.ru_utime + usage.ru_stime,
+        peak,
         tuple(told_back["layers"]),
-    )  # fmt: skip
+    )
 
 
 def _end(group: int) -> None:

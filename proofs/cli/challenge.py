@@ -58,9 +58,14 @@ def make(
 
     with bar("recording") as recording:
         hashed = work(
-            seed, out, kind, cases, jobs=jobs, source=generator,
+            seed,
+            out,
+            kind,
+            cases,
+            jobs=jobs,
+            source=generator,
             progress=lambda done: recording(done, cases),
-        )  # fmt: skip
+        )
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
 
 
@@ -95,9 +100,13 @@ def answer(
     who = find(diagnoser)
     with bar("answering") as progress:
         lost = work(
-            ChallengeFolder(folder), who, limits=Limits(seconds, memory), jobs=jobs,
-            only=tuple(case), progress=progress,
-        )  # fmt: skip
+            ChallengeFolder(folder),
+            who,
+            limits=Limits(seconds, memory),
+            jobs=jobs,
+            only=tuple(case),
+            progress=progress,
+        )
     for name, problem in sorted(lost.items()):
         typer.echo(f"{name}: lost: {problem}", err=True)
     typer.echo(

@@ -57,9 +57,10 @@ def paper(
 
     with bar("paper") as progress:
         result, stored = reproduce_paper(
-            recordings=recordings, workers=workers,
+            recordings=recordings,
+            workers=workers,
             progress=lambda what, share: progress(share, text=what),
-        )  # fmt: skip
+        )
     emit(result.to_json(), json)
     typer.echo(result.to_markdown(), err=str(json) == "-")
     _keep(store, **stored)
@@ -94,9 +95,12 @@ def samples(
     require("matplotlib")
     with bars() as tell:
         result = work.sample_efficiency(
-            scored_lung(lung), range(seeds), out, share=share,
+            scored_lung(lung),
+            range(seeds),
+            out,
+            share=share,
             progress=lambda name, done, best: tell(name, done, text=f"{name}: {best:.3f} cmH2O"),
-        )  # fmt: skip
+        )
     picture = work.learning_curves_png(result)
     files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
     _keep(store, samples=result.stored())
@@ -139,10 +143,14 @@ def controllers(
     _check(only, work.variants(config))
     with bar("controllers") as progress:
         runs = work.compare(
-            frozen.load(), out, range(seeds), config=config, only=only,
+            frozen.load(),
+            out,
+            range(seeds),
+            config=config,
+            only=only,
             workers=workers,
             progress=lambda what, share: progress(share, text=what),
-        )  # fmt: skip
+        )
     _keep(store, controllers=work.stored(runs, config))
     table = work.summary(runs)
     title = "Mean |pressure - target|, cmH2O, averaged over seeds, and difference to the base"
@@ -176,9 +184,12 @@ def networks(
     _check(only, work.variants(work.ARCHITECTURE))
     with bar("networks") as progress:
         breaths = work.compare(
-            folder, out, only=only, workers=workers,
+            folder,
+            out,
+            only=only,
+            workers=workers,
             progress=lambda what, share: progress(share, text=what),
-        )  # fmt: skip
+        )
     _keep(store, networks=work.stored(breaths))
     table = work.summary(breaths)
     title = "Held-out open-loop MAE, cmH2O, and its change from the base, paired by breath"

@@ -68,9 +68,11 @@ def rig(
     compilation.keep()
     with bars() as tell:
         result = prove(
-            folder, out, only or (),
+            folder,
+            out,
+            only or (),
             lambda part, what, share: tell(part, share, text=f"{part}: {what}"),
-        )  # fmt: skip
+        )
     text = proof_section(result)
     if page is not None:
         write_section(page, "proof", text)

@@ -120,19 +120,46 @@ def summaries(breaths: Breaths) -> Floats:
     noise = max(1.4826 * float(np.median(np.abs(rough[inside[:, 2:]]))) / 6**0.5, 1e-3)
     spread, late = max(float(r[inside].std()), 1e-3), _late(q, 1) - q
     found = [
-        np.log(spread / noise), np.log(noise), line[0] - 5.0,
-        np.log(max(line[1], 0.1) / breaths.R[0]), np.log(max(line[2], 0.1) * breaths.C[0] / 1e3),
-        np.log(breaths.R[0]), np.log(breaths.C[0]), np.log(step), np.log(len(u)),
+        np.log(spread / noise),
+        np.log(noise),
+        line[0] - 5.0,
+        np.log(max(line[1], 0.1) / breaths.R[0]),
+        np.log(max(line[2], 0.1) * breaths.C[0] / 1e3),
+        np.log(breaths.R[0]),
+        np.log(breaths.C[0]),
+        np.log(step),
+        np.log(len(u)),
         np.log(np.mean(r[inside] ** 4) / spread**4),
         np.mean(np.isclose(p[inside], p.max(), atol=0.05)),
-    ]  # fmt: skip
+    ]
     signals = (
-        q**2, v**2, q * v, np.gradient(q, axis=1), late, _late(q, 2) - q, _late(q, 4) - q,
-        np.cumsum(np.where(inside, above, 0.0), axis=1), np.cumsum(v, axis=1), np.exp(-time / 0.05),
-        np.exp(-time / 0.2), above**2, above * q, np.maximum(p - high, 0.0), n, n * q, n * v,
-        n * late, time * late, np.sin(2.0 * np.pi * u), np.sin(np.pi * u), _late(np.sign(u), 1),
-        _late(np.minimum(u, 4.0), 1), np.cumsum(q, axis=1) * q, time, _late(np.sign(change), 1),
-    )  # fmt: skip
+        q**2,
+        v**2,
+        q * v,
+        np.gradient(q, axis=1),
+        late,
+        _late(q, 2) - q,
+        _late(q, 4) - q,
+        np.cumsum(np.where(inside, above, 0.0), axis=1),
+        np.cumsum(v, axis=1),
+        np.exp(-time / 0.05),
+        np.exp(-time / 0.2),
+        above**2,
+        above * q,
+        np.maximum(p - high, 0.0),
+        n,
+        n * q,
+        n * v,
+        n * late,
+        time * late,
+        np.sin(2.0 * np.pi * u),
+        np.sin(np.pi * u),
+        _late(np.sign(u), 1),
+        _late(np.minimum(u, 4.0), 1),
+        np.cumsum(q, axis=1) * q,
+        time,
+        _late(np.sign(change), 1),
+    )
     x = np.stack([signal[inside] for signal in signals], axis=1)
     found += _correlations(x - frame @ (frame.T @ x), r[inside])
     loudness = (np.abs(_late(change, 1)), q, v, time, n)
@@ -195,5 +222,11 @@ def _course(series: Floats) -> list[float]:
     sums = np.abs(np.cumsum(centred)) / (sd * len(series) ** 0.5)
     z = series - np.median(series)
     z = z / max(1.4826 * float(np.median(np.abs(z))), 1e-3)
-    return [np.log(sd), drift, float(sums.max()), float(np.log1p(z.max())),
-            float(np.log1p(-z.min())), float(np.mean(np.abs(z) > 4.0))]  # fmt: skip
+    return [
+        np.log(sd),
+        drift,
+        float(sums.max()),
+        float(np.log1p(z.max())),
+        float(np.log1p(-z.min())),
+        float(np.mean(np.abs(z) > 4.0)),
+    ]

@@ -135,11 +135,22 @@ def templates(seen: Seen, fitted: Fit, names: Iterable[str]) -> Templates:
     counted = data.weight[:, 0].copy()
     counted[:, 0] = 0.0
     return Templates(
-        first[:, 0], 1e-3 * first[:, 1], counted * (data.measured[:, 0] - first[:, 0]), counted,
+        first[:, 0],
+        1e-3 * first[:, 1],
+        counted * (data.measured[:, 0] - first[:, 0]),
+        counted,
         np.stack([stepped(path, step) for path, step in _STEPS.items()]),
-        {name: changed({f"{name}.{p.name}": p.mild for p in mechanism(name).description.parameters
-                        if not p.shape}) for name in names},
-    )  # fmt: skip
+        {
+            name: changed(
+                {
+                    f"{name}.{p.name}": p.mild
+                    for p in mechanism(name).description.parameters
+                    if not p.shape
+                }
+            )
+            for name in names
+        },
+    )
 
 
 def candidates() -> tuple[str, ...]:

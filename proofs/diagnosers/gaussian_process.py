@@ -49,12 +49,14 @@ def diagnose(folder: Path) -> dict[str, Any]:
     return {
         "hypotheses": [
             {"terms": [], "probability": 1.0 - missing},
-            *({"terms": [f"unknown:{place}"], "probability": share}
-              for place, share in zip(_PLACES, shares, strict=True)),
+            *(
+                {"terms": [f"unknown:{place}"], "probability": share}
+                for place, share in zip(_PLACES, shares, strict=True)
+            ),
         ],
         "pressures": seen.pressures(predicted[seen.apart]),
         "parameters": intervals(fitted, ("R", "C")),
-    }  # fmt: skip
+    }
 
 
 def _inputs(seen: Seen, model: Templates) -> Floats:

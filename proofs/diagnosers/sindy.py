@@ -23,12 +23,23 @@ _ABSORBED = ("1", "Q", "V", "out")
 
 #: What each other term is called.
 _TERMS = {
-    "Q|Q|": "turbulent_resistance", "V^2": "nonlinear_compliance", "dQ/dt": "inertance",
-    "dp/dt": "sensor_lag", "du/dt": "valve_lag", "u^2": "valve_curve", "sign u": "valve_dead_band",
-    "integral p": "leak", "integral V": "viscoelasticity", "n": "sensor_drift",
-    "n Q": "resistance_drift", "n V": "compliance_drift", "p^2": "sensor_curve",
-    "integral u": "supply_droop", "V Q": "unknown:airway", "Q out": "exhalation_valve_delay",
-}  # fmt: skip
+    "Q|Q|": "turbulent_resistance",
+    "V^2": "nonlinear_compliance",
+    "dQ/dt": "inertance",
+    "dp/dt": "sensor_lag",
+    "du/dt": "valve_lag",
+    "u^2": "valve_curve",
+    "sign u": "valve_dead_band",
+    "integral p": "leak",
+    "integral V": "viscoelasticity",
+    "n": "sensor_drift",
+    "n Q": "resistance_drift",
+    "n V": "compliance_drift",
+    "p^2": "sensor_curve",
+    "integral u": "supply_droop",
+    "V Q": "unknown:airway",
+    "Q out": "exhalation_valve_delay",
+}
 
 #: Thresholds of coefficients of scaled terms, cmH2O, of which held-out breaths choose one.
 _THRESHOLDS = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -108,12 +119,27 @@ def _library(seen: Seen, model: Templates) -> dict[str, Floats]:
         return np.cumsum(signal * dt, axis=1)
 
     return {
-        "1": np.ones_like(p), "Q": q, "V": volume, "out": out,
-        "Q|Q|": q * np.abs(q), "V^2": volume**2, "dQ/dt": rate(q), "dp/dt": rate(p),
-        "du/dt": rate(u), "u^2": u**2, "sign u": np.sign(u), "integral p": integral(below),
-        "integral V": integral(volume), "n": n, "n Q": n * q, "n V": n * volume,
-        "p^2": below**2, "integral u": integral(u), "V Q": volume * q, "Q out": q * out,
-    }  # fmt: skip
+        "1": np.ones_like(p),
+        "Q": q,
+        "V": volume,
+        "out": out,
+        "Q|Q|": q * np.abs(q),
+        "V^2": volume**2,
+        "dQ/dt": rate(q),
+        "dp/dt": rate(p),
+        "du/dt": rate(u),
+        "u^2": u**2,
+        "sign u": np.sign(u),
+        "integral p": integral(below),
+        "integral V": integral(volume),
+        "n": n,
+        "n Q": n * q,
+        "n V": n * volume,
+        "p^2": below**2,
+        "integral u": integral(u),
+        "V Q": volume * q,
+        "Q out": q * out,
+    }
 
 
 def _hypotheses(names: list[str]) -> list[dict[str, Any]]:

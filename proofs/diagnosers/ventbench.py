@@ -18,12 +18,20 @@ from ventbench.physics.catalogue import basis_terms, mechanism
 
 #: Public places of the diagnosis's places.
 _PLACES = {
-    "f(u)": "inspiratory_valve", "memory of u": "inspiratory_valve", "f(p)": "circuit",
-    "f(Q)": "airway", "R(V)": "airway", "R(direction)": "airway", "f(V)": "lung",
-    "memory of p": "lung", "exhalation path": "expiratory_valve",
-    "measurement": "pressure_sensor", "f(t) at the alveolus": "muscles",
-    "f(t) at the supply": "supply", "f(t) in the circuit": "circuit",
-}  # fmt: skip
+    "f(u)": "inspiratory_valve",
+    "memory of u": "inspiratory_valve",
+    "f(p)": "circuit",
+    "f(Q)": "airway",
+    "R(V)": "airway",
+    "R(direction)": "airway",
+    "f(V)": "lung",
+    "memory of p": "lung",
+    "exhalation path": "expiratory_valve",
+    "measurement": "pressure_sensor",
+    "f(t) at the alveolus": "muscles",
+    "f(t) at the supply": "supply",
+    "f(t) in the circuit": "circuit",
+}
 
 #: Names of what changes in the session: a step, and a drift.
 _CHANGES = {"gain": ("gain_step", "gain_drift"), "zero": ("zero_step", "sensor_drift")}
@@ -31,9 +39,12 @@ _CHANGES = {"gain": ("gain_step", "gain_drift"), "zero": ("zero_step", "sensor_d
 
 #: Public places of the sites of basis terms, where they differ.
 _SITES = {
-    "inspiratory valve": "inspiratory_valve", "alveolus": "lung", "sensor": "pressure_sensor",
-    "command": "inspiratory_valve", "expiratory valve": "expiratory_valve",
-}  # fmt: skip
+    "inspiratory valve": "inspiratory_valve",
+    "alveolus": "lung",
+    "sensor": "pressure_sensor",
+    "command": "inspiratory_valve",
+    "expiratory valve": "expiratory_valve",
+}
 
 
 @dataclass(frozen=True)

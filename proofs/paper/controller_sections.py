@@ -52,14 +52,21 @@ def best_gains(grid: pid_search.PIDGrid) -> Section:
         excess.append(error[paper] / error[pi] - 1.0)
         rows.append(
             (
-                name, _gains(grid.gains[paper], 2), float(error[paper]), _gains(grid.gains[pi], 2),
-                float(error[pi]), _gains(grid.gains[best]), float(error[best]),
+                name,
+                _gains(grid.gains[paper], 2),
+                float(error[paper]),
+                _gains(grid.gains[pi], 2),
+                float(error[pi]),
+                _gains(grid.gains[best]),
+                float(error[best]),
                 f"{100 * better:.1f} %",
             )
-        )  # fmt: skip
+        )
     top = sum(value < 0.05 for value in excess)
     return Section(
-        "pid", "Best PIDs", "table 2",
+        "pid",
+        "Best PIDs",
+        "table 2",
         "The best gains are high, several at the end of the grid, and all have D = 0.",
         "agrees" if top >= 5 else "in part",
         f"On {top} of {len(excess)} lungs the gains that were best on the physical lung come "
@@ -71,12 +78,20 @@ def best_gains(grid: pid_search.PIDGrid) -> Section:
             Table(
                 "Mean |pressure - PIP|, cmH2O, of the paper's best P, I; of the best with D = 0; "
                 "of the best of the whole grid; share of P, I that beat the paper's",
-                ("lung", "paper P, I", "error here", "best P, I", "error", "best P, I, D", "error",
-                 "better than the paper's"),
+                (
+                    "lung",
+                    "paper P, I",
+                    "error here",
+                    "best P, I",
+                    "error",
+                    "best P, I, D",
+                    "error",
+                    "better than the paper's",
+                ),
                 tuple(rows),
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def beyond_the_grid(rigs: Rigs) -> Section:
@@ -87,15 +102,19 @@ def beyond_the_grid(rigs: Rigs) -> Section:
     gains = np.array([(*pair, 0.0) for pair in itertools.product(BEYOND, BEYOND_I)])
     error = np.stack(
         [
-            pid_search.drawn_errors(rigs, drawn, k, gains).mean(axis=-1)
-            .reshape(len(BEYOND), -1).min(axis=1)
+            pid_search.drawn_errors(rigs, drawn, k, gains)
+            .mean(axis=-1)
+            .reshape(len(BEYOND), -1)
+            .min(axis=1)
             for k in range(len(names))
         ]
-    )  # fmt: skip
+    )
     change = 100.0 * (error / error[:, :1] - 1.0)
     quickly = int(np.sum(change[:, 1] > QUICKLY))
     return Section(
-        "beyond", "Gains beyond the grid", "appendix A.2",
+        "beyond",
+        "Gains beyond the grid",
+        "appendix A.2",
         "Beyond 10 the performance degrades quickly, by overshoot and ringing.",
         "agrees" if quickly == len(names) else "in part" if quickly > 3 else "differs",
         f"From P = {BEYOND[0]:g} to {BEYOND[1]:g} the error rises by more than {QUICKLY:g} % on "
@@ -104,11 +123,12 @@ def beyond_the_grid(rigs: Rigs) -> Section:
         "computed: the best I at each P, D = 0, four draws for tuning on the training rigs",
         (
             Table(
-                "Error, cmH2O, by P, %/cmH2O", ("lung", *(f"{P:g}" for P in BEYOND)),
+                "Error, cmH2O, by P, %/cmH2O",
+                ("lung", *(f"{P:g}" for P in BEYOND)),
                 tuple((name, *row) for name, row in zip(names, error.tolist(), strict=True)),
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def example(official: frozen.Frozen, grid: pid_search.PIDGrid, residual: Floats) -> Section:
@@ -157,7 +177,9 @@ def example(official: frozen.Frozen, grid: pid_search.PIDGrid, residual: Floats)
     nearer = all(ours[2] < row[2] for row in others)
     verdict: Verdict = "agrees" if faster and nearer else "in part" if nearer else "differs"
     return Section(
-        "example", "Trajectories of one breath", "figures 2, 4 and 9",
+        "example",
+        "Trajectories of one breath",
+        "figures 2, 4 and 9",
         "The trained controller rises fast and stays near the target; P-only, I-only and PID rise "
         "later, overshoot or ring.",
         verdict,
@@ -169,10 +191,12 @@ def example(official: frozen.Frozen, grid: pid_search.PIDGrid, residual: Floats)
             Table(
                 "Third breath: error, cmH2O; rise from 10 to 90 %, s; overshoot, cmH2O; swings "
                 "around the target",
-                ("controller", "P, I, D", "error", "rise", "overshoot", "swings"), tuple(rows), 2,
+                ("controller", "P, I, D", "error", "rise", "overshoot", "swings"),
+                tuple(rows),
+                2,
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def performance(grid: pid_search.PIDGrid, residual: Floats) -> Section:
@@ -194,7 +218,9 @@ def performance(grid: pid_search.PIDGrid, residual: Floats) -> Section:
     verdict: Verdict = "agrees" if high < 0 else "in part" if wins >= 3 else "differs"
     heads = ("best PID of the lung", "residual", "change, %")
     return Section(
-        "performance", "A trained controller for each lung", "figure 7, contribution 1",
+        "performance",
+        "A trained controller for each lung",
+        "figure 7, contribution 1",
         "A network on top of a PID, trained on the simulator, beats the best PID on every lung.",
         verdict,
         f"It is better on {wins} of 6 lungs and at {sum(row[2] < row[1] for row in by_pip)} of 6 "
@@ -205,7 +231,7 @@ def performance(grid: pid_search.PIDGrid, residual: Floats) -> Section:
             Table("Mean |pressure - PIP| by lung, cmH2O", ("lung", *heads), by_lung, 2),
             Table("The same by waveform, cmH2O", ("waveform", *heads), by_pip, 2),
         ),
-    )  # fmt: skip
+    )
 
 
 def robustness(grid: pid_search.PIDGrid, own: Floats, residual: Floats) -> Section:
@@ -225,7 +251,9 @@ def robustness(grid: pid_search.PIDGrid, own: Floats, residual: Floats) -> Secti
     more = _interval(_changes(pid, residual) - _changes(each, own))
     verdict: Verdict = "agrees" if wins == 6 and more[1] < 0 else "in part"
     return Section(
-        "robustness", "One controller for all lungs", "figure 8, contribution 2",
+        "robustness",
+        "One controller for all lungs",
+        "figure 8, contribution 2",
         "One network for all lungs beats the best single PID, by more than networks for single "
         "lungs beat their PIDs.",
         verdict,
@@ -238,10 +266,12 @@ def robustness(grid: pid_search.PIDGrid, own: Floats, residual: Floats) -> Secti
         (
             Table(
                 "Mean |pressure - PIP|, cmH2O; neither is told the lung",
-                ("lung", "best single PID", "one network", "change, %"), rows, 2,
+                ("lung", "best single PID", "one network", "change, %"),
+                rows,
+                2,
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def regularisation(controllers: Mapping[str, Any]) -> Section:
@@ -254,7 +284,9 @@ def regularisation(controllers: Mapping[str, Any]) -> Section:
     )
     better = direct["nominal"] > base["nominal"]
     return Section(
-        "regularisation", "The PID under the network", "section 5",
+        "regularisation",
+        "The PID under the network",
+        "section 5",
         "A correction of a PID does significantly better than a network that commands alone.",
         "agrees" if better else "differs",
         f"A network alone has {direct['nominal']:.3f} cmH2O, one on a PID {base['nominal']:.3f}; "
@@ -267,10 +299,11 @@ def regularisation(controllers: Mapping[str, Any]) -> Section:
             Table(
                 "Parts of the residual controller: error without noise and on the draws, and "
                 "exploitation index, cmH2O",
-                ("variant", "what", "nominal", "draws", "exploitation"), rows,
+                ("variant", "what", "nominal", "draws", "exploitation"),
+                rows,
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def reinforcement(errors: Mapping[str, Floats]) -> Section:
@@ -284,26 +317,38 @@ def reinforcement(errors: Mapping[str, Floats]) -> Section:
     ours, ppo, dqn = (float(x) for x in rows[-1][1:])
     ends = [_interval(_changes(errors[name], errors["residual"])) for name in names[1:]]
     return Section(
-        "reinforcement", "Against PPO and DQN", "figure 10",
+        "reinforcement",
+        "Against PPO and DQN",
+        "figure 10",
         "The score is comparable to that of PPO and DQN on all simulators.",
-        "agrees" if max(high for _, high in ends) <= COMPARABLE else
-        "in part" if ours <= min(ppo, dqn) else "differs",
+        "agrees"
+        if max(high for _, high in ends) <= COMPARABLE
+        else "in part"
+        if ours <= min(ppo, dqn)
+        else "differs",
         f"{ours:.3f} cmH2O against {ppo:.3f} (PPO: {ends[0][0]:+.0f} to {ends[0][1]:+.0f} % by "
         f"lung, 95 %) and {dqn:.3f} (DQN: {ends[1][0]:+.0f} to {ends[1][1]:+.0f} %), after a "
         "handful of trials "
         f"each (the paper: {published.TRIALS['PPO']} and {published.TRIALS['DQN']}).",
         "computed: submissions residual_mlp, ppo, dqn, performance track, nominal runs",
         (Table("Mean |pressure - PIP|, cmH2O", ("lung", *names), tuple(rows)),),
-    )  # fmt: skip
+    )
 
 
 def sample_efficiency(samples: Mapping[str, Any]) -> Section:
     """Error against experience (the paper's figure 11)."""
     methods = {row["method"]: row for row in samples["methods"]}
     columns = (
-        "final", "low95", "high95", "episodes", "at_100_episodes", "episodes_to_best_pid",
-        "episodes_to_2_percent", "seconds", "compile_seconds",
-    )  # fmt: skip
+        "final",
+        "low95",
+        "high95",
+        "episodes",
+        "at_100_episodes",
+        "episodes_to_best_pid",
+        "episodes_to_2_percent",
+        "seconds",
+        "compile_seconds",
+    )
     rows = tuple(
         (name, *(f"{x:,}" if isinstance(x, int) else x for x in map(row.get, columns)))
         for name, row in methods.items()
@@ -321,7 +366,9 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
         )
     close = short["final"] <= 1.02 * min(row["final"] for row in methods.values())
     return Section(
-        "samples", "Breaths of experience", "figure 11, contribution 4, conclusion 3",
+        "samples",
+        "Breaths of experience",
+        "figure 11, contribution 4, conclusion 3",
         "The policy gradient converges in about 100 episodes, PPO and DQN in tens of thousands.",
         "agrees" if close else "in part",
         f"{first} But within {short['episodes']} breaths it stops at "
@@ -334,13 +381,22 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
             Table(
                 f"{samples['lung']}: score without noise, cmH2O (interquartile mean, 95 %), and "
                 "breaths",
-                ("method", "final", "from", "to", "breaths", "score at 100 breaths",
-                 "breaths to the best PID", "breaths to within 2 %", "seconds, two cores",
-                 "compiling, s"),
+                (
+                    "method",
+                    "final",
+                    "from",
+                    "to",
+                    "breaths",
+                    "score at 100 breaths",
+                    "breaths to the best PID",
+                    "breaths to within 2 %",
+                    "seconds, two cores",
+                    "compiling, s",
+                ),
                 rows,
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def stability(samples: Mapping[str, Any]) -> Section:
@@ -351,14 +407,16 @@ def stability(samples: Mapping[str, Any]) -> Section:
     }
     ours, *others = (spread[name] for name in ("policy-gradient", "ppo", "dqn"))
     return Section(
-        "stability", "Stability of the training", "section 6",
+        "stability",
+        "Stability of the training",
+        "section 6",
         "The policy gradient trains stably, PPO and DQN do not.",
         "agrees" if ours < min(others) else "differs",
         f"The 95 % interval of the final score over {samples['seeds']} seeds is as wide as "
         + ", ".join(f"{wide:.1f} % ({name})" for name, wide in spread.items())
         + " of the score.",
         f"`{samples['about']['command']}`, stored",
-    )  # fmt: skip
+    )
 
 
 def _compared(name: str, before: AnyFloats, after: AnyFloats) -> tuple[str, float, float, float]:

@@ -8,14 +8,23 @@ from __future__ import annotations
 
 #: Open-loop mean absolute error on held-out recordings of the real lung, cmH2O (appendix B.1).
 OPEN_LOOP = {
-    "R5C10": 0.64, "R5C20": 0.72, "R5C50": 0.39, "R20C10": 0.72, "R20C20": 0.60, "R20C50": 0.85,
-}  # fmt: skip
+    "R5C10": 0.64,
+    "R5C20": 0.72,
+    "R5C50": 0.39,
+    "R20C10": 0.72,
+    "R20C20": 0.60,
+    "R20C50": 0.85,
+}
 
 #: Best P, I, D of the grid on the physical lung, %/cmH2O (appendix A.2).
 BEST_PID = {
-    "R5C10": (10.0, 0.2, 0.0), "R5C20": (10.0, 10.0, 0.0), "R5C50": (10.0, 10.0, 0.0),
-    "R20C10": (8.0, 1.0, 0.0), "R20C20": (5.0, 10.0, 0.0), "R20C50": (5.0, 10.0, 0.0),
-}  # fmt: skip
+    "R5C10": (10.0, 0.2, 0.0),
+    "R5C20": (10.0, 10.0, 0.0),
+    "R5C50": (10.0, 10.0, 0.0),
+    "R20C10": (8.0, 1.0, 0.0),
+    "R20C20": (5.0, 10.0, 0.0),
+    "R20C50": (5.0, 10.0, 0.0),
+}
 
 #: Architecture search on R5C10: open-loop error, cmH2O, by setting and value (appendix B.1).
 ARCHITECTURES = {

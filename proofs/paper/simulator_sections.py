@@ -114,20 +114,30 @@ def simulators(official: frozen.Frozen, horizon: Mapping[str, Any]) -> Section:
         "magnitude; and the hybrid, physics with learned curves, beats the pure network."
     )
     columns = (
-        "lung", "paper, mean", "hybrid, own rig, mean", "median", "unseen rig, mean", "median",
-        "network", "R-C lung", "two balloons",
-    )  # fmt: skip
+        "lung",
+        "paper, mean",
+        "hybrid, own rig, mean",
+        "median",
+        "unseen rig, mean",
+        "median",
+        "network",
+        "R-C lung",
+        "two balloons",
+    )
     return Section(
-        "simulators", "Errors of the simulators", "table 3, conclusion 1",
+        "simulators",
+        "Errors of the simulators",
+        "table 3, conclusion 1",
         "Networks model ventilator and lung far better than physics-based models.",
-        "in part" if network < physics else "differs", finding,
+        "in part" if network < physics else "differs",
+        finding,
         "held-out errors of the official simulators; the others from recordings, stored",
         (
             Table(
                 "Open-loop mean absolute error on held-out breaths, cmH2O", columns, tuple(rows), 2
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def by_horizon(horizon: Mapping[str, Any]) -> Section:
@@ -145,7 +155,9 @@ def by_horizon(horizon: Mapping[str, Any]) -> Section:
     flat = [name for name, value in growth.items() if value <= GROWTH]
     verdict: Verdict = "agrees" if len(flat) == len(lungs) else "in part" if flat else "differs"
     return Section(
-        "horizon", "Error by horizon", "figure 5, table 5",
+        "horizon",
+        "Error by horizon",
+        "figure 5, table 5",
         "The error stays low as more steps are projected.",
         verdict,
         f"At step {HORIZONS[-1]} the error is at most {GROWTH:g} times its mean over the horizon "
@@ -154,10 +166,12 @@ def by_horizon(horizon: Mapping[str, Any]) -> Section:
         (
             Table(
                 "Hybrid: open-loop distance (sum over steps) and error after n steps, cmH2O",
-                ("lung", "distance", *(f"step {k}" for k in HORIZONS)), tuple(rows), 2,
+                ("lung", "distance", *(f"step {k}" for k in HORIZONS)),
+                tuple(rows),
+                2,
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def architectures(networks: Mapping[str, Any]) -> Section:
@@ -165,13 +179,13 @@ def architectures(networks: Mapping[str, Any]) -> Section:
     base, rows = networks["base"], []
     variants = {row["variant"]: row for row in networks["variants"]}
     clear = [
-        name for name, row in variants.items()
+        name
+        for name, row in variants.items()
         if row.get("low95") is not None and (row["low95"] > 0 or row["high95"] < 0)
-    ]  # fmt: skip
+    ]
     larger = [
-        name for name in variants
-        if name != "base" and int(name.split()[1]) > base[name.split()[0]]
-    ]  # fmt: skip
+        name for name in variants if name != "base" and int(name.split()[1]) > base[name.split()[0]]
+    ]
     gained = [name for name in larger if name in clear and variants[name]["high95"] < 0]
     for setting, values in published.ARCHITECTURES.items():
         ours = {int(base[setting]): variants["base"]}
@@ -185,7 +199,9 @@ def architectures(networks: Mapping[str, Any]) -> Section:
             figures = [row[key] if row else None for key in ("R5C10", "mean", "low95", "high95")]
             rows.append((f"{setting} {value}", values.get(value), *figures))
     return Section(
-        "architectures", "Shapes of the networks", "table 4",
+        "architectures",
+        "Shapes of the networks",
+        "table 4",
         "More expressive networks gain a little, and the gains plateau quickly.",
         "agrees" if len(gained) > len(larger) / 2 else "in part" if gained else "differs",
         f"{len(gained)} of {len(larger)} larger shapes gain, by a paired 95 % interval without "
@@ -196,25 +212,34 @@ def architectures(networks: Mapping[str, Any]) -> Section:
         (
             Table(
                 "Open-loop error on held-out breaths, cmH2O",
-                ("setting", "paper, R5C10", "here, R5C10", "mean of six lungs",
-                 "change of it, 95 % from", "to"),
-                tuple(rows), 2,
+                (
+                    "setting",
+                    "paper, R5C10",
+                    "here, R5C10",
+                    "mean of six lungs",
+                    "change of it, 95 % from",
+                    "to",
+                ),
+                tuple(rows),
+                2,
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def boundary(networks: Mapping[str, Any]) -> Section:
     """Models of their own for the first steps of a breath (the paper's section 4.2)."""
     row = next(row for row in networks["variants"] if row["variant"] == "N_B 0")
     return Section(
-        "boundary", "Boundary models", "section 4.2",
+        "boundary",
+        "Boundary models",
+        "section 4.2",
         "Models of their own for the beginning of a breath are very helpful.",
         "agrees" if row["low95"] > 0 else "in part" if row["change"] > 0 else "differs",
         f"Without them the error changes by {row['change']:+.2f} cmH2O (95 % from "
         f"{row['low95']:+.2f} to {row['high95']:+.2f}).",
         f"`{networks['about']['command']}`, stored",
-    )  # fmt: skip
+    )
 
 
 def exploration(official: frozen.Frozen) -> Section:
@@ -247,14 +272,14 @@ def exploration(official: frozen.Frozen) -> Section:
     )
     safe = peak <= 60.0
     return Section(
-        "exploration", "Exploratory breaths", "figure 6, table 1",
+        "exploration",
+        "Exploratory breaths",
+        "figure 6, table 1",
         "Exploration covers a wide range of controls and stays in a limited, safe range of "
         "pressures.",
         "agrees" if safe and wide / 100.0 > narrow / 60.0 else "in part",
         f"Commands spread over {wide:.0f} of 100 % and pressures over {narrow:.1f} of 60 cmH2O "
         f"between breaths; the highest pressure is {peak:.1f} cmH2O.",
         f"computed: {BREATHS} breaths of {SHOWN}, with the paper's ranges of that lung",
-        (
-            Table(f"Exploration of {SHOWN}", ("quantity", "value"), rows),
-        ),
-    )  # fmt: skip
+        (Table(f"Exploration of {SHOWN}", ("quantity", "value"), rows),),
+    )

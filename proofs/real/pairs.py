@@ -254,14 +254,22 @@ def with_leak(breaths: Breaths, slope: float) -> Breaths:
 
 
 _TOOLS: dict[str, Callable[[Pair, Material], Answered]] = {
-    "label": _label, "lung": _lung, "drive": _lung, "leak": _added, "lag": _added,
-}  # fmt: skip
+    "label": _label,
+    "lung": _lung,
+    "drive": _lung,
+    "leak": _added,
+    "lag": _added,
+}
 
 
 def run(
-    folder: Path, out: Path, *, sealed: bool = False, kinds: Iterable[str] = (),
+    folder: Path,
+    out: Path,
+    *,
+    sealed: bool = False,
+    kinds: Iterable[str] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Answered]:  # fmt: skip
+) -> list[Answered]:
     """Answer the pairs that have no answer yet, and write each answer at once.
 
     Args:

@@ -131,9 +131,11 @@ def prove(
 
 def _run(part: Part, setting: Setting, key: dict[str, Any], out: Path, progress: Progress) -> None:
     diagnosis = diagnose(
-        setting.breaths, simulator=setting.plant, progress=partial(progress, part.name),
+        setting.breaths,
+        simulator=setting.plant,
+        progress=partial(progress, part.name),
         patient=False,  # the ventilator was connected to a test lung
-    )  # fmt: skip
+    )
     diagnosis = dataclasses.replace(diagnosis, simulator=setting.plant_name)
     out.mkdir(parents=True, exist_ok=True)
     (out / DONE).unlink(missing_ok=True)

@@ -65,13 +65,14 @@ def variants(config: ResidualConfig) -> dict[str, Variant]:
         "no commands before": changed("no earlier commands of this breath", commands=0),
         "twice as far back": changed(
             "twice as many errors and commands",
-            pressures=2 * config.pressures, commands=2 * config.commands,
+            pressures=2 * config.pressures,
+            commands=2 * config.commands,
         ),
         "narrow": changed("a quarter of the width", widths=(wide // 4,) * len(config.widths)),
         "wide": changed("twice the width", widths=(2 * wide,) * len(config.widths)),
         "shallow": changed("one hidden layer", widths=(wide,)),
         "deep": changed("four hidden layers", widths=(wide,) * 4),
-    }  # fmt: skip
+    }
 
 
 def compare(
@@ -111,9 +112,11 @@ def compare(
     chosen = {k: v for k, v in variants(config).items() if only is None or k in (BASE, *only)}
     gains = gains or best_single(simulators)
     about = {
-        "config": asdict(config), "gains": list(gains), "draws": draws,
+        "config": asdict(config),
+        "gains": list(gains),
+        "draws": draws,
         "simulators": simulators.about(),
-    }  # fmt: skip
+    }
     work = WorkFolder((out / "rows").resolve(), about)
     trainings = {
         f"{name.replace(' ', '-')}-{seed}": (name, seed) for name in chosen for seed in seeds
@@ -124,9 +127,12 @@ def compare(
         checkpoint = work.checkpoint(part)
         jobs[part] = (simulators, own, chosen[name].config, seed, draws, checkpoint)
     finish(
-        work, _trained, jobs, workers=workers,
+        work,
+        _trained,
+        jobs,
+        workers=workers,
         progress=lambda part, share: progress(trainings[part][0], share),
-    )  # fmt: skip
+    )
     runs = pd.DataFrame(
         {"variant": name, "seed": seed} | work.read(part)
         for part, (name, seed) in trainings.items()
@@ -175,18 +181,28 @@ def stored(runs: pd.DataFrame, config: ResidualConfig) -> dict[str, Any]:
 
 
 def _trained(
-    simulators: frozen.Frozen, gains: Gains, config: ResidualConfig, seed: int, draws: int,
-    checkpoint: Path, tell: Tell | None,
-) -> dict[str, float]:  # fmt: skip
+    simulators: frozen.Frozen,
+    gains: Gains,
+    config: ResidualConfig,
+    seed: int,
+    draws: int,
+    checkpoint: Path,
+    tell: Tell | None,
+) -> dict[str, float]:
     def told(done: int, total: int, _: float) -> None:
         if tell is not None:
             tell(done / total)
 
     with compilation.float32():
         controller = fit(
-            jax.tree.map(np.asarray, simulators.ensemble), gains, config=config, seed=seed,
-            checkpoint=checkpoint, progress=told, keep=True,
-        )  # fmt: skip
+            jax.tree.map(np.asarray, simulators.ensemble),
+            gains,
+            config=config,
+            seed=seed,
+            checkpoint=checkpoint,
+            progress=told,
+            keep=True,
+        )
     error, exploitation = score_controller(simulators, controller, draws)
     checkpoint.unlink()
     return {

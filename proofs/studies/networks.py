@@ -97,16 +97,21 @@ def compare(
     hashes = {name: files.sha256(folder / name) for name in (MEASURED, RECONSTRUCTED)}
     chosen = {k: v for k, v in variants(base).items() if only is None or k in (BASE, *only)}
     about = {
-        "architecture": asdict(base), "config": asdict(config), "recordings": hashes,
+        "architecture": asdict(base),
+        "config": asdict(config),
+        "recordings": hashes,
         "members": members,
-    }  # fmt: skip
+    }
     work = WorkFolder((out / "rows").resolve(), about)
     parts = {name.replace(" ", "-"): name for name in chosen}
     jobs = {part: (data, chosen[name], config, members) for part, name in parts.items()}
     finish(
-        work, _judged, jobs, workers=workers,
+        work,
+        _judged,
+        jobs,
+        workers=workers,
         progress=lambda part, share: progress(parts[part], share),
-    )  # fmt: skip
+    )
     columns = {"breath_id": judged.breath_id, "lung": judged.lung_ids}
     tables = [
         pd.DataFrame({"variant": name, **columns, "error": work.read(part)})

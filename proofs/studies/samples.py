@@ -115,12 +115,13 @@ class SampleStudy:
         seeds = len(self.curves[0].scores)
         return {
             "about": {
-                "command": f"python -m proofs study samples --seeds {seeds}", "simulators": 1,
+                "command": f"python -m proofs study samples --seeds {seeds}",
+                "simulators": 1,
             },
             "lung": self.lung,
             "seeds": seeds,
             "methods": files.json_values(self.summary().to_dict("records")),
-        }  # fmt: skip
+        }
 
     def _row(self, curve: LearningCurve) -> dict[str, object]:
         low, high = band(curve.scores[:, -1:])

@@ -228,9 +228,12 @@ def horizon(config: Training, done: Array, steps: int) -> Array:
 
 
 def open_loop_loss(
-    layers: tuple[Layers, Layers], network: Network, batch: Inspirations, measured: Array,
+    layers: tuple[Layers, Layers],
+    network: Network,
+    batch: Inspirations,
+    measured: Array,
     config: Training,
-) -> Array:  # fmt: skip
+) -> Array:
     """Soft absolute error of the next pressures, cmH2O, with the layers ``(general, boundary)``.
 
     A run starts anew from the measured window where ``measured`` is true, shape ``(n, T)``.

@@ -126,9 +126,13 @@ def _slowly(plant, gains):
 def test_a_dask_worker_that_is_killed_loses_nothing_and_counts_nothing_twice(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
     started = distributed.LocalCluster(
-        n_workers=3, threads_per_worker=1, processes=True, dashboard_address=None,
-        host="127.0.0.1", local_directory=str(tmp_path),
-    )  # fmt: skip
+        n_workers=3,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        host="127.0.0.1",
+        local_directory=str(tmp_path),
+    )
     with started as cluster:
         jobs = {f"{n}": (None, np.full((2, 3), float(n))) for n in range(24)}
         found, killed = [], None

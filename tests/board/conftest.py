@@ -40,11 +40,14 @@ FROZEN, SECRET = datetime(2026, 11, 20, 10, tzinfo=UTC), 20261120
 #: Name of the round, and all entries that any test sends to it, with what they are copies of.
 ROUND = "r1"
 ENTERED = {
-    **dict.fromkeys(("softer", "harder", "broken", "open", "home", "twin", "told", "new", "weak",
-                     "honest"), "pid_best"),
-    **dict.fromkeys(("robust", "leaky", "later", "fails", "absent", "uneven", "zero", "soft"),
-                    "pid_robust"),
-}  # fmt: skip
+    **dict.fromkeys(
+        ("softer", "harder", "broken", "open", "home", "twin", "told", "new", "weak", "honest"),
+        "pid_best",
+    ),
+    **dict.fromkeys(
+        ("robust", "leaky", "later", "fails", "absent", "uneven", "zero", "soft"), "pid_robust"
+    ),
+}
 
 #: Text that must never be anything but text.
 HOSTILE = (
@@ -158,9 +161,12 @@ def draft(
                 description=texts,
             )
         opened = dataclasses.replace(
-            score.submission, label=str(folder), folder=folder, manifest=manifest,
+            score.submission,
+            label=str(folder),
+            folder=folder,
+            manifest=manifest,
             sha256=create.combined_hash(create.file_hashes(folder)),
-        )  # fmt: skip
+        )
         requested = np.full_like(score.requested, 100.0) if wide_open else score.requested * factor
         if change is not None:
             change(requested)
@@ -177,10 +183,14 @@ def draft(
             message = what.message(str(folder), LUNG_IDS[i])
             failures.append(CellFailure("none", LUNG_IDS[i], score.pips[j], None, what, message))
         varied = dataclasses.replace(
-            score, submission=opened, sandbox=sandbox, controllable=np.moveaxis(controllable, 0, 1),
-            runs=rerun(score.runs, np.concatenate([nominal[None], found.drawn]), found, requested,
-                       failures),
-        )  # fmt: skip
+            score,
+            submission=opened,
+            sandbox=sandbox,
+            controllable=np.moveaxis(controllable, 0, 1),
+            runs=rerun(
+                score.runs, np.concatenate([nominal[None], found.drawn]), found, requested, failures
+            ),
+        )
         own = None if stress is None else stress(varied)
         varied = dataclasses.replace(varied, stressed=own)
         return create.create(varied, simulators, now=NOW, **about)
@@ -199,9 +209,13 @@ def rerun(
     safe = found.safe[None, :, None] & np.isfinite(flat(errors))
     commands = requested.reshape(1, 6, -1, *requested.shape[3:])
     return dataclasses.replace(
-        runs, error=flat(errors), peak=flat(found.peak), safe=safe, requested=commands,
+        runs,
+        error=flat(errors),
+        peak=flat(found.peak),
+        safe=safe,
+        requested=commands,
         failures=failures,
-    )  # fmt: skip
+    )
 
 
 def entry_folder(folder: Path, base: str, name: str) -> Path:

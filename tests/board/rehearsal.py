@@ -40,10 +40,15 @@ class Person:
         self.name, self.folder = name, folder / name
         mail = f"{name}@ventbench.invalid"
         self.environ = {
-            **os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(self.folder), **environ,
-            "GIT_AUTHOR_NAME": name, "GIT_AUTHOR_EMAIL": mail,
-            "GIT_COMMITTER_NAME": name, "GIT_COMMITTER_EMAIL": mail,
-        }  # fmt: skip
+            **os.environ,
+            "JAX_PLATFORMS": "cpu",
+            "PYTHONPATH": str(self.folder),
+            **environ,
+            "GIT_AUTHOR_NAME": name,
+            "GIT_AUTHOR_EMAIL": mail,
+            "GIT_COMMITTER_NAME": name,
+            "GIT_COMMITTER_EMAIL": mail,
+        }
         subprocess.run(["git", "clone", "--quiet", origin, self.folder], check=True)
 
     def run(self, *command: str, code: int = 0) -> str:
@@ -112,9 +117,16 @@ def main() -> None:
     chain.write_bytes(msgspec.json.encode(referee.chain(SECRET)))
     closes = datetime.now(UTC).replace(microsecond=0) + timedelta(seconds=30)
     maintainer.ventbench(
-        "round", "open", NAME, "--closes", f"{closes:%Y-%m-%dT%H:%M:%S}", "--delay", str(DELAY_S),
-        "--rehearsal", str(chain),
-    )  # fmt: skip
+        "round",
+        "open",
+        NAME,
+        "--closes",
+        f"{closes:%Y-%m-%dT%H:%M:%S}",
+        "--delay",
+        str(DELAY_S),
+        "--rehearsal",
+        str(chain),
+    )
     maintainer.share("The round is open")
 
     author.pull()
@@ -149,8 +161,11 @@ def main() -> None:
     author.ventbench("board", "build", "--out", str(out / "site"))
     author.ventbench("round", "show", NAME)
     took = time.perf_counter() - scoring
-    print(f"scored, verified and shown in {took:.0f} s; all of it in "
-          f"{time.perf_counter() - begun:.0f} s", flush=True)  # fmt: skip
+    print(
+        f"scored, verified and shown in {took:.0f} s; all of it in "
+        f"{time.perf_counter() - begun:.0f} s",
+        flush=True,
+    )
     board = author.folder / "leaderboard"
     for path in (
         board / "rounds" / NAME / "beacon.json",

@@ -54,8 +54,10 @@ def test_from_records_to_a_verified_board(drafts, entered: Path, tmp_path: Path)
     text = run("show", "--folder", folder, "--json", report)
     rows = json.loads(report.read_text())["rows"]
     assert [(row["name"], row["rank"]) for row in rows] == [
-        ("pid_best", 1), ("softer", 2), ("broken", ""),
-    ]  # fmt: skip
+        ("pid_best", 1),
+        ("softer", 2),
+        ("broken", ""),
+    ]
     assert "softer" in text
     written = csv.DictReader(io.StringIO((tmp_path / "site" / "leaderboard.csv").read_text()))
     assert [row["score_cmH2O"] for row in written] == [row["score_cmH2O"] for row in rows]

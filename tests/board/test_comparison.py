@@ -32,9 +32,7 @@ def world(random, true, rig, *, wild=1.0, heavy=False):
         of_rig = 10.0 * drawn(len(true), len(names))
         of_rig[:, 0] *= wild if lung == 0 else 1.0
         shared = 5.0 * drawn(1, draws)
-        values[:, lung] = true[:, None] + of_rig[:, index] + shared + 10.0 * drawn(
-            len(true), draws
-        )  # fmt: skip
+        values[:, lung] = true[:, None] + of_rig[:, index] + shared + 10.0 * drawn(len(true), draws)
     return values
 
 

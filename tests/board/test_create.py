@@ -27,8 +27,11 @@ def test_a_record_says_where_it_comes_from(drafts, scores, drawn) -> None:
     assert content["official"] is True
     assert content["sandbox"] == SANDBOX
     assert content["draws"] == {
-        "version": 2, "sha256": drawn.commitment, "count": 20, "season": ROUND,
-    }  # fmt: skip
+        "version": 2,
+        "sha256": drawn.commitment,
+        "count": 20,
+        "season": ROUND,
+    }
     assert content["simulators"]["manifest_sha256"] == "2" * 64
     root = Path(draw_tables.__file__).parents[2]
     assert content["versions"]["requirements.lock"] == files.sha256(root / "requirements.lock")

@@ -23,9 +23,12 @@ def test_a_row_an_entry(full: Path, site: Path) -> None:
     names = [name for column in frames.COLUMNS for name in column.names]
     assert list(board.columns[: len(names)]) == names
     for column in (
-        "score_cmH2O", "normalised_to_pid_low", "normalised_to_above_high",
-        "exploitation_cmH2O", "worst_pip",
-    ):  # fmt: skip
+        "score_cmH2O",
+        "normalised_to_pid_low",
+        "normalised_to_above_high",
+        "exploitation_cmH2O",
+        "worst_pip",
+    ):
         written = [float(row[column]) if row[column] else np.nan for row in rows]
         np.testing.assert_allclose(board[column], written, atol=1e-6)
     assert [("" if pd.isna(rank) else str(rank)) for rank in board["rank"]] == [

@@ -44,18 +44,37 @@ def hardware(template: dict[str, Any], runs: list[Any], **changed: Any) -> bytes
         for key in ("format", "protocol", "created", "submission", "sandbox", "versions", "machine")
     }
     own |= {
-        "kind": "hardware", "track": "hardware", "simulated_track": "performance",
-        "device": {"name": "bench", "firmware": "1", "calibration": "a", "emulated": False,
-                   "about": {}},
-        "operator": "A. Person", "notes": "", "lungs": [LUNG], "pips": [PIP], "repeats": len(runs),
-        "errors": [[errors.tolist()]], "stops": [], "safe": [True],
+        "kind": "hardware",
+        "track": "hardware",
+        "simulated_track": "performance",
+        "device": {
+            "name": "bench",
+            "firmware": "1",
+            "calibration": "a",
+            "emulated": False,
+            "about": {},
+        },
+        "operator": "A. Person",
+        "notes": "",
+        "lungs": [LUNG],
+        "pips": [PIP],
+        "repeats": len(runs),
+        "errors": [[errors.tolist()]],
+        "stops": [],
+        "safe": [True],
         "peak_pressure_cmH2O": [float(table.max())],
-        "trace": {"pressure_milli_cmH2O": [[runs]],
-                  "u_in_tenths_percent": [[(0 * np.array(runs)).tolist()]]},
+        "trace": {
+            "pressure_milli_cmH2O": [[runs]],
+            "u_in_tenths_percent": [[(0 * np.array(runs)).tolist()]],
+        },
         "recording": {"sha256": RAW, "bytes": 1, "breaths": 6},
-        "plan": {}, "control": {}, "safety": {}, "timing": {}, "provenance": {},
+        "plan": {},
+        "control": {},
+        "safety": {},
+        "timing": {},
+        "provenance": {},
         "selftest": {LUNG: ["leak"]},
-    }  # fmt: skip
+    }
     return canonical.canonical(own | changed)
 
 

@@ -92,12 +92,16 @@ def test_only_unseen_draws_of_a_round_count() -> None:
         seen = np.flatnonzero(~rigs.ranked)
         assert 0 < len(seen) < rigs.ranked.size
         again = comparison.ranks(
-            np.stack([np.delete(r.record.headroom.normalised[1:], seen, 0).mean(axis=2).T
-                      for r in track.ranked]),
+            np.stack(
+                [
+                    np.delete(r.record.headroom.normalised[1:], seen, 0).mean(axis=2).T
+                    for r in track.ranked
+                ]
+            ),
             np.delete(rigs.session, seen, 1),
             [names.index(r.entry.source) if r.entry.source else None for r in track.ranked],
             matters=comparison.POINTS,
-        )  # fmt: skip
+        )
         assert again.rank.tolist() == [row.rank for row in track.ranked]
         for row in track.ranked:
             assert row.error is not None

@@ -52,9 +52,15 @@ def fresh(tmp_path: Path) -> Path:
         entry_folder(tmp_path / "submissions" / name, "pid_robust", name)
     board = tmp_path / "leaderboard"
     rounds.open_round(
-        board, "r2", FROZEN, ["pid_robust"], delay_s=60, limit=2,
-        chain=referee.chain(SECRET), now=FROZEN - timedelta(days=1),
-    )  # fmt: skip
+        board,
+        "r2",
+        FROZEN,
+        ["pid_robust"],
+        delay_s=60,
+        limit=2,
+        chain=referee.chain(SECRET),
+        now=FROZEN - timedelta(days=1),
+    )
     return board
 
 
@@ -76,8 +82,10 @@ def test_entries_are_limited_by_account_and_not_by_name(fresh: Path) -> None:
     own = freeze(fresh, ask("three", "Eve", 2), ask("one", "eve", 0), ask("two", "EVE", 1))
     assert own.frozen is not None
     assert [(x.name, x.account) for x in own.frozen.entries] == [
-        ("pid_robust", ""), ("one", "eve"), ("two", "eve")
-    ]  # fmt: skip
+        ("pid_robust", ""),
+        ("one", "eve"),
+        ("two", "eve"),
+    ]
     assert own.frozen.left_out == {"three": "account eve has 2 entries already"}
     assert own.state == "frozen"
 
@@ -229,16 +237,22 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
     ran: list[str] = []
     run = official_runs.run_protocol
     monkeypatch.setattr(
-        official_runs, "run_protocol",
+        official_runs,
+        "run_protocol",
         lambda entry, *a, **b: ran.append(entry.manifest.name) or run(entry, *a, **b),
-    )  # fmt: skip
+    )
 
     def score():
         with executor() as pool:
             return official_runs.score(
-                fresh, "r2", pool, fresh.parent / "work", places=[submissions],
-                load=lambda: simulators, runner=InProcessRunner,
-            )  # fmt: skip
+                fresh,
+                "r2",
+                pool,
+                fresh.parent / "work",
+                places=[submissions],
+                load=lambda: simulators,
+                runner=InProcessRunner,
+            )
 
     with monkeypatch.context() as broken:
         broken.setattr(store, "add", lambda *_: 1 / 0)  # as if the machine had gone off
@@ -281,8 +295,9 @@ def _proposed(scored: Path, leaderboard: Path, simulators) -> None:
     assert not store.load(forged).scores
     added = propose.add(scored, leaderboard, "r2", simulators)
     assert {(x.name, x.track) for x in added} == {
-        ("pid_robust", "performance"), ("pid_robust", "robustness")
-    }  # fmt: skip
+        ("pid_robust", "performance"),
+        ("pid_robust", "robustness"),
+    }
     git = Git(leaderboard.parent)
     git.output("init", "--quiet", "--template=")
     assert propose.commit(leaderboard.parent, "r2", "scored") == "round/r2-scored"
@@ -336,9 +351,12 @@ def test_a_thousand_entries_pass_through_dask(
 ) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
     started = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None,
+        n_workers=1,
+        threads_per_worker=2,
+        processes=False,
+        dashboard_address=None,
         local_directory=str(tmp_path),
-    )  # fmt: skip
+    )
     jobs = {f"{entry}-{track}": (entry, track) for entry, track in thousand}
     with started as cluster, executor(0, cluster.scheduler_address) as pool:
         found = list(results(pool, "{}-{}".format, jobs))

@@ -22,8 +22,13 @@ WRONG: dict[str, tuple[Any, str]] = {
     "missing key": (_without("safe"), "missing required field `safe`"),
     "unknown key": (lambda x: {**x, "rank": 1}, "unknown field `rank`"),
     "name that leaves its folder": (
-        lambda x: {**x, "submission": {**x["submission"], "manifest": {
-            **x["submission"]["manifest"], "name": "../../index"}}},
+        lambda x: {
+            **x,
+            "submission": {
+                **x["submission"],
+                "manifest": {**x["submission"]["manifest"], "name": "../../index"},
+            },
+        },
         "key submission.manifest.name",
     ),
     "negative error": (
@@ -37,7 +42,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "official without a sandbox": (lambda x: {**x, "sandbox": None}, "was not official"),
     "other lungs": (lambda x: {**x, "lungs": ["R9C9"] * 6}, "all lungs and PIPs"),
     "shape of gigabytes": (
-        lambda x: {**x, "actions": {**x["actions"], "shape": [10**6] * 5}}, "actions.shape",
+        lambda x: {**x, "actions": {**x["actions"], "shape": [10**6] * 5}},
+        "actions.shape",
     ),
     "number as text": (
         lambda x: {**x, "spread": [["1"] * 6] * 6},
@@ -57,7 +63,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "29 February": (lambda x: {**x, "created": "2026-02-29T00:00:00Z"}, "is no date and time"),
     "no machine": (lambda x: {**x, "machine": {}}, "key machine.system: is missing or empty"),
     "blank machine": (
-        lambda x: {**x, "machine": x["machine"] | {"kernel": " "}}, "key machine.kernel",
+        lambda x: {**x, "machine": x["machine"] | {"kernel": " "}},
+        "key machine.kernel",
     ),
     "no versions": (lambda x: {**x, "versions": {}}, "key versions.ventbench: is missing"),
     "no spreads": (
@@ -73,21 +80,28 @@ WRONG: dict[str, tuple[Any, str]] = {
         "key submission.files: controller.py has no SHA-256",
     ),
     "no files": (
-        lambda x: {**x, "submission": {**x["submission"], "files": {}}}, "controller.py is missing",
+        lambda x: {**x, "submission": {**x["submission"], "files": {}}},
+        "controller.py is missing",
     ),
     "file outside": (
-        lambda x: {**x, "submission": {**x["submission"], "files": {
-            **x["submission"]["files"], "../x": "a" * 64}}},
+        lambda x: {
+            **x,
+            "submission": {
+                **x["submission"],
+                "files": {**x["submission"]["files"], "../x": "a" * 64},
+            },
+        },
         "'../x' is no path within a folder",
     ),
     "integer of 400 digits": (
-        lambda x: {**x, "timing": {"act_median_us": 10**400}}, "key timing: holds a whole number",
+        lambda x: {**x, "timing": {"act_median_us": 10**400}},
+        "key timing: holds a whole number",
     ),
     "deep nesting": (
         lambda x: {**x, "machine": {"a": [[[[[[[[1]]]]]]]]}},
         "key machine: is nested more than 6 deep",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -136,8 +136,10 @@ def test_a_record_that_another_one_names_is_missed(leaderboard: Path, check) -> 
     score = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     store.withdraw(leaderboard, score.sha256, "a bug")
     (leaderboard / store.RECORDS / f"{score.sha256}.json").unlink()
-    assert any(f"withdraws {score.sha256[:12]}, which is not there" in x
-               for x in check(leaderboard).problems)  # fmt: skip
+    assert any(
+        f"withdraws {score.sha256[:12]}, which is not there" in x
+        for x in check(leaderboard).problems
+    )
 
 
 def test_changed_simulators_are_named(leaderboard: Path, simulators: TextbookRigs) -> None:
@@ -192,8 +194,10 @@ FORGERIES = {
     "safe": {"safe": lambda x: [not x[0], *x[1:]]},
     "peak_pressure_cmH2O": {"peak_pressure_cmH2O": _lower},
     "safety.peak_centi_cmH2O": {
-        "safety": lambda x: {**x, "peak_centi_cmH2O": np.maximum(
-            np.array(x["peak_centi_cmH2O"]) - 2, 0).tolist()}
+        "safety": lambda x: {
+            **x,
+            "peak_centi_cmH2O": np.maximum(np.array(x["peak_centi_cmH2O"]) - 2, 0).tolist(),
+        }
     },
     "safety.steps_above": {
         "safety": lambda x: {**x, "steps_above": (np.array(x["steps_above"]) + 1).tolist()}
@@ -201,14 +205,18 @@ FORGERIES = {
     "clipped.below": {"clipped": lambda x: {**x, "below": [0] * 6}},
     "clipped.commands": {"clipped": lambda x: {**x, "commands": 10**6}},
     "trace.pressure_centi_cmH2O": {
-        "trace": lambda x: {**x, "pressure_centi_cmH2O": (
-            np.array(x["pressure_centi_cmH2O"]) + 2).tolist()}
+        "trace": lambda x: {
+            **x,
+            "pressure_centi_cmH2O": (np.array(x["pressure_centi_cmH2O"]) + 2).tolist(),
+        }
     },
     "trace.u_in_tenths_percent": {
-        "trace": lambda x: {**x, "u_in_tenths_percent": (
-            np.array(x["u_in_tenths_percent"]) * 0).tolist()}
+        "trace": lambda x: {
+            **x,
+            "u_in_tenths_percent": (np.array(x["u_in_tenths_percent"]) * 0).tolist(),
+        }
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("key", FORGERIES)

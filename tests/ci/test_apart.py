@@ -64,11 +64,20 @@ def test_the_job_reads_what_a_branch_changes(repository, monkeypatch, capsys) ->
 
 def test_requests_are_of_accounts() -> None:
     merged = [
-        {"author": {"login": "eve"}, "mergedAt": "2027-01-02T00:00:00Z",
-         "files": [{"path": "submissions/one/controller.py"}, {"path": "submissions/one/a/b.py"}]},
-        {"author": {"login": "ada"}, "mergedAt": "2027-01-01T00:00:00Z",
-         "files": [{"path": "submissions/README.md"}, {"path": "submissions/two/x.py"}]},
-    ]  # fmt: skip
+        {
+            "author": {"login": "eve"},
+            "mergedAt": "2027-01-02T00:00:00Z",
+            "files": [
+                {"path": "submissions/one/controller.py"},
+                {"path": "submissions/one/a/b.py"},
+            ],
+        },
+        {
+            "author": {"login": "ada"},
+            "mergedAt": "2027-01-01T00:00:00Z",
+            "files": [{"path": "submissions/README.md"}, {"path": "submissions/two/x.py"}],
+        },
+    ]
     assert requests(merged) == [
         {"name": "two", "account": "ada", "asked": "2027-01-01T00:00:00Z"},
         {"name": "one", "account": "eve", "asked": "2027-01-02T00:00:00Z"},

@@ -88,9 +88,22 @@ def test_a_merged_submission_can_be_scored_again(repository, demo, taken):
 
 @pytest.mark.parametrize(
     "commit",
-    ["", "main", "HEAD", "abc123", "g" * 40, "A" * 40, "0" * 39, "0" * 41, "--upload-pack=x",
-     "0" * 40 + "\n", "$(id)", "0" * 38 + "^0", "\u0660" * 40],
-)  # fmt: skip
+    [
+        "",
+        "main",
+        "HEAD",
+        "abc123",
+        "g" * 40,
+        "A" * 40,
+        "0" * 39,
+        "0" * 41,
+        "--upload-pack=x",
+        "0" * 40 + "\n",
+        "$(id)",
+        "0" * 38 + "^0",
+        "\u0660" * 40,
+    ],
+)
 def test_only_full_names_of_commits(refused, commit):
     assert "is not 40 lower-case hexadecimal digits" in refused(commit)
 
@@ -119,10 +132,19 @@ def test_another_history(repository, demo, refused):
 
 @pytest.mark.parametrize(
     "path",
-    ["ventbench/a.py", "ventbench/task/protocol.py", ".github/workflows/x.yml", ".gitattributes",
-     "submissions/other/controller.py", "submissions/README.md", "submissions/demo2/x.md",
-     "submissions/Demo/controller.py", "leaderboard/index.html", ".gitmodules"],
-)  # fmt: skip
+    [
+        "ventbench/a.py",
+        "ventbench/task/protocol.py",
+        ".github/workflows/x.yml",
+        ".gitattributes",
+        "submissions/other/controller.py",
+        "submissions/README.md",
+        "submissions/demo2/x.md",
+        "submissions/Demo/controller.py",
+        "leaderboard/index.html",
+        ".gitmodules",
+    ],
+)
 def test_changes_outside(repository, demo, refused, path):
     said = refused(repository.commit(demo | {path: b"changed"}, repository.base))
     parts = path.split("/")

@@ -53,10 +53,12 @@ def make(name: str) -> dict[str, GaussianPolicy | GreedyPolicy]:
 @pytest.mark.parametrize(
     ("name", "track"),
     [
-        ("ppo", "performance"), ("ppo", "robustness"),
-        ("dqn", "performance"), ("dqn", "robustness"),
+        ("ppo", "performance"),
+        ("ppo", "robustness"),
+        ("dqn", "performance"),
+        ("dqn", "robustness"),
     ],
-)  # fmt: skip
+)
 def test_numpy_and_jax_act_alike(name, track, tmp_path):
     folder = tmp_path / name
     shutil.copytree(HERE / name, folder, ignore=shutil.ignore_patterns("__pycache__"))

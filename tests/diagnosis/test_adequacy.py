@@ -39,10 +39,16 @@ def checked(
     noise = made.NOISE * np.random.default_rng(seed).standard_normal(pressure.shape)
     pressure = pressure + noise + np.reshape(zeros, (-1, 1))
     return check_residuals(
-        dataclasses.replace(recorded, pressure=pressure), simulated, (slope - simulated) / 0.01,
-        np.zeros_like(slope), made.NOISE, 22.8 * u_in, np.zeros_like(slope),
-        gains_scatter=scatter, settings=settings,
-    )  # fmt: skip
+        dataclasses.replace(recorded, pressure=pressure),
+        simulated,
+        (slope - simulated) / 0.01,
+        np.zeros_like(slope),
+        made.NOISE,
+        22.8 * u_in,
+        np.zeros_like(slope),
+        gains_scatter=scatter,
+        settings=settings,
+    )
 
 
 def test_a_gain_that_rises_in_mid_session_is_located_and_vetoes():

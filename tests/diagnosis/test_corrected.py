@@ -97,8 +97,9 @@ def test_only_breaths_that_were_set_aside_choose(breaths):
     for where, wanted in ((uses.judging, "before"), (~uses.judging, "after")):
         after = before + np.where(where[:, None], -9.0, 0.5) * error
         pressures = {"before": before, "refit": before, "after": after}
-        assert choose(breaths, uses, pressures)[1][small.LABEL] == ("refit" if wanted == "before"
-                                                                     else "after")  # fmt: skip
+        assert choose(breaths, uses, pressures)[1][small.LABEL] == (
+            "refit" if wanted == "before" else "after"
+        )
 
 
 @pytest.mark.parametrize("worse", [False, True], ids=["better", "worse"])
@@ -137,9 +138,14 @@ def test_any_simulator_is_corrected_for_the_least_error(breaths, fake, monkeypat
     identified.pressures = lambda fitted, data, first: least if fitted == "again" else reported
     monkeypatch.setattr(module, "_least_error_model", lambda *_: "again")
     correction = correct(
-        breaths, make_data(breaths), split(breaths), before, identified,
-        something(before, own), load_simulators(given),
-    )  # fmt: skip
+        breaths,
+        make_data(breaths),
+        split(breaths),
+        before,
+        identified,
+        something(before, own),
+        load_simulators(given),
+    )
     again = share < DEFAULT.correction.drift_ratio
     np.testing.assert_allclose(correction.pressures["after"], least if again else reported)
     plant: Any = correction.plants[small.LABEL]
@@ -149,9 +155,14 @@ def test_any_simulator_is_corrected_for_the_least_error(breaths, fake, monkeypat
     # A simulator that is left as it is has no note on a correction.
     reported, least = before - 2.0 * error, before - error
     correction = correct(
-        breaths, make_data(breaths), split(breaths), before, identified,
-        something(before, own), load_simulators(given),
-    )  # fmt: skip
+        breaths,
+        make_data(breaths),
+        split(breaths),
+        before,
+        identified,
+        something(before, own),
+        load_simulators(given),
+    )
     assert correction.unchanged
     assert correction.notes == ()
 
@@ -163,9 +174,14 @@ def test_a_correction_that_helps_its_own_breaths_alone_is_not_chosen(breaths, fa
     error = breaths.pressure - before
     after = before + np.where(uses.judging[:, None], -9.0, 0.5) * error
     one = correct(
-        breaths, make_data(breaths), uses, before, something(after, given),
-        something(before, given), load_simulators(given),
-    )  # fmt: skip
+        breaths,
+        make_data(breaths),
+        uses,
+        before,
+        something(after, given),
+        something(before, given),
+        load_simulators(given),
+    )
     assert not one.unchanged
     assert not one.helps
     assert one.training_errors[1] == pytest.approx(0.5 * one.training_errors[0])

@@ -47,9 +47,14 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     def diagnose(breaths, *, simulator, lung, patient, drive, progress):
         progress("fitting", 0.5)
         seen.append(
-            {"breaths": breaths, "simulator": simulator, "lung": lung, "patient": patient,
-             "drive": drive}
-        )  # fmt: skip
+            {
+                "breaths": breaths,
+                "simulator": simulator,
+                "lung": lung,
+                "patient": patient,
+                "drive": drive,
+            }
+        )
         return made.diagnosis(12)
 
     module = types.ModuleType("ventbench.diagnosis.diagnose")

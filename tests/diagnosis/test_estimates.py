@@ -34,8 +34,10 @@ def test_the_larger_of_two_lags_comes_first(found):
 def test_two_lags_may_change_places():
     data = make_data(small.made())
     simulator = Predictor(data, paths(("valve_lag",)))
-    order = [parameter_values(data, simulator.names, dict(zip(LAGS, pair, strict=True)))
-             for pair in ((0.09, 0.03), (0.03, 0.09))]  # fmt: skip
+    order = [
+        parameter_values(data, simulator.names, dict(zip(LAGS, pair, strict=True)))
+        for pair in ((0.09, 0.03), (0.03, 0.09))
+    ]
     one, other = simulator.predict_all(np.stack(order))
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
     off = simulator.predict(parameter_values(data, simulator.names, {}))

@@ -49,8 +49,13 @@ def test_what_acts_in_time_is_integrated_out_once_for_all_sets() -> None:
 
 
 def test_odds_of_other_names_are_those_of_sets_that_differ_in_one() -> None:
-    weights = {("leak", "valve_lag"): 0.5, ("leak", "valve_delay"): 0.2, ("leak",): 0.1,
-               ("valve_lag", "zero_step"): 0.05, ("valve_delay", "zero_step"): 0.15}  # fmt: skip
+    weights = {
+        ("leak", "valve_lag"): 0.5,
+        ("leak", "valve_delay"): 0.2,
+        ("leak",): 0.1,
+        ("valve_lag", "zero_step"): 0.05,
+        ("valve_delay", "zero_step"): 0.15,
+    }
     named = {frozenset(names): weight for names, weight in weights.items()}
     found = Posterior((), named)
     best = frozenset({"leak", "valve_lag"})

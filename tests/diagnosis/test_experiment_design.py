@@ -39,9 +39,15 @@ def simulated(u, out, truth, *, R=20.0, C=20.0, seed=0):
     """Breaths of the physics with noise of 0.2 cmH2O."""
     n = len(u)
     empty = Data(
-        u, out, np.full((n, T), DT), np.zeros((n, 1, T)), np.ones((n, 1, T)), np.full(n, R),
-        np.full(n, C), np.linspace(0, 1, n),
-    )  # fmt: skip
+        u,
+        out,
+        np.full((n, T), DT),
+        np.zeros((n, 1, T)),
+        np.ones((n, 1, T)),
+        np.full(n, R),
+        np.full(n, C),
+        np.linspace(0, 1, n),
+    )
     rng = np.random.default_rng(seed + 100)
     start = 5.0 + rng.normal(0, 0.3, n)
     values = parameter_values(empty, paths(), {"PEEP": 5.0, "start": start, **truth})
@@ -64,9 +70,15 @@ def expected(truth, other, u_in, u_out):
     n = len(u_in)
     shape = (n, 1, T)
     new = Data(
-        u_in, u_out, np.full((n, T), DT), np.zeros(shape), np.ones(shape), np.full(n, data.R[0]),
-        np.full(n, data.C[0]), np.ones(n),
-    )  # fmt: skip
+        u_in,
+        u_out,
+        np.full((n, T), DT),
+        np.zeros(shape),
+        np.ones(shape),
+        np.full(n, data.R[0]),
+        np.full(n, data.C[0]),
+        np.ones(n),
+    )
     here = np.arange(len(data))
     simulator = Predictor(new, paths())
     one, two = (forecast(x, new, simulator, here, 5.0, NOISE) for x in (truth, other))

@@ -36,9 +36,15 @@ def recorded(
     pressure = 6.0 + volume / C + R * q + quadratic * q * np.abs(q)
     pressure += noise * rng.standard_normal(time.shape)
     return make_breaths(
-        np.arange(1, n + 1), [20.0] * n, [50.0] * n, time, 0 * time, time >= 0.9, pressure,
+        np.arange(1, n + 1),
+        [20.0] * n,
+        [50.0] * n,
+        time,
+        0 * time,
+        time >= 0.9,
+        pressure,
         flow=flow,
-    )  # fmt: skip
+    )
 
 
 def test_flow_is_recognised_as_the_drive():

@@ -34,9 +34,19 @@ def session(name: str = "", affected: np.ndarray = AFFECTED, **values: float) ->
     """Breaths of the world of faults, of which some are from a rig with the fault."""
     base = Base(R=20.0, C=20.0, R_ex=5.0, peep=5.0, gain=22.8)
     case = FaultsCase(
-        "", 20.0, 20.0, (), base=base, noise=0.15, breaths=BREATHS, samples=50, step=0.05,
-        jitter=1e-4, interval=0.04, choice=5,
-    )  # fmt: skip
+        "",
+        20.0,
+        20.0,
+        (),
+        base=base,
+        noise=0.15,
+        breaths=BREATHS,
+        samples=50,
+        step=0.05,
+        jitter=1e-4,
+        interval=0.04,
+        choice=5,
+    )
     plain = record(case, np.random.default_rng(3))
     if not name:
         return plain
@@ -47,9 +57,10 @@ def session(name: str = "", affected: np.ndarray = AFFECTED, **values: float) ->
     other = record(faulty, np.random.default_rng(3))
     chosen = np.isin(plain.breath_id, affected)[:, None]
     return dataclasses.replace(
-        plain, u_in=np.where(chosen, other.u_in, plain.u_in),
+        plain,
+        u_in=np.where(chosen, other.u_in, plain.u_in),
         pressure=np.where(chosen, other.pressure, plain.pressure),
-    )  # fmt: skip
+    )
 
 
 def found(breaths: Breaths, **changed: Any) -> Intermittent | None:
@@ -136,9 +147,12 @@ def test_commands_that_were_lost_are_found_and_followed():
 def test_the_affected_breaths_stand_in_the_first_sentence_the_json_and_the_page(tmp_path):
     """Commands that are lost or late are one answer with two members."""
     about = dataclasses.replace(
-        made.diagnosis(12).mechanisms[0], name="lost_commands", parameters={},
-        alternatives=("late_commands",), affected=(2, 3, 4, 9, 12),
-    )  # fmt: skip
+        made.diagnosis(12).mechanisms[0],
+        name="lost_commands",
+        parameters={},
+        alternatives=("late_commands",),
+        affected=(2, 3, 4, 9, 12),
+    )
     told = dataclasses.replace(made.diagnosis(12), mechanisms=(about,), plants={})
     first = str(told).splitlines()[0]
     assert "never reach the valve, or commands that reach the valve late" in first

@@ -28,8 +28,9 @@ HERE = Path(__file__).parent.parent
 #: Rows of the table of the method page, ``|pattern|`file.py::test`, ...|``.
 ROWS = re.findall(
     r"^\|(\d+)\. (.*?)\|(.*::.*)\|$",
-    (HERE.parent / "docs" / "missing_physics_method.md").read_text("utf-8"), re.MULTILINE,
-)  # fmt: skip
+    (HERE.parent / "docs" / "missing_physics_method.md").read_text("utf-8"),
+    re.MULTILINE,
+)
 
 #: Pattern, and the tests that would fail if it came back.
 PATTERNS = {what: tuple(re.findall("`(.*?)`", tests)) for _, what, tests in ROWS} | {
@@ -95,10 +96,18 @@ def selected(
     """What is selected from a stranger's recording of a lung."""
     label = lung(where)
     case = StrangerCase(
-        "", label.R, label.C, effects, base=Base(1.06 * label.R, 0.97 * label.C), noise=noise,
-        breaths=small.BREATHS, samples=small.SAMPLES, inspiration=0.8,
-        explored=0.0 if closed_loop else 0.5, proportional=4.0,
-    )  # fmt: skip
+        "",
+        label.R,
+        label.C,
+        effects,
+        base=Base(1.06 * label.R, 0.97 * label.C),
+        noise=noise,
+        breaths=small.BREATHS,
+        samples=small.SAMPLES,
+        inspiration=0.8,
+        explored=0.0 if closed_loop else 0.5,
+        proportional=4.0,
+    )
     return small.concluded(record(case, np.random.default_rng(seed))).named
 
 

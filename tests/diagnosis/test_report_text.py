@@ -64,10 +64,12 @@ def test_a_named_mechanism():
     assert "This recording cannot tell valve_delay from valve_lag." in said
     assert any(text.startswith("The lung does not match its label R20C50: R 22.1") for text in said)
     assert any(
-        text.startswith("Record next: 3 breaths of random pulses of the valve. These breaths "
-        "distinguish between valve_delay and valve_lag (expected evidence 64 nats; 4.6 decide).")
+        text.startswith(
+            "Record next: 3 breaths of random pulses of the valve. These breaths "
+            "distinguish between valve_delay and valve_lag (expected evidence 64 nats; 4.6 decide)."
+        )
         for text in said
-    )  # fmt: skip
+    )
     assert said[-1] == found.notes[0]
     changed = dataclasses.replace(found.mechanisms[0], changed=True)
     assert (

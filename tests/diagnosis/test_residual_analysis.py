@@ -56,9 +56,17 @@ def exact(seed: int, n: int = 60, samples: int = 80, lungs: int = 1):
     volume = np.cumsum(flow * dt, axis=1) * (u_out == 0)
     pressure = 5.0 + volume / 50.0 + 0.02 * flow
     recorded = Breaths(
-        np.arange(n), R, np.full(n, 50.0), time, dt, u_in, u_out, pressure.copy(),
-        np.ones((n, samples), bool), np.zeros(n, bool),
-    )  # fmt: skip
+        np.arange(n),
+        R,
+        np.full(n, 50.0),
+        time,
+        dt,
+        u_in,
+        u_out,
+        pressure.copy(),
+        np.ones((n, samples), bool),
+        np.zeros(n, bool),
+    )
     return recorded, pressure, flow, volume
 
 
@@ -257,8 +265,10 @@ def breaths():
 def answers(breaths):
     """Off by a number in inspiration and by twice as much after it."""
     off = np.where(breaths.u_out == 1, 2.0, 1.0)
-    return {name: breaths.pressure + k * off for name, k in
-            (("before", 3.0), ("refit", 2.0), ("after", 1.0))}  # fmt: skip
+    return {
+        name: breaths.pressure + k * off
+        for name, k in (("before", 3.0), ("refit", 2.0), ("after", 1.0))
+    }
 
 
 def test_only_inspiration_of_held_out_breaths_counts(breaths):
@@ -309,9 +319,12 @@ def test_parts_of_the_breath_and_lungs(breaths):
     given["before"][breaths.lung_ids == "R5C10"] += 5.0
     found = compare_open_loop(breaths, held, given, 0.2)
     assert list(found.groups) == [
-        "first 0.2 s of inspiration", "rest of inspiration", "expiration", "lung R5C10",
+        "first 0.2 s of inspiration",
+        "rest of inspiration",
+        "expiration",
+        "lung R5C10",
         "lung R20C50",
-    ]  # fmt: skip
+    ]
     assert found.groups["first 0.2 s of inspiration"]["after"].mae == pytest.approx(5.0)
     assert found.groups["rest of inspiration"]["after"].mae == pytest.approx(1.0)
     assert found.groups["lung R5C10"]["before"].mae == pytest.approx(8.0)

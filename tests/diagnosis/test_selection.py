@@ -133,8 +133,9 @@ def test_strong_efforts_are_selected_and_nothing_else():
 
 def test_two_strong_effects_are_both_selected():
     two = (
-        small.effect("turbulent_resistance", quadratic=10.0), small.effect("sensor_lag", tau=0.12)
-    )  # fmt: skip
+        small.effect("turbulent_resistance", quadratic=10.0),
+        small.effect("sensor_lag", tau=0.12),
+    )
     named = small.concluded(small.made(*two)).named
     assert set(named.hypothesis.names) == {"turbulent_resistance", "sensor_lag"}
 
@@ -162,9 +163,13 @@ def test_a_small_term_that_hides_others_is_compared_with_and_not_named():
         small.effect("valve_curve", "rational saturation", loss=0.43),
     )
     breaths = small.strange(
-        *acting, noise=0.15, seed=5, dead_space=0.05,
-        base=dataclasses.replace(small.RIG, R=52.8, C=9.5, gain=22.8), proportional=1.3,
-    )  # fmt: skip
+        *acting,
+        noise=0.15,
+        seed=5,
+        dead_space=0.05,
+        base=dataclasses.replace(small.RIG, R=52.8, C=9.5, gain=22.8),
+        proportional=1.3,
+    )
     assert set(small.concluded(breaths).names) == {"valve_delay", "valve_curve"}
 
 
@@ -184,9 +189,11 @@ def test_strong_lags_are_told_from_a_lung_without_resistance():
         small.effect("valve_delay", delay=0.0728),
     )
     breaths = small.strange(
-        *acting, noise=0.2, seed=3,
+        *acting,
+        noise=0.2,
+        seed=3,
         base=dataclasses.replace(small.RIG, R=51.3, C=9.8, gain=22.8),
-    )  # fmt: skip
+    )
     labelled = dataclasses.replace(breaths, R=50.0 + 0.0 * breaths.R, C=10.0 + 0.0 * breaths.C)
     named = small.concluded(labelled).named
     assert set(named.names) == {"sensor_lag", "valve_delay"}

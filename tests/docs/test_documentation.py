@@ -43,17 +43,25 @@ SLOW = re.compile(r"diagnose\(|train_|\bfit\(|ventbench\.score\(")
 #: with those before them, and with the page's own controller or diagnoser.
 QUICK = {"docs/mechanics.md": (1,), "docs/missing_physics.md": (2,)}
 WHOLE = {
-    "README.md": (2,), "docs/submitting.md": (1,), "docs/reinforcement.md": (2,),
-    "docs/diagnosers.md": (1,), "docs/mechanics.md": (2,),
-}  # fmt: skip
+    "README.md": (2,),
+    "docs/submitting.md": (1,),
+    "docs/reinforcement.md": (2,),
+    "docs/diagnosers.md": (1,),
+    "docs/mechanics.md": (2,),
+}
 
 #: Examples of ``--help`` that run as they are written.
 EXAMPLES = (
-    "ventbench lungs", "ventbench stressors", "ventbench doctor",
-    "ventbench simulate", "ventbench open-loop", "ventbench coverage",
+    "ventbench lungs",
+    "ventbench stressors",
+    "ventbench doctor",
+    "ventbench simulate",
+    "ventbench open-loop",
+    "ventbench coverage",
     "ventbench data import",
-    "ventbench board show", "ventbench board new-key",
-)  # fmt: skip
+    "ventbench board show",
+    "ventbench board new-key",
+)
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -198,9 +206,11 @@ def test_blocks_of_commands_run(page: str, tmp_path: Path, public_recordings: Pa
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", f"trap 'kill $(jobs -p) 2>&- || true' EXIT\n{script}"],
-        cwd=tmp_path, env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=tmp_path,
+        env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 

@@ -30,9 +30,12 @@ def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path):
     tables = {
         "stress": [line.name for line in STRESSORS],
         "physics": list(library()),
-        "commands": ["ventbench board withdraw", "ventbench-hardware emulate",
-                     "python -m proofs challenge reveal"],
-    }  # fmt: skip
+        "commands": [
+            "ventbench board withdraw",
+            "ventbench-hardware emulate",
+            "python -m proofs challenge reveal",
+        ],
+    }
     for page, names in tables.items():
         text = (tmp_path / f"{page}.html").read_text("utf-8")
         assert all(f"<td><code>{name}</code></td>" in text for name in names), page

@@ -88,9 +88,14 @@ def test_physics_that_cannot_be_is_left_out(monkeypatch) -> None:
     """And pressures count once they are held for longer than 0.1 s."""
     rigs = load_rigs("physics")
     bench = _Bench(
-        as_submission(lambda o: 1.0), InProcessRunner(), None, rigs, [0, 5],
-        (stressor("supply_high"),), False,
-    )  # fmt: skip
+        as_submission(lambda o: 1.0),
+        InProcessRunner(),
+        None,
+        rigs,
+        [0, 5],
+        (stressor("supply_high"),),
+        False,
+    )
     points, pip = np.linspace(0.1, 1.0, 12).reshape(6, 2, 1), np.full((6, 2), PIP)
     pressure = np.full((12, 3, 34), 5.0)
     pressure[2, 1, 7:11] = LIMIT + 4.0  # four samples, and three

@@ -138,7 +138,12 @@ def test_checks_find_a_forged_bound(found, inputs):
     result = references.checked(found, plants, cells, every=40)
     assert result["witness_deviation"] < 1e-9
     forged = references.Reference(
-        found.about, found.gains, found.attainable - 0.01, found.lower, found.stationarity,
-        found.pid, found.commands,
-    )  # fmt: skip
+        found.about,
+        found.gains,
+        found.attainable - 0.01,
+        found.lower,
+        found.stationarity,
+        found.pid,
+        found.commands,
+    )
     assert not references.checked(forged, plants, cells, every=40)["sound"]

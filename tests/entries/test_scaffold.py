@@ -200,8 +200,10 @@ def trained(library: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
     actions = []
     for x in seen.tolist():
         for k, (w, b) in enumerate(weights):
-            x = [sum(a * c for a, c in zip(x, col, strict=True)) + d
-                 for col, d in zip(w.T.tolist(), b.tolist(), strict=True)]  # fmt: skip
+            x = [
+                sum(a * c for a, c in zip(x, col, strict=True)) + d
+                for col, d in zip(w.T.tolist(), b.tolist(), strict=True)
+            ]
             x = [math.tanh(a) for a in x] if k < 2 else x
         actions.append(x[0])
     return arrays | {"check.input": seen, "check.output": np.array(actions)}, np.array(actions)

@@ -253,8 +253,13 @@ def test_failed_cells(make, plants):
     assert result["lungs"]["R5C10"]["score"] > 0
     (failure,) = result["failures"]
     assert {k: failure[k] for k in ("lung", "pip", "draw", "breath", "step", "kind")} == {
-        "lung": "R5C20", "pip": 20.0, "draw": None, "breath": 2, "step": 6, "kind": "act",
-    }  # fmt: skip
+        "lung": "R5C20",
+        "pip": 20.0,
+        "draw": None,
+        "breath": 2,
+        "step": 6,
+        "kind": "act",
+    }
     assert failure["message"].endswith(
         "controller.py line 8 raised ValueError at step 6 of breath 2 (lung R5C20): no idea; "
         "the entry is not ranked."
@@ -307,8 +312,11 @@ def test_clipping(make, plants):
         open_submission(str(make(act=act))), Rigs(LUNGS, plants), runner=InProcessRunner()
     ).to_json()
     assert result["lungs"]["R5C10"]["clipped"] == {
-        "below": 18, "above": 36, "commands": 612, "share": 54 / 612,
-    }  # fmt: skip
+        "below": 18,
+        "above": 36,
+        "commands": 612,
+        "share": 54 / 612,
+    }
     assert result["secondary"]["clipped_share"] == pytest.approx(3 / 34)
 
 
@@ -533,9 +541,12 @@ def test_progress_counts_the_rounds_of_all_runs():
     seen = []
     stressors = ["supply_high"]
     score(
-        lambda observation: 5.0, simulator="physics", stress=1, stressors=stressors,
+        lambda observation: 5.0,
+        simulator="physics",
+        stress=1,
+        stressors=stressors,
         progress=lambda *far: seen.append(far),
-    )  # fmt: skip
+    )
     total = 2 * protocol.BREATHS * protocol.INSPIRATION_STEPS
     assert seen == [(done, total) for done in range(1, total + 1)]
 
@@ -555,9 +566,13 @@ def test_entries_on_a_cluster_have_the_scores_that_they_have_here(tmp_path):
         }
 
     started = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None,
-        host="127.0.0.1", local_directory=str(tmp_path),
-    )  # fmt: skip
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        host="127.0.0.1",
+        local_directory=str(tmp_path),
+    )
     with started as cluster:
         there = scores("--scheduler", cluster.scheduler_address)
     assert list(there) == ["pid_robust", "pid_best"]

@@ -73,9 +73,13 @@ def runs(score: Score) -> Runs:
 
 def _scored(controller: Any) -> Score:
     return run_protocol(
-        submission_of(controller), load_rigs(), track="robustness", pips=(10.0,), stress=1,
+        submission_of(controller),
+        load_rigs(),
+        track="robustness",
+        pips=(10.0,),
+        stress=1,
         stressors=NAMES,
-    )  # fmt: skip
+    )
 
 
 def _six() -> Cells:
@@ -181,8 +185,15 @@ def test_figures_of_pressures_that_are_known(cells: Cells) -> None:
 def test_the_plateau_may_be_off_by_2_cmH2O_and_4_percent(cells: Cells) -> None:
     allowed = 2.0 + 0.04 * np.asarray(cells.scenario.pip)[..., None]
     for share, held in ((0.99, True), (1.01, False)):
-        score = _made(cells, np.stack([np.zeros((6, 1, 3, 34)), -share * allowed + np.zeros(34)
-                                       [None, None, None] + np.zeros((6, 1, 3, 34))]))  # fmt: skip
+        score = _made(
+            cells,
+            np.stack(
+                [
+                    np.zeros((6, 1, 3, 34)),
+                    -share * allowed + np.zeros(34)[None, None, None] + np.zeros((6, 1, 3, 34)),
+                ]
+            ),
+        )
         assert np.all(score.survived[1] == held)
 
 

@@ -42,10 +42,30 @@ def invoke(*words: str) -> Any:
 def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> None:
     out, result = tmp_path / "out", tmp_path / "result.json"
     done = invoke(
-        "run", "pid_best", "--port", "p", "--lung", "R5C20", "--pips", "10", "--repeats", "1",
-        "--control-every", "0", "--no-dry-run", "--no-selftest", "--in-process", "--rest", "0.5",
-        "--yes", "--out", str(out), "--json", str(result), "--blind",
-    )  # fmt: skip
+        "run",
+        "pid_best",
+        "--port",
+        "p",
+        "--lung",
+        "R5C20",
+        "--pips",
+        "10",
+        "--repeats",
+        "1",
+        "--control-every",
+        "0",
+        "--no-dry-run",
+        "--no-selftest",
+        "--in-process",
+        "--rest",
+        "0.5",
+        "--yes",
+        "--out",
+        str(out),
+        "--json",
+        str(result),
+        "--blind",
+    )
     assert done.exit_code == 0, done.output
     # Who stands at the bench learns at the end which entry it was.
     blinded, _, revealed = done.output.partition("entry 1 is pid_best")
@@ -81,9 +101,17 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
 
 def test_without_a_terminal_and_without_yes_nothing_moves(on_line: Line, tmp_path: Path) -> None:
     done = invoke(
-        "run", "pid_best", "--port", "p", "--lung", "R5C20", "--no-dry-run", "--in-process",
-        "--out", str(tmp_path / "out"),
-    )  # fmt: skip
+        "run",
+        "pid_best",
+        "--port",
+        "p",
+        "--lung",
+        "R5C20",
+        "--no-dry-run",
+        "--in-process",
+        "--out",
+        str(tmp_path / "out"),
+    )
     assert done.exit_code == 1
     assert "did not confirm" in done.output
 
@@ -103,10 +131,29 @@ def test_an_entry_of_which_every_run_failed_has_no_score(
     monkeypatch.setattr(SubmissionController, "act", act)
     out, result = tmp_path / "out", tmp_path / "result.json"
     done = invoke(
-        "run", "pid_best", "--port", "p", "--lung", "R5C20", "--pips", "10", "--repeats", "1",
-        "--control-every", "0", "--no-dry-run", "--no-selftest", "--in-process", "--rest", "0.5",
-        "--yes", "--out", str(out), "--json", str(result),
-    )  # fmt: skip
+        "run",
+        "pid_best",
+        "--port",
+        "p",
+        "--lung",
+        "R5C20",
+        "--pips",
+        "10",
+        "--repeats",
+        "1",
+        "--control-every",
+        "0",
+        "--no-dry-run",
+        "--no-selftest",
+        "--in-process",
+        "--rest",
+        "0.5",
+        "--yes",
+        "--out",
+        str(out),
+        "--json",
+        str(result),
+    )
     assert done.exit_code == 1, done.output
     assert "no score: 1 of 1 runs failed" in done.output
     assert said in done.output
@@ -119,10 +166,14 @@ def test_the_port_and_not_the_device_decides_what_is_emulated(tmp_path: Path) ->
     link = tmp_path / "ttyACM0"  # called what it likes
     link.symlink_to(os.ttyname(slave))
     kinds = {
-        "virtual:R5C20": "virtual", str(link): "pseudo-terminal", "/dev/ttyACM0": "serial",
-        "socket://localhost:5": "own socket", "socket://127.0.1.1:5": "own socket",
-        "socket://pi.lan:5005": "socket", "/dev/ttys003": "pseudo-terminal",
-    }  # fmt: skip
+        "virtual:R5C20": "virtual",
+        str(link): "pseudo-terminal",
+        "/dev/ttyACM0": "serial",
+        "socket://localhost:5": "own socket",
+        "socket://127.0.1.1:5": "own socket",
+        "socket://pi.lan:5005": "socket",
+        "/dev/ttys003": "pseudo-terminal",
+    }
     assert {port: evaluate.port_kind(port) for port in kinds} == kinds
     for descriptor in (master, slave):
         os.close(descriptor)
@@ -168,9 +219,17 @@ def test_pressures_that_would_not_ease_are_refused_before_the_port_is_opened(
     ease: str, tmp_path: Path
 ) -> None:
     done = invoke(
-        "collect", "--port", "/dev/nothing", "--lung", "R5C20", "--ease", ease, "--yes",
-        "--out", str(tmp_path / "out"),
-    )  # fmt: skip
+        "collect",
+        "--port",
+        "/dev/nothing",
+        "--lung",
+        "R5C20",
+        "--ease",
+        ease,
+        "--yes",
+        "--out",
+        str(tmp_path / "out"),
+    )
     assert isinstance(done.exception, InputError)
     assert f"--ease {ease} cmH2O: give more than 5 and at most" in str(done.exception)
     assert not (tmp_path / "out").exists()

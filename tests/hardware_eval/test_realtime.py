@@ -32,7 +32,10 @@ def test_a_process_in_a_loop_loses_its_priority(who: str) -> None:
     except (AttributeError, PermissionError):
         pytest.skip("this user may not ask for real-time scheduling")
     ended = subprocess.run(
-        [sys.executable, "-c", IN_A_LOOP], env={**os.environ, "WHO": who},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        [sys.executable, "-c", IN_A_LOOP],
+        env={**os.environ, "WHO": who},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert int(ended.stdout) == os.SCHED_OTHER

@@ -37,9 +37,20 @@ def noise(rng, shape, sigma=0.2, rho=0.6):
 
 
 def recording(
-    R=20.0, C=20.0, extra=None, *, n=10, seed=0, dt=0.01, jitter=0.0, sensors=SENSORS, peep=5.0,
-    label=None, sigma=0.2, tube=0.0,
-) -> Breaths:  # fmt: skip
+    R=20.0,
+    C=20.0,
+    extra=None,
+    *,
+    n=10,
+    seed=0,
+    dt=0.01,
+    jitter=0.0,
+    sensors=SENSORS,
+    peep=5.0,
+    label=None,
+    sigma=0.2,
+    tube=0.0,
+) -> Breaths:
     """Breaths of 3 s: volume rises and falls as Gaussians in time, so that flow is exact.
 
     ``extra(V, Q, slope, t, p)`` adds to the pressure, cmH2O; volumes in L. With a ``tube``, of
@@ -55,9 +66,7 @@ def recording(
     V = full * falls
     into, out = 2 * t / a**2, -2 * late / b**2
     Q = np.where(t < 1.2, into * (size - V), out * V)
-    slope = np.where(
-        t < 1.2, (2 / a**2 - into**2) * (size - V), (-2 / b**2 + out**2) * V
-    )  # fmt: skip
+    slope = np.where(t < 1.2, (2 / a**2 - into**2) * (size - V), (-2 / b**2 + out**2) * V)
     pressure = peep + R * Q + 1000.0 / C * V
     if extra is not None:
         pressure = pressure + extra(V, Q, slope, t, pressure)
@@ -69,9 +78,16 @@ def recording(
     shown = {name: x + rng.normal(0, 1.0, x.shape) for name, x in shown.items() if name in sensors}
     label = label or (R, C)
     return make_breaths(
-        np.arange(n), np.full(n, label[0]), np.full(n, label[1]), t, np.zeros(t.shape), t >= 1.2,
-        pressure + noise(rng, t.shape, sigma), flow=shown.get("flow"), volume=shown.get("volume"),
-    )  # fmt: skip
+        np.arange(n),
+        np.full(n, label[0]),
+        np.full(n, label[1]),
+        t,
+        np.zeros(t.shape),
+        t >= 1.2,
+        pressure + noise(rng, t.shape, sigma),
+        flow=shown.get("flow"),
+        volume=shown.get("volume"),
+    )
 
 
 def creep(ratio, time, C=20.0):
@@ -151,20 +167,32 @@ def test_a_lung_that_is_no_setting():
 
 CASES = {
     "turbulent_resistance": (
-        lambda V, Q, slope, t, p: 6.0 * Q * np.abs(Q), "quadratic", 6.0, 0.1, {}
+        lambda V, Q, slope, t, p: 6.0 * Q * np.abs(Q),
+        "quadratic",
+        6.0,
+        0.1,
+        {},
     ),
     "nonlinear_compliance": (
         # stiffening k: P = V / C + k / 2 (V / C)^2
-        lambda V, Q, slope, t, p: 0.5 * 0.02 * (50.0 * V) ** 2, "stiffening", 0.02, 0.1, {}
+        lambda V, Q, slope, t, p: 0.5 * 0.02 * (50.0 * V) ** 2,
+        "stiffening",
+        0.02,
+        0.1,
+        {},
     ),
     "viscoelasticity": (creep(0.4, 0.8), "ratio", 0.4, 0.3, {}),
     "inertance": (lambda V, Q, slope, t, p: 0.1 * slope, "inertance", 0.1, 0.1, {}),
     "direction_resistance": (
-        lambda V, Q, slope, t, p: 5.0 * np.minimum(Q, 0.0), "difference", 5.0, 0.1, {}
+        lambda V, Q, slope, t, p: 5.0 * np.minimum(Q, 0.0),
+        "difference",
+        5.0,
+        0.1,
+        {},
     ),
     "volume_resistance": (lambda V, Q, slope, t, p: 15.0 * Q * V, "slope", 15.0, 0.1, {}),
     "circuit_compliance": (None, "compliance", 1.5, 0.15, {"tube": 1.5}),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -282,12 +310,15 @@ def pretended(R, C, *, label=(20.0, 20.0), quadratic=0.0):
     """What a fit to pressure alone would say of one lung."""
     data = SimpleNamespace(lung=np.zeros(3, int), R=np.full(3, label[0]), C=np.full(3, label[1]))
     values = {"R": R, "C": C}
-    return cast(Any, SimpleNamespace(
-        problem=SimpleNamespace(data=data),
-        value=lambda path: np.array([values[path]]),
-        ci95=lambda path: np.array([[0.99 * values[path], 1.01 * values[path]]]),
-        column=lambda path: np.full(3, quadratic),
-    ))  # fmt: skip
+    return cast(
+        Any,
+        SimpleNamespace(
+            problem=SimpleNamespace(data=data),
+            value=lambda path: np.array([values[path]]),
+            ci95=lambda path: np.array([[0.99 * values[path], 1.01 * values[path]]]),
+            column=lambda path: np.full(3, quadratic),
+        ),
+    )
 
 
 def label_match(fit):

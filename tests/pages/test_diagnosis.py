@@ -64,9 +64,7 @@ def test_report(found: Diagnosis, tmp_path: Path) -> None:
     assert found.notes[0] in page.text
     ids = [attrs["id"] for _, attrs in page.tags if "id" in attrs]
     assert len(ids) == len(set(ids))
-    pointed = {
-        attrs["aria-labelledby"] for _, attrs in page.tags if "aria-labelledby" in attrs
-    }  # fmt: skip
+    pointed = {attrs["aria-labelledby"] for _, attrs in page.tags if "aria-labelledby" in attrs}
     assert pointed <= set(ids)
     assert all("scope" in attrs for tag, attrs in page.tags if tag == "th")
 
@@ -215,9 +213,17 @@ def test_axes_of_a_chart() -> None:
     assert chart.zero == pytest.approx(bottom - 0.25 * (bottom - top), abs=0.05)
     chart.band(1.0, 5.0)
     assert chart.bands == [(round((left + right) / 2, 1), round((right - left) / 2, 1))]
-    assert ticks(0.0, 1.1, 6) == (pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0]), [
-        "0.0", "0.2", "0.4", "0.6", "0.8", "1.0",
-    ])  # fmt: skip
+    assert ticks(0.0, 1.1, 6) == (
+        pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0]),
+        [
+            "0.0",
+            "0.2",
+            "0.4",
+            "0.6",
+            "0.8",
+            "1.0",
+        ],
+    )
     assert ticks(-3.0, 12.0, 4)[1] == ["0", "5", "10"]
     assert limits([1.0, np.nan], [3.0], around=0.5) == (0.0, 4.0)
     low, high = limits([2.0])
@@ -246,8 +252,9 @@ def test_the_time_since_an_edge_has_a_logarithmic_axis(found: Diagnosis) -> None
     assert edge.log
     assert not any(chart.log for chart in charts if chart is not edge)
     assert log_ticks(0.01, 1.0) == (
-        [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0], ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1"],
-    )  # fmt: skip
+        [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0],
+        ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1"],
+    )
     chart = Chart((0.01, 1.0), (0.0, 1.0), "s", "", "", log=True)
     left, middle, right = chart.at_x([0.01, 0.1, 1.0])
     assert middle == pytest.approx(0.5 * (left + right))
@@ -257,9 +264,9 @@ def test_the_time_since_an_edge_has_a_logarithmic_axis(found: Diagnosis) -> None
 def test_sentences_and_charts_agree(found: Diagnosis) -> None:
     """A range that a sentence calls too low lies above zero in the chart, by the same mean."""
     traces = found.traces
-    shown = {p.axis.name: p for p in profiles(
-        traces.breaths, traces.refit, traces.flow, traces.volume
-    )}  # fmt: skip
+    shown = {
+        p.axis.name: p for p in profiles(traces.breaths, traces.refit, traces.flow, traces.volume)
+    }
     told = [region for region in found.location if region.axis in shown]
     assert len(told) > 5
     for region in told:

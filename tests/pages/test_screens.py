@@ -93,8 +93,16 @@ def viewer_command() -> list[str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    return [sys.executable, "-m", "rerun", "--headless", "--window-size", "1600x900",
-            "--port", str(port)]  # fmt: skip
+    return [
+        sys.executable,
+        "-m",
+        "rerun",
+        "--headless",
+        "--window-size",
+        "1600x900",
+        "--port",
+        str(port),
+    ]
 
 
 @pytest.mark.slow

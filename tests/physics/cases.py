@@ -38,18 +38,35 @@ def recording(n, m, *, R=10.0, C=25.0, noise=0.0, seed=0, positions=None, each=N
     rng = np.random.default_rng(seed + 1000)
     start = 5.0 + rng.normal(0, 0.3, n)
     positions = np.linspace(0, 1, n) if positions is None else positions
-    rows = np.stack([
-        oracle.breath(
-            R, C, u_in[i], u_out[i], dt[i], start[i], m | (each(i) if each else {}),
-            position=positions[i], **base,
-        )
-        for i in range(n)
-    ])  # fmt: skip
+    rows = np.stack(
+        [
+            oracle.breath(
+                R,
+                C,
+                u_in[i],
+                u_out[i],
+                dt[i],
+                start[i],
+                m | (each(i) if each else {}),
+                position=positions[i],
+                **base,
+            )
+            for i in range(n)
+        ]
+    )
     pressure = rows[:, 0] + rng.normal(0, noise, (n, T))
     time = np.cumsum(np.pad(dt[:, :-1], ((0, 0), (1, 0))), axis=1)
     return Breaths(
-        breath_id=np.arange(n), R=np.full(n, R), C=np.full(n, C), time=time,
-        dt=dt.copy(), u_in=u_in, u_out=u_out.astype(np.int8), pressure=pressure,
-        valid=np.ones((n, T), bool), time_inferred=np.zeros(n, bool), flow=rows[:, 1],
+        breath_id=np.arange(n),
+        R=np.full(n, R),
+        C=np.full(n, C),
+        time=time,
+        dt=dt.copy(),
+        u_in=u_in,
+        u_out=u_out.astype(np.int8),
+        pressure=pressure,
+        valid=np.ones((n, T), bool),
+        time_inferred=np.zeros(n, bool),
+        flow=rows[:, 1],
         volume=rows[:, 2],
-    )  # fmt: skip
+    )

@@ -124,9 +124,11 @@ class Breath:
                 return np.sign(x) * (root - self.R) / 2 / self.K2
             size = abs(x)
             return np.sign(x) * brentq(
-                lambda q: self.R * q + self.K2 * q**self.power - size, 0.0, size / self.R + 1e-9,
+                lambda q: self.R * q + self.K2 * q**self.power - size,
+                0.0,
+                size / self.R + 1e-9,
                 xtol=1e-13,
-            )  # fmt: skip
+            )
 
         wide = opened
         if opened and self.opening:

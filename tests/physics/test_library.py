@@ -121,8 +121,11 @@ def test_special_cases_differ_between_the_terms_of_a_component():
     assert special_cases("volume_resistance") == ()
     assert special_cases("flow_shape") == ("turbulent_resistance",)
     assert set(special_cases("command_memory")) == {
-        "valve_delay", "valve_lag", "supply_droop", "valve_hysteresis",
-    }  # fmt: skip
+        "valve_delay",
+        "valve_lag",
+        "supply_droop",
+        "valve_hysteresis",
+    }
 
 
 @pytest.mark.parametrize("name", library())

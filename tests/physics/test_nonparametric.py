@@ -20,20 +20,34 @@ from ventbench.task.rollouts import open_loop
 from . import cases
 
 NAMES = {
-    "f(u)", "memory of u", "f(p)", "f(Q)", "R(V)", "R(direction)", "f(V)", "memory of p",
-    "exhalation path", "measurement",
-}  # fmt: skip
+    "f(u)",
+    "memory of u",
+    "f(p)",
+    "f(Q)",
+    "R(V)",
+    "R(direction)",
+    "f(V)",
+    "memory of p",
+    "exhalation path",
+    "measurement",
+}
 
 ALL = paths((*library(), *basis_terms()))
 
 #: Elements that are fitted together here; as many unknowns as one compiled function takes.
 TOGETHER = (
-    ("valve_shape",), ("leak_shape",), ("flow_shape",), ("recoil_shape",), ("volume_resistance",),
-    ("direction_resistance", "recoil_memory"), ("command_memory",),
-    ("command_plays", "supply_memory"), ("outlet_shape", "outlet_memory"),
+    ("valve_shape",),
+    ("leak_shape",),
+    ("flow_shape",),
+    ("recoil_shape",),
+    ("volume_resistance",),
+    ("direction_resistance", "recoil_memory"),
+    ("command_memory",),
+    ("command_plays", "supply_memory"),
+    ("outlet_shape", "outlet_memory"),
     ("sensor_shape",),
     ("sensor_memory", "drift_shape"),
-)  # fmt: skip
+)
 
 #: Gaussian: with exponential tails, an edge that is far off would count for little.
 NOISE = Noise((0.1,), (0.0,), np.inf)
@@ -110,10 +124,15 @@ def test_coefficients_tend_to_zero_and_strengths_of_the_library_do_not(bench):
 def test_all_at_zero_are_off(bench):
     """Beside others, of which none may be moved."""
     given = {
-        "valve_lag.tau": 0.03, "viscoelasticity.ratio": 0.3, "turbulent_resistance.quadratic": 3.0,
-        "circuit_compliance.compliance": 1.0, "exhalation_valve_delay.opening": 0.05,
-        "valve_hysteresis.width": 3.0, "sensor_drift.drift": 2.0, "leak.conductance": 5.0,
-    }  # fmt: skip
+        "valve_lag.tau": 0.03,
+        "viscoelasticity.ratio": 0.3,
+        "turbulent_resistance.quadratic": 3.0,
+        "circuit_compliance.compliance": 1.0,
+        "exhalation_valve_delay.opening": 0.05,
+        "valve_hysteresis.width": 3.0,
+        "sensor_drift.drift": 2.0,
+        "leak.conductance": 5.0,
+    }
     without = Predictor(bench.data, paths()).predict(bench.values(given, paths()))[:, 0]
     np.testing.assert_allclose(bench.predict(given), without, atol=1e-12, rtol=0)
 
@@ -153,9 +172,13 @@ def test_shapes_are_recovered(bench, names):
 
 #: Where the data say something of a term, and what base parameters could produce there.
 SEEN = {
-    "valve_shape": (3.0, 20.0), "flow_shape": (-0.4, 0.4), "recoil_shape": (120.0, 350.0),
-    "leak_shape": (6.0, 20.0), "sensor_shape": (6.0, 20.0), "volume_resistance": (150.0, 320.0),
-}  # fmt: skip
+    "valve_shape": (3.0, 20.0),
+    "flow_shape": (-0.4, 0.4),
+    "recoil_shape": (120.0, 350.0),
+    "leak_shape": (6.0, 20.0),
+    "sensor_shape": (6.0, 20.0),
+    "volume_resistance": (150.0, 320.0),
+}
 
 
 def drawn(name, values):

@@ -35,8 +35,11 @@ def test_every_file_is_what_the_manifest_says(official):
     folder = frozen.folder()
     manifest = tomllib.loads((folder / frozen.MANIFEST).read_text("utf-8"))
     assert {path.name for path in folder.iterdir()} == {
-        *NAMES, frozen.MANIFEST, frozen.POPULATION, frozen.ROLES
-    }  # fmt: skip
+        *NAMES,
+        frozen.MANIFEST,
+        frozen.POPULATION,
+        frozen.ROLES,
+    }
     assert files.sha256(folder / frozen.ROLES) == frozen.ROLES_SHA256
     hashes = {name: files.sha256(folder / name) for name in NAMES}
     assert manifest["files"][frozen.MEMBERS]["sha256"] == hashes[frozen.MEMBERS]

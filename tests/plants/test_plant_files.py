@@ -29,11 +29,12 @@ PLANTS = {
     "TwoBalloon": lambda: two_balloon(LUNGS[0]),
     "Hybrid": lambda: frozen.load().ensemble,
     "Corrected": lambda: Corrected(
-        single_compartment(LUNGS[0]), physics(LUNGS[0], {"valve_lag": {"tau": 0.04}}),
+        single_compartment(LUNGS[0]),
+        physics(LUNGS[0], {"valve_lag": {"tau": 0.04}}),
         physics(LUNGS[0]),
     ),
     "Physics": lambda: physics(LUNGS[0], {"leak": {"conductance": 8.0}}),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", PLANTS)
@@ -140,10 +141,16 @@ def test_what_is_no_file_of_plants_is_refused(tmp_path: Path) -> None:
     dtype = json.loads(json.dumps(good).replace('"float64"', '"object"', 1))
     label = {**good, "lungs": {"big": good["lungs"]["R20C50"]}}
     for text in (
-        "", "[]", "{}", json.dumps({**good, "format": "x"}), json.dumps({**good, "lungs": {}}),
-        json.dumps(unknown), json.dumps(dtype), json.dumps(label),
+        "",
+        "[]",
+        "{}",
+        json.dumps({**good, "format": "x"}),
+        json.dumps({**good, "lungs": {}}),
+        json.dumps(unknown),
+        json.dumps(dtype),
+        json.dumps(label),
         json.dumps({**good, "arrays": {}}),
-    ):  # fmt: skip
+    ):
         path.write_text(text)
         with pytest.raises(InputError, match=r"corrected\.json is not a file of plants"):
             load_plants(path)

@@ -81,8 +81,9 @@ def test_drawn_rigs_are_lungs_of_their_label_and_rise_with_the_command(official)
         rigs = official.population.rigs(SEED, lung, 60)
         assert np.median(1000.0 / rigs.E) == pytest.approx(settings["C"], rel=0.25)
         # Fitted rigs of one labelled resistor differ by 20 %.
-        same = [own for own, other in zip(official.rigs, LUNGS, strict=True)
-                if settings["R"] == other.R]  # fmt: skip
+        same = [
+            own for own, other in zip(official.rigs, LUNGS, strict=True) if settings["R"] == other.R
+        ]
         fitted = (official.members.R[0] + FLOW * official.members.K2[0])[np.concatenate(same)]
         resistance = np.median(rigs.R + FLOW * rigs.K2)
         assert resistance == pytest.approx(np.median(fitted), rel=0.25)

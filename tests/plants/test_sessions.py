@@ -129,8 +129,12 @@ def test_a_lung_without_a_session_is_named_with_the_known_ones(make_recording):
 def test_to_plain_values_and_back():
     plain = TABLE.to_list()
     assert plain[1] == {
-        "lung": "R5C10", "interval_ms": 31.9, "spiky": True, "inspiratory": 31, "breaths": 9,
-    }  # fmt: skip
+        "lung": "R5C10",
+        "interval_ms": 31.9,
+        "spiky": True,
+        "inspiratory": 31,
+        "breaths": 9,
+    }
     assert Sessions.from_list(plain) == TABLE
     assert len(TABLE) == 5
     for wrong in ([{"lung": "R5C10"}], [plain[0] | {"colour": "red"}]):

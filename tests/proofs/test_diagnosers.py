@@ -29,8 +29,14 @@ from ventbench.system_id import make_data
 
 def test_the_project_enters_itself_and_its_rivals() -> None:
     assert built_in() == (
-        "classifier", "forward_search", "gaussian_process", "lisdd", "refit", "sindy", "ventbench",
-    )  # fmt: skip
+        "classifier",
+        "forward_search",
+        "gaussian_process",
+        "lisdd",
+        "refit",
+        "sindy",
+        "ventbench",
+    )
 
 
 @pytest.mark.slow
@@ -115,9 +121,14 @@ def test_the_classifier_has_its_weights_and_sees_what_drifts() -> None:
 
 
 def told(verdict: str, *mechanisms: str, **found) -> dict[frozenset[str], float]:
-    given = {"verdict": verdict, "mechanisms": [{"name": name} for name in mechanisms],
-             "slot": None, "changes": [], "saturated": None,
-             "posterior": [{"terms": list(mechanisms), "probability": 1.0}]} | found  # fmt: skip
+    given = {
+        "verdict": verdict,
+        "mechanisms": [{"name": name} for name in mechanisms],
+        "slot": None,
+        "changes": [],
+        "saturated": None,
+        "posterior": [{"terms": list(mechanisms), "probability": 1.0}],
+    } | found
     answer = hypotheses(given, PUBLISHED)
     assert sum(each["probability"] for each in answer) == pytest.approx(1.0)
     assert all(TERMS.issuperset(each["terms"]) for each in answer)
@@ -133,8 +144,10 @@ def test_the_posterior_is_passed_on_beside_what_held_out_breaths_accept() -> Non
     silent = told("nothing_missing")
     assert silent[terms()] == pytest.approx(sure)
     assert silent[terms("unknown:lung")] == pytest.approx((1.0 - sure) / 9)
-    two = [{"terms": ["leak", "recoil_shape"], "probability": 0.2},
-           {"terms": ["valve_dead_band"], "probability": 0.6}]  # fmt: skip
+    two = [
+        {"terms": ["leak", "recoil_shape"], "probability": 0.2},
+        {"terms": ["valve_dead_band"], "probability": 0.6},
+    ]
     both = told("named", "leak", posterior=two)
     assert both[terms("leak")] == pytest.approx(sure * accepted)
     assert both[terms("valve_dead_band")] == pytest.approx(sure * (1.0 - accepted) * 0.75)

@@ -42,9 +42,13 @@ def test_a_challenge_tells_its_code_and_its_figures(monkeypatch: pytest.MonkeyPa
     right = judged("single", [leak], answer((1.0, "leak")))
     wrong = judged("single", [leak], answer((0.9, "unknown:lung valve_lag"), (0.1, "")), worth=0.1)
     result = Judged(
-        "refit", "stranger", (Draw("words", "abc123", 40, 1), Draw("-more", "def456", 8, 1)),
-        {(0, "case_0001"): right, (1, "case_0001"): wrong}, ("case_0003",), ("1a2b3c",),
-    )  # fmt: skip
+        "refit",
+        "stranger",
+        (Draw("words", "abc123", 40, 1), Draw("-more", "def456", 8, 1)),
+        {(0, "case_0001"): right, (1, "case_0001"): wrong},
+        ("case_0003",),
+        ("1a2b3c",),
+    )
     more = (
         Figure("strong: more", 0.9, ">= 98%", 20, (0.7, 0.97), False, True),
         Figure("seconds a case, median", 5.25, "", 20, None, None),
@@ -83,13 +87,19 @@ def test_the_board_has_a_column_and_a_difference_for_each() -> None:
 
 def test_the_proof_is_told_part_by_part_and_lung_by_lung() -> None:
     estimate = {"value": 0.032, "unit": "s", "ci95": [0.028, 0.036]}
-    stages = {name: {"mae": mae, "rmse": mae} for name, mae in
-              (("before", 5.0), ("refit", 3.0), ("after", 1.5))}  # fmt: skip
+    stages = {
+        name: {"mae": mae, "rmse": mae}
+        for name, mae in (("before", 5.0), ("refit", 3.0), ("after", 1.5))
+    }
     part = {
-        "held_out": 29, "mae": {"before": 5.0, "refit": 3.0, "after": None}, "cut_percent": 70.0,
+        "held_out": 29,
+        "mae": {"before": 5.0, "refit": 3.0, "after": None},
+        "cut_percent": 70.0,
         "mechanisms": [{"name": "valve_delay", "parameters": {"delay": estimate}}],
-        "slot": None, "groups": {"lung R5C10": stages, "expiration": stages}, "code": "1a2b3c",
-    }  # fmt: skip
+        "slot": None,
+        "groups": {"lung R5C10": stages, "expiration": stages},
+        "code": "1a2b3c",
+    }
     proof = Proof("f" * 64, {"rc": part}, {"injected": "no file"}, (Claim("rc", "w", "v", True),))
     text = proof_section(proof)
     assert "Code 1a2b3c, recording `ffffffffffffffff`" in text

@@ -51,9 +51,14 @@ def entry(folder: Path, name: str) -> str:
 @pytest.fixture
 def frozen(tmp_path: Path) -> Round:
     return freeze(
-        tmp_path / "round", [entry(tmp_path, "mine"), entry(tmp_path, "other")], {"faults": 1},
-        delay_s=60, kind="null", chain=referee.chain(SECRET), now=FROZEN,
-    )  # fmt: skip
+        tmp_path / "round",
+        [entry(tmp_path, "mine"), entry(tmp_path, "other")],
+        {"faults": 1},
+        delay_s=60,
+        kind="null",
+        chain=referee.chain(SECRET),
+        now=FROZEN,
+    )
 
 
 def test_the_seed_is_that_of_the_value_after_the_delay(frozen: Round) -> None:

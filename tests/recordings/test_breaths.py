@@ -201,8 +201,17 @@ def test_arrays_that_do_not_fit(change, text):
 
 
 JOINED = (
-    "breath_id", "R", "C", "time", "dt", "u_in", "u_out", "pressure", "valid", "time_inferred",
-)  # fmt: skip
+    "breath_id",
+    "R",
+    "C",
+    "time",
+    "dt",
+    "u_in",
+    "u_out",
+    "pressure",
+    "valid",
+    "time_inferred",
+)
 
 
 def test_joined_breaths_are_in_order_and_without_a_source(make):

@@ -53,8 +53,9 @@ def test_a_table_of_another_country(tmp_path):
     start = int(np.argmax(breaths.flow[1] > 100.0))
     np.testing.assert_allclose(
         breaths.pressure[1, start : start + 100],
-        made["pressure"][first + 5 : first + 105], atol=2e-4,
-    )  # fmt: skip
+        made["pressure"][first + 5 : first + 105],
+        atol=2e-4,
+    )
     np.testing.assert_allclose(np.nanmax(breaths.flow), 500.0, rtol=1e-5)
     out = (breaths.u_out[0] == 1) & breaths.valid[0]
     inward = (breaths.u_out[0] == 0) & breaths.valid[0]
@@ -133,16 +134,25 @@ def test_runs_of_one_file_begin_before_their_numbers_change(tmp_path):
     time = np.arange(1000) * 0.01
     target = np.where((time % 4) < 1, 30.0, 5.0)
     one = {
-        "run": "a day", "test": 1, "breath": np.repeat([0, 1, 2, 3], [30, 400, 500, 70]),
-        "time_step": time, "R": 20, "C": 50, "pressure": time, "target": target,
-        "flow": np.nan, "volume": 10.0 * time, "cmd_inh_valve": 0.0,
-    }  # fmt: skip
+        "run": "a day",
+        "test": 1,
+        "breath": np.repeat([0, 1, 2, 3], [30, 400, 500, 70]),
+        "time_step": time,
+        "R": 20,
+        "C": 50,
+        "pressure": time,
+        "target": target,
+        "flow": np.nan,
+        "volume": 10.0 * time,
+        "cmd_inh_valve": 0.0,
+    }
     table = pd.concat([pd.DataFrame(one), pd.DataFrame(one | {"test": 2, "C": 10})])
     table.to_parquet(tmp_path / "runs.parquet")
     runs = import_runs(tmp_path / "runs.parquet")
     assert {name: breaths.lung_ids[0] for name, breaths in runs.items()} == {
-        "a day 1": "R20C50", "a day 2": "R20C10",
-    }  # fmt: skip
+        "a day 1": "R20C50",
+        "a day 2": "R20C10",
+    }
     breaths = runs["a day 1"]
     # Cut 0.25 s before each breath, so that the steep rise lies within; the stub is left out.
     assert breaths.valid.sum(axis=1).tolist() == [400, 500, 95]
@@ -234,8 +244,11 @@ def test_the_command_shows_writes_and_reports(tmp_path):
     )
     report = json.loads(plain.stdout)
     assert report["units"]["flow"] == {
-        "unit": "L/min", "to": "mL/s", "numerator": 50, "denominator": 3,
-    }  # fmt: skip
+        "unit": "L/min",
+        "to": "mL/s",
+        "numerator": 50,
+        "denominator": 3,
+    }
     assert len(load(out, pad=True)) == report["breaths"] == 4
     bad = run.invoke(app, ["import", str(lab), "--map", "Paw"])
     assert "NAME=VALUE is wanted" in str(bad.exception)

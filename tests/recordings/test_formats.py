@@ -42,9 +42,14 @@ def record(folder: Path) -> Path:
         import wfdb
 
         wfdb.wrsamp(
-            "lab", fs=RATE, units=["cmH2O", "L/min"], sig_name=["Paw", "Flow"],
-            p_signal=np.stack(waveforms(), axis=1), fmt=["16", "16"], write_dir=str(folder),
-        )  # fmt: skip
+            "lab",
+            fs=RATE,
+            units=["cmH2O", "L/min"],
+            sig_name=["Paw", "Flow"],
+            p_signal=np.stack(waveforms(), axis=1),
+            fmt=["16", "16"],
+            write_dir=str(folder),
+        )
     return folder / "lab.hea"
 
 
@@ -59,8 +64,9 @@ def _the_waveforms_come_back(imported: Imported, quantum: float) -> None:
         onset = int(np.argmax(breaths.flow[breath][valid] > 100.0))
         length = min(int(valid.sum()) - onset, int(PERIOD * RATE) - 5)
         for values, expected, factor in (
-            (breaths.pressure, pressure, 1.0), (breaths.flow, flow, 1000.0 / 60.0),
-        ):  # fmt: skip
+            (breaths.pressure, pressure, 1.0),
+            (breaths.flow, flow, 1000.0 / 60.0),
+        ):
             np.testing.assert_allclose(
                 values[breath][valid][onset : onset + length],
                 factor * expected[5 : 5 + length],

@@ -52,7 +52,7 @@ EXPORTS = {
     "another clock and other ids": lambda b: replace(
         b, breath_id=b.breath_id + 7, time=1.1 * b.time, dt=1.1 * b.dt
     ),
-}  # fmt: skip
+}
 
 
 def made(lungs, u_in, random):

@@ -85,8 +85,11 @@ def clocks(made, form: str) -> list[str]:
         ms = round(1000 * (t + 86390.0))  # from ten seconds before midnight
         day, ms = divmod(ms, 86_400_000)
         h, m, s, f = ms // 3600_000, ms // 60_000 % 60, ms // 1000 % 60, ms % 1000
-        out.append(form.format(d=1 + day, h=h, m=m, s=s, f=f, H=(h - 1) % 12 + 1,
-                               half="AM" if h < 12 else "PM"))  # fmt: skip
+        out.append(
+            form.format(
+                d=1 + day, h=h, m=m, s=s, f=f, H=(h - 1) % 12 + 1, half="AM" if h < 12 else "PM"
+            )
+        )
     return out
 
 
@@ -120,8 +123,11 @@ def test_a_coarse_clock_names_the_rate(tmp_path):
 def test_an_alarm_below_the_names_and_signs_of_type(tmp_path):
     made = lung()
     columns = [[x.replace("-", "\N{MINUS SIGN}") for x in column] for column in plain(made)]
-    path = table(tmp_path / "a.csv", ["Time,Paw,Flow\nALARM", "low battery"], [columns[0],
-                 [f"{p},{q}" for p, q in zip(*columns[1:], strict=True)]])  # fmt: skip
+    path = table(
+        tmp_path / "a.csv",
+        ["Time,Paw,Flow\nALARM", "low battery"],
+        [columns[0], [f"{p},{q}" for p, q in zip(*columns[1:], strict=True)]],
+    )
     same_breaths(import_recording(path, lung=LABEL), made)
     quoted = [[f'"{x}"'.replace(".", ",") for x in column] for column in plain(made)]
     same_breaths(import_recording(table(path, NAMES, quoted), lung=LABEL), made)
@@ -204,8 +210,10 @@ def test_breaths_between_marks(tmp_path):
     for k in range(4):
         at = slice(round(k * PERIOD * RATE), round((k + 1) * PERIOD * RATE), 2)
         lines += ["2016-12-15-11-54-58.672431", f"BS, S:{100 + k},"]
-        lines += [f"{0.06 * q:.2f}, {p:.2f}" for q, p in
-                  zip(made["flow"][at], made["pressure"][at], strict=True)]  # fmt: skip
+        lines += [
+            f"{0.06 * q:.2f}, {p:.2f}"
+            for q, p in zip(made["flow"][at], made["pressure"][at], strict=True)
+        ]
         lines += ["BE"] if k < 3 else []
     path = tmp_path / "a.csv"
     path.write_text("\n".join(lines))
@@ -265,8 +273,11 @@ def test_what_else_a_servo_exports_is_named(tmp_path):
 def test_absolute_pressure(tmp_path):
     made = lung()
     absolute = texts(made["pressure"] * 0.980665 + 1013.25)
-    path = table(tmp_path / "a.csv", ["Time", "Paw [hPa]", "Flow"],
-                 [plain(made)[0], absolute, plain(made)[2]])  # fmt: skip
+    path = table(
+        tmp_path / "a.csv",
+        ["Time", "Paw [hPa]", "Flow"],
+        [plain(made)[0], absolute, plain(made)[2]],
+    )
     with pytest.raises(InputError, match=r"absolute.*--offset pressure=-1013\.25"):
         import_recording(path, lung=LABEL)
     same_breaths(import_recording(path, lung=LABEL, offsets={"pressure": -1013.25}), made)
@@ -320,13 +331,19 @@ FLOW = np.asarray(BASE.flow)
         ({"u_in": 30.0 - BASE.u_in}, 1, "--invert u_in"),
         ({"u_out": 1 - BASE.u_out}, 1, "--invert u_out"),
         ({"flow": -FLOW}, 2, "--invert flow"),
-        ({name: np.roll(getattr(BASE, name), -100, axis=1)
-          for name in ("pressure", "flow", "u_in", "u_out")}, 1, "--split-breaths"),
+        (
+            {
+                name: np.roll(getattr(BASE, name), -100, axis=1)
+                for name in ("pressure", "flow", "u_in", "u_out")
+            },
+            1,
+            "--split-breaths",
+        ),
         ({"u_out": np.zeros(1)}, 1, "inspiration (u_out = 0) is 100 %"),
         ({"pressure": np.minimum(BASE.pressure, 19.9)}, 1, "saturate at 19.9 cmH2O in"),
         ({"flow": np.clip(FLOW, -550.0, 550.0)}, 1, "flow is clipped at 550 mL/s in"),
     ],
-)  # fmt: skip
+)
 def test_what_no_ventilator_does_is_said(tmp_path, changes, code, said):
     write(recording(**changes), tmp_path / "a.csv")
     result = CliRunner().invoke(app, ["check", str(tmp_path / "a.csv")])
@@ -365,11 +382,16 @@ def test_reversed_flow_is_said_everywhere(tmp_path):
     assert mended.warnings == ()
 
 
-UNITS = {"pressure": {"cmH2O": 1.0, "mbar": 0.980665, "hPa": 0.980665, "kPa": 0.0980665},
-         "flow": {"mL/s": 1.0, "L/min": 0.06, "LPM": 0.06, "slm": 0.06, "L/s": 1e-3},
-         "time": {"s": 1.0, "ms": 1e3}}  # fmt: skip
-HEADERS = {"time": ["Time", "t", "Zeit", "time_step"], "flow": ["Flow", "flow", "Q", "Flow_rate"],
-           "pressure": ["Paw", "Pressure", "P_aw", "airway pressure"]}  # fmt: skip
+UNITS = {
+    "pressure": {"cmH2O": 1.0, "mbar": 0.980665, "hPa": 0.980665, "kPa": 0.0980665},
+    "flow": {"mL/s": 1.0, "L/min": 0.06, "LPM": 0.06, "slm": 0.06, "L/s": 1e-3},
+    "time": {"s": 1.0, "ms": 1e3},
+}
+HEADERS = {
+    "time": ["Time", "t", "Zeit", "time_step"],
+    "flow": ["Flow", "flow", "Q", "Flow_rate"],
+    "pressure": ["Paw", "Pressure", "P_aw", "airway pressure"],
+}
 
 
 FORMS = ["{} [{}]", "{}_{}", "{} ({})", "{} {}"]
@@ -412,7 +434,11 @@ def test_the_same_breaths_come_out(tmp_path_factory, block):
             columns.append([["", "a", "b"][row % 3] for row in range(len(columns[0]))])
         names[0] = drawn["above"] + names[0]
         path = table(
-            tmp_path_factory.mktemp("any") / "a.csv", names, columns,
-            separator=separator, end=drawn["end"], encoding=drawn["encoding"],
-        )  # fmt: skip
+            tmp_path_factory.mktemp("any") / "a.csv",
+            names,
+            columns,
+            separator=separator,
+            end=drawn["end"],
+            encoding=drawn["encoding"],
+        )
         same_breaths(import_recording(path, lung=LABEL), made, cycles=2, atol=2e-3)

@@ -18,12 +18,24 @@ ORDER = (*paths(), START)
 
 #: None at a kink.
 ACTING = {
-    "R": 11.0, "C": 23.0, "PEEP": 5.0, "gain": 21.0, "R_ex": 4.0, "valve_lag.tau": 0.03,
-    "valve_curve.loss": 0.2, "valve_dead_band.width": 1.23, "circuit_compliance.compliance": 1.0,
-    "leak.conductance": 5.0, "inertance.inertance": 0.04, "turbulent_resistance.quadratic": 3.0,
-    "nonlinear_compliance.stiffening": 0.02, "viscoelasticity.ratio": 0.3, "sensor_lag.tau": 0.03,
-    "sensor_drift.drift": 1.0, "supply_droop.drop": 0.1,
-}  # fmt: skip
+    "R": 11.0,
+    "C": 23.0,
+    "PEEP": 5.0,
+    "gain": 21.0,
+    "R_ex": 4.0,
+    "valve_lag.tau": 0.03,
+    "valve_curve.loss": 0.2,
+    "valve_dead_band.width": 1.23,
+    "circuit_compliance.compliance": 1.0,
+    "leak.conductance": 5.0,
+    "inertance.inertance": 0.04,
+    "turbulent_resistance.quadratic": 3.0,
+    "nonlinear_compliance.stiffening": 0.02,
+    "viscoelasticity.ratio": 0.3,
+    "sensor_lag.tau": 0.03,
+    "sensor_drift.drift": 1.0,
+    "supply_droop.drop": 0.1,
+}
 
 LATE = ("valve_delay.delay", "exhalation_valve_delay.opening", "exhalation_valve_delay.closing")
 

@@ -132,9 +132,14 @@ def test_minimise_stops_at_bounds():
     def run(high):
         low, high = np.full(2, -2.0), np.asarray(high)
         return minimise(
-            lambda x: float(0.5 * residual(x) @ residual(x)), normal, np.array([-1.2, 1.0]),
-            low, high, tolerance=1e-10, iterations=100,
-        )  # fmt: skip
+            lambda x: float(0.5 * residual(x) @ residual(x)),
+            normal,
+            np.array([-1.2, 1.0]),
+            low,
+            high,
+            tolerance=1e-10,
+            iterations=100,
+        )
 
     free = run([3.0, 3.0])
     assert free.converged

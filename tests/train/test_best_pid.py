@@ -16,8 +16,9 @@ from ventbench.train.pid_search import drawn_errors
 def test_no_neighbour_of_the_published_gains_and_no_pid_of_the_paper_is_better():
     rigs = load_rigs().of_training
     drawn = rigs.draws(COUNT)
-    corners = np.array([[1.5**k if at == axis else 1.0 for at in range(3)]
-                        for axis in range(3) for k in (-1, 1)])  # fmt: skip
+    corners = np.array(
+        [[1.5**k if at == axis else 1.0 for at in range(3)] for axis in range(3) for k in (-1, 1)]
+    )
     paper = np.stack(np.meshgrid([2.0, 5.0, 10.0], [1.0, 4.0, 10.0], [0.0, 5.0]), -1).reshape(-1, 3)
     for lung, gains in enumerate(np.array(PID_GAINS)):
         tried = np.concatenate([gains[None], gains * corners, paper])

@@ -31,9 +31,13 @@ class InputTypeError(InputError, TypeError):
 
 #: What values of an annotation are, in words.
 _WORDS = {
-    "None": "None", "str": "text", "Path": "a path", "bool": "True or False",
-    "int": "a whole number", "float": "a number",
-}  # fmt: skip
+    "None": "None",
+    "str": "text",
+    "Path": "a path",
+    "bool": "True or False",
+    "int": "a whole number",
+    "float": "a number",
+}
 _MANY = re.compile(r"(Sequence|Iterable|Mapping)\[(?:str, )?(\w+)\]")
 
 

@@ -31,8 +31,13 @@ ATTESTATIONS = "attestations.toml"
 #: Folder of rounds, the name of one, and its files in the order in which they come to be.
 ROUNDS, ROUND_NAME = "rounds", "[a-z0-9][a-z0-9-]{0,39}"
 ROUND_FILES = (
-    "round.toml", "protocol.json", "frozen.toml", "beacon.json", "bounds.npz", "result.json",
-)  # fmt: skip
+    "round.toml",
+    "protocol.json",
+    "frozen.toml",
+    "beacon.json",
+    "bounds.npz",
+    "result.json",
+)
 
 #: Of a round too: what the maintainers say of entries.
 NOTES = "notes.toml"

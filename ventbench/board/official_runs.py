@@ -191,9 +191,13 @@ def _run(
         stress = 0 if score.stress is None else score.stress.tables.pips.shape[1]
         known = store.load(folder).evidence.rounds
         result = run_protocol(
-            submission, rigs_of(simulators), track=score.track, stress=stress, runner=apart,
+            submission,
+            rigs_of(simulators),
+            track=score.track,
+            stress=stress,
+            runner=apart,
             drawn=draws_of(score.header, simulators, known),
-        )  # fmt: skip
+        )
         _check_same(open_submission(str(code)), score)
         recorded = store.load_commands(score, folder / RECORDS)
         detail = difference(score, recorded, result.requested)
@@ -324,9 +328,15 @@ def bounds_of(
     plants, cells = rigs.cells(drawn, protocol.PIPS)
     about = references.settings(rigs.about, drawn.about())
     return references.compute(
-        plants, cells, np.array(references.PID_GAINS), about,
-        folder=folder, starts=starts, pool=pool, progress=progress,
-    )  # fmt: skip
+        plants,
+        cells,
+        np.array(references.PID_GAINS),
+        about,
+        folder=folder,
+        starts=starts,
+        pool=pool,
+        progress=progress,
+    )
 
 
 def score(
@@ -368,15 +378,26 @@ def score(
     code = code_of(own, places)
     done = WorkFolder(work, {"round": own.frozen_sha256, "draws": own.commitment})
     computed = bounds_of(
-        own, simulators, pool, work / "bounds", starts=starts,
+        own,
+        simulators,
+        pool,
+        work / "bounds",
+        starts=starts,
         progress=lambda ready, count: tell("bounds of the draws", ready, count),
-    )  # fmt: skip
+    )
     bounds = computed.save(own.folder / BOUNDS)
     jobs = {
-        f"{entry}-{track}": (leaderboard.resolve(), name, code[entry], track, work.resolve(),
-                             load, runner)
+        f"{entry}-{track}": (
+            leaderboard.resolve(),
+            name,
+            code[entry],
+            track,
+            work.resolve(),
+            load,
+            runner,
+        )
         for entry, track in runs
-    }  # fmt: skip
+    }
     jobs |= {
         f"{entry}-{track}-seed{at}": (*jobs[f"{entry}-{track}"], seed.name)
         for entry, track in runs
@@ -415,9 +436,15 @@ def score(
 
 
 def _score_entry(
-    leaderboard: Path, name: str, code: Path, track: str, work: Path, load: Load,
-    runner: Callable[[], Runner], seed: str = "",
-) -> dict[str, Any]:  # fmt: skip
+    leaderboard: Path,
+    name: str,
+    code: Path,
+    track: str,
+    work: Path,
+    load: Load,
+    runner: Callable[[], Runner],
+    seed: str = "",
+) -> dict[str, Any]:
     """Score one entry on one track, or the same with the files of one of its seeds.
 
     Returns:
@@ -437,9 +464,14 @@ def _score_entry(
                 shutil.copytree(code / SEEDS / seed, other, dirs_exist_ok=True)
                 submission = open_submission(str(other))
             result = run_protocol(
-                submission, rigs, track=track, drawn=drawn, reference=own.bounds(),
-                stress=DRAWS if track == "robustness" and not seed else 0, runner=runner(),
-            )  # fmt: skip
+                submission,
+                rigs,
+                track=track,
+                drawn=drawn,
+                reference=own.bounds(),
+                stress=DRAWS if track == "robustness" and not seed else 0,
+                runner=runner(),
+            )
         if seed:
             assert result.normalised is not None
             value = float(result.normalised[:, 1:][:, result.ranked].mean())

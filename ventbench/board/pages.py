@@ -109,8 +109,11 @@ def interval(estimate: Interval | None, digits: int, *, sign: bool = False) -> d
     kind = "" if not sign else "same" if not estimate.clear else "worse"
     kind = "better" if kind == "worse" and estimate.value < 0 else kind
     return {
-        "text": text, "small": f"{low} to {high}", "value": f"{estimate.value:.9f}", "kind": kind,
-    }  # fmt: skip
+        "text": text,
+        "small": f"{low} to {high}",
+        "value": f"{estimate.value:.9f}",
+        "kind": kind,
+    }
 
 
 def step_time(timing: Mapping[str, Any]) -> float:

@@ -197,8 +197,10 @@ def board(leaderboard: Store) -> tuple[Track, ...]:
     ]
     # Hardware stands beside the newest simulated ranking.
     newest = len(TRACKS)
-    return (*(replace(x, hardware=_hardware_rows(leaderboard, x)) for x in tracks[:newest]),
-            *tracks[newest:])  # fmt: skip
+    return (
+        *(replace(x, hardware=_hardware_rows(leaderboard, x)) for x in tracks[:newest]),
+        *tracks[newest:],
+    )
 
 
 def newest(tracks: Sequence[Track]) -> list[Track]:
@@ -208,9 +210,12 @@ def newest(tracks: Sequence[Track]) -> list[Track]:
 
 
 def _track(
-    leaderboard: Store, draws: str, name: str, histories: dict[str, list[Record]],
+    leaderboard: Store,
+    draws: str,
+    name: str,
+    histories: dict[str, list[Record]],
     evidence: Evidence,
-) -> Track:  # fmt: skip
+) -> Track:
     """Sort the entries of a track: ranked, not ranked, not official."""
     own = evidence.rounds.get(draws)
     placed: dict[str, list[Entry]] = defaultdict(list)
@@ -229,12 +234,15 @@ def _track(
     records = [row.record for row in ranked]
     base = _baseline(records, name)
     return Track(
-        name=name, draws=draws, round=own, ranked=tuple(ranked),
+        name=name,
+        draws=draws,
+        round=own,
+        ranked=tuple(ranked),
         unranked=tuple(_unranked_rows(placed["unranked"])),
         unofficial=tuple(_unranked_rows(placed["unofficial"])),
         baseline=None if base is None else records[base],
         stress=tuple(_stress_rows(ranked, evidence)),
-    )  # fmt: skip
+    )
 
 
 def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:

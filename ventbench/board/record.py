@@ -313,9 +313,12 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
     assert isinstance(values, schema.ScoreContent)
     size = len(values.lungs), len(values.pips)
     return Record(
-        sha256, values.header(), nominal=np.array(values.errors.nominal, float),
+        sha256,
+        values.header(),
+        nominal=np.array(values.errors.nominal, float),
         drawn=np.array(values.errors.drawn, float).reshape(values.draws.count, *size),
-        spread=np.array(values.spread, float), breath=values.trace.breath,
+        spread=np.array(values.spread, float),
+        breath=values.trace.breath,
         pressure=np.array(values.trace.pressure_centi_cmH2O) / 100.0,
         u_in=np.array(values.trace.u_in_tenths_percent) / 10.0,
         peak=np.array(values.safety.peak_centi_cmH2O) / 100.0,
@@ -328,7 +331,7 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
             np.array(values.headroom.pid, float),
         ),
         stress=_stress(values, label),
-    )  # fmt: skip
+    )
 
 
 def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
@@ -342,13 +345,19 @@ def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
         )
     ranked = np.flatnonzero(draws.ranked(np.array(values.rigs.session)))[: len(own.pips[0])]
     tables = Runs(
-        conditions=chosen, lungs=tuple(values.lungs), pips=np.array(own.pips, float),
+        conditions=chosen,
+        lungs=tuple(values.lungs),
+        pips=np.array(own.pips, float),
         rig=np.array(values.rigs.session)[:, ranked],
-        member=np.array(values.rigs.member)[:, ranked], error=np.array(own.errors, float),
-        safe=np.array(own.safe, bool), survived=np.array(own.survived, bool),
-        alarm_s=np.array(own.above_alarm_ms) / 1e3, peak=np.array(own.peak_centi_cmH2O) / 100.0,
-        volume=np.array(own.volume_mL, float), draw=np.arange(1, len(ranked) + 1),
-    )  # fmt: skip
+        member=np.array(values.rigs.member)[:, ranked],
+        error=np.array(own.errors, float),
+        safe=np.array(own.safe, bool),
+        survived=np.array(own.survived, bool),
+        alarm_s=np.array(own.above_alarm_ms) / 1e3,
+        peak=np.array(own.peak_centi_cmH2O) / 100.0,
+        volume=np.array(own.volume_mL, float),
+        draw=np.arange(1, len(ranked) + 1),
+    )
     if own.stressors == STRESSORS_VERSION and not tables.complete:
         raise InputError(
             f"{label}, key stress: does not have all conditions and draws of the stress track"

@@ -196,17 +196,21 @@ def _measure(
     gate = passes_safety_gate(pressure, pip[..., None], dt[..., None])
     above = pressure > safety_limit(pip[..., None, None])
     return Replayed(
-        nominal=errors[:, 0], drawn=np.moveaxis(errors[:, 1:], 1, 0),
-        safe=np.all(gate, axis=(1, 2, 3)), peak=np.moveaxis(pressure.max(axis=(3, 4)), 1, 0),
+        nominal=errors[:, 0],
+        drawn=np.moveaxis(errors[:, 1:], 1, 0),
+        safe=np.all(gate, axis=(1, 2, 3)),
+        peak=np.moveaxis(pressure.max(axis=(3, 4)), 1, 0),
         steps_above=np.moveaxis(longest_run(above).max(axis=-1), 1, 0),
         below=np.sum(requested < 0.0, axis=(1, 2, 3, 4)),
-        above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3, 4)), spread=spread,
+        above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3, 4)),
+        spread=spread,
         pressure=pressure[:, 0, :, TRACE_BREATH],
         u_in=np.clip(requested[:, 0, :, TRACE_BREATH], 0.0, protocol.U_MAX),
         first=np.moveaxis(requested[..., 0, 0], 1, 0),
         controllable=np.moveaxis(controllable_error(pressure, pip[..., None, None]), 1, 0),
-        session=draws.rig, member=draws.member,
-    )  # fmt: skip
+        session=draws.rig,
+        member=draws.member,
+    )
 
 
 def deviation(record: Record, replayed: Replayed) -> float:

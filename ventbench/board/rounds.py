@@ -230,10 +230,16 @@ def load_all(leaderboard: Path) -> tuple[Round, ...]:
 
 
 def open_round(
-    leaderboard: Path, name: str, closes: datetime, project: Sequence[str], *,
-    delay_s: int = DELAY_S, limit: int = LIMIT, chain: Chain = QUICKNET,
+    leaderboard: Path,
+    name: str,
+    closes: datetime,
+    project: Sequence[str],
+    *,
+    delay_s: int = DELAY_S,
+    limit: int = LIMIT,
+    chain: Chain = QUICKNET,
     now: datetime | None = None,
-) -> Round:  # fmt: skip
+) -> Round:
     """Open a round; arguments as of :class:`Opened`.
 
     Raises:

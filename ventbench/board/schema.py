@@ -406,14 +406,23 @@ def _check_shapes(record: ScoreContent, label: str) -> None:
     cells, trace = (lungs, len(record.pips)), (lungs, len(record.pips), protocol.INSPIRATION_STEPS)
     every = (1 + draws, *cells)
     shapes: dict[str, tuple[int, ...]] = {
-        "errors.nominal": cells, "errors.drawn": (draws, *cells),
-        "safe": (lungs,), "peak_pressure_cmH2O": (lungs,),
-        "safety.peak_centi_cmH2O": every, "safety.steps_above": every,
-        "clipped.below": (lungs,), "clipped.above": (lungs,), "spread": cells,
-        "trace.pressure_centi_cmH2O": trace, "trace.u_in_tenths_percent": trace,
-        "rigs.session": (lungs, draws), "rigs.member": (lungs, draws),
-        "headroom.error": every, "headroom.attainable": every, "headroom.pid": every,
-    }  # fmt: skip
+        "errors.nominal": cells,
+        "errors.drawn": (draws, *cells),
+        "safe": (lungs,),
+        "peak_pressure_cmH2O": (lungs,),
+        "safety.peak_centi_cmH2O": every,
+        "safety.steps_above": every,
+        "clipped.below": (lungs,),
+        "clipped.above": (lungs,),
+        "spread": cells,
+        "trace.pressure_centi_cmH2O": trace,
+        "trace.u_in_tenths_percent": trace,
+        "rigs.session": (lungs, draws),
+        "rigs.member": (lungs, draws),
+        "headroom.error": every,
+        "headroom.attainable": every,
+        "headroom.pid": every,
+    }
     if (own := record.stress) is not None:
         of_pips = (lungs, min(draws, len(own.pips[0])) if own.pips else 0)
         keys = ("errors", "safe", "survived", "above_alarm_ms", "peak_centi_cmH2O", "volume_mL")

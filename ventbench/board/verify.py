@@ -260,9 +260,13 @@ def _loaded(load: Load, report: Report) -> ReplayPlants | None:
 
 
 def _replay_group(
-    folder: Path, group: Sequence[Record], simulators: ReplayPlants, drawn: Draws,
-    report: Report, progress: Progress | None,
-) -> dict[str, Floats]:  # fmt: skip
+    folder: Path,
+    group: Sequence[Record],
+    simulators: ReplayPlants,
+    drawn: Draws,
+    report: Report,
+    progress: Progress | None,
+) -> dict[str, Floats]:
     """Replay records over the same draws; see :func:`_check_replay`."""
     sound, requested = [], []
     by_draw: dict[str, Floats] = {}

@@ -211,9 +211,13 @@ def verify(
 
 
 def _rerun(
-    report: Report, folder: Path, records: list[str], sources: list[Path], jobs: int,
+    report: Report,
+    folder: Path,
+    records: list[str],
+    sources: list[Path],
+    jobs: int,
     scheduler: str | None,
-) -> None:  # fmt: skip
+) -> None:
     """Run code again; note in the report what came of it."""
     from ventbench.board import official_runs
 
@@ -225,9 +229,13 @@ def _rerun(
             status.update(f"{report.reproduced} records reproduced")
 
         outcomes = official_runs.rerun(
-            folder, records=records, sources=sources, jobs=jobs, scheduler=scheduler,
+            folder,
+            records=records,
+            sources=sources,
+            jobs=jobs,
+            scheduler=scheduler,
             progress=note,
-        )  # fmt: skip
+        )
     report.second_runs = [str(x) for x in outcomes]
     report.problems += [str(x) for x in outcomes if x.state == official_runs.DIFFERENT]
     report.notes += [str(x) for x in outcomes if x.state == official_runs.NOT_RERUN]
@@ -292,9 +300,13 @@ def _plain_table(title: str) -> Table:
     from rich.table import Table
 
     return Table(
-        title=title or None, box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False,
-        title_justify="left", caption_justify="left",
-    )  # fmt: skip
+        title=title or None,
+        box=box.SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
+        pad_edge=False,
+        title_justify="left",
+        caption_justify="left",
+    )
 
 
 def _table(track: Track) -> Table:
@@ -329,9 +341,13 @@ def _stress_table(track: Track) -> Table:
     for row in rows:
         score, ranks = row["score"], row["ranks"]
         table.add_row(
-            "" if row["rank"] is None else str(row["rank"]), row["name"],
-            "failed" if score is None else score["text"], "" if score is None else score["small"],
-            "" if ranks is None else f"{ranks[0]} to {ranks[1]}", row["unstressed"],
-            f"{row['survived']} %", str(row["unsafe"]),
-        )  # fmt: skip
+            "" if row["rank"] is None else str(row["rank"]),
+            row["name"],
+            "failed" if score is None else score["text"],
+            "" if score is None else score["small"],
+            "" if ranks is None else f"{ranks[0]} to {ranks[1]}",
+            row["unstressed"],
+            f"{row['survived']} %",
+            str(row["unsafe"]),
+        )
     return table

@@ -129,17 +129,28 @@ def import_(
     from ventbench.recordings.foreign import import_recording
 
     units = {
-        "pressure": pressure_unit, "flow": flow_unit, "volume": volume_unit, "time": time_unit,
+        "pressure": pressure_unit,
+        "flow": flow_unit,
+        "volume": volume_unit,
+        "time": time_unit,
         "u_in": u_in_unit,
-    }  # fmt: skip
+    }
     with waiting(f"reading {file}"):
         imported = import_recording(
-            file, columns=_pairs(columns, "--map"),
-            units={role: unit for role, unit in units.items() if unit is not None}, layout=layout,
-            lung=lung, rate=rate, split_breaths=split_breaths, invert=invert or (),
-            offsets=_offsets(offset), select=_pairs(select, "--select"),
-            skip_bad_breaths=skip_bad_breaths, separator=separator, decimal=decimal,
-        )  # fmt: skip
+            file,
+            columns=_pairs(columns, "--map"),
+            units={role: unit for role, unit in units.items() if unit is not None},
+            layout=layout,
+            lung=lung,
+            rate=rate,
+            split_breaths=split_breaths,
+            invert=invert or (),
+            offsets=_offsets(offset),
+            select=_pairs(select, "--select"),
+            skip_bad_breaths=skip_bad_breaths,
+            separator=separator,
+            decimal=decimal,
+        )
     emit(imported.as_dict(), json)
     to_stderr = str(json) == "-"
     for name, role in imported.columns.items():

@@ -135,9 +135,12 @@ def _table(lungs: dict[str, Mechanics]) -> Any:
         for label, lung in lungs.items()
     )
     return table_of(
-        "Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O", columns, rows,
-        left=columns, caption=f"Tolerance of a label beyond the intervals: {tolerance_text()}.",
-    )  # fmt: skip
+        "Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O",
+        columns,
+        rows,
+        left=columns,
+        caption=f"Tolerance of a label beyond the intervals: {tolerance_text()}.",
+    )
 
 
 if TYPE_CHECKING:
@@ -214,7 +217,7 @@ def diagnose(
 
 def _diagnose(
     breaths: Breaths, plant: str, lung: str | None, patient: bool, drive: str
-) -> Diagnosis:  # fmt: skip
+) -> Diagnosis:
     """Diagnose with a progress bar that says what is done and how long it will take."""
     from ventbench.base import compilation
     from ventbench.diagnosis.diagnose import diagnose as find
@@ -226,10 +229,13 @@ def _diagnose(
     notes().print(expected_time(len(breaths), lungs, compilation.is_warm()))
     with bar("diagnosing") as diagnosing:
         return find(
-            breaths, simulator=simulators, lung=lung, patient=patient,
+            breaths,
+            simulator=simulators,
+            lung=lung,
+            patient=patient,
             drive=drive,  # type: ignore[arg-type]
             progress=lambda what, share: diagnosing(share, text=what),
-        )  # fmt: skip
+        )
 
 
 def expected_time(breaths: int, lungs: int, warm: bool) -> str:
@@ -274,9 +280,12 @@ def isolability(
 
     compilation.keep()
     found = compute(
-        controls, lung=lung, sensors=[each.strip() for each in sensors.split(",")],
-        noise={"pressure": noise}, names=[each for each in names.split(",") if each] or None,
-    )  # fmt: skip
+        controls,
+        lung=lung,
+        sensors=[each.strip() for each in sensors.split(",")],
+        noise={"pressure": noise},
+        names=[each for each in names.split(",") if each] or None,
+    )
     console = told(found.as_dict(), json)
     for group in found.groups:
         apart = "told from all others" if len(group) == 1 else "not told apart"

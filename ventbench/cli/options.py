@@ -179,9 +179,14 @@ def told(value: object, json: Path | None) -> Console:
 
 
 def table_of(
-    title: str, columns: Iterable[str], rows: Iterable[Iterable[str]] = (), *,
-    left: Iterable[str] = (), no_wrap: bool = False, caption: str | None = None,
-) -> Table:  # fmt: skip
+    title: str,
+    columns: Iterable[str],
+    rows: Iterable[Iterable[str]] = (),
+    *,
+    left: Iterable[str] = (),
+    no_wrap: bool = False,
+    caption: str | None = None,
+) -> Table:
     """Return a table of texts: the first column and those named stand to the left, others right."""
     from rich.table import Table
 
@@ -258,9 +263,12 @@ def _progress(*columns: ProgressColumn) -> Progress:
     console = notes()
     # Where stderr is a file, bars would leave nothing but an empty line.
     return Progress(
-        *columns, transient=True, console=console, disable=not console.is_terminal,
+        *columns,
+        transient=True,
+        console=console,
+        disable=not console.is_terminal,
         speed_estimate_period=600.0,  # of long work whose steps take minutes
-    )  # fmt: skip
+    )
 
 
 def read_recording(path: Path, *, clip: bool, pad: bool) -> Breaths:
@@ -320,9 +328,7 @@ def waiting(text: str) -> Progress:
     """Return a spinner on stderr with the time taken, for work whose length nobody knows."""
     from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (
-        SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
-    )  # fmt: skip
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
     shown = _progress(*columns)
     shown.add_task(text, total=None)
     return shown
@@ -335,9 +341,13 @@ INTERRUPTED = 130
 def program(name: str, about: str, *, completion: bool = True) -> typer.Typer:
     """Return a command line without commands: its help, ``--version`` and ``--quiet``."""
     app = typer.Typer(
-        name=name, help=about, no_args_is_help=True, add_completion=completion,
-        pretty_exceptions_enable=False, rich_markup_mode="markdown",
-    )  # fmt: skip
+        name=name,
+        help=about,
+        no_args_is_help=True,
+        add_completion=completion,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="markdown",
+    )
 
     def show(value: bool) -> None:
         if value:

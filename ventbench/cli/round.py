@@ -66,9 +66,14 @@ def open_(
     from ventbench.entries.folder import bundled
 
     made = rounds.open_round(
-        folder, name, closes.replace(tzinfo=datetime.UTC), project or bundled(), delay_s=delay,
-        limit=limit, chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
-    )  # fmt: skip
+        folder,
+        name,
+        closes.replace(tzinfo=datetime.UTC),
+        project or bundled(),
+        delay_s=delay,
+        limit=limit,
+        chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
+    )
     _told(made, json)
 
 
@@ -166,9 +171,14 @@ def score(
         return
     with bars() as tell, executor(workers, scheduler) as pool:
         made = official_runs.score(
-            folder, name, pool, out / name, places=[folder.parent / "submissions", *(source or [])],
-            secret=os.environ.get(gate.SECRET) or None, progress=tell,
-        )  # fmt: skip
+            folder,
+            name,
+            pool,
+            out / name,
+            places=[folder.parent / "submissions", *(source or [])],
+            secret=os.environ.get(gate.SECRET) or None,
+            progress=tell,
+        )
     _told(made, json)
 
 

@@ -139,8 +139,8 @@ def score(
     jobs = []
     for entry in opened:
         entered = entry.manifest.tracks
-        for each in entered if track == "all" else (track or entered[0],):
-            jobs.append((entry, each, stress if each == "robustness" else 0))
+        tracks = entered if track == "all" else (track or entered[0],)
+        jobs.extend((entry, each, stress if each == "robustness" else 0) for each in tracks)
         if stress and not any(job[0] is entry and job[2] for job in jobs):
             notes().print(f"{entry.manifest.name} is told its lung: no score under missing physics")
     work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process)
@@ -198,9 +198,10 @@ def _table(results: list[dict[str, Any]]) -> Table:
     some = [k for k in range(len(names)) if any(row[k] != "-" for row in rows)]
     return table_of(
         "Mean |pressure - target|, cmH2O (lower is better)",
-        [names[k] for k in some], [[row[k] for k in some] for row in rows],
+        [names[k] for k in some],
+        [[row[k] for k in some] for row in rows],
         caption="normalised: 0 = best attainable, 100 = best PID",
-    )  # fmt: skip
+    )
 
 
 def _compare(console: Console, scores: list[Score]) -> None:
@@ -489,9 +490,13 @@ def adversary(
     compilation.keep()
     with waiting(f"searching for what makes {name} unsafe"):
         found = search(
-            name, simulator=plant, track=track, lungs=lung or (), stressors=stressor or (),
+            name,
+            simulator=plant,
+            track=track,
+            lungs=lung or (),
+            stressors=stressor or (),
             sandbox=not in_process,
-        )  # fmt: skip
+        )
     values = {"submission": name, "lungs": [asdict(one) for one in found]}
     text = "\n".join(line for one in found for line in one.lines())
     emit(values, json)

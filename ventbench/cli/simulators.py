@@ -55,9 +55,11 @@ def lungs(json: JsonFile = None) -> None:
         rows.append((lung_id, *setting, *figures, str(about["held_out_breaths"])))
     table = table_of(
         "The six lungs: error of their simulators on breaths held out, cmH2O",
-        ("lung", "R", "C", "rigs", *kinds.values(), "breaths"), rows, no_wrap=True,
+        ("lung", "R", "C", "rigs", *kinds.values(), "breaths"),
+        rows,
+        no_wrap=True,
         caption="Mean / median. R in cmH2O/(L/s), C in mL/cmH2O.",
-    )  # fmt: skip
+    )
     console = told(known, json)
     console.print(table)
     for session, reason in official.rejected.items():
@@ -94,10 +96,14 @@ def coverage(
     by_lung = open_loop.by_lung(dict(zip(entry.lungs, commands, strict=True)), lungs)
     columns = ("lung", "70 % and above", "ranges hardly recorded", "recorded at 70 % and above")
     rows = (
-        (name, f"{100 * share.wide_open:.1f}", f"{100 * share.sparse:.1f}",
-         f"{share.recorded_wide_open} of {share.recorded}")
+        (
+            name,
+            f"{100 * share.wide_open:.1f}",
+            f"{100 * share.sparse:.1f}",
+            f"{share.recorded_wide_open} of {share.recorded}",
+        )
         for name, share in by_lung.items()
-    )  # fmt: skip
+    )
     table = table_of("Commands beyond the recordings, % of all", columns, rows)
     told({name: asdict(share) for name, share in by_lung.items()}, json).print(table)
 
@@ -191,12 +197,16 @@ def open_loop(
 def _open_loop_table(result: dict[str, Any]) -> Any:
     rows = [
         (
-            lung, str(figures["breaths"]), number(figures["mae"]), number(figures["median_mae"]),
-            number(figures["held_out_mae"]), "..".join(map(number, figures["held_out_ci95"])),
+            lung,
+            str(figures["breaths"]),
+            number(figures["mae"]),
+            number(figures["median_mae"]),
+            number(figures["held_out_mae"]),
+            "..".join(map(number, figures["held_out_ci95"])),
             number(figures["held_out_median_mae"]),
         )
         for lung, figures in result["lungs"].items()
-    ]  # fmt: skip
+    ]
     title = f"Open-loop MAE of the {result['plant']} simulators, cmH2O"
     columns = ("lung", "n", "mean", "median", "held-out", "95 %", "median")
     return table_of(title, columns, rows, no_wrap=True)

@@ -86,9 +86,12 @@ def simulator(
     listed = None if lungs is None else [name.strip() for name in lungs.split(",")]
     with bar("learning") as learning:
         train_rigs(
-            folder, out, lungs=listed, config=RigConfig(laminar_share=laminar_share),
+            folder,
+            out,
+            lungs=listed,
+            config=RigConfig(laminar_share=laminar_share),
             progress=lambda what, share: learning(share, text=what),
-        )  # fmt: skip
+        )
     typer.echo(f"wrote {out}")
 
 
@@ -170,9 +173,13 @@ def residual(
                 tell(what, *progress[:2], text=f"{what}: {progress[2]:.3f} cmH2O")
 
         trained = train_residual(
-            names, out, config=config, seeds=range(seed, seed + seeds), simulator=plant,
+            names,
+            out,
+            config=config,
+            seeds=range(seed, seed + seeds),
+            simulator=plant,
             progress=report,
-        )  # fmt: skip
+        )
     console = told(trained.report, json)
     console.print(_residual_table(trained.report))
     console.print(f"wrote {out}", soft_wrap=True)
@@ -224,9 +231,15 @@ app.command("dqn")(
 
 
 def _train_policies(
-    method: str, lung: str | None, all_lungs: bool, seeds: range, steps: int | None, out: Path,
-    plant: str, json: Path | None,
-) -> None:  # fmt: skip
+    method: str,
+    lung: str | None,
+    all_lungs: bool,
+    seeds: range,
+    steps: int | None,
+    out: Path,
+    plant: str,
+    json: Path | None,
+) -> None:
     from ventbench.train.plants import ALL
     from ventbench.train.rl.train import train_dqn, train_ppo
 
@@ -236,11 +249,15 @@ def _train_policies(
     work = {"ppo": train_ppo, "dqn": train_dqn}[method]
     with bars() as tell:
         trained = work(
-            networks, out, seeds=seeds, steps=steps, simulator=plant,
+            networks,
+            out,
+            seeds=seeds,
+            steps=steps,
+            simulator=plant,
             progress=lambda label, share, best: tell(
                 label, share, text=f"{method}, {label}: {best:.3f} cmH2O"
             ),
-        )  # fmt: skip
+        )
     console = told(trained.report, json)
     console.print(_trained(trained.report))
     console.print(f"wrote {out}", soft_wrap=True)
@@ -252,16 +269,22 @@ def _trained(about: dict[str, Any]) -> Any:
 
     rows = (
         (
-            name, str(own["breaths"]), f"{own['error_pid']:.3f}",
-            values(own["error_nominal_at_end"]), values(own["error_fresh"]), str(own["seed"]),
+            name,
+            str(own["breaths"]),
+            f"{own['error_pid']:.3f}",
+            values(own["error_nominal_at_end"]),
+            values(own["error_fresh"]),
+            str(own["seed"]),
         )
         for name, own in about["networks"].items()
-    )  # fmt: skip
+    )
     columns = ("network", "breaths", "PID", "at the end", "fresh cells", "best seed")
     return table_of(
-        f"{about['method']}: mean |pressure - target|, cmH2O", columns, rows,
+        f"{about['method']}: mean |pressure - target|, cmH2O",
+        columns,
+        rows,
         caption="Fresh cells: new deviations, drawn like the published draws.",
-    )  # fmt: skip
+    )
 
 
 PLOT = "grid.png"
@@ -325,9 +348,13 @@ def pid(
     with bar("PIDs") as progress:
         if beyond:
             result = tune_beyond(
-                names, draws=draws, each=not robust, single=lung is None, simulator=plant,
+                names,
+                draws=draws,
+                each=not robust,
+                single=lung is None,
+                simulator=plant,
                 progress=progress,
-            )  # fmt: skip
+            )
             files.write_json(out / RESULT, result)
             written = [RESULT]
         else:

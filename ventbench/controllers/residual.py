@@ -130,8 +130,10 @@ class Residual:
         rest = [observation.target / TARGET, observation.time + zero, step, state.known]
         commands = [state.commands, state.command_before[..., : self.ahead]]
         columns = [
-            errors / ERROR, jnp.stack(rest, axis=-1), jnp.concatenate(commands, axis=-1) / COMMAND
-        ]  # fmt: skip
+            errors / ERROR,
+            jnp.stack(rest, axis=-1),
+            jnp.concatenate(commands, axis=-1) / COMMAND,
+        ]
         features = jnp.concatenate(columns, axis=-1)
         state = state.replace(  # type: ignore[attr-defined]
             errors=_push(error, state.errors),
@@ -274,9 +276,26 @@ SCALE = 20.0
 
 #: Corrections that DQN chooses from, %: fine about zero, coarse to the whole range of the valve.
 CHOICES = (
-    -90.0, -60.0, -40.0, -25.0, -15.0, -9.0, -5.0, -2.5, -1.0,
-    0.0, 1.0, 2.5, 5.0, 9.0, 15.0, 25.0, 40.0, 60.0, 90.0,
-)  # fmt: skip
+    -90.0,
+    -60.0,
+    -40.0,
+    -25.0,
+    -15.0,
+    -9.0,
+    -5.0,
+    -2.5,
+    -1.0,
+    0.0,
+    1.0,
+    2.5,
+    5.0,
+    9.0,
+    15.0,
+    25.0,
+    40.0,
+    60.0,
+    90.0,
+)
 
 
 @flax.struct.dataclass

@@ -150,9 +150,12 @@ def conclude(
         term = unknown[-1]
         named = fit_with_noise(evaluator, full.hypothesis.without(term), full)
         unnamed = UnnamedEffect(
-            component_of(term), term, None, gains[term],
+            component_of(term),
+            term,
+            None,
+            gains[term],
             _places(found, names, component_of(term), term),
-        )  # fmt: skip
+        )
     noise = full.noise
     for term in best.terms:
         if unnamed is None and term.name in SWINGS:
@@ -162,9 +165,12 @@ def conclude(
             ):
                 place = SWINGS[term.name][0]
                 unnamed = UnnamedEffect(
-                    place, None, swing, float(gained.sum()),
+                    place,
+                    None,
+                    swing,
+                    float(gained.sum()),
                     _places(found, names, place, term.name),
-                )  # fmt: skip
+                )
                 noise = swing.noise
     return Conclusion(
         base,

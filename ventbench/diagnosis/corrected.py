@@ -72,9 +72,14 @@ class Correction:
 
 
 def correct(
-    breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
-    simulator_model: IdentifiedModel | None, simulators: Simulators,
-) -> Correction:  # fmt: skip
+    breaths: Breaths,
+    data: Data,
+    split: Split,
+    before: Floats,
+    recording_model: IdentifiedModel,
+    simulator_model: IdentifiedModel | None,
+    simulators: Simulators,
+) -> Correction:
     """Correct a simulator by the difference of the models of the recording and of itself.
 
     A simulator that is not the base model stays as it is if the correction raises its mean error on
@@ -232,9 +237,13 @@ def _base_model(
 
 
 def _any_model(
-    breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
+    breaths: Breaths,
+    data: Data,
+    split: Split,
+    before: Floats,
+    recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel,
-) -> tuple[dict[str, Floats], dict[str, Plants], list[str]]:  # fmt: skip
+) -> tuple[dict[str, Floats], dict[str, Plants], list[str]]:
     """Candidates for any simulator: itself plus differences of the physics of both models.
 
     The correction has the reported parameters, unless it errs less with those that are fitted for
@@ -271,9 +280,12 @@ def _any_model(
 
 
 def _least_error_model(
-    data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
+    data: Data,
+    split: Split,
+    before: Floats,
+    recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel,
-) -> FittedModel | None:  # fmt: skip
+) -> FittedModel | None:
     """The recording's model, fitted for the least error of the simulator that it corrects.
 
     None if it has parameters of each breath, which nobody knows of breaths to come.
@@ -287,9 +299,13 @@ def _least_error_model(
 
 
 def fit_open_loop(
-    evaluator: Evaluator, fitted: FittedModel, partition: Partition, settings: CorrectionSettings,
-    *, label: bool = False,
-) -> FittedModel:  # fmt: skip
+    evaluator: Evaluator,
+    fitted: FittedModel,
+    partition: Partition,
+    settings: CorrectionSettings,
+    *,
+    label: bool = False,
+) -> FittedModel:
     """Fit a hypothesis for the least open-loop error: at white noise, from several starts.
 
     Coloured noise excuses slow errors, and a fit from one start may end in a local minimum far off.
@@ -390,9 +406,16 @@ def compare_open_loop(
     error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
     usual = _usual_error(error)
     return OpenLoopComparison(
-        ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups, scatter, usual,
+        ids,
+        whole["before"],
+        whole["refit"],
+        whole["after"],
+        noise_floor,
+        groups,
+        scatter,
+        usual,
         sensor,
-    )  # fmt: skip
+    )
 
 
 def _usual_error(error: Floats) -> float:

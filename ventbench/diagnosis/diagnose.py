@@ -155,9 +155,14 @@ def diagnose(
     posterior = None  # that of all breaths has all effects
     while True:
         found = _diagnose(
-            breaths, simulators, patient, by_flow, progress or (lambda what, share: None),
-            settings, look=not by_flow and len(told) < _MOST_INTERMITTENT,
-        )  # fmt: skip
+            breaths,
+            simulators,
+            patient,
+            by_flow,
+            progress or (lambda what, share: None),
+            settings,
+            look=not by_flow and len(told) < _MOST_INTERMITTENT,
+        )
         if isinstance(found, Diagnosis):
             break
         told.append(found.missing)
@@ -174,9 +179,15 @@ def diagnose(
 
 
 def _diagnose(
-    breaths: Breaths, simulators: Simulators, patient: bool, by_flow: bool,
-    tell: Progress, settings: SelectionConfig, *, look: bool,
-) -> Diagnosis | Intermittent:  # fmt: skip
+    breaths: Breaths,
+    simulators: Simulators,
+    patient: bool,
+    by_flow: bool,
+    tell: Progress,
+    settings: SelectionConfig,
+    *,
+    look: bool,
+) -> Diagnosis | Intermittent:
     """Diagnose breaths in which all effects act alike; see :func:`diagnose`.
 
     Args:
@@ -228,18 +239,27 @@ def _diagnose(
     if not simulators.is_base_physics:
         tell("fitting the simulator's response", halfway)
         recording_model, simulator_model = identify_both(
-            data.select(seen), held, before[seen], recording_only_model, excluded,
-            steps_between(tell, halfway, _IDENTIFIED), fitted,
-        )  # fmt: skip
+            data.select(seen),
+            held,
+            before[seen],
+            recording_only_model,
+            excluded,
+            steps_between(tell, halfway, _IDENTIFIED),
+            fitted,
+        )
     tell("drawing conclusions", _IDENTIFIED)
 
     def compared(recording_model: IdentifiedModel) -> _Comparison:
         missing, notes = missing_mechanisms(recording_model, simulator_model)
         if simulator_model is not None:
             steady = refit_at_simulator_parameters(
-                data.select(seen), held, before[seen], recording_model, simulator_model,
+                data.select(seen),
+                held,
+                before[seen],
+                recording_model,
+                simulator_model,
                 tuple(missing),
-            )  # fmt: skip
+            )
             if steady is not None:  # the simulator keeps its mechanisms, shown or not
                 (recording_model, kept), notes = steady, []
                 missing = {name: changed for name, changed in missing.items() if name in kept}
@@ -256,9 +276,14 @@ def _diagnose(
     ):
         tell("describing the recording by what the simulator has", _IDENTIFIED)
         in_its_terms = identify(
-            data.select(seen), held, excluded, steps_between(tell, _IDENTIFIED, 1.0), settings,
-            fitted, simulator_model.conclusion.named,
-        )  # fmt: skip
+            data.select(seen),
+            held,
+            excluded,
+            steps_between(tell, _IDENTIFIED, 1.0),
+            settings,
+            fitted,
+            simulator_model.conclusion.named,
+        )
         comparison = min(
             comparison, compared(in_its_terms), key=lambda each: each.error(data, uses.testing)
         )
@@ -279,10 +304,16 @@ def _diagnose(
     here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1))
     gain, start = recording_model.sensitivities(data)
     adequacy = check_residuals(
-        breaths.select(here), pressures["after"][here], gain[here], start[here], noise.sigma[0],
-        flow[here], volume[here], gains_scatter=conclusion.gain_sd > 0.0,
+        breaths.select(here),
+        pressures["after"][here],
+        gain[here],
+        start[here],
+        noise.sigma[0],
+        flow[here],
+        volume[here],
+        gains_scatter=conclusion.gain_sd > 0.0,
         settings=settings.residuals,
-    )  # fmt: skip
+    )
     # A simulator that is more than a lung and a valve may know the gains of its rigs, and gains
     # that have an order in time do not scatter.
     scatters = simulators.is_base_physics and not any(c.of == "gain" for c in adequacy.changes)
@@ -290,9 +321,13 @@ def _diagnose(
     scatter_error = np.hypot(gain_error, recording_model.effort_spread(data))
     sensor = sensor_noise(breaths)
     open_loop = compare_open_loop(
-        breaths, uses.judging, pressures,
-        noise_floor(float(noise.sigma[0]), sensor), scatter_error, sensor,
-    )  # fmt: skip
+        breaths,
+        uses.judging,
+        pressures,
+        noise_floor(float(noise.sigma[0]), sensor),
+        scatter_error,
+        sensor,
+    )
     if adequacy.changes:  # breaths that err more because of a change are no outliers
         open_loop = replace(open_loop, usual=open_loop.after.rmse)
     is_input = conclusion.unnamed is not None and conclusion.unnamed.swing is not None
@@ -303,9 +338,13 @@ def _diagnose(
         missing, notes_on_simulator = {}, [_note_on_unchanged(correction)]
         term = term if is_input and not correction.unchanged else None
     location = locate(
-        breaths.select(here), pressures["refit"][here], noise.sigma[0], flow[here], volume[here],
+        breaths.select(here),
+        pressures["refit"][here],
+        noise.sigma[0],
+        flow[here],
+        volume[here],
         settings=settings.residuals,
-    )  # fmt: skip
+    )
     form, term = estimates.split_form(term, tuple(missing))
     swings = None if term is None else estimates.oscillation(conclusion)
     term = term if swings is None else None
@@ -319,11 +358,10 @@ def _diagnose(
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(
-            _missing_mechanism(
-                name, changed, recording_model, simulator_model, breaths, data, left
-            )
+            _missing_mechanism(name, changed, recording_model, simulator_model, breaths, data, left)
             for name, changed in missing.items()
-        ) + ((swings,) if swings else ()),
+        )
+        + ((swings,) if swings else ()),
         nonparametric=term,
         form=form,
         location=location,
@@ -331,8 +369,15 @@ def _diagnose(
         open_loop=open_loop,
         lungs=lungs,
         request=None if rejected or by_flow else _request(conclusion),
-        traces=Traces(breaths, uses.judging, pressures["before"], pressures["refit"],
-                      pressures["after"], flow, volume),
+        traces=Traces(
+            breaths,
+            uses.judging,
+            pressures["before"],
+            pressures["refit"],
+            pressures["after"],
+            flow,
+            volume,
+        ),
         split=_ids(breaths, uses),
         chosen=correction.chosen,
         changes=adequacy.changes,
@@ -344,11 +389,14 @@ def _diagnose(
         simulator=simulators.name,
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
         notes=(
-            *notes, *notes_on_simulator, *correction.notes, *notes_on_lungs,
+            *notes,
+            *notes_on_simulator,
+            *correction.notes,
+            *notes_on_lungs,
         ),
         settings=settings,
         seconds=0.0,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,10 +73,15 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     # Where rigs differ, gains that are the same in all breaths would be made up for by mechanisms.
     start.pop("gain", None)
     found = fit(
-        data, hypothesis.names, free=dict.fromkeys((*hypothesis.free, *free)),
-        fixed=dict(hypothesis.fixed), start=start, gain_sd=evaluator.gain_sd, noise=fitted.noise,
+        data,
+        hypothesis.names,
+        free=dict.fromkeys((*hypothesis.free, *free)),
+        fixed=dict(hypothesis.fixed),
+        start=start,
+        gain_sd=evaluator.gain_sd,
+        noise=fitted.noise,
         predictor=partition.predictor,
-    )  # fmt: skip
+    )
     return FittedModel(hypothesis.names, found.problem, found.minimum, hypothesis)
 
 
@@ -274,9 +279,16 @@ def _input(place: UnnamedEffect, source: Swing, explains: float) -> Nonparametri
     meaning = f"{_INPUTS[place.name]}, {source.frequency:.1f} times a second"
     x = np.arange(len(course), dtype=float)
     return NonparametricTerm(
-        place.name, meaning, explains, place.nats, x, "sample of the breath where it is largest",
-        course, unit, places=place.places,
-    )  # fmt: skip
+        place.name,
+        meaning,
+        explains,
+        place.nats,
+        x,
+        "sample of the breath where it is largest",
+        course,
+        unit,
+        places=place.places,
+    )
 
 
 def _curve(full: FittedModel, element: str) -> tuple[Floats, Floats, str, str]:

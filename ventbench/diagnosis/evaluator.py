@@ -161,9 +161,15 @@ class Evaluator:
 
         def search(x: Floats, known: Minimum | None = None) -> Minimum:
             return minimise(
-                problem.cost, problem.normal, x, low, high, tolerance=settings.tolerance,
-                iterations=iterations, known=known,
-            )  # fmt: skip
+                problem.cost,
+                problem.normal,
+                x,
+                low,
+                high,
+                tolerance=settings.tolerance,
+                iterations=iterations,
+                known=known,
+            )
 
         minimum = search(x, _known_minimum(problem, x, warm_start))
         for _ in range(settings.delay_rounds):
@@ -275,9 +281,13 @@ class Evaluator:
         fixed = self.transferred(fitted, partition)
         problem = make_problem(partition, (START,), fitted.noise, fixed, self.gain_sd)
         minimum = minimise(
-            problem.cost, problem.normal, problem.start({}), *problem.unknowns.bounds(),
-            tolerance=settings.breath_tolerance, iterations=settings.breath_iterations,
-        )  # fmt: skip
+            problem.cost,
+            problem.normal,
+            problem.start({}),
+            *problem.unknowns.bounds(),
+            tolerance=settings.breath_tolerance,
+            iterations=settings.breath_iterations,
+        )
         return problem, minimum.x
 
     def transferred_values(self, fitted: FittedModel, partition: Partition) -> Floats:

@@ -35,7 +35,7 @@ from ventbench.diagnosis.linearised import (
     names_of,
     simulate,
     within,
-)  # fmt: skip
+)
 from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.problem import parameter_of
@@ -346,9 +346,14 @@ class _Search:
         return simulate(self.data, self.predictor, fitted, self.names, self.unnamed or (), events)
 
     def known(
-        self, around: Simulated, fitted: FittedModel, noise: Noise, terms: Set = (),
-        *, loose: bool = False,
-    ) -> Known:  # fmt: skip
+        self,
+        around: Simulated,
+        fitted: FittedModel,
+        noise: Noise,
+        terms: Set = (),
+        *,
+        loose: bool = False,
+    ) -> Known:
         """A linearised fit at the scatter of the gains that is likelier beside it.
 
         A drift of the gain is scatter, too, until it is among the terms.
@@ -360,9 +365,12 @@ class _Search:
         return max(ways, key=lambda known: known.evidence)
 
     def fit(
-        self, terms: Set, data: Data | None = None, noise: Noise | None = None,
+        self,
+        terms: Set,
+        data: Data | None = None,
+        noise: Noise | None = None,
         warm_start: FittedModel | None = None,
-    ) -> FittedModel:  # fmt: skip
+    ) -> FittedModel:
         """Fit what of a set is a parameter of the model, from where the linear problem has it."""
         partition = self.evaluator.training
         if data is not None:
@@ -381,16 +389,21 @@ class _Search:
             noise = self.known(around, base, noise, loose=True).left
         known = self.known(around, base, noise)
         latent = in_time(
-            known, Partition(self.data, self.predictor), base, self.excluded,
+            known,
+            Partition(self.data, self.predictor),
+            base,
+            self.excluded,
             self.evaluator.settings,
-        )  # fmt: skip
+        )
         ways = [
             enumerate_sets(
-                Known(around, base, self.base, noise, scatter=scatter), latent, 3,
+                Known(around, base, self.base, noise, scatter=scatter),
+                latent,
+                3,
                 self.settings.beam,
             )
             for scatter in self.scatters
-        ]  # fmt: skip
+        ]
         return _View(base, around, noise, self.scatters, tuple(ways), latent)
 
     def is_far_from_label(self, base: FittedModel) -> bool:
@@ -401,9 +414,13 @@ class _Search:
     def at_label(self, noise: Noise) -> FittedModel:
         """The base model with the labels' R and C: lags of 0.1 s take R to nothing."""
         return self.evaluator.fit(
-            Hypothesis(), noise, None, {"R": self.data.R, "C": self.data.C},
-            partition=Partition(self.data, self.predictor), iterations=0,
-        )  # fmt: skip
+            Hypothesis(),
+            noise,
+            None,
+            {"R": self.data.R, "C": self.data.C},
+            partition=Partition(self.data, self.predictor),
+            iterations=0,
+        )
 
     def attempt(self, around: Simulated, noise: Noise, terms: Set, start: FittedModel) -> None:
         """Fit a set; what acts in time is taken from the readings before a second fit."""

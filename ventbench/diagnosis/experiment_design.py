@@ -102,9 +102,13 @@ def values_of(fitted: Fit, data: Data, lung: NDArray[np.intp], start: float) -> 
 
 
 def forecast(
-    fitted: Fit, data: Data, predictor: Predictor, lung: NDArray[np.intp],
-    start: float, noise: Noise,
-) -> Forecast:  # fmt: skip
+    fitted: Fit,
+    data: Data,
+    predictor: Predictor,
+    lung: NDArray[np.intp],
+    start: float,
+    noise: Noise,
+) -> Forecast:
     """Predict new breaths with derivatives; for the arguments see :func:`values_of`."""
     problem = fitted.problem
     layout = problem.unknowns
@@ -153,9 +157,7 @@ def contrast(truth: Forecast, refitted: Forecast, noise: Noise) -> Contrast:
     count, extra = len(truth.white), len(refitted.own_precision)
     no_difference = np.zeros((count, extra))
     difference = np.concatenate([truth.white - refitted.white, no_difference], axis=1)
-    rows = np.concatenate(
-        [refitted.rows, np.zeros((*refitted.rows.shape[:2], extra))], axis=2
-    )  # fmt: skip
+    rows = np.concatenate([refitted.rows, np.zeros((*refitted.rows.shape[:2], extra))], axis=2)
     # The prior of a breath's own unknowns counts as further readings of them.
     before = np.broadcast_to(np.diag(np.sqrt(refitted.own_precision)), (count, extra, extra))
     own = np.concatenate([refitted.own, before], axis=2)
@@ -208,9 +210,11 @@ class _Design:
 
 
 def _best_on_lung(
-    chosen: Fit, alternatives: Sequence[Fit], noise: Noise,
+    chosen: Fit,
+    alternatives: Sequence[Fit],
+    noise: Noise,
     recorded_rows: NDArray[np.intp],
-) -> _Design | None:  # fmt: skip
+) -> _Design | None:
     """The best design on the lung of the recorded breaths ``here``."""
     problem = chosen.problem
     values = problem.values(chosen.minimum.x)[recorded_rows]
@@ -260,9 +264,12 @@ def _best(kinds: tuple[Family, ...], pairs: Sequence[Contrast], lung: Lung) -> _
 
 
 def _safe(
-    kinds: tuple[Family, ...], hypotheses: Sequence[Fit], recorded: Data,
-    recorded_rows: NDArray[np.intp], start: float,
-) -> tuple[Family, ...]:  # fmt: skip
+    kinds: tuple[Family, ...],
+    hypotheses: Sequence[Fit],
+    recorded: Data,
+    recorded_rows: NDArray[np.intp],
+    start: float,
+) -> tuple[Family, ...]:
     """Breaths that every hypothesis predicts within the pressure limits, weakened where needed."""
     low, high = _LIMITS
     for attempt in range(_ATTEMPTS + 1):
@@ -295,9 +302,15 @@ def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.int
     weight[:, 1:, 0] = 0.0
     ones: Floats = np.ones(count)
     return Data(
-        u_in, u_out, np.full(u_in.shape, float(np.median(recorded.dt))), np.zeros(shape), weight,
-        recorded.R[recorded_rows[0]] * ones, recorded.C[recorded_rows[0]] * ones, ones,
-    )  # fmt: skip
+        u_in,
+        u_out,
+        np.full(u_in.shape, float(np.median(recorded.dt))),
+        np.zeros(shape),
+        weight,
+        recorded.R[recorded_rows[0]] * ones,
+        recorded.C[recorded_rows[0]] * ones,
+        ones,
+    )
 
 
 def _worded(design: _Design, hypotheses: Sequence[Fit], dt: float) -> BreathRequest:
@@ -308,9 +321,13 @@ def _worded(design: _Design, hypotheses: Sequence[Fit], dt: float) -> BreathRequ
     common = acts[0].intersection(*acts[1:])
     names = [" + ".join(sorted(own - common)) or "no further mechanism" for own in acts]
     return BreathRequest(
-        f"{'; '.join(parts)} (lung {design.lung.id})", tuple(dict.fromkeys(names)), design.nats,
-        u_in, u_out, np.full(u_in.shape, dt),
-    )  # fmt: skip
+        f"{'; '.join(parts)} (lung {design.lung.id})",
+        tuple(dict.fromkeys(names)),
+        design.nats,
+        u_in,
+        u_out,
+        np.full(u_in.shape, dt),
+    )
 
 
 @dataclass(frozen=True)

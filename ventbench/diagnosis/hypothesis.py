@@ -94,8 +94,10 @@ def linearise(problem: Problem, x: Floats, *, clip: float = 4.0) -> Linearisatio
     columns = []
     for k in np.flatnonzero(~breath):
         left = linear.without_own(rows[:, [k]])[:, 0]
-        for unknown in np.unique(layout.index[:, k]):
-            columns.append(np.where((layout.index[:, k] == unknown)[:, None], left, 0.0).ravel())
+        columns.extend(
+            np.where((layout.index[:, k] == unknown)[:, None], left, 0.0).ravel()
+            for unknown in np.unique(layout.index[:, k])
+        )
     if columns:
         linear = replace(linear, shared_basis=_orthonormal(np.asarray(columns)[None])[0])
     clean = linear.without_shared(linear.without_own(white[:, None]))[:, 0]

@@ -90,9 +90,12 @@ def _affected(G: Floats, b: Floats, sd: float, cost: float) -> tuple[Any, Floats
 
 
 def in_time(
-    known: Known, partition: Partition, around: FittedModel, excluded: Collection[str],
+    known: Known,
+    partition: Partition,
+    around: FittedModel,
+    excluded: Collection[str],
     settings: SelectionConfig,
-) -> list[Term]:  # fmt: skip
+) -> list[Term]:
     """Terms that act in time.
 
     Args:

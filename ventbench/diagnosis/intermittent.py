@@ -159,10 +159,13 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         return None
     near = np.exp(-_CLOSE)
     missing = MissingMechanism(
-        best.name, estimates, odds[best.name] / sum(odds.values()),
+        best.name,
+        estimates,
+        odds[best.name] / sum(odds.values()),
         tuple(name for name, value in odds.items() if value > near and name != best.name),
-        float(gained.sum()), affected=tuple(int(i) for i in ids[affected]),
-    )  # fmt: skip
+        float(gained.sum()),
+        affected=tuple(int(i) for i in ids[affected]),
+    )
     return Intermittent(missing, ids, affected, u_in, told_posterior(conclusion.posterior))
 
 
@@ -286,8 +289,9 @@ def _everywhere(found: _Found, data: Data) -> tuple[Bools, Floats | None, dict[s
         estimates = {"share": Estimate(p, "1", (max(p - width, 0.0), min(p + width, 1.0)))}
         if found.strength:
             dt = float(np.median(data.dt[:, :-1]))
-            near = [_paths(evaluator, found.fitted, partition, found.share, k).nats.sum()
-                    for k in _LAGS]  # fmt: skip
+            near = [
+                _paths(evaluator, found.fitted, partition, found.share, k).nats.sum() for k in _LAGS
+            ]
             likely = np.array(_LAGS)[np.array(near) > max(near) - _ALIKE]
             ends = (float(likely[0] - 1) * dt, float(likely[-1]) * dt)
             estimates["delay"] = Estimate(0.5 * sum(ends), "s", ends)
@@ -322,9 +326,13 @@ class _Evidence:
 
     @classmethod
     def of(
-        cls, evaluator: Evaluator, fitted: FittedModel, partition: Partition, name: str,
+        cls,
+        evaluator: Evaluator,
+        fitted: FittedModel,
+        partition: Partition,
+        name: str,
         strengths: tuple[float, ...] | None = None,
-    ) -> _Evidence:  # fmt: skip
+    ) -> _Evidence:
         """Simulate the effect in breaths whose shared parameters are known.
 
         What each breath has of its own, its start and perhaps its gain, is refitted to first order.

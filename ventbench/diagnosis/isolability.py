@@ -164,9 +164,15 @@ def isolability(
         if value < threshold
     ]
     return Isolability(
-        label.id, tuple(sensors), threshold, detectable, nats, tuple(confused), tuple(unseen),
+        label.id,
+        tuple(sensors),
+        threshold,
+        detectable,
+        nats,
+        tuple(confused),
+        tuple(unseen),
         _groups(seen, confused),
-    )  # fmt: skip
+    )
 
 
 def _data(breaths: Sequence[Controls], planned: int, R: float, C: float, samples: int) -> Data:

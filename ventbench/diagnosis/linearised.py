@@ -198,9 +198,13 @@ def simulate(
         alike = sum(other == name for other, _, _ in found) * (len(between) if at else 1)
         low, high = sorted((about.strength.low / size, about.strength.high / size))
         term = Term(
-            name, (abs(about.strength.strong / size),), (k,), point, (low, high),
+            name,
+            (abs(about.strength.strong / size),),
+            (k,),
+            point,
+            (low, high),
             -float(np.log(max(alike, 1))),
-        )  # fmt: skip
+        )
         for x in between if at else ():
             columns.append(np.where(data.position[:, None] > x, columns[k], 0.0))
             terms.append(replace(term, main=(len(columns) - 1,), values=point | {at[0]: x}))
@@ -223,9 +227,16 @@ class Known:
     """
 
     def __init__(
-        self, around: Simulated, fitted: FittedModel, base: FittedModel, noise: Noise,
-        terms: Set = (), *, scatter: float = SCATTER, loose: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        around: Simulated,
+        fitted: FittedModel,
+        base: FittedModel,
+        noise: Noise,
+        terms: Set = (),
+        *,
+        scatter: float = SCATTER,
+        loose: bool = False,
+    ) -> None:
         """Linearise.
 
         Args:

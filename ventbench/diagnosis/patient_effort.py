@@ -232,9 +232,14 @@ class PatientEffortTerm(BreathTerm):
         first |= {AMPLITUDE: start.amplitude, ONSET: start.onset}
         low, high = layout.bounds()
         return problem, minimise(
-            problem.cost, problem.normal, layout.pack(first), low, high,
-            tolerance=_TOLERANCE, iterations=_STEPS,
-        )  # fmt: skip
+            problem.cost,
+            problem.normal,
+            layout.pack(first),
+            low,
+            high,
+            tolerance=_TOLERANCE,
+            iterations=_STEPS,
+        )
 
     def _log_volume(self, curvature: Floats, amplitude: Floats) -> Floats:
         """Logarithm of prior density times posterior volume around the best effort, ``(n,)``.

@@ -176,9 +176,10 @@ def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
 def change(found: Change) -> str:
     """What changes in the course of the recording, as a phrase."""
     what = {
-        "gain": "the gain of the valve", "zero": "the zero of the pressure",
+        "gain": "the gain of the valve",
+        "zero": "the zero of the pressure",
         "error": "the size of the error",
-    }[found.of]  # fmt: skip
+    }[found.of]
     by = f"x {found.size:.3g}" if found.of != "zero" else f"by {signed(found.size)} cmH2O"
     if found.drifts:
         how = f"drifts from the first to the last breath ({by}"
@@ -259,12 +260,12 @@ def would_change(findings: Findings) -> list[str]:
             f"A further recording whose held-out breaths gain less than {_deciding(findings):g} "
             f"nats by {it} would withdraw {them}."
         )
-    for name in names:
-        if same := mechanism(name).description.equivalents:
-            texts.append(
-                f"Pressure alone can never tell {name} from {_listed(same, 'or')}; flow or volume "
-                "of the lung may."
-            )
+    texts.extend(
+        f"Pressure alone can never tell {name} from {_listed(same, 'or')}; flow or volume of the "
+        "lung may."
+        for name in names
+        if (same := mechanism(name).description.equivalents)
+    )
     count = len(findings.open_loop.held_out_breaths)
     if count < _FEW_BREATHS:
         texts.append(

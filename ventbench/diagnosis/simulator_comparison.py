@@ -30,10 +30,14 @@ from ventbench.system_id.problem import free_paths
 
 
 def identify_both(
-    data: Data, held: Bools, response: Floats, recording_only_model: IdentifiedModel,
-    excluded: tuple[str, ...], tell: Callable[[str], None],
+    data: Data,
+    held: Bools,
+    response: Floats,
+    recording_only_model: IdentifiedModel,
+    excluded: tuple[str, ...],
+    tell: Callable[[str], None],
     fitted: Bools | None = None,
-) -> tuple[IdentifiedModel, IdentifiedModel]:  # fmt: skip
+) -> tuple[IdentifiedModel, IdentifiedModel]:
     """Identify the models of a simulator and of its recording.
 
     What no model can describe may be common to both: valves that differ from breath to breath, or
@@ -237,9 +241,13 @@ def missing_mechanisms(
 
 
 def refit_at_simulator_parameters(
-    data: Data, held: Bools, response: Floats, recording_model: IdentifiedModel,
-    simulator_model: IdentifiedModel, missing: Sequence[str],
-) -> tuple[IdentifiedModel, tuple[str, ...]] | None:  # fmt: skip
+    data: Data,
+    held: Bools,
+    response: Floats,
+    recording_model: IdentifiedModel,
+    simulator_model: IdentifiedModel,
+    missing: Sequence[str],
+) -> tuple[IdentifiedModel, tuple[str, ...]] | None:
     """Fit what a simulator lacks with the rest of its physics held at the simulator's own values.
 
     The base parameters are refitted in every hypothesis so that mechanisms can be trusted, but they
@@ -309,9 +317,11 @@ def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> 
 
 
 def _noiseless_fit(
-    simulator_model: IdentifiedModel, own: Data, held: Bools,
+    simulator_model: IdentifiedModel,
+    own: Data,
+    held: Bools,
     recording_model: IdentifiedModel,
-) -> FittedModel:  # fmt: skip
+) -> FittedModel:
     """Fit of the simulator's model to its own pressures, without noise or unmodelled part.
 
     The values are those of the model; their intervals are what such breaths tell of them.
@@ -357,10 +367,15 @@ def _fit_beside(
     fixed: dict[str, ArrayLike] = {p: x for p, x in values.items() if p not in free}
     given = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in asked}
     found = fit(
-        partition.data, hypothesis.names, free=free, fixed=fixed | given,
-        start={p: float(np.median(full.column(p))) for p in free}, gain_sd=evaluator.gain_sd,
-        noise=full.noise, predictor=partition.predictor,
-    )  # fmt: skip
+        partition.data,
+        hypothesis.names,
+        free=free,
+        fixed=fixed | given,
+        start={p: float(np.median(full.column(p))) for p in free},
+        gain_sd=evaluator.gain_sd,
+        noise=full.noise,
+        predictor=partition.predictor,
+    )
     return FittedModel(hypothesis.names, found.problem, found.minimum, hypothesis)
 
 

@@ -304,9 +304,17 @@ class Adequacy:
 
 
 def check_residuals(
-    breaths: Breaths, simulated: Floats, gain: Floats, start: Floats, noise_sd: float,
-    flow: Floats, volume: Floats, *, gains_scatter: bool, settings: ResidualSettings,
-) -> Adequacy:  # fmt: skip
+    breaths: Breaths,
+    simulated: Floats,
+    gain: Floats,
+    start: Floats,
+    noise_sd: float,
+    flow: Floats,
+    volume: Floats,
+    *,
+    gains_scatter: bool,
+    settings: ResidualSettings,
+) -> Adequacy:
     """Test what a model leaves of a recording.
 
     Args:
@@ -328,9 +336,14 @@ def check_residuals(
     of_start = signals[..., 2] * amplitudes[:, 2:]
     own_gain = signals[..., 0] * amplitudes[:, :1] if gains_scatter else 0.0
     regions = locate(
-        breaths, simulated + of_start + own_gain, noise_sd, flow, volume,
-        settings=settings, least=settings.negligible,
-    )  # fmt: skip
+        breaths,
+        simulated + of_start + own_gain,
+        noise_sd,
+        flow,
+        volume,
+        settings=settings,
+        least=settings.negligible,
+    )
     lungs = np.unique(breaths.lung_ids, return_inverse=True)[1]
     series: dict[Quantity, Floats] = {
         "gain": amplitudes[:, 0],

@@ -313,9 +313,15 @@ class _Bench:
     """
 
     def __init__(
-        self, entry: Submission, runner: Runner, track: str | None, rigs: Rigs,
-        chosen: Sequence[int], lines: Sequence[Stressor], rig: bool,
-    ) -> None:  # fmt: skip
+        self,
+        entry: Submission,
+        runner: Runner,
+        track: str | None,
+        rigs: Rigs,
+        chosen: Sequence[int],
+        lines: Sequence[Stressor],
+        rig: bool,
+    ) -> None:
         self._entry, self._runner = entry, runner
         self.lungs, self.lines = [rigs.lungs[k] for k in chosen], lines
         names = [lung.id for lung in self.lungs]
@@ -380,9 +386,13 @@ class _Bench:
             )
             try:
                 run = step_through(
-                    plants, nominal_scenario(pip.ravel()), self._runner, self._entry, self._tasks,
+                    plants,
+                    nominal_scenario(pip.ravel()),
+                    self._runner,
+                    self._entry,
+                    self._tasks,
                     changing=True,
-                )  # fmt: skip
+                )
             except PlantError as error:  # such physics cannot be: the search goes round it
                 broken = divmod(error.index, len(self.lungs))
                 if not points[broken].any():

@@ -114,9 +114,11 @@ def open_submission(name: str) -> Submission:
         problems.append(f"{name}: {size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:g} MB are accepted")
     if len(seeds(folder)) > MAX_SEEDS:
         problems.append(f"{name}: more than {MAX_SEEDS} folders in {SEEDS}")
-    for required in (CONTROLLER, MANIFEST):
-        if not (folder / required).is_file():
-            problems.append(f"{name}: {required} is missing")
+    problems.extend(
+        f"{name}: {required} is missing"
+        for required in (CONTROLLER, MANIFEST)
+        if not (folder / required).is_file()
+    )
     if problems:
         raise SubmissionError(*problems)
     manifest = _manifest(folder, f"{name}/{MANIFEST}".replace("//", "/"))

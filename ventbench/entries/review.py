@@ -262,9 +262,11 @@ def _module(name: str) -> Iterator[tuple[str, str]]:
 LISTED = 200
 
 _CHECKS: Mapping[str, Callable[[Path], list[Finding]]] = {
-    "manifest": lambda folder: check_manifest(folder)[0], "files": check_files,
-    "sources": check_sources, "review": review,
-}  # fmt: skip
+    "manifest": lambda folder: check_manifest(folder)[0],
+    "files": check_files,
+    "sources": check_sources,
+    "review": review,
+}
 
 
 def findings_as_json(folder: str, *checks: str) -> list[dict[str, Any]]:

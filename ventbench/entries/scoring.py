@@ -108,9 +108,15 @@ def score(
     """
     entry = as_submission(submission)
     result = run_protocol(
-        entry, load_rigs(simulator), track=track, draws=draws, stress=stress, stressors=stressors,
-        runner=runner_of(entry, sandbox=sandbox), progress=progress,
-    )  # fmt: skip
+        entry,
+        load_rigs(simulator),
+        track=track,
+        draws=draws,
+        stress=stress,
+        stressors=stressors,
+        runner=runner_of(entry, sandbox=sandbox),
+        progress=progress,
+    )
     if len(result.failures) == result.requested[..., 0, 0].size and entry.sha256 is None:
         raise SubmissionError(result.failures[0].message)  # a class or function that never works
     return result
@@ -153,9 +159,14 @@ def run_protocol(
             "physics does not tell the lung and needs an entry of the robustness track"
         )
     what = protocol_of(
-        rigs, draws=draws, drawn=drawn, pips=pips, stress=stress, stressors=stressors,
+        rigs,
+        draws=draws,
+        drawn=drawn,
+        pips=pips,
+        stress=stress,
+        stressors=stressors,
         reference=reference,
-    )  # fmt: skip
+    )
     count = _counted(progress, 1 + stress)
     with compilation.float64():
         run = run_cells(what.cells, runner, submission, tasks, count)
@@ -189,9 +200,13 @@ def run_protocol(
         for x in (scenario.peep, pip, scenario.dt)
     )
     return Score(
-        submission=submission, track=track, protocol=what,
-        runs=runs_of(run, what.cells, submission, tasks), stressed=under_stress,
-        controllable=controllable, figures=figures(InspirationSignals(*signals, *levels)),
+        submission=submission,
+        track=track,
+        protocol=what,
+        runs=runs_of(run, what.cells, submission, tasks),
+        stressed=under_stress,
+        controllable=controllable,
+        figures=figures(InspirationSignals(*signals, *levels)),
         below=np.sum(requested < 0.0, axis=(1, 2, 3)),
         above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3)),
         trajectories=end_to_end(submission.manifest.name, track, names, what.pips, *joined),
@@ -201,7 +216,7 @@ def run_protocol(
             "act_median_us": 1e6 * float(np.median(run.act_seconds)),
             "act_max_us": 1e6 * float(np.max(run.act_seconds)),
         },
-    )  # fmt: skip
+    )
 
 
 def _counted(progress: Progress | None, sessions: int) -> Callable[[], object]:
@@ -279,12 +294,19 @@ def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Seque
         return values.reshape(len(cells.conditions), count, draws * pips, *values.shape[4:])
 
     return Runs(
-        conditions=cells.conditions, lungs=lungs, pips=cells.pips.reshape(count, -1),
-        rig=np.repeat(cells.rig, pips, axis=1), member=np.repeat(cells.member, pips, axis=1),
-        error=flat(error), safe=flat(safe), survived=flat(survived),
+        conditions=cells.conditions,
+        lungs=lungs,
+        pips=cells.pips.reshape(count, -1),
+        rig=np.repeat(cells.rig, pips, axis=1),
+        member=np.repeat(cells.member, pips, axis=1),
+        error=flat(error),
+        safe=flat(safe),
+        survived=flat(survived),
         alarm_s=flat(time_above_alarm(*by_breath).max(axis=-1)),
-        peak=flat(run.pressure.max(axis=(-2, -1))), volume=flat(volume),
-        draw=np.repeat(cells.draw, pips), plateau_error=flat(plateau),
+        peak=flat(run.pressure.max(axis=(-2, -1))),
+        volume=flat(volume),
+        draw=np.repeat(cells.draw, pips),
+        plateau_error=flat(plateau),
         requested=flat(run.requested),
         failures=[
             CellFailure(
@@ -297,7 +319,7 @@ def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Seque
             )
             for (s, lung, draw, at), failure in sorted(run.failures.items())
         ],
-    )  # fmt: skip
+    )
 
 
 #: Where an entry is tried, in the order of the table.

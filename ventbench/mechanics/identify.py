@@ -269,21 +269,40 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
         R, C = (Estimate(math.nan, unit, (math.nan, math.nan)) for unit in _UNITS)
         match = LungMatch(name, R.value, C.value, R.ci95, C.ci95, False, source)
         return Mechanics(
-            name, R, C, full.offset(), (), match, noise, len(table), samples, (problem, *notes),
+            name,
+            R,
+            C,
+            full.offset(),
+            (),
+            match,
+            noise,
+            len(table),
+            samples,
+            (problem, *notes),
             faults,
-        )  # fmt: skip
+        )
     match = match_label(label, best.resistance, best.compliance(), source)
     return Mechanics(
-        name, best.resistance(0.0), best.compliance(), full.offset(),
+        name,
+        best.resistance(0.0),
+        best.compliance(),
+        full.offset(),
         (*_with_equivalent_lag(delayed_by, best), *(full.term(term) for term in selected)),
-        match, noise, len(table), samples, notes, faults,
-    )  # fmt: skip
+        match,
+        noise,
+        len(table),
+        samples,
+        notes,
+        faults,
+    )
 
 
 def _fit_lung(
-    table: CrossProducts, selected: tuple[SelectedTerm, ...], segments: tuple[Segment, ...],
+    table: CrossProducts,
+    selected: tuple[SelectedTerm, ...],
+    segments: tuple[Segment, ...],
     breaths: Breaths,
-) -> LungFit:  # fmt: skip
+) -> LungFit:
     columns = (*range(len(BASE)), *(term.column for term in selected))
     fitted = fit(table, np.ones(len(table), bool), columns)
     # A flow may jump between two samples, which a measured volume shows.

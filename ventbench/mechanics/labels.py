@@ -120,9 +120,16 @@ def match_label(
     if same and known:  # what holds comes first, whatever is nearer
         near.sort(key=lambda setting: setting != label.id)
     return LungMatch(
-        label.id, at.value, compliance.value, at.ci95, compliance.ci95, same and known, source,
-        tuple(near), informative=known or not same,
-    )  # fmt: skip
+        label.id,
+        at.value,
+        compliance.value,
+        at.ci95,
+        compliance.ci95,
+        same and known,
+        source,
+        tuple(near),
+        informative=known or not same,
+    )
 
 
 def _is_informative(ci95: tuple[float, float], apparatus: float = 0.0) -> bool:

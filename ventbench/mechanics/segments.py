@@ -86,10 +86,11 @@ def segments(breaths: Breaths) -> tuple[Segment, ...]:
         for start, stop in parts:
             part = slice(start, stop)
             signals = _smoothed(
-                breaths.time[i, part], pressure[i, part],
+                breaths.time[i, part],
+                pressure[i, part],
                 None if flow is None else flow[i, part],
                 None if volume is None else volume[i, part],
-            )  # fmt: skip
+            )
             if signals is not None:
                 smoothed.append(Segment(i, start == 0, *signals))
     return tuple(smoothed)
@@ -112,9 +113,10 @@ def _smoothed(
     filled: Any = integrate(time, flow) if volume is None and flow is not None else volume
     flows = np.isfinite(filled)
     flows &= True if flow is None else np.isfinite(flow)
-    fine = np.concatenate([
-        np.arange(start + half, stop - half, step) for start, stop in runs(flows)
-    ] or [np.zeros(0, int)])  # fmt: skip
+    fine = np.concatenate(
+        [np.arange(start + half, stop - half, step) for start, stop in runs(flows)]
+        or [np.zeros(0, int)]
+    )
     rows, begins = _compared(fine, flows & np.isfinite(pressure), half, step)
     if len(rows) < FEWEST_SAMPLES:
         return None

@@ -320,13 +320,21 @@ class _DelayFamily:
 #: Circuits from 0 to 4 mL/cmH2O, and sensors from 0 to 150 ms. A lag shorter than a sample at
 #: 100 Hz cannot be told from clocks that differ, so that it is not reported.
 _CIRCUIT = _DelayFamily(
-    "circuit_compliance", "compliance", "mL/cmH2O", tuple(np.arange(0.0, 4.01, 0.25).tolist()),
-    least=0.1, deviation=0.02,
-)  # fmt: skip
+    "circuit_compliance",
+    "compliance",
+    "mL/cmH2O",
+    tuple(np.arange(0.0, 4.01, 0.25).tolist()),
+    least=0.1,
+    deviation=0.02,
+)
 _SENSOR = _DelayFamily(
-    "sensor_lag", "tau", "s", tuple(np.arange(0.0, 0.1501, 0.01).tolist()),
-    least=0.01, deviation=0.001,
-)  # fmt: skip
+    "sensor_lag",
+    "tau",
+    "s",
+    tuple(np.arange(0.0, 0.1501, 0.01).tolist()),
+    least=0.01,
+    deviation=0.001,
+)
 
 
 def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> Term | None:

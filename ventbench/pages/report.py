@@ -166,9 +166,8 @@ def comparison(
             texts[key] = f"{number(abs(value))} cmH2O, {where}"
     drawn = panels.paired_draws(given[0], given[other]) if given is not None else None
     mean, low, high = (
-        ("", "", "") if drawn is None
-        else (number(x, sign=True) for x in (drawn.mean, *drawn.ci95))
-    )  # fmt: skip
+        ("", "", "") if drawn is None else (number(x, sign=True) for x in (drawn.mean, *drawn.ci95))
+    )
     return {
         "name": names[other],
         "lungs": int(np.sum(lungs < 0.0)),

@@ -147,9 +147,15 @@ def _quantities(run: Trajectories) -> tuple[tuple[str, str, Floats], ...]:
 
 
 def send(
-    stream: rr.RecordingStream, entity: str, time: Floats, values: Floats, series: list[str],
-    colors: list[str], width: float, timeline: str = TIMELINE,
-) -> None:  # fmt: skip
+    stream: rr.RecordingStream,
+    entity: str,
+    time: Floats,
+    values: Floats,
+    series: list[str],
+    colors: list[str],
+    width: float,
+    timeline: str = TIMELINE,
+) -> None:
     """Log lines: style once, values in bulk; ``values`` has shape ``(series, T)``."""
     n = len(series)
     look = rr.SeriesLines(

@@ -6,6 +6,17 @@ from ventbench.physics.mechanism import Description, Mechanism, Parameter
 from ventbench.physics.model import Physics, PhysicsState, physics
 
 __all__ = [
-    "Description", "Mechanism", "Parameter", "Physics", "PhysicsState", "library", "mechanism",
-    "parameter", "paths", "physics", "resolution", "resolution_of", "strength_path",
-]  # fmt: skip
+    "Description",
+    "Mechanism",
+    "Parameter",
+    "Physics",
+    "PhysicsState",
+    "library",
+    "mechanism",
+    "parameter",
+    "paths",
+    "physics",
+    "resolution",
+    "resolution_of",
+    "strength_path",
+]

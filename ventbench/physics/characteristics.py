@@ -173,9 +173,14 @@ def _late_outlet(
 
 
 def _response(
-    shown: Mechanism, own: Values, hook: Callable[..., Pair], end: float, low: float, high: float,
+    shown: Mechanism,
+    own: Values,
+    hook: Callable[..., Pair],
+    end: float,
+    low: float,
+    high: float,
     y_label: str,
-) -> Characteristic:  # fmt: skip
+) -> Characteristic:
     """Response to a step from ``low`` to ``high`` at time zero, with the edge as a vertical."""
     state, after = jnp.asarray(low), []
     if shown.stateful:
@@ -202,9 +207,12 @@ def _sensor(shown: Mechanism, own: Values) -> Characteristic:
         true = np.full_like(x, _HIGH)
         after = shown.sensor_output(own, jnp.asarray(true), jnp.asarray(x))
         return Characteristic(
-            100 * x, true, _floats(after), "share of the recording, %",
+            100 * x,
+            true,
+            _floats(after),
+            "share of the recording, %",
             f"reading at {_HIGH:.0f} cmH2O",
-        )  # fmt: skip
+        )
     x = np.linspace(0.0, _PRESSURE, _STATIC)
     after = shown.sensor_output(own, jnp.asarray(x), jnp.asarray(0.0))
     return Characteristic(
@@ -220,15 +228,32 @@ def _view(
     zero = jnp.zeros(shape)
     elastance = 1e3 / base["C"]
     view = View(
-        zero, zero, zero, zero, zero, zero + 1e-3, zero + elastance, zero + base["PEEP"], zero,
-        zero + base["R"], zero + 1.0 / base["R_ex"], zero,
-    ).replace(state=jnp.asarray(state), **changed)  # type: ignore[attr-defined]  # fmt: skip
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero + 1e-3,
+        zero + elastance,
+        zero + base["PEEP"],
+        zero,
+        zero + base["R"],
+        zero + 1.0 / base["R_ex"],
+        zero,
+    ).replace(state=jnp.asarray(state), **changed)  # type: ignore[attr-defined]
     network = Network(
-        inflow=zero + _FLOW, circuit=zero, leak=zero, leak_flow=zero,
+        inflow=zero + _FLOW,
+        circuit=zero,
+        leak=zero,
+        leak_flow=zero,
         outlet=view.opened * view.outlet,
-        behind=view.peep, resistance=view.resistance, quadratic=zero, inertance=zero,
-        recoil=view.elastance * view.volume, elastance=view.elastance,
-    )  # fmt: skip
+        behind=view.peep,
+        resistance=view.resistance,
+        quadratic=zero,
+        inertance=zero,
+        recoil=view.elastance * view.volume,
+        elastance=view.elastance,
+    )
     return view, network
 
 
@@ -275,24 +300,36 @@ def _network(
     return (
         curve(flow, before, after, "flow into the lung, L/s", "pressure along the airway, cmH2O")
         or curve(
-            acceleration, a.inertance[0] * acceleration, b.inertance[0] * acceleration,
-            "acceleration of the flow, L/s2", "pressure that it takes, cmH2O",
+            acceleration,
+            a.inertance[0] * acceleration,
+            b.inertance[0] * acceleration,
+            "acceleration of the flow, L/s2",
+            "pressure that it takes, cmH2O",
         )
         or curve(
-            pressure, 1e3 * a.circuit[0] * pressure, 1e3 * b.circuit[0] * pressure, p_label,
+            pressure,
+            1e3 * a.circuit[0] * pressure,
+            1e3 * b.circuit[0] * pressure,
+            p_label,
             "gas that the circuit takes up, mL",
         )
         or curve(time, -e.recoil, -f.recoil, "time in the breath, s", "pull of the muscles, cmH2O")
         or curve(1e3 * volume, c.recoil, d.recoil, "volume, mL", "recoil of the lung, cmH2O")
         or curve(
-            1e3 * volume, c.resistance, d.resistance, "volume, mL",
+            1e3 * volume,
+            c.resistance,
+            d.resistance,
+            "volume, mL",
             "resistance of the airway, cmH2O/(L/s)",
         )
         or curve(
-            across, 1e3 * g.outlet, 1e3 * h.outlet, "pressure above PEEP, cmH2O",
+            across,
+            1e3 * g.outlet,
+            1e3 * h.outlet,
+            "pressure above PEEP, cmH2O",
             "conductance of the open expiratory valve, mL/s per cmH2O",
         )
-    )  # fmt: skip
+    )
 
 
 def _hold(
@@ -307,9 +344,12 @@ def _hold(
     linear, acting = [0.0], [0.0]
     for now in flow:
         view, network = _view(
-            base, state, volume=jnp.asarray(volume), length=jnp.asarray(length),
+            base,
+            state,
+            volume=jnp.asarray(volume),
+            length=jnp.asarray(length),
             flow=jnp.asarray(now),
-        )  # fmt: skip
+        )
         after = shown.network(own, network, view)
         linear.append(float(network.recoil + network.elastance * length * now))
         acting.append(float(after.recoil + after.elastance * length * now))

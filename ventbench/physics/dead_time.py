@@ -52,9 +52,13 @@ def resolution_of(dt: Floats) -> tuple[int, int]:
 
 
 def windows(
-    dt: Array, past: tuple[Array, ...], dead_times: tuple[Array | float, ...],
-    held: tuple[tuple[Array, ...], ...], count: int, skip_idle: bool = False,
-) -> tuple[Array, ...]:  # fmt: skip
+    dt: Array,
+    past: tuple[Array, ...],
+    dead_times: tuple[Array | float, ...],
+    held: tuple[tuple[Array, ...], ...],
+    count: int,
+    skip_idle: bool = False,
+) -> tuple[Array, ...]:
     """Cut a sample into substeps, and average delayed commands over each of them.
 
     Samples, substeps and cuts are arrays of their own, or the first axis: an operation on a whole
@@ -138,9 +142,12 @@ def window_weights(start: Array, length: Array, past: tuple[Array, ...]) -> list
 
 
 def _mean(
-    _: object, delay: Array, lengths: tuple[Array, ...], past: tuple[Array, ...],
+    _: object,
+    delay: Array,
+    lengths: tuple[Array, ...],
+    past: tuple[Array, ...],
     values: tuple[Array, ...],
-) -> tuple[Array, ...]:  # fmt: skip
+) -> tuple[Array, ...]:
     """Mean over each substep of what was commanded ``delay`` seconds before, ``(...)`` each."""
     means, start = [], 0.0 - delay
     for length in lengths:

@@ -118,37 +118,88 @@ REFITTED = ("R", "C", "R_ex", "PEEP")
 #: that a breath starts from. R and C stand for a label that must be given.
 BASE_PARAMETERS = (
     Parameter(
-        "R", "cmH2O/(L/s)", "resistance of the airway", 0.5, 200.0, 20.0, 20.0, 50.0, "log",
+        "R",
+        "cmH2O/(L/s)",
+        "resistance of the airway",
+        0.5,
+        200.0,
+        20.0,
+        20.0,
+        50.0,
+        "log",
         follows="R",
     ),
     Parameter(
-        "C", "mL/cmH2O", "compliance of the lung at low volume", 2.0, 250.0, 20.0, 20.0, 50.0,
-        "log", follows="C",
+        "C",
+        "mL/cmH2O",
+        "compliance of the lung at low volume",
+        2.0,
+        250.0,
+        20.0,
+        20.0,
+        50.0,
+        "log",
+        follows="C",
     ),
     Parameter(
-        "gain", "mL/s per %", "flow of the inspiratory valve", 2.0, 100.0, VALVE_GAIN, VALVE_GAIN,
-        VALVE_GAIN, "log",
+        "gain",
+        "mL/s per %",
+        "flow of the inspiratory valve",
+        2.0,
+        100.0,
+        VALVE_GAIN,
+        VALVE_GAIN,
+        VALVE_GAIN,
+        "log",
     ),
     Parameter(
-        "R_ex", "cmH2O/(L/s)", "resistance of the expiratory path", 0.3, 100.0,
-        EXPIRATORY_RESISTANCE, EXPIRATORY_RESISTANCE, EXPIRATORY_RESISTANCE, "log",
+        "R_ex",
+        "cmH2O/(L/s)",
+        "resistance of the expiratory path",
+        0.3,
+        100.0,
+        EXPIRATORY_RESISTANCE,
+        EXPIRATORY_RESISTANCE,
+        EXPIRATORY_RESISTANCE,
+        "log",
     ),
+    Parameter("PEEP", "cmH2O", "pressure behind the expiratory valve", -10.0, 30.0, 5.0, 5.0, 5.0),
     Parameter(
-        "PEEP", "cmH2O", "pressure behind the expiratory valve", -10.0, 30.0, 5.0, 5.0, 5.0
-    ),
-    Parameter(
-        "rest", "%", "command before the first sample of a breath", 0.0, 100.0, 0.0, 0.0, 0.0,
+        "rest",
+        "%",
+        "command before the first sample of a breath",
+        0.0,
+        100.0,
+        0.0,
+        0.0,
+        0.0,
         shape=True,
     ),
     Parameter(
-        "offset", "cmH2O", "recoil minus airway pressure at the first sample", -10.0, 10.0, 0.0,
-        0.0, 0.0, shape=True,
+        "offset",
+        "cmH2O",
+        "recoil minus airway pressure at the first sample",
+        -10.0,
+        10.0,
+        0.0,
+        0.0,
+        0.0,
+        shape=True,
     ),
     Parameter(
-        "position", "1", "of the breath in its recording, 0 first, 1 last", 0.0, 1.0, 0.0, 0.0,
-        1.0, "linear", "breath", shape=True,
+        "position",
+        "1",
+        "of the breath in its recording, 0 first, 1 last",
+        0.0,
+        1.0,
+        0.0,
+        0.0,
+        1.0,
+        "linear",
+        "breath",
+        shape=True,
     ),
-)  # fmt: skip
+)
 
 
 #: Values of a mechanism's parameters, by short name.
@@ -162,9 +213,15 @@ Before = TypeVar("Before")
 
 #: Where in the physics a mechanism sits.
 Site = Literal[
-    "command", "inspiratory valve", "supply", "circuit", "airway", "alveolus", "expiratory valve",
+    "command",
+    "inspiratory valve",
+    "supply",
+    "circuit",
+    "airway",
+    "alveolus",
+    "expiratory valve",
     "sensor",
-]  # fmt: skip
+]
 
 
 @flax.struct.dataclass

@@ -105,15 +105,25 @@ class Physics:
         flow, memory = _commanded(replace(assembly, active={}), u_in, memory)
         rest, ones = _at_rest(assembly, shown, flow), jnp.ones_like(flow)
         state = PhysicsState(
-            rest, memory, (flow,) * (self.memory + 1), (ones,) * (self.memory + 1),
-            (0.03 * ones,) * self.memory, 0.0 * ones, rest.volume, peep * ones,
-        )  # fmt: skip
+            rest,
+            memory,
+            (flow,) * (self.memory + 1),
+            (ones,) * (self.memory + 1),
+            (0.03 * ones,) * self.memory,
+            0.0 * ones,
+            rest.volume,
+            peep * ones,
+        )
         return state, Signals(shown, rest.pressure, 1000.0 * rest.flow, 0.0 * ones)
 
     def step(
-        self, state: PhysicsState, u_in: Array, u_out: Array, dt: Array,
+        self,
+        state: PhysicsState,
+        u_in: Array,
+        u_out: Array,
+        dt: Array,
         divisions: int | Array | None = None,
-    ) -> tuple[PhysicsState, Signals]:  # fmt: skip
+    ) -> tuple[PhysicsState, Signals]:
         """Hold one command; see :class:`~ventbench.task.interfaces.Plant`.
 
         ``divisions`` are steps of the integrator in a substep; the model's own if not given. The
@@ -131,9 +141,13 @@ class Physics:
             lambda mechanism, own: mechanism.outlet_dead_time(own, u_out, time)
         )
         lengths, open_for, commanded_flow = dead_time.windows(
-            dt, state.past, (outlet_delay, delay), (opened, commanded), self.substeps,
+            dt,
+            state.past,
+            (outlet_delay, delay),
+            (opened, commanded),
+            self.substeps,
             self.skip_idle,
-        )  # fmt: skip
+        )
         held = (commanded_flow, open_for, lengths)
 
         def advance(k: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
@@ -149,9 +163,15 @@ class Physics:
         count = divisions * len(held[0])
         now, time = jax.lax.fori_loop(0, count, advance, (state.continuous, state.time))
         after = PhysicsState(
-            now, memory, commanded[:-1], opened[:-1],
-            (dt + zero, *state.past)[:-1], time, state.first, state.peep,
-        )  # fmt: skip
+            now,
+            memory,
+            commanded[:-1],
+            opened[:-1],
+            (dt + zero, *state.past)[:-1],
+            time,
+            state.first,
+            state.peep,
+        )
         volume = 1000.0 * (now.volume - state.first)
         reading = _sensor_output(assembly, now.reading)
         return after, Signals(reading, now.pressure, 1000.0 * now.flow, volume)
@@ -266,9 +286,14 @@ def _at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousStat
 
 
 def _substep(
-    assembly: Assembly, now: ContinuousState, commanded_flow: Array, opened: Array, time: Array,
-    h: Array, peep: Array,
-) -> ContinuousState:  # fmt: skip
+    assembly: Assembly,
+    now: ContinuousState,
+    commanded_flow: Array,
+    opened: Array,
+    time: Array,
+    h: Array,
+    peep: Array,
+) -> ContinuousState:
     """Advance by ``h`` seconds in two stages, the second of which ends the substep."""
 
     def advance(guess: ContinuousState, place: tuple[Array, Array]) -> tuple[ContinuousState, None]:
@@ -293,9 +318,16 @@ def _sensor_output(assembly: Assembly, reading: Array) -> Array:
 
 
 def _implicit(
-    assembly: Assembly, now: ContinuousState, guess: ContinuousState, ahead: Array,
-    commanded_flow: Array, opened: Array, time: Array, length: Array, peep: Array,
-) -> ContinuousState:  # fmt: skip
+    assembly: Assembly,
+    now: ContinuousState,
+    guess: ContinuousState,
+    ahead: Array,
+    commanded_flow: Array,
+    opened: Array,
+    time: Array,
+    length: Array,
+    peep: Array,
+) -> ContinuousState:
     """Backward Euler step of ``length`` seconds that ends at ``time``.
 
     It starts at the share ``ahead`` of the way from ``now`` to ``guess``, which is near its end.
@@ -332,15 +364,26 @@ def _implicit(
 
 
 def _network(
-    assembly: Assembly, start: ContinuousState, inflow: Array, view: View,
+    assembly: Assembly,
+    start: ContinuousState,
+    inflow: Array,
+    view: View,
     state: Callable[[str], Array],
-) -> Network:  # fmt: skip
+) -> Network:
     zero = jnp.zeros_like(start.volume)
     network = Network(
-        inflow=inflow, circuit=zero, leak=zero, leak_flow=zero, outlet=view.opened * view.outlet,
-        behind=view.peep, resistance=view.resistance + zero, quadratic=zero, inertance=zero,
-        recoil=view.elastance * start.volume, elastance=view.elastance + zero,
-    )  # fmt: skip
+        inflow=inflow,
+        circuit=zero,
+        leak=zero,
+        leak_flow=zero,
+        outlet=view.opened * view.outlet,
+        behind=view.peep,
+        resistance=view.resistance + zero,
+        quadratic=zero,
+        inertance=zero,
+        recoil=view.elastance * start.volume,
+        elastance=view.elastance + zero,
+    )
     for name, mechanism in assembly.mechanisms.items():
         if mechanism.has("network"):
             network = assembly.change(name, _joined, network, partial(state, name), view)
@@ -348,14 +391,29 @@ def _network(
 
 
 def _view(
-    assembly: Assembly, start: ContinuousState, guess: ContinuousState, opened: Array, time: Array,
-    length: Array, peep: Array,
-) -> View:  # fmt: skip
+    assembly: Assembly,
+    start: ContinuousState,
+    guess: ContinuousState,
+    opened: Array,
+    time: Array,
+    length: Array,
+    peep: Array,
+) -> View:
     base = assembly.base
     return View(
-        time, start.volume, guess.pressure, guess.flow, jnp.zeros_like(start.volume), length,
-        1e3 / base["C"], peep, base["position"], base["R"], 1.0 / base["R_ex"], opened,
-    )  # fmt: skip
+        time,
+        start.volume,
+        guess.pressure,
+        guess.flow,
+        jnp.zeros_like(start.volume),
+        length,
+        1e3 / base["C"],
+        peep,
+        base["position"],
+        base["R"],
+        1.0 / base["R_ex"],
+        opened,
+    )
 
 
 def _inflow(
@@ -371,9 +429,13 @@ def _joined(
 
 
 def _after(
-    mechanism: Mechanism, own: Values, before: Pair, state: Callable[[], Array] | None, flow: Array,
+    mechanism: Mechanism,
+    own: Values,
+    before: Pair,
+    state: Callable[[], Array] | None,
+    flow: Array,
     view: View,
-) -> Pair:  # fmt: skip
+) -> Pair:
     reading, new_state = before
     if mechanism.stateful and state is not None:
         new_state = state()

@@ -199,10 +199,17 @@ def _frozen(
     loaded: frozen.Frozen, name: str, lungs: tuple[Lung, ...], official: bool
 ) -> Simulators:
     return Simulators(
-        "frozen", name, loaded.about(), lungs, loaded.manifest_sha256,
-        loaded if official else None, lambda: loaded.plants,
-        loaded.for_breaths, loaded.cross_fitted, loaded,
-    )  # fmt: skip
+        "frozen",
+        name,
+        loaded.about(),
+        lungs,
+        loaded.manifest_sha256,
+        loaded if official else None,
+        lambda: loaded.plants,
+        loaded.for_breaths,
+        loaded.cross_fitted,
+        loaded,
+    )
 
 
 def _at_label(name: str, make: Callable[[Lung], Plant], for_breaths: PlantsFor) -> Simulators:
@@ -256,9 +263,15 @@ def _plants(
         return stack_heterogeneous([plants[key] for key in breaths.lung_ids.tolist()])
 
     return Simulators(
-        "plants", name, about, tuple(lung(key) for key in plants), sha256, None,
-        lambda: stack_heterogeneous(list(plants.values())), for_breaths,
-    )  # fmt: skip
+        "plants",
+        name,
+        about,
+        tuple(lung(key) for key in plants),
+        sha256,
+        None,
+        lambda: stack_heterogeneous(list(plants.values())),
+        for_breaths,
+    )
 
 
 def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
@@ -266,9 +279,15 @@ def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
         return jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), plant)
 
     return Simulators(
-        "plants", name, _about("plant", sha256, plant=name), LUNGS, sha256, None,
-        partial(repeated, len(LUNGS)), lambda breaths: VmappedPlant(repeated(len(breaths))),
-    )  # fmt: skip
+        "plants",
+        name,
+        _about("plant", sha256, plant=name),
+        LUNGS,
+        sha256,
+        None,
+        partial(repeated, len(LUNGS)),
+        lambda breaths: VmappedPlant(repeated(len(breaths))),
+    )
 
 
 def _plant_file(path: Path) -> Simulators:

@@ -141,12 +141,18 @@ class Hybrid:
         rest = self.rest + zero
         flow = self.valve(rest)
         state = HybridState(
-            elastic=pressure + self.offset, drop=zero - self.offset, sensor=pressure, flow=flow,
-            commanded=(flow,) * (MEMORY + 1), opened=(zero + 1.0,) * (MEMORY + 1),
-            past=(zero + 0.03,) * MEMORY, plays=tuple(rest for _ in PLAYS), u_in=rest,
+            elastic=pressure + self.offset,
+            drop=zero - self.offset,
+            sensor=pressure,
+            flow=flow,
+            commanded=(flow,) * (MEMORY + 1),
+            opened=(zero + 1.0,) * (MEMORY + 1),
+            past=(zero + 0.03,) * MEMORY,
+            plays=tuple(rest for _ in PLAYS),
+            u_in=rest,
             peep=pressure if peep is None else peep + zero,
             outlet=None if self.closing_lag is None else zero + 1.0,
-        )  # fmt: skip
+        )
         return state, self._signals(state, pressure)
 
     def step(
@@ -195,9 +201,18 @@ class Hybrid:
             + self.falling * jnp.tanh(jnp.minimum(change, 0.0))
         )
         after = HybridState(
-            elastic, drop, sensor, flow, commanded[:-1], opened[:-1],
-            (dt + 0.0 * drop, *state.past[:-1]), plays, u_in, state.peep, opening,
-        )  # fmt: skip
+            elastic,
+            drop,
+            sensor,
+            flow,
+            commanded[:-1],
+            opened[:-1],
+            (dt + 0.0 * drop, *state.past[:-1]),
+            plays,
+            u_in,
+            state.peep,
+            opening,
+        )
         return after, self._signals(after, reading)
 
     def _signals(self, state: HybridState, reading: Array) -> Signals:
@@ -304,9 +319,19 @@ DIRECTION_SUM = 0.98
 DIGITS = 6
 
 _LOGARITHMS = (
-    "valve_delay", "valve_lag", "circuit_compliance", "sensor_lag", "rising", "falling",
-    "conductance", "closing_conductance", "opening_delay", "closing_delay", "closing_lag", "rest",
-)  # fmt: skip
+    "valve_delay",
+    "valve_lag",
+    "circuit_compliance",
+    "sensor_lag",
+    "rising",
+    "falling",
+    "conductance",
+    "closing_conductance",
+    "opening_delay",
+    "closing_delay",
+    "closing_lag",
+    "rest",
+)
 
 #: What the lung decides: resistance at :data:`FLOW`, share of its quadratic part, elastance, offset
 #: and elastic curve. All other numbers are the ventilator's.
@@ -377,12 +402,15 @@ def from_vector(vector: Any, xp: Any = jnp) -> Hybrid:
     at += _PLAYS
     laminar = xp.exp(resistance) / (1.0 + xp.exp(turbulence))
     return Hybrid(
-        R=laminar, K2=laminar * xp.exp(turbulence) / FLOW, E=xp.exp(elastance),
-        stiffening=xp.diff(slope, axis=-1, prepend=xp.ones_like(slope[..., :1])), offset=offset,
+        R=laminar,
+        K2=laminar * xp.exp(turbulence) / FLOW,
+        E=xp.exp(elastance),
+        stiffening=xp.diff(slope, axis=-1, prepend=xp.ones_like(slope[..., :1])),
+        offset=offset,
         slopes=shape * (xp.exp(size) / (shape * _WIDTHS).sum(axis=-1))[..., None],
         direction=-DIRECTION_SUM * odds / (1.0 + odds.sum(axis=-1, keepdims=True)),
         **{name: xp.exp(vector[..., at + k]) for k, name in enumerate(_LOGARITHMS)},
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,9 +42,13 @@ class Rigs:
         return 1 if self.sessions is None else jax.tree.leaves(self.plants)[0].shape[0]
 
     def draws(
-        self, n: int, pips: Sequence[float] = protocol.PIPS, *,
-        seed: bytes = draw_tables.DEVELOPMENT_SEED, name: str = draw_tables.DEVELOPMENT,
-    ) -> Draws:  # fmt: skip
+        self,
+        n: int,
+        pips: Sequence[float] = protocol.PIPS,
+        *,
+        seed: bytes = draw_tables.DEVELOPMENT_SEED,
+        name: str = draw_tables.DEVELOPMENT,
+    ) -> Draws:
         """Return the first n draws of a seed on these rigs at some of the protocol's PIPs.
 
         Raises:
@@ -61,9 +65,14 @@ class Rigs:
         ]
         drawn = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
         return draw_tables.build(
-            sessions, self.members, held_out=self.held_out, drawn=drawn, seed=seed, name=name,
+            sessions,
+            self.members,
+            held_out=self.held_out,
+            drawn=drawn,
+            seed=seed,
+            name=name,
             pips=pips,
-        ).first(n)  # fmt: skip
+        ).first(n)
 
     @property
     def of_training(self) -> Rigs:
@@ -109,6 +118,11 @@ def load_rigs(simulator: Given = "frozen") -> Rigs:
 def rigs_of(official: Any) -> Rigs:
     """Rigs of a set of simulators, such as :func:`ventbench.plants.frozen.load` returns."""
     return Rigs(
-        LUNGS, official.sessions_plants, official.rigs, official.about(),
-        official.manifest_sha256, official.held_out_rigs, official.population,
-    )  # fmt: skip
+        LUNGS,
+        official.sessions_plants,
+        official.rigs,
+        official.about(),
+        official.manifest_sha256,
+        official.held_out_rigs,
+        official.population,
+    )

@@ -162,9 +162,12 @@ class Simulators:
         return self._training.perhaps_copies(breaths)
 
     def pressures(
-        self, breaths: Breaths, *, cross_fitted: bool = False,
+        self,
+        breaths: Breaths,
+        *,
+        cross_fitted: bool = False,
         progress: Callable[[int], object] | None = None,
-    ) -> Floats:  # fmt: skip
+    ) -> Floats:
         """Open-loop answers to recorded commands, each from the first recorded pressure.
 
         Args:
@@ -229,9 +232,11 @@ class Simulators:
         return f"{self.name} holds simulated pressures of recorded breaths, not a simulator."
 
     def _by_function(
-        self, function: PythonSimulator, breaths: Breaths,
+        self,
+        function: PythonSimulator,
+        breaths: Breaths,
         progress: Callable[[int], object] | None,
-    ) -> Floats:  # fmt: skip
+    ) -> Floats:
         answers = np.full(breaths.pressure.shape, np.nan)
         for i, start in enumerate(breaths.pressure[:, 0].tolist()):
             if np.isfinite(start):
@@ -249,9 +254,16 @@ class Simulators:
         return answers
 
     def _call(
-        self, function: PythonSimulator, u_in: Floats, u_out: Floats, dt: Floats, label: Lung,
-        start: float, what: str, flow: Floats | None = None,
-    ) -> Floats:  # fmt: skip
+        self,
+        function: PythonSimulator,
+        u_in: Floats,
+        u_out: Floats,
+        dt: Floats,
+        label: Lung,
+        start: float,
+        what: str,
+        flow: Floats | None = None,
+    ) -> Floats:
         commands = {"u_in": u_in, "u_out": u_out, "dt": dt}
         given: dict[str, Any] = {key: np.array(column, float) for key, column in commands.items()}
         given |= {"R": label.R, "C": label.C, "initial_pressure": float(start), "flow": flow}

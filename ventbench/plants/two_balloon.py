@@ -114,9 +114,13 @@ class TwoBalloon:
 
 
 def two_balloon(
-    lung: Lung, *, gain: ArrayLike = VALVE_GAIN, R_ex: ArrayLike = EXPIRATORY_RESISTANCE,
-    K: ArrayLike = BALLOON_PRESSURE, supply: ArrayLike = SUPPLY_PRESSURE,
-) -> TwoBalloon:  # fmt: skip
+    lung: Lung,
+    *,
+    gain: ArrayLike = VALVE_GAIN,
+    R_ex: ArrayLike = EXPIRATORY_RESISTANCE,
+    K: ArrayLike = BALLOON_PRESSURE,
+    supply: ArrayLike = SUPPLY_PRESSURE,
+) -> TwoBalloon:
     """Build a :class:`TwoBalloon` lung of a label; what it does not say is as of the class.
 
     Raises:

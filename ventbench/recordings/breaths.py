@@ -235,9 +235,12 @@ def valid_mask(lengths: np.ndarray, width: int | None = None) -> np.ndarray:
 
 
 def arranged(
-    lengths: np.ndarray, time: np.ndarray, samples: Mapping[str, np.ndarray],
-    width: int | None = None, **rest: Any,
-) -> Breaths:  # fmt: skip
+    lengths: np.ndarray,
+    time: np.ndarray,
+    samples: Mapping[str, np.ndarray],
+    width: int | None = None,
+    **rest: Any,
+) -> Breaths:
     """Make breaths of consecutive samples; short ones are padded.
 
     Args:
@@ -254,10 +257,17 @@ def arranged(
 
 
 def make_breaths(
-    breath_id: ArrayLike, R: ArrayLike, C: ArrayLike, time: ArrayLike, u_in: ArrayLike,
-    u_out: ArrayLike, pressure: ArrayLike, *, flow: ArrayLike | None = None,
+    breath_id: ArrayLike,
+    R: ArrayLike,
+    C: ArrayLike,
+    time: ArrayLike,
+    u_in: ArrayLike,
+    u_out: ArrayLike,
+    pressure: ArrayLike,
+    *,
+    flow: ArrayLike | None = None,
     volume: ArrayLike | None = None,
-) -> Breaths:  # fmt: skip
+) -> Breaths:
     """Make breaths of equal length from arrays, for instance from a simulation.
 
     Arguments have the units and shapes of the attributes of :class:`Breaths`, and are copied. All

@@ -88,10 +88,18 @@ def decimate(breaths: Breaths) -> Decimation:
     width = -(-int(counts.max()) // _MULTIPLE) * _MULTIPLE
     flat = {name: np.concatenate(parts) for name, parts in columns.items()}
     fewer = arranged(
-        counts, flat.pop("time"), flat, width,
-        breath_id=breaths.breath_id, R=breaths.R, C=breaths.C, time_inferred=breaths.time_inferred,
-        source=breaths.source, sha256=breaths.sha256, notes=breaths.notes,
-    )  # fmt: skip
+        counts,
+        flat.pop("time"),
+        flat,
+        width,
+        breath_id=breaths.breath_id,
+        R=breaths.R,
+        C=breaths.C,
+        time_inferred=breaths.time_inferred,
+        source=breaths.source,
+        sha256=breaths.sha256,
+        notes=breaths.notes,
+    )
     index = np.stack(
         [np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes, _ in kept]
     )

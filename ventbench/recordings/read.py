@@ -109,9 +109,12 @@ def simulated_pressures(
 
 
 def _at_times(
-    values: Floats, at: Floats, wanted: Floats, file: str,
+    values: Floats,
+    at: Floats,
+    wanted: Floats,
+    file: str,
     number: int,
-) -> Floats:  # fmt: skip
+) -> Floats:
     if len(at) < 2 or not np.all(np.diff(at) > 0):
         raise InputError(f"{file}: the times of breath {number} do not increase")
     if at[-1] < wanted[-1] - (at[-1] - at[-2]) - 1e-9:
@@ -490,9 +493,15 @@ def _assemble(scanned: Scanned, file: str) -> Breaths:
         start, length = scanned.starts[i], scanned.lengths[i]
         time[start : start + length] = dt * np.arange(length)
     return arranged(
-        scanned.lengths, time, scanned.samples, breath_id=scanned.breath_id, R=scanned.R,
-        C=scanned.C, time_inferred=scanned.times.blank, source=file,
-    )  # fmt: skip
+        scanned.lengths,
+        time,
+        scanned.samples,
+        breath_id=scanned.breath_id,
+        R=scanned.R,
+        C=scanned.C,
+        time_inferred=scanned.times.blank,
+        source=file,
+    )
 
 
 def recordings_dir() -> Path | None:

@@ -144,9 +144,12 @@ def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
 
 
 def _regression(
-    time: Floats, pressure: Floats, flow: Floats, starts: Ints,
+    time: Floats,
+    pressure: Floats,
+    flow: Floats,
+    starts: Ints,
     breath: Ints,
-) -> dict[str, Floats]:  # fmt: skip
+) -> dict[str, Floats]:
     """Correlation of pressure and flow, and the cross products of p = R Q + V / C + p0."""
     known = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
     q = np.where(known, flow, 0.0)
@@ -216,8 +219,15 @@ def findings(
     found += _times(interval)
     if _agree(figures.get("correlation", np.zeros(0)), _OPPOSITE):
         what = "flow goes out while pressure is high, so it is counted from the patient"
-        found.append(Finding("flow", what, "Pass --invert flow to `ventbench data import`.",
-                             "refused", float(np.nanmedian(figures["correlation"]))))  # fmt: skip
+        found.append(
+            Finding(
+                "flow",
+                what,
+                "Pass --invert flow to `ventbench data import`.",
+                "refused",
+                float(np.nanmedian(figures["correlation"])),
+            )
+        )
     inverted = _agree((figures["inside"] - figures["outside"])[moves], 0.0)
     if inverted and not any(f.column == "flow" for f in found):
         what = "pressure is higher while u_out is 1 than while it is 0, so 0 and 1 are exchanged"
@@ -228,10 +238,15 @@ def findings(
         found += _phases(figures, low, spans, moves)
     found += _pressures(float(np.nanmedian(low)), float(np.nanmedian(high)))
     found += [
-        Finding(s.column, str(s), "What lies beyond the sensor is unknown: widen its range, or "
-                "judge the other samples only.", value=s.level)
+        Finding(
+            s.column,
+            str(s),
+            "What lies beyond the sensor is unknown: widen its range, or "
+            "judge the other samples only.",
+            value=s.level,
+        )
         for s in saturations(figures)
-    ]  # fmt: skip
+    ]
     if not any(f.level == "refused" for f in found):
         found += _labels(figures, R, C)
     return tuple(sorted(found, key=lambda f: f.level))  # what is refused comes first
@@ -273,8 +288,9 @@ def _commands(figures: Mapping[str, Floats]) -> list[Finding]:
     largest = float(figures["u_in"].max())
     if 0.0 < largest <= 1.0:
         what = f"u_in is {largest:.3g} % at most, so it looks like 0 to 1"
-        return [Finding("u_in", what, "Pass --u-in-unit 1 to `ventbench data import`.",
-                        value=largest)]  # fmt: skip
+        return [
+            Finding("u_in", what, "Pass --u-in-unit 1 to `ventbench data import`.", value=largest)
+        ]
     inside, outside = figures["u_in_inside"], figures["u_in_outside"]
     if largest > 0.0 and _agree(inside - outside, 0.0):
         what = "u_in is larger while the expiratory valve is open than in inspiration"
@@ -313,10 +329,13 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
     pairs = np.unique(np.stack([R, C], axis=1), axis=0) if "qq" in figures else []
     for labelled_R, labelled_C in pairs:
         own = (labelled_R == R) & (labelled_C == C)
-        s = {k: float(figures[k][own].sum()) for k in
-             ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p")}  # fmt: skip
-        A = np.array([[s["qq"], s["qv"], s["q1"]], [s["qv"], s["vv"], s["v1"]],
-                      [s["q1"], s["v1"], s["11"]]])  # fmt: skip
+        s = {
+            k: float(figures[k][own].sum())
+            for k in ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p")
+        }
+        A = np.array(
+            [[s["qq"], s["qv"], s["q1"]], [s["qv"], s["vv"], s["v1"]], [s["q1"], s["v1"], s["11"]]]
+        )
         if s["qq"] == 0.0 or np.linalg.matrix_rank(A) < 3:
             continue
         r, e, _ = np.linalg.solve(A, np.array([s["qp"], s["vp"], s["1p"]]))

@@ -237,9 +237,13 @@ def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarr
 
 
 def _add_repeat(
-    rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarray, column: str,
+    rows: Rows,
+    log: ProblemLog,
+    previous: np.ndarray,
+    here: np.ndarray,
+    column: str,
     values: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     what, advice = "the row repeats {other}", "Remove one of the two."
     log.add(here, column, what, advice, values=values[here], others=previous)
 
@@ -411,9 +415,13 @@ def _scanned(rows: Rows, columns: dict[str, np.ndarray]) -> Scanned:
     samples = {name: columns[name] for name in keep if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
     return Scanned(
-        breath_id=columns["breath_id"][starts], R=columns["R"][starts], C=columns["C"][starts],
-        starts=starts, lengths=lengths,
+        breath_id=columns["breath_id"][starts],
+        R=columns["R"][starts],
+        C=columns["C"][starts],
+        starts=starts,
+        lengths=lengths,
         n_inspiratory=leading_zeros(samples["u_out"], starts, lengths),
-        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1), times=times,
+        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
+        times=times,
         samples=samples,
-    )  # fmt: skip
+    )

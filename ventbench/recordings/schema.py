@@ -113,10 +113,16 @@ class ProblemLog:
     _kept: dict[Level, list[_Entry]] = field(default_factory=lambda: {"problem": [], "warning": []})
 
     def add(
-        self, rows: np.ndarray, column: str | None, what: str, advice: str, *,
-        values: np.ndarray | None = None, others: np.ndarray | None = None,
+        self,
+        rows: np.ndarray,
+        column: str | None,
+        what: str,
+        advice: str,
+        *,
+        values: np.ndarray | None = None,
+        others: np.ndarray | None = None,
         level: Level = "problem",
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Add a problem, or a warning, for each row.
 
         Args:
@@ -265,8 +271,10 @@ def _advice(names: Sequence[str], missing: Sequence[str]) -> str:
     hints = []
     for name in missing:
         plain = {other.strip().lower(): other for other in names if other not in COLUMNS}
-        for match in get_close_matches(name.lower(), plain, n=1, cutoff=0.75):
-            hints.append(f"rename {plain[match]!r} to {name}")
+        hints.extend(
+            f"rename {plain[match]!r} to {name}"
+            for match in get_close_matches(name.lower(), plain, n=1, cutoff=0.75)
+        )
     if hints:
         return f"Perhaps {', '.join(hints)}."
     return f"The header is {HEADER}; `ventbench data import` reads other tables."

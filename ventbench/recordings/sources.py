@@ -111,11 +111,12 @@ class CsvSource(Source):
             stream = pa.CompressedInputStream(stream, "gzip")
         whole = {name: column.whole for name, column in COLUMNS.items() if name in self.names}
         convert = arrow_csv.ConvertOptions(
-            column_types={name: pa.int64() if is_whole else pa.float64()
-                          for name, is_whole in whole.items()},
+            column_types={
+                name: pa.int64() if is_whole else pa.float64() for name, is_whole in whole.items()
+            },
             include_columns=list(whole),
             null_values=BLANKS,
-        )  # fmt: skip
+        )
         options = arrow_csv.ReadOptions(
             block_size=BLOCK, skip_rows=1, column_names=list(self.names)
         )

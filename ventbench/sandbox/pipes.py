@@ -43,7 +43,7 @@ from ventbench.sandbox.child.zygote import (
     SIZE,
     START,
     TOKEN,
-)  # fmt: skip
+)
 from ventbench.sandbox.reader import ENVIRONMENT, OPTIONS, ROOT, SITE, UnreadableError, read_apart
 from ventbench.task.interfaces import Task
 
@@ -237,9 +237,15 @@ class Pipes:
                 os.write(self._ends[cell][0], frames[cell])
 
     def collect(
-        self, due: set[int], sequence: Mapping[int, int] | Sequence[int], kind: int,
-        patience_s: float, deadline: float, *, some: bool = False,
-    ) -> dict[int, Outcome]:  # fmt: skip
+        self,
+        due: set[int],
+        sequence: Mapping[int, int] | Sequence[int],
+        kind: int,
+        patience_s: float,
+        deadline: float,
+        *,
+        some: bool = False,
+    ) -> dict[int, Outcome]:
         """Wait for one reply of each cell.
 
         Args:
@@ -324,9 +330,15 @@ class ZygoteClient:
         command = [sys.executable, *OPTIONS, "-c", _BOOT, *told]
         try:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._stderr,
-                cwd="/", env=ENVIRONMENT, pass_fds=[theirs.fileno()], start_new_session=True,
-            )  # fmt: skip
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._stderr,
+                cwd="/",
+                env=ENVIRONMENT,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
         except OSError as error:
             self._control.close()
             self._stderr.close()

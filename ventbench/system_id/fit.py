@@ -127,11 +127,17 @@ class Fit:
 
 
 def fit(
-    data: Data, mechanisms: Iterable[str] = (), *, free: Iterable[str] = (),
-    fixed: Mapping[str, ArrayLike] | None = None, start: Mapping[str, ArrayLike] | None = None,
-    gain_sd: float = 0.0, noise: Noise | None = None, predictor: Predictor | None = None,
+    data: Data,
+    mechanisms: Iterable[str] = (),
+    *,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, ArrayLike] | None = None,
+    start: Mapping[str, ArrayLike] | None = None,
+    gain_sd: float = 0.0,
+    noise: Noise | None = None,
+    predictor: Predictor | None = None,
     iterations: int = 40,
-) -> Fit:  # fmt: skip
+) -> Fit:
     """Fit a hypothesis: R, C, R_ex, PEEP, starting pressures and parameters of mechanisms.
 
     Shared parameters with several known minima are searched from several starts.
@@ -364,9 +370,14 @@ def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
         trial = float(np.clip(inside + stride, low[unknown], high[unknown]))
         if beyond(trial) > 0.0:
             between = optimize.brentq(
-                beyond, inside, trial, xtol=_RESOLVED * abs(stride), maxiter=_REFITS,
-                full_output=True, disp=False,
-            )  # fmt: skip
+                beyond,
+                inside,
+                trial,
+                xtol=_RESOLVED * abs(stride),
+                maxiter=_REFITS,
+                full_output=True,
+                disp=False,
+            )
             return float(between[0])
         inside, stride = trial, 1.6 * stride
         if trial == bound:

@@ -33,9 +33,16 @@ class Minimum:
 
 
 def minimise(
-    cost: Cost, normal: Normal, x: Floats, low: Floats, high: Floats, *, tolerance: float = 1e-3,
-    iterations: int = 40, known: Minimum | None = None,
-) -> Minimum:  # fmt: skip
+    cost: Cost,
+    normal: Normal,
+    x: Floats,
+    low: Floats,
+    high: Floats,
+    *,
+    tolerance: float = 1e-3,
+    iterations: int = 40,
+    known: Minimum | None = None,
+) -> Minimum:
     """Search for a local minimum within bounds, starting from ``x``.
 
     An unknown at a bound that the gradient pushes it against stays there for the step. An unknown

@@ -74,9 +74,15 @@ Commands = tuple[Array, Array, Array]
 
 
 def _run(
-    values: Array, commands: Commands, divisions: Array, names: tuple[str, ...], substeps: int,
-    memory: int, flow: bool, skip_idle: bool,
-) -> Array:  # fmt: skip
+    values: Array,
+    commands: Commands,
+    divisions: Array,
+    names: tuple[str, ...],
+    substeps: int,
+    memory: int,
+    flow: bool,
+    skip_idle: bool,
+) -> Array:
     plant = Physics(
         tuple(jnp.moveaxis(values[..., :-1], -1, 0)), names, substeps, memory, skip_idle
     )
@@ -119,9 +125,12 @@ class Predictor:
     """
 
     def __init__(
-        self, data: Data, names: tuple[str, ...], substeps: int | None = None,
+        self,
+        data: Data,
+        names: tuple[str, ...],
+        substeps: int | None = None,
         sizes: tuple[int, ...] = SIZES,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Choose the sizes to compile for.
 
         Args:
@@ -141,9 +150,12 @@ class Predictor:
         self.substeps, self.memory = substeps or enough, memory
         flow = data.measured.shape[1] > 1
         self._static = {
-            "names": names, "substeps": self.substeps, "memory": memory, "flow": flow,
+            "names": names,
+            "substeps": self.substeps,
+            "memory": memory,
+            "flow": flow,
             "skip_idle": True,
-        }  # fmt: skip
+        }
         self._commands = (data.u_in, data.u_out, data.dt)
         self._stiff = [
             (column, *stiff) for column, name in enumerate(names) if (stiff := _small_steps(name))

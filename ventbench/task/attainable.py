@@ -86,9 +86,13 @@ def _pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
         return after.signals.scored
 
     return rollouts.inspiration(
-        env.vary(plant, cell, 0), cell, rollouts.commanded,
-        steps=len(u_in), inputs=u_in, record=record,
-    )[2]  # fmt: skip
+        env.vary(plant, cell, 0),
+        cell,
+        rollouts.commanded,
+        steps=len(u_in),
+        inputs=u_in,
+        record=record,
+    )[2]
 
 
 #: Pressures of n cells under commands, ``(n, COMMANDS)``, and their derivatives by the commands.

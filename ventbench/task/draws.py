@@ -76,9 +76,28 @@ OF_RIGS = ("r_scale", "c_scale", "delay")
 #: probability from 0 to 1: quantiles of the measured breaths of the scored rigs, which the manifest
 #: of the simulators holds too. Between neighbouring breaths no correlation was found.
 GAIN_QUANTILES = (
-    -0.41, -0.294, -0.152, -0.093, -0.081, -0.046, -0.033, -0.02, -0.011, -0.001, 0.0,
-    0.001, 0.011, 0.021, 0.033, 0.039, 0.051, 0.081, 0.093, 0.122, 0.247,
-)  # fmt: skip
+    -0.41,
+    -0.294,
+    -0.152,
+    -0.093,
+    -0.081,
+    -0.046,
+    -0.033,
+    -0.02,
+    -0.011,
+    -0.001,
+    0.0,
+    0.001,
+    0.011,
+    0.021,
+    0.033,
+    0.039,
+    0.051,
+    0.081,
+    0.093,
+    0.122,
+    0.247,
+)
 
 #: What kind of rig a draw is on.
 TRAINING, HELD_OUT, DRAWN = 0, 1, 2
@@ -148,10 +167,16 @@ class Draws:
 
 
 def build(
-    rigs: Sequence[Sequence[int]], members: int, *, held_out: Sequence[Sequence[int]] = (),
-    drawn: Plant | None = None, seed: bytes = DEVELOPMENT_SEED, name: str = DEVELOPMENT,
-    n: int = COUNT, pips: Sequence[float] = protocol.PIPS,
-) -> Draws:  # fmt: skip
+    rigs: Sequence[Sequence[int]],
+    members: int,
+    *,
+    held_out: Sequence[Sequence[int]] = (),
+    drawn: Plant | None = None,
+    seed: bytes = DEVELOPMENT_SEED,
+    name: str = DEVELOPMENT,
+    n: int = COUNT,
+    pips: Sequence[float] = protocol.PIPS,
+) -> Draws:
     """Make the draws of a seed; the result is the same everywhere.
 
     The rigs of a lung of one kind are drawn equally often, up to one, and so are the members. The
@@ -213,9 +238,14 @@ def build(
     rig = np.array(places)
     turns = [_balanced(uniform(f"member {k}", (n + 1,)), members) for k in range(len(rigs))]
     return Draws(
-        name=name, commitment=commitment(seed), cells=deviate(pip, values, quantum, noise), rig=rig,
-        member=np.where(rig >= FIRST_DRAWN, 0, turns), ranked=ranked(rig), drawn=drawn,
-    )  # fmt: skip
+        name=name,
+        commitment=commitment(seed),
+        cells=deviate(pip, values, quantum, noise),
+        rig=rig,
+        member=np.where(rig >= FIRST_DRAWN, 0, turns),
+        ranked=ranked(rig),
+        drawn=drawn,
+    )
 
 
 def ranked(rig: Ints) -> Bools:
@@ -230,9 +260,12 @@ def ranked(rig: Ints) -> Bools:
 
 
 def _places(
-    rigs: Sequence[int], held_out: Sequence[int], anew: bool,
-    uniform: Callable[[tuple[int, ...]], Floats], n: int,
-) -> Ints:  # fmt: skip
+    rigs: Sequence[int],
+    held_out: Sequence[int],
+    anew: bool,
+    uniform: Callable[[tuple[int, ...]], Floats],
+    n: int,
+) -> Ints:
     """Rig of each draw of one lung."""
     kind = np.resize(np.array(PATTERN), n)
     kind[(kind == DRAWN) & (not anew)] = HELD_OUT

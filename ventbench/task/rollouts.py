@@ -97,9 +97,13 @@ def scored_step(before: LoopState, after: LoopState, requested: Array, applied: 
 
 
 def control_step(
-    plant: Plant, scenario: Scenario, policy: Policy, record: Record,
-    carry: tuple[LoopState, Any], at: tuple[Array | int, Array | int, Any],
-) -> tuple[tuple[LoopState, Any], Any]:  # fmt: skip
+    plant: Plant,
+    scenario: Scenario,
+    policy: Policy,
+    record: Record,
+    carry: tuple[LoopState, Any],
+    at: tuple[Array | int, Array | int, Any],
+) -> tuple[tuple[LoopState, Any], Any]:
     """One step of an inspiration, as the body of a scan; every compiled loop is made of it.
 
     Args:
@@ -119,10 +123,16 @@ def control_step(
 
 
 def inspiration(
-    plant: Plant, scenario: Scenario, policy: Policy, state: Any = None, *,
-    breath: Array | int = 0, steps: int = INSPIRATION, inputs: Any = None,
+    plant: Plant,
+    scenario: Scenario,
+    policy: Policy,
+    state: Any = None,
+    *,
+    breath: Array | int = 0,
+    steps: int = INSPIRATION,
+    inputs: Any = None,
     record: Record = scored_step,
-) -> tuple[LoopState, Any, Any]:  # fmt: skip
+) -> tuple[LoopState, Any, Any]:
     """Run one inspiration from rest; further arguments as of :func:`control_step`.
 
     Args:

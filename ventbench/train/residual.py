@@ -129,9 +129,13 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
         rest = env.start_breath(varied, cell)
         start = jax.tree.map(lambda new, old: jnp.where(at[1] == 0, new, old), rest, carry[0])
         (after, state), (pressure, applied) = rollouts.control_step(
-            varied, cell, policy, lambda before, _, __, u: (before.signals.scored, u),
-            (start, carry[1]), (*at, None),
-        )  # fmt: skip
+            varied,
+            cell,
+            policy,
+            lambda before, _, __, u: (before.signals.scored, u),
+            (start, carry[1]),
+            (*at, None),
+        )
         return (after, state), DifferentiableRun(pressure, state[1], applied)
 
     count = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS)
@@ -298,9 +302,12 @@ def fit(
     adam = optimiser(config.updates, config.learning_rate, config.weight_decay)
     carry: Any = (controller.layers, adam.init(controller.layers))
     settings = {
-        "config": dataclasses.asdict(config), "gains": list(gains), "seed": seed,
-        "simulators": fingerprint(plants), "weights": fingerprint(weights),
-    }  # fmt: skip
+        "config": dataclasses.asdict(config),
+        "gains": list(gains),
+        "seed": seed,
+        "simulators": fingerprint(plants),
+        "weights": fingerprint(weights),
+    }
     stored = Checkpoint(checkpoint, settings)
     carry, first = stored.restore(carry)
     while first < config.updates:
@@ -389,10 +396,15 @@ def train_residual(
             about_it = f"network {name}, seed {seed}" if len(seeds) > 1 else f"network {name}"
             with compilation.float32():
                 each[seed][name] = fit(
-                    plants, best, config=config, seed=seed, keep=True, weights=weights,
+                    plants,
+                    best,
+                    config=config,
+                    seed=seed,
+                    keep=True,
+                    weights=weights,
                     checkpoint=_checkpoint(out, name, seed),
                     progress=lambda *how_far, about_it=about_it: progress(about_it, how_far),
-                )  # fmt: skip
+                )
                 lungs_of = environment.Lungs(plants, jnp.asarray(weights))
                 fresh.append(float(_fresh(lungs_of, each[seed][name])))
         chosen = seeds[int(np.argmin(fresh))]

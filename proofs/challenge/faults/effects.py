@@ -142,15 +142,23 @@ def _case(effects: tuple[Effect, ...], breaths: int, rng: np.random.Generator) -
         gain=float(NOMINAL_GAIN * np.exp(0.06 * rng.standard_normal())),
     )
     return FaultsCase(
-        name="", lung_R=label.R, lung_C=label.C, effects=effects, base=base,
+        name="",
+        lung_R=label.R,
+        lung_C=label.C,
+        effects=effects,
+        base=base,
         noise=float(rng.uniform(0.1, 0.25)),
         coloured=float(rng.uniform(0.0, 0.4)) if rng.uniform() < 0.4 else 0.0,
         step=float(rng.choice(np.array([0.05, 0.07]))),
         jitter=float(rng.choice(np.array([1e-4, 6e-4]))),
-        breaths=breaths, samples=samples, log_step=0.01, interval=interval,
-        inspiration=float(rng.uniform(0.8, 1.1)), tubing=float(rng.uniform(0.02, 0.08)),
+        breaths=breaths,
+        samples=samples,
+        log_step=0.01,
+        interval=interval,
+        inspiration=float(rng.uniform(0.8, 1.1)),
+        tubing=float(rng.uniform(0.02, 0.08)),
         choice=int(rng.integers(2**31)),
-    )  # fmt: skip
+    )
 
 
 def affected(case: FaultsCase, effect: Effect, number: NDArray[np.int64]) -> NDArray[np.bool_]:

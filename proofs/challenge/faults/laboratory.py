@@ -148,9 +148,16 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
     quiet = np.zeros(breaths.time.shape)
     rng = np.random.default_rng(seed)
     simulated = _run(
-        case, rng, breaths.time, breaths.u_out, lambda k, pressure: breaths.u_in[:, k],
-        breaths.breath_id - 1, quiet, start, exact=True,
-    )  # fmt: skip
+        case,
+        rng,
+        breaths.time,
+        breaths.u_out,
+        lambda k, pressure: breaths.u_in[:, k],
+        breaths.breath_id - 1,
+        quiet,
+        start,
+        exact=True,
+    )
     return simulated.pressure
 
 
@@ -173,10 +180,17 @@ def active(case: Case, breaths: Breaths) -> Flags | None:
 
 
 def _run(
-    case: FaultsCase, rng: np.random.Generator, time: Floats, u_out: NDArray[np.int8],
-    command: Command, number: NDArray[np.int64], noise: Floats, start: Floats | None = None,
-    *, exact: bool = False,
-) -> Breaths:  # fmt: skip
+    case: FaultsCase,
+    rng: np.random.Generator,
+    time: Floats,
+    u_out: NDArray[np.int8],
+    command: Command,
+    number: NDArray[np.int64],
+    noise: Floats,
+    start: Floats | None = None,
+    *,
+    exact: bool = False,
+) -> Breaths:
     """Simulate breaths side by side and log them; ``exact``: without converter."""
     assert case.base is not None
     (n, samples), base, faults = time.shape, case.base, _Faults(case, number)
@@ -222,9 +236,14 @@ def _run(
     ones = np.ones(n)
     return make_breaths(
         # A replay may ask for a breath several times, and takes the pressures alone.
-        number[0] + 1 + np.arange(n), case.lung_R * ones, case.lung_C * ones, time, u_in, u_out,
+        number[0] + 1 + np.arange(n),
+        case.lung_R * ones,
+        case.lung_C * ones,
+        time,
+        u_in,
+        u_out,
         np.round(pressure, 6),
-    )  # fmt: skip
+    )
 
 
 def _moved(faults: _Faults, u: Floats) -> Floats:
@@ -252,9 +271,16 @@ def _swing(faults: _Faults, flow: Floats, now: Floats) -> Floats | float:
 
 
 def _step(
-    faults: _Faults, p: Floats, volume: Floats, h: Floats, now: Floats, q: Floats,
-    out: NDArray[np.int8], R: Floats, C: Floats,
-) -> tuple[Floats, Floats]:  # fmt: skip
+    faults: _Faults,
+    p: Floats,
+    volume: Floats,
+    h: Floats,
+    now: Floats,
+    q: Floats,
+    out: NDArray[np.int8],
+    R: Floats,
+    C: Floats,
+) -> tuple[Floats, Floats]:
     """Pressure of the circuit and volume of the lung after an implicit step of ``h``, s."""
     base, tubing = faults.case.base, 1e-3 * faults.case.tubing
     assert base is not None

@@ -238,9 +238,11 @@ class Circuit:
         self._double = "valve_lag" in effects and effects["valve_lag"].form == "two lags"
         self._drop = parameter("supply_droop", "drop")
         self._recovery = parameter("supply_droop", "recovery")
-        self._subtract = "supply_droop" in effects and self._drop and (
-            effects["supply_droop"].form == "subtractive"
-        )  # fmt: skip
+        self._subtract = (
+            "supply_droop" in effects
+            and self._drop
+            and (effects["supply_droop"].form == "subtractive")
+        )
         self._tubing = 1e-3 * parameter("circuit_compliance", "compliance")
         self._mass = parameter("inertance", "inertance")
         self._stress = parameter("viscoelasticity", "ratio") / self._recoil.C
@@ -330,9 +332,14 @@ class Circuit:
         return near, far, x[VOLUME] / self._recoil.C / near + x[SECOND] / C2 / far
 
     def _store(
-        self, x: Floats, after: Floats, h: Floats, flow: Floats, R: Floats | float,
+        self,
+        x: Floats,
+        after: Floats,
+        h: Floats,
+        flow: Floats,
+        R: Floats | float,
         slope: Floats | float,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Write the volumes and the stress that result from the flow into the lung."""
         after[FLOW] = flow
         if self._second:

@@ -79,21 +79,29 @@ def _null(lung: Lung, rng: np.random.Generator) -> Case:
     """A case without effects, but with noise, gain, jitter and rounding that are no physics."""
     base = draw_base(lung.R, lung.C, rng)
     return Case(
-        "", lung.R, lung.C, (), base,
+        "",
+        lung.R,
+        lung.C,
+        (),
+        base,
         noise=float(rng.uniform(0.1, 0.3)),
         coloured=float(rng.uniform(0.0, 0.6)),
         correlation=float(rng.uniform(0.5, 0.9)),
         jitter=float(rng.choice(np.array([3e-4, 1e-3]))),
         log_step=float(rng.choice(np.array([0.01, 1.0]))),
         style="mixed" if rng.uniform() < 0.5 else "pi",
-    )  # fmt: skip
+    )
 
 
 def _masked(lung: Lung, effect: Effect, rng: np.random.Generator) -> Case:
     """A case with few breaths, all in closed loop."""
     return Case(
-        "", lung.R, lung.C, (effect,), draw_base(lung.R, lung.C, rng),
+        "",
+        lung.R,
+        lung.C,
+        (effect,),
+        draw_base(lung.R, lung.C, rng),
         noise=float(rng.choice(np.array([0.1, 0.2, 0.3]))),
         breaths=int(rng.integers(8, 16)),
         style="pi",
-    )  # fmt: skip
+    )

@@ -129,16 +129,29 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
     assert case.base is not None
     clean = replace(case, noise=0.0, step=0.0, samples=breaths.time.shape[1])
     return _run(
-        clean, case.base, breaths.time, breaths.u_out, lambda k, p: breaths.u_in[:, k],
-        breaths.breath_id - 1, np.random.default_rng(seed), steps, start,
-    ).pressure  # fmt: skip
+        clean,
+        case.base,
+        breaths.time,
+        breaths.u_out,
+        lambda k, p: breaths.u_in[:, k],
+        breaths.breath_id - 1,
+        np.random.default_rng(seed),
+        steps,
+        start,
+    ).pressure
 
 
 def _run(
-    case: Case, base: Base, time: Floats, u_out: NDArray[np.int8],
-    command: Callable[[int, Floats], Floats], number: NDArray[np.int64],
-    rng: np.random.Generator, steps: int | None = None, start: Floats | None = None,
-) -> Breaths:  # fmt: skip
+    case: Case,
+    base: Base,
+    time: Floats,
+    u_out: NDArray[np.int8],
+    command: Callable[[int, Floats], Floats],
+    number: NDArray[np.int64],
+    rng: np.random.Generator,
+    steps: int | None = None,
+    start: Floats | None = None,
+) -> Breaths:
     """Simulate breaths side by side; ``number``: place of each in the recording, from 0."""
     n, samples = time.shape
     effects = {effect.name: effect for effect in case.effects}
@@ -170,9 +183,14 @@ def _run(
             state = circuit.step(state, lengths[:, s], flow, grid.opened[:, s], grid.nodes[:, s])
     return make_breaths(
         # A replay may ask for a breath several times, and takes the pressures alone.
-        number[0] + 1 + np.arange(n), np.full(n, case.lung_R), np.full(n, case.lung_C), time, u_in,
-        u_out, np.round(pressure, 6),
-    )  # fmt: skip
+        number[0] + 1 + np.arange(n),
+        np.full(n, case.lung_R),
+        np.full(n, case.lung_C),
+        time,
+        u_in,
+        u_out,
+        np.round(pressure, 6),
+    )
 
 
 #: The paper's grid of gains.

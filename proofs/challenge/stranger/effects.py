@@ -80,46 +80,98 @@ EFFECTS: dict[str, Family] = {
         "amplitude", 2.0, 5.0, ("half sine", "exponential"), (("duration", (0.5, 1.1)),)
     ),
     "volume_resistance": Family(
-        "capacity", 18.0, 8.0, ("conductance grows with volume",), inside=False, places=("airway",),
+        "capacity",
+        18.0,
+        8.0,
+        ("conductance grows with volume",),
+        inside=False,
+        places=("airway",),
     ),
     "direction_resistance": Family(
-        "ratio", 1.6, 2.1, ("expiratory resistance",), inside=False,
+        "ratio",
+        1.6,
+        2.1,
+        ("expiratory resistance",),
+        inside=False,
         places=("airway",),
     ),
     "cardiogenic": Family(
-        "amplitude", 0.6, 1.2, ("two harmonics",), (("frequency", (0.9, 1.8)),), inside=False,
+        "amplitude",
+        0.6,
+        1.2,
+        ("two harmonics",),
+        (("frequency", (0.9, 1.8)),),
+        inside=False,
         places=("muscles",),
     ),
     "pulsating_supply": Family(
-        "amplitude", 0.12, 0.18, ("piston",), (("frequency", (2.5, 7.0)),), inside=False,
-        places=("supply",), names=("supply_ripple",),
+        "amplitude",
+        0.12,
+        0.18,
+        ("piston",),
+        (("frequency", (2.5, 7.0)),),
+        inside=False,
+        places=("supply",),
+        names=("supply_ripple",),
     ),
     "second_compartment": Family(
-        "share", 0.25, 0.45, ("Otis",), (("time", (0.4, 1.6)),), inside=False,
-        places=("lung",), names=("viscoelasticity",),
+        "share",
+        0.25,
+        0.45,
+        ("Otis",),
+        (("time", (0.4, 1.6)),),
+        inside=False,
+        places=("lung",),
+        names=("viscoelasticity",),
     ),
     "sensor_nonlinearity": Family(
-        "bend", 0.9, 1.4, ("bow",), signs=(1.0, -1.0), inside=False, places=("pressure_sensor",),
+        "bend",
+        0.9,
+        1.4,
+        ("bow",),
+        signs=(1.0, -1.0),
+        inside=False,
+        places=("pressure_sensor",),
         names=("sensor_curve",),
     ),
     "expiratory_valve_orifice": Family(
-        "amount", 1.0, 1.0, ("orifice",), inside=False, places=("expiratory_valve",),
+        "amount",
+        1.0,
+        1.0,
+        ("orifice",),
+        inside=False,
+        places=("expiratory_valve",),
     ),
     "supply_back_pressure": Family(
-        "supply", 120.0, 70.0, ("incompressible valve",), inside=False,
+        "supply",
+        120.0,
+        70.0,
+        ("incompressible valve",),
+        inside=False,
         places=("supply", "inspiratory_valve", "circuit"),
         names=("supply_pressure",),
     ),
     "compliance_change": Family(
-        "change", 0.2, 0.4, ("recruitment",), signs=(1.0, -1.0), inside=False,
+        "change",
+        0.2,
+        0.4,
+        ("recruitment",),
+        signs=(1.0, -1.0),
+        inside=False,
         places=("lung",),
         names=("compliance_drift",),
     ),
     "resistance_change": Family(
-        "change", 0.3, 0.6, ("secretions",), signs=(1.0, -1.0), inside=False, places=("airway",),
+        "change",
+        0.3,
+        0.6,
+        ("secretions",),
+        signs=(1.0, -1.0),
+        inside=False,
+        places=("airway",),
         names=("resistance_drift",),
     ),
-}  # fmt: skip
+}
 
 INSIDE: tuple[str, ...] = tuple(name for name, family in EFFECTS.items() if family.inside)
 OUTSIDE: tuple[str, ...] = tuple(name for name, family in EFFECTS.items() if not family.inside)
@@ -129,8 +181,13 @@ SETTINGS = tuple(Lung(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.
 
 #: Shares of the kinds. There is no kind ``form``, since all forms are strangers.
 SHARES: dict[Kind, float] = {
-    "single": 0.40, "null": 0.16, "pair": 0.14, "four": 0.08, "outside": 0.16, "masked": 0.06,
-}  # fmt: skip
+    "single": 0.40,
+    "null": 0.16,
+    "pair": 0.14,
+    "four": 0.08,
+    "outside": 0.16,
+    "masked": 0.06,
+}
 
 #: Effects that are not combined with others: too small beside them, or no size.
 _ALONE = ("inertance", "command_rounding")
@@ -211,13 +268,19 @@ def _laboratory(
         gain=float(NOMINAL_GAIN * np.exp(0.06 * rng.standard_normal())),
     )
     return StrangerCase(
-        name="", lung_R=label.R, lung_C=label.C, effects=effects, base=base,
+        name="",
+        lung_R=label.R,
+        lung_C=label.C,
+        effects=effects,
+        base=base,
         noise=float(rng.uniform(0.1, 0.3)),
         coloured=float(rng.uniform(0.0, 0.6)) if rng.uniform() < 0.5 else 0.0,
         correlation=float(rng.uniform(0.4, 0.9)),
         step=float(rng.choice(np.array([0.0703, 0.01, 0.1]))),
         jitter=float(rng.choice(np.array([1e-4, 5e-4, 1.2e-3]))),
-        breaths=breaths, samples=samples, style="pi" if few else "mixed",
+        breaths=breaths,
+        samples=samples,
+        style="pi" if few else "mixed",
         log_step=float(rng.choice(np.array([0.001, 0.01, 0.1]))),
         interval=interval,
         inspiration=float(rng.uniform(0.8, 1.2)),
@@ -228,4 +291,4 @@ def _laboratory(
         proportional=float(rng.uniform(0.5, 10.0)),
         explored=0.0 if few else float(rng.choice(np.array([0.0, 0.3, 0.6]))),
         dead_space=float(rng.uniform(0.01, 0.05)),
-    )  # fmt: skip
+    )

@@ -99,9 +99,14 @@ def record(
         logged = np.round(time / case.clock_step) * case.clock_step
     ones = np.ones(n)
     return make_breaths(
-        np.arange(1, n + 1), case.lung_R * ones, case.lung_C * ones,
-        np.round(logged, 6), np.round(u_in, 6), u_out, np.round(pressure, 6),
-    )  # fmt: skip
+        np.arange(1, n + 1),
+        case.lung_R * ones,
+        case.lung_C * ones,
+        np.round(logged, 6),
+        np.round(u_in, 6),
+        u_out,
+        np.round(pressure, 6),
+    )
 
 
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
@@ -116,17 +121,27 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
     assert isinstance(case, StrangerCase)
     quiet = replace(case, gain_scatter=0.0)
     return _run(
-        quiet, np.random.default_rng(seed), breaths.time, breaths.u_out,
-        lambda k, shown, due: (shown, breaths.u_in[:, k]), breaths.breath_id - 1, REPLAY_STEP,
+        quiet,
+        np.random.default_rng(seed),
+        breaths.time,
+        breaths.u_out,
+        lambda k, shown, due: (shown, breaths.u_in[:, k]),
+        breaths.breath_id - 1,
+        REPLAY_STEP,
         start,
-    )[0]  # fmt: skip
+    )[0]
 
 
 def _run(
-    case: StrangerCase, rng: np.random.Generator, time: Floats, u_out: NDArray[np.int8],
-    command: Command, number: NDArray[np.int64],
-    step: float, start: Floats | None = None,
-) -> tuple[Floats, Floats]:  # fmt: skip
+    case: StrangerCase,
+    rng: np.random.Generator,
+    time: Floats,
+    u_out: NDArray[np.int8],
+    command: Command,
+    number: NDArray[np.int64],
+    step: float,
+    start: Floats | None = None,
+) -> tuple[Floats, Floats]:
     """Simulate breaths side by side; returns what ``command`` returns at each sample, ``(n, T)``.
 
     The breaths have clocks of their own: at each step of the integration, every breath whose next
@@ -144,9 +159,13 @@ def _run(
         scatter = np.clip(1.0 + _EFFORT_SCATTER * rng.standard_normal(m), 0.3, 1.8)
         size = np.where(acts, effects["patient_effort"].parameters["amplitude"] * scatter, 0.0)
     rig = Rig(
-        case.base, effects, number / max(case.breaths - 1, 1), case.dead_space,
-        rng.uniform(0.0, 2.0 * np.pi, m)[which], np.stack([size, onset])[:, which],
-    )  # fmt: skip
+        case.base,
+        effects,
+        number / max(case.breaths - 1, 1),
+        case.dead_space,
+        rng.uniform(0.0, 2.0 * np.pi, m)[which],
+        np.stack([size, onset])[:, which],
+    )
     gains = 1.0 + case.gain_scatter * rng.standard_normal(m)[which]
     spread = 0.2 * rng.standard_normal(m)[which]
     rig.start(case.base.peep + spread if start is None else start)

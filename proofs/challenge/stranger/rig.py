@@ -299,9 +299,15 @@ class Rig:
         return total
 
     def _two_compartments(
-        self, inflow: Floats, outlet: Floats, leak_slope: Floats | float, leak_flow: Floats | float,
-        R: Floats, slope: Floats, h: float,
-    ) -> None:  # fmt: skip
+        self,
+        inflow: Floats,
+        outlet: Floats,
+        leak_slope: Floats | float,
+        leak_flow: Floats | float,
+        R: Floats,
+        slope: Floats,
+        h: float,
+    ) -> None:
         """Otis: a common airway of half the resistance, and two parallel lungs behind it."""
         share = self._strength("second_compartment", "share")
         slow = self._strength("second_compartment", "time")

@@ -120,7 +120,11 @@ def test_keys_of_the_self_test_do_not_raise_the_pressure(
     with person.keys(), RawLog(tmp_path / "raw.jsonl") as log:
         keyboard.press_later("y", 0.02)
         end = run_plan(
-            replace(bench, operator=person), plan, lambda run: pytest.fail("it ran"), log,
-            about={}, before_lung=selftest,
-        )  # fmt: skip
+            replace(bench, operator=person),
+            plan,
+            lambda run: pytest.fail("it ran"),
+            log,
+            about={},
+            before_lung=selftest,
+        )
     assert end == "the operator pressed the emergency stop"

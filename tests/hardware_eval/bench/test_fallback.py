@@ -115,6 +115,8 @@ def test_an_entry_outside_its_envelope_is_rescued_and_fails(bench: Bench) -> Non
     assert "were outside the envelope" in result.reason
     assert result.trips == ()
     assert result.outside > 50
-    held = [breath.pressure[DEFAULT.lags[1] + 3 : protocol.INSPIRATION_STEPS] for breath in
-            result.breaths]  # fmt: skip
+    held = [
+        breath.pressure[DEFAULT.lags[1] + 3 : protocol.INSPIRATION_STEPS]
+        for breath in result.breaths
+    ]
     assert np.max(held) < 10.0 + protocol.SAFETY_MARGIN

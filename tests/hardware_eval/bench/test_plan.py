@@ -20,8 +20,10 @@ def test_every_cell_is_repeated_and_the_control_runs_in_between() -> None:
     scored = Counter((r.entry, r.lung, r.pip) for r in plan.runs if r.kind == "scored")
     assert scored == {
         (entry, lung, pip): 3
-        for entry in "ab" for lung in ("R5C10", "R20C50") for pip in (10.0, 20.0)
-    }  # fmt: skip
+        for entry in "ab"
+        for lung in ("R5C10", "R20C50")
+        for pip in (10.0, 20.0)
+    }
     control = [run for run in plan.runs if run.entry == CONTROL]
     assert Counter(run.lung for run in control) == {"R5C10": 3, "R20C50": 3}  # 0, 10, and the end
     assert [run.number for run in plan.runs] == list(range(len(plan.runs)))
@@ -36,8 +38,10 @@ def test_a_lung_is_mounted_once_and_pip_rises_first() -> None:
     for lung in plan.lungs:
         runs = [run for run in plan.runs if run.lung == lung]
         assert [(run.kind, run.pip) for run in runs[:3]] == [
-            ("ramp", 10.0), ("ramp", 20.0), ("ramp", 30.0)
-        ]  # fmt: skip
+            ("ramp", 10.0),
+            ("ramp", 20.0),
+            ("ramp", 30.0),
+        ]
 
 
 def test_the_order_depends_on_the_seed_and_not_on_how_lungs_are_listed() -> None:
@@ -49,10 +53,16 @@ def test_the_order_depends_on_the_seed_and_not_on_how_lungs_are_listed() -> None
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"entries": []}, {"lungs": []}, {"lungs": ["R5C10", "R5C10"]}, {"lungs": ["R50C10"]},
-        {"pips": [12.0]}, {"repeats": 0}, {"perturbations": ["kick"]}, {"entries": [CONTROL]},
+        {"entries": []},
+        {"lungs": []},
+        {"lungs": ["R5C10", "R5C10"]},
+        {"lungs": ["R50C10"]},
+        {"pips": [12.0]},
+        {"repeats": 0},
+        {"perturbations": ["kick"]},
+        {"entries": [CONTROL]},
     ],
-)  # fmt: skip
+)
 def test_wrong_plans_are_refused(wrong: dict) -> None:
     given: dict[str, Any] = {"entries": ["a"], "lungs": ["R5C10"]} | wrong
     with pytest.raises(InputError):

@@ -66,10 +66,11 @@ FAULTS: dict[str, tuple[Callable[[int, SafetySample], SafetySample], float]] = {
     "no_answer": (lambda i, s: s._replace(pressure=math.nan, answered=False), 0.06),
     "low_pressure": (lambda i, s: s._replace(pressure=0.5 + 0.01 * (i % 2)), 0.5),
     "expiratory_valve": (
-        lambda i, s: s._replace(pressure=24.0 + 0.01 * (i % 2) if s.u_out else s.pressure), 1.0
+        lambda i, s: s._replace(pressure=24.0 + 0.01 * (i % 2) if s.u_out else s.pressure),
+        1.0,
     ),
     "applied_command": (lambda i, s: s._replace(applied=s.u_in + 5.0), 0.1),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", sorted(FAULTS))

@@ -42,8 +42,13 @@ def test_parts_are_left_out_one_by_one_and_the_sheet_says_so(
     assert sheet.go, str(sheet)
     assert sheet.skipped == ("sensor", "sweep", "lung")
     assert {x.name for x in sheet.findings} == {
-        "leak", "interruptions", "safety", "on_time", "latest_step", "round_trip"
-    }  # fmt: skip
+        "leak",
+        "interruptions",
+        "safety",
+        "on_time",
+        "latest_step",
+        "round_trip",
+    }
     assert sheet.as_dict()["skipped"] == ["sensor", "sweep", "lung"]
     assert "left out: lung" in str(sheet)
     moved = device.actuations[begun - 1 :]

@@ -152,9 +152,10 @@ FAULTS = {
     "sensor stuck": (Fault(FaultKind.SENSOR_STUCK, 0.0), {"stuck_sensor"}),
     "sensor lost": (Fault(FaultKind.SENSOR_LOST, 0.0), {"no_reading"}),
     "expiratory valve stuck": (
-        Fault(FaultKind.EXPIRATORY_STUCK, 0.0), {"expiratory_valve", "stuck_sensor"}
+        Fault(FaultKind.EXPIRATORY_STUCK, 0.0),
+        {"expiratory_valve", "stuck_sensor"},
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", sorted(FAULTS))
@@ -357,9 +358,13 @@ def test_six_lungs_survive_three_crashes_and_two_cables(tmp_path: Path) -> None:
         try:
             with RawLog(path) as log:
                 result = run_plan(
-                    bench, everything, lambda run: Scripted(trouble), log, about={},
+                    bench,
+                    everything,
+                    lambda run: Scripted(trouble),
+                    log,
+                    about={},
                     before_lung=mount,
-                )  # fmt: skip
+                )
         except CrashError:
             restarts += 1
             client.hello()

@@ -337,9 +337,11 @@ def test_the_program_runs_on_the_packages_of_its_own_list_alone(
     tty.setraw(master)
     words = ["--config", str(configuration), "--pressure-limit", "50", "--port", os.ttyname(slave)]
     program = subprocess.Popen(
-        [sys.executable, "-m", "hardware_eval.device", *words], cwd=root,
-        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{root}"}, stderr=subprocess.PIPE,
-    )  # fmt: skip
+        [sys.executable, "-m", "hardware_eval.device", *words],
+        cwd=root,
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{root}"},
+        stderr=subprocess.PIPE,
+    )
     try:
         hello = encode(Packet(7, 1, Hello(PROTOCOL_VERSION, None)))
         answer, end = b"", time.monotonic() + 60.0

@@ -157,10 +157,23 @@ def test_a_death_in_an_inspiration_vents(
 ) -> None:
     link, log = tmp_path / "lung", tmp_path / "valves.csv"
     emulator = subprocess.Popen(
-        [sys.executable, "-m", "hardware_eval", "emulate", "--plant", "single_compartment",
-         "--link", str(link), "--electronics", str(log), *normally],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "hardware_eval",
+            "emulate",
+            "--plant",
+            "single_compartment",
+            "--link",
+            str(link),
+            "--electronics",
+            str(log),
+            *normally,
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     assert emulator.stdout is not None
     assert emulator.stderr is not None
     assert emulator.stdout.readline()

@@ -41,9 +41,11 @@ PATIENCE = 600.0
 @pytest.fixture
 def emulator(tmp_path: Path) -> Iterator[Emulator]:
     running = Emulator(
-        DeviceService(Bench(), DeviceSettings(), 0.0), link=tmp_path / "lung",
-        control=tmp_path / "control", log=tmp_path / "valves.csv",
-    )  # fmt: skip
+        DeviceService(Bench(), DeviceSettings(), 0.0),
+        link=tmp_path / "lung",
+        control=tmp_path / "control",
+        log=tmp_path / "valves.csv",
+    )
     stop = threading.Event()
     thread = threading.Thread(target=running.run, args=(stop.is_set,))
     thread.start()

@@ -94,10 +94,28 @@ def invoke(app: Any, *words: str) -> Any:
 
 def test_a_run_over_a_terminal(terminal: DeviceOnTerminal, tmp_path: Path) -> None:
     done = invoke(
-        cli.app, "run", "pid_best", "--port", "p", "--lung", LUNG, "--pips", "10", "--repeats", "1",
-        "--control-every", "0", "--no-dry-run", "--no-selftest", "--in-process", "--rest", "0.5",
-        "--yes", "--out", str(tmp_path / "out"),
-    )  # fmt: skip
+        cli.app,
+        "run",
+        "pid_best",
+        "--port",
+        "p",
+        "--lung",
+        LUNG,
+        "--pips",
+        "10",
+        "--repeats",
+        "1",
+        "--control-every",
+        "0",
+        "--no-dry-run",
+        "--no-selftest",
+        "--in-process",
+        "--rest",
+        "0.5",
+        "--yes",
+        "--out",
+        str(tmp_path / "out"),
+    )
     assert done.exit_code == 0, done.output
     assert terminal.carried > 10_000
 
@@ -112,10 +130,24 @@ def test_self_test_wrong_lung_run_and_board(terminal: DeviceOnTerminal, tmp_path
     assert f"is the lung set to {LUNG}?" in wrong.output
     out = tmp_path / "out"
     done = invoke(
-        cli.app, "run", "pid_best", "--port", "p", "--lung", LUNG, "--pips", "10,20",
-        "--repeats", "2", "--in-process", "--yes", "--out", str(out),
-        "--json", str(tmp_path / "done.json"),
-    )  # fmt: skip
+        cli.app,
+        "run",
+        "pid_best",
+        "--port",
+        "p",
+        "--lung",
+        LUNG,
+        "--pips",
+        "10,20",
+        "--repeats",
+        "2",
+        "--in-process",
+        "--yes",
+        "--out",
+        str(out),
+        "--json",
+        str(tmp_path / "done.json"),
+    )
     assert done.exit_code == 0, done.output
     path = json.loads((tmp_path / "done.json").read_text())["records"]["pid_best"]
     board = tmp_path / "leaderboard"
@@ -140,8 +172,10 @@ def test_an_emulator_of_its_own_vents_when_its_host_falls_silent(tmp_path: Path)
     command = [sys.executable, "-m", "hardware_eval", "emulate", "--link", str(link)]
     emulator = subprocess.Popen(
         [*command, "--lung", LUNG, "--plant", "single_compartment"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         assert emulator.stdout is not None
         assert emulator.stdout.readline().strip(), emulator.communicate()[1]

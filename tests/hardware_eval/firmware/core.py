@@ -85,13 +85,19 @@ class Core:
         name = identity.name.encode()[:32]
         highest = hundredths(identity.highest) if identity.highest < 327.0 else 0x7FFFFFFF
         self._write(
-            struct.pack("<Q", microseconds(begun)) + identity.device_id + identity.calibration
+            struct.pack("<Q", microseconds(begun))
+            + identity.device_id
+            + identity.calibration
             + struct.pack(
-                "<BHHiB", identity.noisy, identity.capabilities, hundredths(limit), highest,
+                "<BHHiB",
+                identity.noisy,
+                identity.capabilities,
+                hundredths(limit),
+                highest,
                 len(name),
             )
             + name
-        )  # fmt: skip
+        )
         self.valves, self.mode, self.causes = (0, 1), Mode.CLOSED, 0
 
     def steps(
@@ -107,11 +113,15 @@ class Core:
             marks = sample.saturated + 2 * sample.lapsed
             self._write(
                 _REQUEST.pack(
-                    now, microseconds(sample.time), hundredths(sample.pressure), flow, marks,
+                    now,
+                    microseconds(sample.time),
+                    hundredths(sample.pressure),
+                    flow,
+                    marks,
                     len(data),
                 )
                 + data
-            )  # fmt: skip
+            )
         assert self._process.stdin is not None
         self._process.stdin.flush()
         return [self._reply() for _ in steps]

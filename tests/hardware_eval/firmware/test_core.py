@@ -68,9 +68,12 @@ class Stimuli:
             pressure = math.nan
         taken = self.now - random.choice((0, 0, 0, 400, 51_000)) * (random.random() < 0.1)
         return Sample(
-            max(taken, 0) / 1e6, pressure, random.choice((math.nan, -40.0, 1200.0)),
-            saturated=random.random() < 0.003, lapsed=random.random() < 0.003,
-        )  # fmt: skip
+            max(taken, 0) / 1e6,
+            pressure,
+            random.choice((math.nan, -40.0, 1200.0)),
+            saturated=random.random() < 0.003,
+            lapsed=random.random() < 0.003,
+        )
 
     def _packet(self, state: program.DeviceState) -> Packet:
         random = self.random
@@ -94,11 +97,15 @@ class Stimuli:
         u_out = random.randrange(2) if random.random() < 0.98 else random.randrange(256)
         return random.choices(
             (
-                Command(u_in / 100, u_out, seen & 0xFFFFFFFF), Heartbeat(), Statistics(), Vent(),
-                Arm(), Reading(1, 0.0, 5.0, 1.0, 2.0, 1, Mode.READY, Flag.NONE),
+                Command(u_in / 100, u_out, seen & 0xFFFFFFFF),
+                Heartbeat(),
+                Statistics(),
+                Vent(),
+                Arm(),
+                Reading(1, 0.0, 5.0, 1.0, 2.0, 1, Mode.READY, Flag.NONE),
             ),
             (30, 5, 2, 1, 1, 1),
-        )[0]  # fmt: skip
+        )[0]
 
     def _damaged(self, packet: Packet) -> bytes:
         random, frame = self.random, encode(packet)

@@ -249,10 +249,22 @@ def test_self_test_and_a_run_of_twelve_on_an_emulated_microcontroller(tmp_path: 
     tool("qemu-system-arm")
     link, out = tmp_path / "lung", tmp_path / "out"
     emulator = subprocess.Popen(
-        [sys.executable, "-m", "hardware_eval", "emulate", "--firmware", str(image), "--lung", LUNG,
-         "--link", str(link)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "hardware_eval",
+            "emulate",
+            "--firmware",
+            str(image),
+            "--lung",
+            LUNG,
+            "--link",
+            str(link),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         assert emulator.stdout is not None
         assert emulator.stdout.readline().strip(), emulator.communicate()[1]
@@ -262,10 +274,29 @@ def test_self_test_and_a_run_of_twelve_on_an_emulated_microcontroller(tmp_path: 
         done = CliRunner().invoke(
             cli.app,
             # At higher pressures the entry leaves its envelope, which the host sees to.
-            ["run", "pid_best", "--port", str(link), "--lung", LUNG, "--pips", "10,15,20",
-             "--repeats", "4", "--rest", "0.5", "--control-every", "0", "--no-dry-run",
-             "--no-selftest", "--in-process", "--yes", "--out", str(out)],
-        )  # fmt: skip
+            [
+                "run",
+                "pid_best",
+                "--port",
+                str(link),
+                "--lung",
+                LUNG,
+                "--pips",
+                "10,15,20",
+                "--repeats",
+                "4",
+                "--rest",
+                "0.5",
+                "--control-every",
+                "0",
+                "--no-dry-run",
+                "--no-selftest",
+                "--in-process",
+                "--yes",
+                "--out",
+                str(out),
+            ],
+        )
         assert done.exit_code == 0, done.output
     finally:
         emulator.send_signal(signal.SIGINT)

@@ -39,10 +39,17 @@ def done(tmp_path_factory: pytest.TempPathFactory, shared_device: Any) -> ev.Eva
     client.hello()
     plan = make_plan(["pid_best"], [LUNG], pips=PIPS, repeats=2, control_every=3)
     return ev.evaluate(
-        [open_submission("pid_best")], Line(client, shared_device.clock),
-        tmp_path_factory.mktemp("bench"), Operator(), plan=plan, sandbox=False, dry=False,
-        operator_name="A. Person", notes="a note", rest=1.0,
-    )  # fmt: skip
+        [open_submission("pid_best")],
+        Line(client, shared_device.clock),
+        tmp_path_factory.mktemp("bench"),
+        Operator(),
+        plan=plan,
+        sandbox=False,
+        dry=False,
+        operator_name="A. Person",
+        notes="a note",
+        rest=1.0,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -126,19 +133,21 @@ def test_the_board_shows_it_beside_the_simulated_score(path: Path, tmp_path: Pat
     assert isinstance(added, HardwareRecord)
     (hardware,) = frames.load_tracks(folder, track="performance")[0].hardware
     assert hardware.reasons == (
-        "software stood in for the ventilator and its lung", gate.NO_BENCH_LOG,
+        "software stood in for the ventilator and its lung",
+        gate.NO_BENCH_LOG,
         "no self-test of the sensor's zero on R5C20",
         "no self-test of which lung was mounted on R5C20",
-    )  # fmt: skip
+    )
     assert hardware.rank is None
     done = build.build(folder, out)
     assert BOARD in done.changed
     page = (out / BOARD).read_text()
     made = loaded(path)
     simulated = next(
-        entry for entry in reversed(store.load(folder).scores)
+        entry
+        for entry in reversed(store.load(folder).scores)
         if entry.official and entry.key[1:] == ("performance", "pid_best")
-    )  # fmt: skip
+    )
     lung, pips = simulated.lungs.index(LUNG), [simulated.pips.index(pip) for pip in PIPS]
     gap = made.score - simulated.nominal[lung, pips].mean()
     assert f"{made.score:.3f}" in page

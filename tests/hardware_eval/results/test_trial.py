@@ -95,9 +95,15 @@ def write(path: Path, seed: int, errors: dict[str, Any]) -> Path:
             status = "failed" if error is None else "complete"
             about = {"entry": run.entry, "kind": run.kind, "lung": run.lung, "pip": run.pip}
             log.append(
-                {"type": "run", "run": run.number, "status": status, "error": error,
-                 "repeat": run.repeat, **about}
-            )  # fmt: skip
+                {
+                    "type": "run",
+                    "run": run.number,
+                    "status": status,
+                    "error": error,
+                    "repeat": run.repeat,
+                    **about,
+                }
+            )
     return path
 
 

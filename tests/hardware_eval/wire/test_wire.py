@@ -58,18 +58,30 @@ def _message(sequence: int) -> st.SearchStrategy:
         st.sampled_from([Arm(), Heartbeat(), Vent(), Statistics()]),
         st.builds(Command, percent, u8, u32),
         st.builds(
-            Welcome, u8, st.tuples(u8, u8, u8), st.integers(0, 3).map(Capability),
-            u16.map(lambda n: n / 1000), u16.map(lambda n: n / 100),
-            st.binary(min_size=8, max_size=8), st.binary(min_size=32, max_size=32),
+            Welcome,
+            u8,
+            st.tuples(u8, u8, u8),
+            st.integers(0, 3).map(Capability),
+            u16.map(lambda n: n / 1000),
+            u16.map(lambda n: n / 100),
+            st.binary(min_size=8, max_size=8),
+            st.binary(min_size=32, max_size=32),
             st.text("abc é", max_size=16),
         ),
         st.builds(
-            Reading, st.just(sequence), st.integers(0, 10**12).map(lambda n: n / 1e6), pressure,
-            known_flow, percent, u8, modes, flags,
+            Reading,
+            st.just(sequence),
+            st.integers(0, 10**12).map(lambda n: n / 1e6),
+            pressure,
+            known_flow,
+            percent,
+            u8,
+            modes,
+            flags,
         ),
         st.builds(Refusal, st.just(sequence), st.sampled_from(Reason), modes, flags),
         st.builds(Counters, *[u32] * 14),
-    )  # fmt: skip
+    )
 
 
 @st.composite

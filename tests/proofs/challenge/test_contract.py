@@ -23,12 +23,14 @@ DOCS = Path(__file__).parents[3] / "docs" / "diagnosers.md"
 
 def good(**changed: Any) -> dict[str, Any]:
     full = answer(
-        (0.7, "leak"), (0.2, ""), (0.1, "unknown:airway valve_lag"),
+        (0.7, "leak"),
+        (0.2, ""),
+        (0.1, "unknown:airway valve_lag"),
         parameters={"leak.conductance": {"value": 9.0, "low": 8.0, "high": 10}},
         active={"1": [[0.0, 0.5]]},
         record_next=[{"time": [0, 0.03], "u_in": [3, 4], "u_out": [0, 1]}],
         notes={"anything": [None]},
-    )  # fmt: skip
+    )
     return full | changed
 
 

@@ -19,9 +19,18 @@ from proofs.challenge.truth import true_values
 from ventbench.base.errors import InputError
 
 QUIET = FaultsCase(
-    "x", 20.0, 20.0, (), Base(20.0, 20.0, 5.0, 5.0, 22.8), noise=0.0, step=0.0, jitter=0.0,
-    breaths=8, samples=60, choice=4,
-)  # fmt: skip
+    "x",
+    20.0,
+    20.0,
+    (),
+    Base(20.0, 20.0, 5.0, 5.0, 22.8),
+    noise=0.0,
+    step=0.0,
+    jitter=0.0,
+    breaths=8,
+    samples=60,
+    choice=4,
+)
 
 
 def case(name: str, form: str = "plain", **parameters: float) -> FaultsCase:
@@ -51,36 +60,59 @@ def test_a_plain_lung_answers_as_the_textbook_says():
     ("rig", "what"),
     [
         (case("saturation", level=15.0), lambda p: p.max() == 15.0),
-        (case("clock_offset", offset=0.06),
-         lambda p: np.allclose(p[:, 2:], PLAIN[:, :-2], atol=0.01)),
+        (
+            case("clock_offset", offset=0.06),
+            lambda p: np.allclose(p[:, 2:], PLAIN[:, :-2], atol=0.01),
+        ),
         (case("clock_skew", skew=0.03), lambda p: (PLAIN - p)[:, 30].min() > 0.3),
-        (case("gain_step", change=0.2, breath=5.0),
-         lambda p: np.allclose(p[:4], PLAIN[:4]) and (p - PLAIN)[4:, END].min() > 2.0),
-        (case("gain_drift", "linear", change=0.2),
-         lambda p: np.all(np.diff(p[:, END]) > 0.0) and p[0, END] == PLAIN[0, END]),
-        (case("zero_step", change=-1.5, breath=3.0),
-         lambda p: np.allclose(p[:2], PLAIN[:2]) and np.allclose(p[2:], PLAIN[2:] - 1.5)),
-        (case("sensor_drift", "warm-up", drift=2.0),
-         lambda p: (p - PLAIN)[4, 3] > 1.5 and (p - PLAIN)[7, 3] == pytest.approx(2.0)),
+        (
+            case("gain_step", change=0.2, breath=5.0),
+            lambda p: np.allclose(p[:4], PLAIN[:4]) and (p - PLAIN)[4:, END].min() > 2.0,
+        ),
+        (
+            case("gain_drift", "linear", change=0.2),
+            lambda p: np.all(np.diff(p[:, END]) > 0.0) and p[0, END] == PLAIN[0, END],
+        ),
+        (
+            case("zero_step", change=-1.5, breath=3.0),
+            lambda p: np.allclose(p[:2], PLAIN[:2]) and np.allclose(p[2:], PLAIN[2:] - 1.5),
+        ),
+        (
+            case("sensor_drift", "warm-up", drift=2.0),
+            lambda p: (p - PLAIN)[4, 3] > 1.5 and (p - PLAIN)[7, 3] == pytest.approx(2.0),
+        ),
         (case("resistance_step", change=0.5, breath=4.0), lambda p: (p - PLAIN)[3:, 6].min() > 2.0),
         (case("resistance_drift", "linear", change=0.5), lambda p: (p - PLAIN)[7, 6] > 2.0),
-        (case("compliance_step", change=-0.3, breath=4.0),
-         lambda p: (p - PLAIN)[3:, END].min() > 2.0),
+        (
+            case("compliance_step", change=-0.3, breath=4.0),
+            lambda p: (p - PLAIN)[3:, END].min() > 2.0,
+        ),
         (case("compliance_drift", "linear", change=0.4), lambda p: (p - PLAIN)[7, END] < -2.0),
-        (case("lost_commands", share=0.3), lambda p: np.allclose(p[:, END], PLAIN[:, END], atol=3.0)
-         and not np.allclose(p, PLAIN, atol=0.5)),
+        (
+            case("lost_commands", share=0.3),
+            lambda p: (
+                np.allclose(p[:, END], PLAIN[:, END], atol=3.0)
+                and not np.allclose(p, PLAIN, atol=0.5)
+            ),
+        ),
         (case("late_commands", share=0.5, delay=0.09), lambda p: (p - PLAIN)[:, 2].min() < -2.0),
-        (case("relief_leak", opening=14.0, conductance=30.0),
-         lambda p: np.allclose(p[:, :5], PLAIN[:, :5]) and (p - PLAIN)[:, END].max() < -2.0),
+        (
+            case("relief_leak", opening=14.0, conductance=30.0),
+            lambda p: np.allclose(p[:, :5], PLAIN[:, :5]) and (p - PLAIN)[:, END].max() < -2.0,
+        ),
         (case("trapped_gas", pressure=4.0), lambda p: (p - PLAIN)[:, 5].min() > 2.0),
         (case("command_rounding", "nearest", step=2.0), lambda p: (p - PLAIN)[:, 6].min() > 0.5),
-        (case("supply_ripple", amplitude=0.2, frequency=5.0),
-         lambda p: np.std((p - PLAIN)[:, 5:33]) > 0.5),
-        (case("circuit_water", amplitude=1.5, frequency=4.0),
-         lambda p: 1.2 < np.abs((p - PLAIN)[:, 5:33]).max() < 1.6),
+        (
+            case("supply_ripple", amplitude=0.2, frequency=5.0),
+            lambda p: np.std((p - PLAIN)[:, 5:33]) > 0.5,
+        ),
+        (
+            case("circuit_water", amplitude=1.5, frequency=4.0),
+            lambda p: 1.2 < np.abs((p - PLAIN)[:, 5:33]).max() < 1.6,
+        ),
     ],
     ids=lambda value: value.effects[0].name if isinstance(value, FaultsCase) else "",
-)  # fmt: skip
+)
 def test_a_fault_does_what_it_is_called(rig, what):
     assert what(answered(rig))
 
@@ -107,8 +139,13 @@ def test_a_fault_of_some_breaths_leaves_the_others_alone(rig, sign):
 
 def test_where_a_fault_acts_that_is_everywhere_has_no_flags():
     assert active(QUIET, record(QUIET, np.random.default_rng(0))) is None
-    both = replace(QUIET, effects=(*case("cough", pressure=9.0, affected=0.3).effects,
-                                   *case("clock_offset", offset=0.05).effects))  # fmt: skip
+    both = replace(
+        QUIET,
+        effects=(
+            *case("cough", pressure=9.0, affected=0.3).effects,
+            *case("clock_offset", offset=0.05).effects,
+        ),
+    )
     assert active(both, record(both, np.random.default_rng(0))) is None
 
 

@@ -101,8 +101,14 @@ def test_errors_are_measured_on_the_withheld_pressures():
 
 
 def test_an_answer_that_lies_about_itself_changes_nothing():
-    forged = SURE | {"notes": {"open_loop": {"after": {"rmse": 0.0}}, "verdict": "named",
-                               "seconds": 0.0, "right": True}}  # fmt: skip
+    forged = SURE | {
+        "notes": {
+            "open_loop": {"after": {"rmse": 0.0}},
+            "verdict": "named",
+            "seconds": 0.0,
+            "right": True,
+        }
+    }
     assert judged("single", [LEAK], forged) == judged("single", [LEAK], SURE)
     first, second = (
         [f for f in [*scores([c]), *by_kind([c])] if f.value is not None]
@@ -137,10 +143,14 @@ def test_values_are_those_a_fit_with_the_nominal_gain_sees():
     tube = Effect("circuit_compliance", "mild", "library", {"compliance": 1.2})
     rough = Effect("turbulent_resistance", "mild", "library", {"quadratic": 4.0})
     weak = case(LEAK, tube, rough, LAG, base=Base(10.0, 20.0, gain=22.8 * 1.1))
-    assert true_values(weak) == pytest.approx({
-        "leak.conductance": 20 / 1.1, "circuit_compliance.compliance": 1.2 / 1.1,
-        "turbulent_resistance.quadratic": 4 * 1.21, "valve_lag.tau": 0.04,
-    })  # fmt: skip
+    assert true_values(weak) == pytest.approx(
+        {
+            "leak.conductance": 20 / 1.1,
+            "circuit_compliance.compliance": 1.2 / 1.1,
+            "turbulent_resistance.quadratic": 4 * 1.21,
+            "valve_lag.tau": 0.04,
+        }
+    )
     assert true_values(case(LINEAR)) == {}
     assert true_values(case(base=Base(10.0, 20.0, gain=22.8 * 1.1))) == pytest.approx(
         {"R": 11.0, "C": 20 / 1.1}

@@ -25,9 +25,18 @@ from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths, make_breaths
 
 QUIET = StrangerCase(
-    "", 20.0, 20.0, (), Base(20.0, 20.0, 5.0, 5.0, 22.8), noise=0.0, step=0.0, jitter=3e-4,
-    breaths=4, samples=40, dead_space=0.002,
-)  # fmt: skip
+    "",
+    20.0,
+    20.0,
+    (),
+    Base(20.0, 20.0, 5.0, 5.0, 22.8),
+    noise=0.0,
+    step=0.0,
+    jitter=3e-4,
+    breaths=4,
+    samples=40,
+    dead_space=0.002,
+)
 
 
 def held(u_in: np.ndarray, u_out: np.ndarray) -> Breaths:
@@ -121,8 +130,9 @@ def test_a_breath_starts_on_the_curve_of_the_lung(form):
 def test_what_leaves_the_reservoir_empties_it():
     """The deficit of the supply follows the flow that is drawn, so that more is never less."""
     drop, recovery, R, C, asked = 0.3, 1.0, 20.0, 0.02, 1.14
-    effect = Effect("supply_droop", "strong", "regulator and reservoir",
-                    {"drop": drop, "recovery": recovery})  # fmt: skip
+    effect = Effect(
+        "supply_droop", "strong", "regulator and reservoir", {"drop": drop, "recovery": recovery}
+    )
     given = held(np.full(25, 50.0), np.zeros(25, np.int8))
     case = replace(QUIET, effects=(effect,), breaths=1)
     shown = replay(case, given, np.array([5.0]), 0)[0]
@@ -176,9 +186,17 @@ def test_cases_cover_the_laboratory():
 
 def test_a_recording_has_the_nuisances_of_its_case():
     case = replace(
-        QUIET, breaths=30, samples=60, noise=0.2, step=0.1, outliers=0.01, missing=0.02,
-        clock_step=1e-3, jitter=1e-3, proportional=10.0,
-    )  # fmt: skip
+        QUIET,
+        breaths=30,
+        samples=60,
+        noise=0.2,
+        step=0.1,
+        outliers=0.01,
+        missing=0.02,
+        clock_step=1e-3,
+        jitter=1e-3,
+        proportional=10.0,
+    )
     breaths = record(case, np.random.default_rng(1))
     known = breaths.pressure[np.isfinite(breaths.pressure)]
     assert 0.005 < np.isnan(breaths.pressure).mean() < 0.05

@@ -56,15 +56,24 @@ def answer(*hypotheses: tuple[float, str], **changed: Any) -> dict[str, Any]:
 def answered(given: dict[str, Any] | None, **changed: Any) -> dict[str, Any]:
     """The file of an answer; None for a lost case."""
     return {
-        "recording_sha256": "", "seconds": 10.0, "peak_mib": 500.0, "code": "", "layers": [],
-        "problem": "" if given else "failed", "answer": given,
-    } | changed  # fmt: skip
+        "recording_sha256": "",
+        "seconds": 10.0,
+        "peak_mib": 500.0,
+        "code": "",
+        "layers": [],
+        "problem": "" if given else "failed",
+        "answer": given,
+    } | changed
 
 
 def judged(
-    kind: Any, effects: list[Effect], given: dict[str, Any] | None, worth: float = 100.0,
-    kept: Withheld | None = None, **changed: Any,
-) -> JudgedCase:  # fmt: skip
+    kind: Any,
+    effects: list[Effect],
+    given: dict[str, Any] | None,
+    worth: float = 100.0,
+    kept: Withheld | None = None,
+    **changed: Any,
+) -> JudgedCase:
     nats = [worth] * len(effects)
     file = answered(given, **changed)
     return judge(drawn(kind, *effects), nats, recording(), kept or withheld(), file)
@@ -89,9 +98,10 @@ def unsure(folder: Path) -> dict[str, Any]:
     """Is not sure."""
     return _flat(folder, ["leak"]) | {
         "hypotheses": [
-            {"terms": ["leak"], "probability": 0.6}, {"terms": [], "probability": 0.4},
+            {"terms": ["leak"], "probability": 0.6},
+            {"terms": [], "probability": 0.4},
         ],
-    }  # fmt: skip
+    }
 
 
 def fails(folder: Path) -> None:

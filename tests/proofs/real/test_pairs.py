@@ -28,9 +28,16 @@ def run(R: float, C: float, label: tuple[float, float], seed: int) -> Breaths:
     volume = np.cumsum(flow * 0.01, axis=1)
     pressure = 5.0 + volume / C + R * flow * 1e-3 + 0.1 * rng.standard_normal(time.shape)
     return make_breaths(
-        np.arange(n), [label[0]] * n, [label[1]] * n, time, 0 * time, out, pressure,
-        flow=flow, volume=volume,
-    )  # fmt: skip
+        np.arange(n),
+        [label[0]] * n,
+        [label[1]] * n,
+        time,
+        0 * time,
+        out,
+        pressure,
+        flow=flow,
+        volume=volume,
+    )
 
 
 @pytest.fixture(scope="module")

@@ -290,8 +290,9 @@ def test_the_unnamed_part_does_not_count_for_the_cut(recordings, tmp_path, monke
     assert part["mae_by_names_alone"] == pytest.approx(one.open_loop.before.mae, rel=0.1)
     assert abs(part["cut_percent"]) < 10.0
     assert not found.met
-    kept, summary = (json.loads((tmp_path / "rc" / f"{name}.json").read_text())
-                     for name in ("diagnosis", "part"))  # fmt: skip
+    kept, summary = (
+        json.loads((tmp_path / "rc" / f"{name}.json").read_text()) for name in ("diagnosis", "part")
+    )
     assert figures(kept, summary)["cut_percent"] == part["cut_percent"]
     assert figures(kept | {"mechanisms": []}, summary)["cut_percent"] is None  # names do nothing
 
@@ -313,9 +314,13 @@ def test_the_command(recordings, tmp_path, diagnoses):
     assert ran.exit_code == (0 if met else 1)
     assert plain["met"] is met
     assert sorted(p.name for p in (tmp_path / "rc").iterdir()) == [
-        "corrected.json", "diagnosis.json", "diagnosis.rrd", "part.json", "record_next.csv",
+        "corrected.json",
+        "diagnosis.json",
+        "diagnosis.rrd",
+        "part.json",
+        "record_next.csv",
         "report.html",
-    ]  # fmt: skip
+    ]
     assert all(name in str(command.rig.__annotations__["only"]) for name in PARTS)
 
 

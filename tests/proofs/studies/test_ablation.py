@@ -75,9 +75,15 @@ def test_controllers_are_compared(tmp_path):
 
     def compare(simulators: Any = Textbook(), config: ResidualConfig = SMALL) -> pd.DataFrame:
         return controllers.compare(
-            simulators, tmp_path, (0, 1), config=config, only=["direct"], draws=1, gains=GAINS,
+            simulators,
+            tmp_path,
+            (0, 1),
+            config=config,
+            only=["direct"],
+            draws=1,
+            gains=GAINS,
             progress=lambda *x: told.append(x),
-        )  # fmt: skip
+        )
 
     runs: Any = compare()
     assert runs["variant"].tolist() == ["base", "base", "direct", "direct"]
@@ -106,9 +112,15 @@ def test_a_training_in_another_process_is_that_in_this_one(tmp_path):
     def compare(folder: str, workers: int) -> pd.DataFrame:
         lungs: Any = Textbook()
         return controllers.compare(
-            lungs, tmp_path / folder, (0,), config=SMALL, only=[], draws=1, gains=GAINS,
+            lungs,
+            tmp_path / folder,
+            (0,),
+            config=SMALL,
+            only=[],
+            draws=1,
+            gains=GAINS,
             workers=workers,
-        )  # fmt: skip
+        )
 
     pd.testing.assert_frame_equal(compare("there", 1), compare("here", 0))
 
@@ -119,10 +131,13 @@ def test_the_table_of_controllers_pairs_seeds():
         [
             {"variant": name, "seed": seed, "nominal": nominal} | figures
             for name, seed, nominal in (
-                ("base", 0, 2.0), ("base", 1, 2.4), ("wide", 0, 1.9), ("wide", 1, 2.6)
+                ("base", 0, 2.0),
+                ("base", 1, 2.4),
+                ("wide", 0, 1.9),
+                ("wide", 1, 2.6),
             )
         ]
-    )  # fmt: skip
+    )
     rows: Any = controllers.summary(runs).set_index("variant")
     assert rows.loc["wide", "nominal"] == pytest.approx(2.25)
     assert rows.loc["wide", "nominal_change_low"] == pytest.approx(-0.1)
@@ -143,9 +158,14 @@ def test_networks_of_another_process_are_those_of_this_one(tmp_path):
 
     def compare(out: str, workers: int) -> pd.DataFrame:
         return networks.compare(
-            folder, tmp_path / out, base=TINY, config=Training(steps=1, batch=2), members=2,
-            only=[], workers=workers,
-        )  # fmt: skip
+            folder,
+            tmp_path / out,
+            base=TINY,
+            config=Training(steps=1, batch=2),
+            members=2,
+            only=[],
+            workers=workers,
+        )
 
     pd.testing.assert_frame_equal(compare("there", 1), compare("here", 0))
 
@@ -161,10 +181,14 @@ def test_networks_are_compared(tmp_path):
 
     def compare() -> pd.DataFrame:
         return networks.compare(
-            folder, out, base=TINY, config=Training(steps=2, batch=2), members=2,
+            folder,
+            out,
+            base=TINY,
+            config=Training(steps=2, batch=2),
+            members=2,
             only=["H_p 1"],
             progress=lambda *x: told.append(x),
-        )  # fmt: skip
+        )
 
     breaths: Any = compare()
     assert breaths["variant"].unique().tolist() == ["base", "H_p 1"]

@@ -77,7 +77,8 @@ def test_one_line_in_the_registry_brings_a_figure_into_scores_and_under_the_cont
     plants = stack([single_compartment(LUNGS[0])])
     score = run_protocol(
         submission_of(lambda seen: 2.0 * (seen.target - seen.pressure)),
-        Rigs(LUNGS[:1], plants), pips=(20.0,),
-    )  # fmt: skip
+        Rigs(LUNGS[:1], plants),
+        pips=(20.0,),
+    )
     assert list(score.figures) == list(FIGURES)
     assert score.figures["peak_cmH2O"].shape == (1, 1, 2)

@@ -47,11 +47,19 @@ def read(
     believed, true = REFERENCE_FLOW, gain * REFERENCE_FLOW
     R = (drop(label.R, share, true) + tube * true) / believed
     return LabelTest(
-        session=0, lung=label, measured=5, breaths=20,
-        R=R, R_interval=(0.97 * R, 1.03 * R), C=C / gain, C_interval=(0.97 * C, 1.03 * C),
-        laminar_share=0.4, error_own_label=0.5, best_other_label="R50C20",
+        session=0,
+        lung=label,
+        measured=5,
+        breaths=20,
+        R=R,
+        R_interval=(0.97 * R, 1.03 * R),
+        C=C / gain,
+        C_interval=(0.97 * C, 1.03 * C),
+        laminar_share=0.4,
+        error_own_label=0.5,
+        best_other_label="R50C20",
         error_best_other_label=0.9,
-    )  # fmt: skip
+    )
 
 
 PASSED = read("R20C50", C=48.0)
@@ -163,10 +171,14 @@ def recorded(
             pressure = pressure + (gain * 0.0228 * u_in[:, k] - flow) / 0.0008 * dt / parts
             recoil = recoil + 1000.0 * flow / C * dt / parts
     return make_breaths(
-        breath_id=np.arange(n) + first_id, R=np.full(n, label.R), C=np.full(n, label.C),
-        time=np.tile(dt * np.arange(samples), (n, 1)), u_in=u_in,
-        u_out=np.zeros((n, samples), int), pressure=readings + random.normal(0.0, 0.1, u_in.shape),
-    )  # fmt: skip
+        breath_id=np.arange(n) + first_id,
+        R=np.full(n, label.R),
+        C=np.full(n, label.C),
+        time=np.tile(dt * np.arange(samples), (n, 1)),
+        u_in=u_in,
+        u_out=np.zeros((n, samples), int),
+        pressure=readings + random.normal(0.0, 0.1, u_in.shape),
+    )
 
 
 def judged(*parts: Breaths) -> list[LabelTest]:

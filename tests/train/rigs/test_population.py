@@ -59,9 +59,14 @@ def test_rigs_of_known_size_are_told_apart_through_the_gains_of_their_breaths():
     zeros: Any = np.zeros((n, samples))
     make: Any = InspirationData
     data = make(
-        groups, np.full(n, 5.0), np.ones(n), u_in, np.full((n, samples), 0.032), zeros,
+        groups,
+        np.full(n, 5.0),
+        np.ones(n),
+        u_in,
+        np.full((n, samples), 0.032),
+        zeros,
         np.full((n, samples), 1.0 / samples),
-    )  # fmt: skip
+    )
     with compilation.float64():
         rigs: Any = from_vector(true[at], np)
         rigs = rigs.replace(slopes=rigs.slopes * np.exp(gain)[:, None])

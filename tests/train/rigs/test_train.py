@@ -49,8 +49,9 @@ def test_every_file_in_the_schema_is_read_and_a_breath_counts_once(folder):
     data = load_rig_recordings(folder, folds=CONFIG.folds, seed=CONFIG.seed)
     assert data.labels == (OWN,)
     assert {name: about["breaths"] for name, about in data.sources.items()} == {
-        "monday.csv": 6, "tuesday.parquet": 7,
-    }  # fmt: skip
+        "monday.csv": 6,
+        "tuesday.parquet": 7,
+    }
     assert data.skipped == ("notes.csv",)
     assert len(data.breaths) == data.measured == 12
     assert len(set(data.breaths.breath_id.tolist())) == 12
@@ -162,8 +163,10 @@ def test_progress_and_nothing_left_behind(trained):
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, 1.0)
     assert {path.name for path in out.iterdir()} == {
-        frozen.MANIFEST, frozen.MEMBERS, frozen.SEEN,
-    }  # fmt: skip
+        frozen.MANIFEST,
+        frozen.MEMBERS,
+        frozen.SEEN,
+    }
 
 
 @pytest.mark.slow

@@ -85,9 +85,13 @@ def test_the_features_are_those_of_the_residual_controller():
     network = Residual(PID(*residual.GAINS), ())
     assert residual.FEATURES == 30
     seen = Observation(
-        jnp.asarray(0.0), jnp.asarray(0.03), jnp.asarray(5.0), jnp.asarray(20.0),
-        jnp.full((10,), 15.0), jnp.asarray(5.0),
-    )  # fmt: skip
+        jnp.asarray(0.0),
+        jnp.asarray(0.03),
+        jnp.asarray(5.0),
+        jnp.asarray(20.0),
+        jnp.full((10,), 15.0),
+        jnp.asarray(5.0),
+    )
     _, found, base = residual.features(residual.init_features(()), seen)
     _, wanted, asked = network.features(network.init(()), seen)
     np.testing.assert_array_equal(found, wanted)

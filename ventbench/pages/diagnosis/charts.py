@@ -227,29 +227,38 @@ def _panel(
     time, recorded = breath.time[i][use], breath.pressure[i][use]
     simulated = {key: getattr(traces, key)[i][use] for key in looks}
     pressure = Chart(
-        (0.0, end), limits(recorded, traces.refit[i][use], traces.after[i][use]), "", "cmH2O",
+        (0.0, end),
+        limits(recorded, traces.refit[i][use], traces.after[i][use]),
+        "",
+        "cmH2O",
         f"Pressure of {name}: recorded, and simulated before, after refit and corrected.",
         height=140.0,
-    )  # fmt: skip
+    )
     low, high = window(time, recorded, simulated["refit"])
     pressure.band(low, high)
     within = (time >= low - 1e-9) & (time <= high + 1e-9)
     seen = [recorded[within], *(simulated[key][within] for key in looks if key != "before")]
     near = Chart(
-        (low, high), limits(*seen), "", "magnified, cmH2O",
-        f"{capital(name)} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
-    )  # fmt: skip
+        (low, high),
+        limits(*seen),
+        "",
+        "magnified, cmH2O",
+        f"{capital(name)} from {low:.2f} to {high:.2f} s, magnified.",
+        height=130.0,
+    )
     for chart, part in ((pressure, slice(None)), (near, within)):
         chart.line("seen", time[part], recorded[part])
         for key in looks:
             chart.line(key, time[part], simulated[key][part])
     left = {key: recorded - values for key, values in simulated.items()}
     error = Chart(
-        (0.0, end), limits(*(left[key] for key in looks if key != "before"), least=1.0), "",
+        (0.0, end),
+        limits(*(left[key] for key in looks if key != "before"), least=1.0),
+        "",
         "recorded − simulated, cmH2O",
         f"Error of {name}, recorded minus simulated: as given, refitted and corrected.",
         height=110.0,
-    )  # fmt: skip
+    )
     for key in looks:
         error.line(key, time, left[key])
     valve = command(time, breath.u_in[i][use], end, f"Commands of {name}.", 84.0)
@@ -308,11 +317,13 @@ def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
     where = "; ".join(f"{p.low:.6g} to {p.high:.6g}" for p in places) or "none"
     chart = Chart(
         (float(edges[0]), float(edges[-1])),
-        y if y[1] - y[0] > 0.2 else limits(y, least=0.2, around=0.0), f"{axis.name}{unit}",
+        y if y[1] - y[0] > 0.2 else limits(y, least=0.2, around=0.0),
+        f"{axis.name}{unit}",
         "recorded − simulated, cmH2O",
-        f"Mean error along {axis.name}{unit}; significant ranges: {where}.", width=330.0,
+        f"Mean error along {axis.name}{unit}; significant ranges: {where}.",
+        width=330.0,
         height=190.0,
-    )  # fmt: skip
+    )
     if axis.name == EDGE:
         # Half of what matters happens in the first two samples after an edge.
         chart.log, chart.x = True, (_FIRST_EDGE_TIME, max(float(edges[-1]), 2 * _FIRST_EDGE_TIME))
@@ -335,11 +346,14 @@ def _near(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
 def own_signal(name: str, shown: Characteristic) -> Chart:
     """What a mechanism does to its own quantity, without it and with it."""
     chart = Chart(
-        (float(shown.x.min()), float(shown.x.max())), limits(shown.without, shown.acting),
-        shown.x_label, shown.y_label,
-        f"{shown.y_label} over {shown.x_label}, without and with {name}.", width=360.0,
+        (float(shown.x.min()), float(shown.x.max())),
+        limits(shown.without, shown.acting),
+        shown.x_label,
+        shown.y_label,
+        f"{shown.y_label} over {shown.x_label}, without and with {name}.",
+        width=360.0,
         height=200.0,
-    )  # fmt: skip
+    )
     chart.line(_WITHOUT, shown.x, shown.without)
     chart.line(_WITH, shown.x, shown.acting)
     return chart
@@ -348,10 +362,14 @@ def own_signal(name: str, shown: Characteristic) -> Chart:
 def nonparametric_term(shape: NonparametricTerm) -> Chart:
     """The curve of a nonparametric term."""
     chart = Chart(
-        (float(shape.x.min()), float(shape.x.max())), limits(shape.y, [0.0]), shape.x_unit,
-        shape.y_unit, f"Shape of {shape.name}: {shape.y_unit} over {shape.x_unit}.", width=420.0,
+        (float(shape.x.min()), float(shape.x.max())),
+        limits(shape.y, [0.0]),
+        shape.x_unit,
+        shape.y_unit,
+        f"Shape of {shape.name}: {shape.y_unit} over {shape.x_unit}.",
+        width=420.0,
         height=220.0,
-    )  # fmt: skip
+    )
     chart.line("after", shape.x, shape.y)
     return chart
 

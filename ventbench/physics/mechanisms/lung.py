@@ -22,23 +22,44 @@ class TurbulentResistance(Mechanism):
     """A pressure drop that grows with the square of flow, or nearly."""
 
     description = Description(
-        name="turbulent_resistance", title="resistance that grows with flow", site="airway",
+        name="turbulent_resistance",
+        title="resistance that grows with flow",
+        site="airway",
         equation="p = ... + R Q + quadratic Q |Q| (Q^2 + e^2)^(exponent / 2 - 1), e = 0.02 L/s",
         parameters=(
-            Parameter("quadratic", "cmH2O s2/L2", "second coefficient of Rohrer; drop at 1 L/s",
-                      0.0, 80.0, 0.0, 4.0, 10.0, follows="R"),
-            Parameter("exponent", "1", "2 for an orifice, 1.75 for a smooth tube",
-                      1.5, 2.0, 2.0, 2.0, 2.0, shape=True),
+            Parameter(
+                "quadratic",
+                "cmH2O s2/L2",
+                "second coefficient of Rohrer; drop at 1 L/s",
+                0.0,
+                80.0,
+                0.0,
+                4.0,
+                10.0,
+                follows="R",
+            ),
+            Parameter(
+                "exponent",
+                "1",
+                "2 for an orifice, 1.75 for a smooth tube",
+                1.5,
+                2.0,
+                2.0,
+                2.0,
+                2.0,
+                shape=True,
+            ),
         ),
         source="Rohrer's equation (Otis, Fenn and Rahn, J. Appl. Physiol. 2, 1950, 592); parabolic "
         "resistors of test lungs hold their label at one flow only. 1 to 30 cmH2O s2/L2. In a "
         "smooth tube the exponent is 1.75 (Blasius).",
         signature="Pressure drop grows faster than flow: error at high flow, in inspiration and at "
         "the start of expiration, most in lungs with low R; fitted R falls below the label.",
-        confusable=("valve_curve",), least=1.0,
+        confusable=("valve_curve",),
+        least=1.0,
         least_reason="the curvature of a straight tracheal tube; less is within R",
         special_case_of=("flow_shape",),
-    )  # fmt: skip
+    )
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Add the resistance; the part that differs from a square is taken at the last flow."""
@@ -59,22 +80,35 @@ class Inertance(Mechanism):
     """
 
     description = Description(
-        name="inertance", title="inertance of the gas", site="airway",
+        name="inertance",
+        title="inertance of the gas",
+        site="airway",
         equation="p = ... + inertance dQ/dt, tubing inertance / (inertance + 0.003) dp/dt = q_in - "
         "Q - q_out",
         parameters=(
-            Parameter("inertance", "cmH2O s2/L", "of gas in airway and tubing",
-                      0.0, 0.4, 0.0, 0.04, 0.1),
-            Parameter("tubing", "mL/cmH2O", "compliance of the circuit before it",
-                      0.0, 1.2, 0.0, 0.3, 0.5, grid=(0.0, 0.15, 0.4, 0.8)),
+            Parameter(
+                "inertance", "cmH2O s2/L", "of gas in airway and tubing", 0.0, 0.4, 0.0, 0.04, 0.1
+            ),
+            Parameter(
+                "tubing",
+                "mL/cmH2O",
+                "compliance of the circuit before it",
+                0.0,
+                1.2,
+                0.0,
+                0.3,
+                0.5,
+                grid=(0.0, 0.15, 0.4, 0.8),
+            ),
         ),
         source="Mass of the gas in airway and tubing, 0.01 to 0.02 cmH2O s2/L in adults (Bates, "
         "Lung Mechanics, Cambridge 2009), behind 0.1 to 1 mL/cmH2O of tubing.",
         signature="Overshoot and ringing after edges, above all at the start of expiration with "
         "low R; below 0.15 cmH2O s2/L without tubing invisible at 30 samples a second.",
-        confusable=("circuit_compliance", "exhalation_valve_delay"), least=0.008,
+        confusable=("circuit_compliance", "exhalation_valve_delay"),
+        least=0.008,
         least_reason="less than the gas in a tracheal tube alone",
-    )  # fmt: skip
+    )
 
     # With tubing it rings at 20 Hz: at 7 ms a step, a fit finds 15 to 50 % too little of it.
     divisions = 4
@@ -97,16 +131,35 @@ class NonlinearCompliance(Mechanism):
     """A recoil that rises faster than volume."""
 
     description = Description(
-        name="nonlinear_compliance", title="lung that stiffens as it fills", site="alveolus",
+        name="nonlinear_compliance",
+        title="lung that stiffens as it fills",
+        site="alveolus",
         equation="P_elastic = (ln(1 + sigmoid x) - ln(1 - x)) / (1 + sigmoid) / stiffening, x = "
         "stiffening V / C",
         parameters=(
-            Parameter("stiffening", "1/cmH2O", "1 over (capacity / C); negative: the lung softens",
-                      -0.05, 0.08, 0.0, 1 / 40, 1 / 24),
-            Parameter("sigmoid", "1",
-                      "0 for an exponential curve, 1 for the upper half of a sigmoid, more for one "
-                      "whose middle lies above zero pressure",
-                      0.0, 4.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0)),
+            Parameter(
+                "stiffening",
+                "1/cmH2O",
+                "1 over (capacity / C); negative: the lung softens",
+                -0.05,
+                0.08,
+                0.0,
+                1 / 40,
+                1 / 24,
+            ),
+            Parameter(
+                "sigmoid",
+                "1",
+                "0 for an exponential curve, 1 for the upper half of a sigmoid, more for one "
+                "whose middle lies above zero pressure",
+                0.0,
+                4.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
         ),
         source="Exponential pressure-volume curve of Salazar and Knowles (J. Appl. Physiol. 19, "
         "1964, 97), or the sigmoid of Venegas, Harris and Simon (J. Appl. Physiol. 84, 1998, 389), "
@@ -114,10 +167,11 @@ class NonlinearCompliance(Mechanism):
         "at 30 cmH2O.",
         signature="Pressure rises faster at high volume: end of inspiration of big breaths; "
         "expiration begins faster.",
-        confusable=("valve_curve", "leak"), least=0.003,
+        confusable=("valve_curve", "leak"),
+        least=0.003,
         least_reason="stiffening by 5 % at 15 cmH2O; less is within the spread of springs",
         special_case_of=("recoil_shape",),
-    )  # fmt: skip
+    )
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Tangent of the curve at the last volume, less the linear lung's.
@@ -156,23 +210,46 @@ class Viscoelasticity(Mechanism):
     """A spring with a dashpot beside the lung's elastance."""
 
     description = Description(
-        name="viscoelasticity", title="stress relaxation of the tissue", site="alveolus",
+        name="viscoelasticity",
+        title="stress relaxation of the tissue",
+        site="alveolus",
         equation="dS/dt = ratio / C Q - S / time, P = V / C + S",
         parameters=(
-            Parameter("ratio", "1", "elastance of the Maxwell element over that of the lung",
-                      0.0, 1.5, 0.0, 0.25, 0.7),
-            Parameter("time", "s", "its relaxation time",
-                      0.1, 5.0, 1.0, 1.0, 1.0, "log", grid=(0.2, 0.5, 1.5)),
+            Parameter(
+                "ratio",
+                "1",
+                "elastance of the Maxwell element over that of the lung",
+                0.0,
+                1.5,
+                0.0,
+                0.25,
+                0.7,
+            ),
+            Parameter(
+                "time",
+                "s",
+                "its relaxation time",
+                0.1,
+                5.0,
+                1.0,
+                1.0,
+                1.0,
+                "log",
+                grid=(0.2, 0.5, 1.5),
+            ),
         ),
         source="Maxwell element beside the elastance (Bates, Lung Mechanics, Cambridge 2009): "
         "ratio 0.05 to 0.7, 0.3 to 2 s. A second compartment has an impedance of the same order.",
         signature="Pressure creeps down while volume is held and lags behind slow changes, in "
         "inspiration and expiration; nearly all of it can hide in R and C.",
-        confusable=("leak", "supply_droop"), least=0.04,
-        least_reason="creep below that of rubber bellows", special_case_of=("recoil_memory",),
+        confusable=("leak", "supply_droop"),
+        least=0.04,
+        least_reason="creep below that of rubber bellows",
+        special_case_of=("recoil_memory",),
         # Its slow stress trades against C, and what is left of another mechanism's form decides.
-        beside_error=0.2, equivalents=("second_compartment",),
-    )  # fmt: skip
+        beside_error=0.2,
+        equivalents=("second_compartment",),
+    )
 
     stateful = True
 
@@ -192,20 +269,31 @@ class TrappedGas(Mechanism):
     """A pressure in the lung above that at the airway when a breath begins (auto-PEEP)."""
 
     description = Description(
-        name="trapped_gas", title="trapped gas at the start of a breath", site="alveolus",
+        name="trapped_gas",
+        title="trapped gas at the start of a breath",
+        site="alveolus",
         equation="P_alveolus(0) = p(0) + pressure",
         parameters=(
-            Parameter("pressure", "cmH2O", "excess in the lung at the first sample",
-                      0.0, 10.0, 0.0, 1.5, 4.0),
+            Parameter(
+                "pressure",
+                "cmH2O",
+                "excess in the lung at the first sample",
+                0.0,
+                10.0,
+                0.0,
+                1.5,
+                4.0,
+            ),
         ),
         source="Expiration that ends before the lung is empty leaves 1 to 15 cmH2O (Pepe and "
         "Marini, Am. Rev. Respir. Dis. 126, 1982, 166).",
         signature=(
             "A breath begins above its first reading at once, and gas flows out before it is given."
         ),
-        confusable=("leak", "zero_step"), least=0.3,
+        confusable=("leak", "zero_step"),
+        least=0.3,
         least_reason="a valve that closes some milliseconds late",
-    )  # fmt: skip
+    )
 
     def of_breath(self, values: Values, base: Values) -> Values:
         """Recoil above the pressure at the airway."""
@@ -221,20 +309,49 @@ class PatientEffort(Mechanism):
     """A pressure source at the alveolus: half a sine, or a muscle that relaxes after its peak."""
 
     description = Description(
-        name="patient_effort", title="effort of the patient's muscles", site="alveolus",
+        name="patient_effort",
+        title="effort of the patient's muscles",
+        site="alveolus",
         equation="P_alveolus = ... - amplitude ((1 - relaxing) sin(pi x) + relaxing m(x)), x = (t "
         "- onset) / duration, m = sin(3 pi x / 4) up to x = 2/3, then exp(4 - 6 x)",
         parameters=(
-            Parameter("amplitude", "cmH2O",
-                      "highest pressure of the muscles, positive if inspiratory",
-                      -20.0, 20.0, 0.0, 2.0, 5.0, scope="breath", scan=(2.0, -2.0)),
-            Parameter("onset", "s", "after the first sample",
-                      0.0, 2.5, 0.3, 0.3, 0.3, scope="breath",
-                      scan=(0.05, 0.3, 0.6, 0.9, 1.2, 1.6)),
+            Parameter(
+                "amplitude",
+                "cmH2O",
+                "highest pressure of the muscles, positive if inspiratory",
+                -20.0,
+                20.0,
+                0.0,
+                2.0,
+                5.0,
+                scope="breath",
+                scan=(2.0, -2.0),
+            ),
+            Parameter(
+                "onset",
+                "s",
+                "after the first sample",
+                0.0,
+                2.5,
+                0.3,
+                0.3,
+                0.3,
+                scope="breath",
+                scan=(0.05, 0.3, 0.6, 0.9, 1.2, 1.6),
+            ),
             Parameter("duration", "s", "of the effort", 0.2, 2.0, 0.8, 0.8, 0.8),
-            Parameter("relaxing", "1",
-                      "0 for half a sine, 1 for a muscle that relaxes exponentially after its peak",
-                      0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0)),
+            Parameter(
+                "relaxing",
+                "1",
+                "0 for half a sine, 1 for a muscle that relaxes exponentially after its peak",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
         ),
         source="Half-sine muscle pressure, as active lung simulators take it: 1 to 15 cmH2O for "
         "0.4 to 1.2 s; inspiratory muscles relax exponentially, with time constants of 0.05 to 0.2 "
@@ -242,8 +359,9 @@ class PatientEffort(Mechanism):
         signature="A dent in pressure that the commands do not explain and that differs from "
         "breath to breath: absent in some, early or late in others.",
         confusable=("a source at the alveolus that repeats in every breath",),
-        least=0.5, least_reason="a muscle pressure that a trigger would hardly see",
-    )  # fmt: skip
+        least=0.5,
+        least_reason="a muscle pressure that a trigger would hardly see",
+    )
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Subtract the pressure of the muscles from the recoil."""

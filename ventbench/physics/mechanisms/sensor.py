@@ -18,23 +18,33 @@ class SensorLag(Mechanism):
     """The reading follows the airway's pressure through one lag or two."""
 
     description = Description(
-        name="sensor_lag", title="lag of the pressure sensor", site="sensor",
+        name="sensor_lag",
+        title="lag of the pressure sensor",
+        site="sensor",
         equation="tau dx/dt = p - x, second dy/dt = x - y",
         parameters=(
             Parameter("tau", "s", "time constant", 0.0, 0.25, 0.0, 0.05, 0.12),
-            Parameter("second", "s",
-                      "time constant of a lag behind the first, as of a filter behind a sampling "
-                      "line",
-                      0.0, 0.25, 0.0, 0.0, 0.0, shape=True),
+            Parameter(
+                "second",
+                "s",
+                "time constant of a lag behind the first, as of a filter behind a sampling line",
+                0.0,
+                0.25,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+            ),
         ),
         source="Low-pass filter of sensor, sampling line and electronics: 5 to 120 ms.",
         signature="All edges of pressure are rounded, in inspiration and at the start of "
         "expiration alike, whatever R is.",
         confusable=("valve_lag", "circuit_compliance", "valve_delay"),
-        least=0.012, least_reason="a third of a sample: less is an offset between two clocks",
+        least=0.012,
+        least_reason="a third of a sample: less is an offset between two clocks",
         special_case_of=("sensor_memory",),
         interchangeable=(("tau", "second"),),
-    )  # fmt: skip
+    )
     stateful = True
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
@@ -63,21 +73,31 @@ class SensorCurve(Mechanism):
     """A parabola on top of the true pressure."""
 
     description = Description(
-        name="sensor_curve", title="bent characteristic of the pressure sensor", site="sensor",
+        name="sensor_curve",
+        title="bent characteristic of the pressure sensor",
+        site="sensor",
         equation="y = p + 4 bend p / 40 (1 - p / 40)",
         parameters=(
-            Parameter("bend", "cmH2O",
-                      "error at 20 cmH2O of a sensor that is right at 0 and at 40 cmH2O",
-                      -6.0, 6.0, 0.0, 0.9, 1.4),
+            Parameter(
+                "bend",
+                "cmH2O",
+                "error at 20 cmH2O of a sensor that is right at 0 and at 40 cmH2O",
+                -6.0,
+                6.0,
+                0.0,
+                0.9,
+                1.4,
+            ),
         ),
         source="Terminal-base nonlinearity of piezoresistive sensors: 0.1 to 1 % of full scale if "
         "compensated, several percent if not.",
         signature="An error by pressure alone, in inspiration and expiration alike, whatever flow "
         "and volume are.",
-        confusable=("nonlinear_compliance", "supply_pressure"), least=0.25,
+        confusable=("nonlinear_compliance", "supply_pressure"),
+        least=0.25,
         least_reason="half a percent of a usual sensor's full scale",
         special_case_of=("sensor_shape",),
-    )  # fmt: skip
+    )
 
     def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
         """Bent pressure."""
@@ -116,20 +136,32 @@ class ClockOffset(Mechanism):
     """One dead time of all commands: that of a path or clock that all readings share."""
 
     description = Description(
-        name="clock_offset", title="delay between commands and pressure", site="sensor",
+        name="clock_offset",
+        title="delay between commands and pressure",
+        site="sensor",
         equation="y(t) = p(t - offset): both commands act late by one time",
         parameters=(
-            Parameter("offset", "s", "common dead time",
-                      0.0, 0.15, 0.0, 0.03, 0.06, scan=tuple(0.01 * k for k in range(16)),
-                      kinked=True),
+            Parameter(
+                "offset",
+                "s",
+                "common dead time",
+                0.0,
+                0.15,
+                0.0,
+                0.03,
+                0.06,
+                scan=tuple(0.01 * k for k in range(16)),
+                kinked=True,
+            ),
         ),
         source="Clocks that are not aligned, a buffer of one to three samples before the log, or a "
         "sensor with a dead time.",
         signature="All that happens in pressure comes late by one time, at edges of both valves "
         "alike.",
-        confusable=("valve_delay", "exhalation_valve_delay", "sensor_lag"), least=0.008,
+        confusable=("valve_delay", "exhalation_valve_delay", "sensor_lag"),
+        least=0.008,
         least_reason="a quarter of a sample: less is within the time stamps of a log",
-    )  # fmt: skip
+    )
 
     def dead_time(self, values: Values, time: Array) -> Array:
         """The delay, s."""
@@ -144,20 +176,33 @@ class ClockSkew(Mechanism):
     """A common dead time that grows through each breath."""
 
     description = Description(
-        name="clock_skew", title="clocks of commands and pressure that run apart", site="sensor",
+        name="clock_skew",
+        title="clocks of commands and pressure that run apart",
+        site="sensor",
         equation="y(t) = p(t - skew t), t = time since the start of the breath",
         parameters=(
-            Parameter("skew", "1", "share of the time by which pressure falls behind",
-                      0.0, 0.04, 0.0, 0.01, 0.025, scan=(0.0, 0.003, 0.006, 0.012, 0.02, 0.03),
-                      kinked=True, share=True),
+            Parameter(
+                "skew",
+                "1",
+                "share of the time by which pressure falls behind",
+                0.0,
+                0.04,
+                0.0,
+                0.01,
+                0.025,
+                scan=(0.0, 0.003, 0.006, 0.012, 0.02, 0.03),
+                kinked=True,
+                share=True,
+            ),
         ),
         source="Quartz clocks agree to 0.01 %; those of operating systems, and rates that are "
         "given as rounded numbers, to 0.1 to 4 %.",
         signature="Early edges are on time; others come late in proportion to the time in the "
         "breath.",
-        confusable=("clock_offset", "exhalation_valve_delay", "valve_delay"), least=0.002,
+        confusable=("clock_offset", "exhalation_valve_delay", "valve_delay"),
+        least=0.002,
         least_reason="4 ms at the end of a breath of 2 s",
-    )  # fmt: skip
+    )
 
     def dead_time(self, values: Values, time: Array) -> Array:
         """The delay of a command at a time in the breath, s."""

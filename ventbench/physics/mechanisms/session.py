@@ -15,15 +15,30 @@ _STEADY = 1e-4
 
 #: Where a step is, which a fit finds by trying each breath; there is no slope towards it.
 _AT = Parameter(
-    "at", "1", "position of the change between two breaths of the recording, 0..1",
-    0.0, 1.0, 0.5, 0.5, 0.5, spread=np.inf, change_point=True,
-)  # fmt: skip
+    "at",
+    "1",
+    "position of the change between two breaths of the recording, 0..1",
+    0.0,
+    1.0,
+    0.5,
+    0.5,
+    0.5,
+    spread=np.inf,
+    change_point=True,
+)
 
 #: How a drift fades.
 _WARMING = Parameter(
-    "warming", "1", "times that the drift fades by e in the recording; 0: it is steady",
-    0.0, 10.0, 0.0, 0.0, 0.0, shape=True,
-)  # fmt: skip
+    "warming",
+    "1",
+    "times that the drift fades by e in the recording; 0: it is steady",
+    0.0,
+    10.0,
+    0.0,
+    0.0,
+    0.0,
+    shape=True,
+)
 
 _POSITION = "x = position of the breath in the recording, 0..1"
 _GROWN = f"g = (1 - exp(-warming x)) / (1 - exp(-warming)), {_POSITION}"
@@ -76,10 +91,19 @@ class SensorChange(Mechanism):
 
 
 def _pair(
-    path: str, short: str, words: str, site: Site, bounds: tuple[float, float],
-    sizes: tuple[float, float], least: float, reason: str, step: str, drift: str, sign: str,
+    path: str,
+    short: str,
+    words: str,
+    site: Site,
+    bounds: tuple[float, float],
+    sizes: tuple[float, float],
+    least: float,
+    reason: str,
+    step: str,
+    drift: str,
+    sign: str,
     confusable: tuple[tuple[str, ...], tuple[str, ...]],
-) -> tuple[ChangedParameter, ChangedParameter]:  # fmt: skip
+) -> tuple[ChangedParameter, ChangedParameter]:
     """A step and a drift of one parameter; ``step`` and ``drift`` are their sources."""
     mild, scan = sizes[0], (sizes[0], -sizes[0])
 
@@ -88,91 +112,180 @@ def _pair(
     ) -> Description:
         when = "before" if kind == "step" else "from the first breath to the last"
         change = Parameter(
-            "change", "1", f"change, as a share of {path} {when}", *bounds, 0.0, mild, sizes[1],
-            scan=scan if kind == "step" else (), share=True,
-        )  # fmt: skip
+            "change",
+            "1",
+            f"change, as a share of {path} {when}",
+            *bounds,
+            0.0,
+            mild,
+            sizes[1],
+            scan=scan if kind == "step" else (),
+            share=True,
+        )
         return Description(
-            name=f"{short}_{kind}", title=title, site=site, equation=equation,
-            parameters=(change, form), confusable=confusable[kind == "drift"],
-            least=least, least_reason=reason, source=source, signature=signature,
-        )  # fmt: skip
+            name=f"{short}_{kind}",
+            title=title,
+            site=site,
+            equation=equation,
+            parameters=(change, form),
+            confusable=confusable[kind == "drift"],
+            least=least,
+            least_reason=reason,
+            source=source,
+            signature=signature,
+        )
 
     return (
-        ChangedParameter(described(
-            "step", f"step of the {words}",
-            f"{path} = {path} (1 + change) where x > at, {_POSITION}", _AT,
-            source=step, signature=f"From one breath on, {sign}.",
-        ), path),
-        ChangedParameter(described(
-            "drift", f"drift of the {words}", f"{path} = {path} (1 + change g), {_GROWN}", _WARMING,
-            source=drift, signature=f"With the number of the breath, {sign} more or less.",
-        ), path),
-    )  # fmt: skip
+        ChangedParameter(
+            described(
+                "step",
+                f"step of the {words}",
+                f"{path} = {path} (1 + change) where x > at, {_POSITION}",
+                _AT,
+                source=step,
+                signature=f"From one breath on, {sign}.",
+            ),
+            path,
+        ),
+        ChangedParameter(
+            described(
+                "drift",
+                f"drift of the {words}",
+                f"{path} = {path} (1 + change g), {_GROWN}",
+                _WARMING,
+                source=drift,
+                signature=f"With the number of the breath, {sign} more or less.",
+            ),
+            path,
+        ),
+    )
 
 
 MECHANISMS = (
     *_pair(
-        "gain", "gain", "valve's gain", "inspiratory valve", (-0.6, 1.5), (0.15, 0.3), 0.03,
+        "gain",
+        "gain",
+        "valve's gain",
+        "inspiratory valve",
+        (-0.6, 1.5),
+        (0.15, 0.3),
+        0.03,
         "regulators hold their pressure to a few percent",
         "A regulator that is set anew, a bottle that is changed, a filter that clogs, or a driver "
         "that is calibrated between two breaths.",
         "Blowers and coils warm up within minutes and lose 5 to 20 % of their flow; a bottle "
         "empties steadily.",
         "all that the valve delivers is larger by one factor",
-        (("gain_drift", "compliance_step", "resistance_step"),
-         ("gain_step", "compliance_drift", "resistance_drift")),
+        (
+            ("gain_drift", "compliance_step", "resistance_step"),
+            ("gain_step", "compliance_drift", "resistance_drift"),
+        ),
     ),
     *_pair(
-        "R", "resistance", "resistance", "airway", (-0.8, 3.0), (0.3, 0.6), 0.05,
+        "R",
+        "resistance",
+        "resistance",
+        "airway",
+        (-0.8, 3.0),
+        (0.3, 0.6),
+        0.05,
         "resistors repeat to a few percent",
         "A hose that kinks, a plug of secretions or its suction, or a resistor that is exchanged "
         "between two breaths.",
         "Secretions, wet filters and bronchodilators change resistance by tens of percent (Bates, "
         "Lung Mechanics, Cambridge 2009).",
         "an error that grows with flow",
-        (("resistance_drift", "gain_step", "compliance_step"),
-         ("resistance_step", "compliance_drift", "sensor_drift")),
+        (
+            ("resistance_drift", "gain_step", "compliance_step"),
+            ("resistance_step", "compliance_drift", "sensor_drift"),
+        ),
     ),
     *_pair(
-        "C", "compliance", "compliance", "alveolus", (-0.7, 2.0), (0.2, 0.4), 0.03,
+        "C",
+        "compliance",
+        "compliance",
+        "alveolus",
+        (-0.7, 2.0),
+        (0.2, 0.4),
+        0.03,
         "test lungs repeat their compliance to a few percent",
         "Turning, a lobe that opens or collapses, or a spring that is exchanged changes 20 to 50 % "
         "of the compliance between two breaths.",
         "Recruitment moves compliance by tens of percent within minutes (Hickling, Am. J. Respir. "
         "Crit. Care Med. 158, 1998, 194); springs and bellows settle as they warm.",
         "an error that grows with volume",
-        (("compliance_drift", "gain_step", "resistance_step"),
-         ("compliance_step", "sensor_drift", "resistance_drift")),
+        (
+            ("compliance_drift", "gain_step", "resistance_step"),
+            ("compliance_step", "sensor_drift", "resistance_drift"),
+        ),
     ),
-    SensorChange(Description(
-        name="zero_step", title="step of the pressure sensor's zero", site="sensor",
-        equation=f"y = p + change where x > at, {_POSITION}",
-        parameters=(
-            Parameter("change", "cmH2O", "change of the offset",
-                      -8.0, 8.0, 0.0, 1.2, 3.0, scan=(1.2, -1.2)),
-            _AT,
-        ),
-        source="A sensor that is zeroed, knocked or plugged in anew between two breaths.",
-        signature="From one breath on, an error that is the same at all samples.",
-        confusable=("sensor_drift", "a PEEP that is set anew"), least=0.15,
-        least_reason="two steps of a usual converter",
-    )),
-    SensorChange(Description(
-        name="sensor_drift", title="drift of the pressure sensor", site="sensor",
-        equation=f"y = p (1 + gain g) + drift g, {_GROWN}",
-        parameters=(
-            Parameter("drift", "cmH2O", "change of the offset from the first breath to the last",
-                      -8.0, 8.0, 0.0, 1.2, 3.0),
-            Parameter("gain", "1", "change of the gain over the recording",
-                      -0.3, 0.3, 0.0, 0.0, 0.0, shape=True, share=True),
-            _WARMING,
-        ),
-        source="Temperature and ageing of piezoresistive sensors between two zeroings: up to 3 "
-        "cmH2O a recording.",
-        signature=(
-            "An error that grows with the number of the breath and is the same at all its samples."
-        ),
-        confusable=("zero_step", "a PEEP that changes during the recording"),
-        least=0.15, least_reason="two steps of a usual converter", special_case_of=("drift_shape",),
-    )),
-)  # fmt: skip
+    SensorChange(
+        Description(
+            name="zero_step",
+            title="step of the pressure sensor's zero",
+            site="sensor",
+            equation=f"y = p + change where x > at, {_POSITION}",
+            parameters=(
+                Parameter(
+                    "change",
+                    "cmH2O",
+                    "change of the offset",
+                    -8.0,
+                    8.0,
+                    0.0,
+                    1.2,
+                    3.0,
+                    scan=(1.2, -1.2),
+                ),
+                _AT,
+            ),
+            source="A sensor that is zeroed, knocked or plugged in anew between two breaths.",
+            signature="From one breath on, an error that is the same at all samples.",
+            confusable=("sensor_drift", "a PEEP that is set anew"),
+            least=0.15,
+            least_reason="two steps of a usual converter",
+        )
+    ),
+    SensorChange(
+        Description(
+            name="sensor_drift",
+            title="drift of the pressure sensor",
+            site="sensor",
+            equation=f"y = p (1 + gain g) + drift g, {_GROWN}",
+            parameters=(
+                Parameter(
+                    "drift",
+                    "cmH2O",
+                    "change of the offset from the first breath to the last",
+                    -8.0,
+                    8.0,
+                    0.0,
+                    1.2,
+                    3.0,
+                ),
+                Parameter(
+                    "gain",
+                    "1",
+                    "change of the gain over the recording",
+                    -0.3,
+                    0.3,
+                    0.0,
+                    0.0,
+                    0.0,
+                    shape=True,
+                    share=True,
+                ),
+                _WARMING,
+            ),
+            source="Temperature and ageing of piezoresistive sensors between two zeroings: up to 3 "
+            "cmH2O a recording.",
+            signature=(
+                "An error that grows with the number of the breath, the same at all its samples."
+            ),
+            confusable=("zero_step", "a PEEP that changes during the recording"),
+            least=0.15,
+            least_reason="two steps of a usual converter",
+            special_case_of=("drift_shape",),
+        )
+    ),
+)

@@ -20,24 +20,45 @@ class CommandRounding(Mechanism):
     """Integer positions of the valve behind a logged fractional command."""
 
     description = Description(
-        name="command_rounding", title="command rounded to whole percents", site="command",
+        name="command_rounding",
+        title="command rounded to whole percents",
+        site="command",
         equation="u_effective = u + amount (floor(u + bias) - u)",
         parameters=(
-            Parameter("amount", "1",
-                      "share of the rounding that is seen: 1 if the valve gets whole percents",
-                      0.0, 1.0, 0.0, 1.0, 1.0),
-            Parameter("bias", "%", "0 cuts off, 0.5 rounds to the nearest; no derivative: try both",
-                      0.0, 0.5, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 0.5), discrete=True),
+            Parameter(
+                "amount",
+                "1",
+                "share of the rounding that is seen: 1 if the valve gets whole percents",
+                0.0,
+                1.0,
+                0.0,
+                1.0,
+                1.0,
+            ),
+            Parameter(
+                "bias",
+                "%",
+                "0 cuts off, 0.5 rounds to the nearest; no derivative: try both",
+                0.0,
+                0.5,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 0.5),
+                discrete=True,
+            ),
         ),
         source=(
             "Valve drivers that take integers while the controller logs its fractional request."
         ),
         signature="Cut off, half a percent of the command is missing on average, which looks like "
         "a dead band of 0.5 %; what remains follows the fraction of each command.",
-        confusable=("valve_dead_band",), least=0.5,
+        confusable=("valve_dead_band",),
+        least=0.5,
         least_reason="a driver rounds or does not; half a rounding is another effect",
         special_case_of=("valve_shape",),
-    )  # fmt: skip
+    )
 
     def driven(self, values: Values, u_in: Array) -> Array:
         """The command, moved towards a whole number."""
@@ -57,29 +78,48 @@ class ValveDeadBand(Mechanism):
     """The first part of the stroke gives no flow."""
 
     description = Description(
-        name="valve_dead_band", title="dead band of the inspiratory valve",
+        name="valve_dead_band",
+        title="dead band of the inspiratory valve",
         site="inspiratory valve",
         equation="u_effective = 0 below width, u - (1 - crack) width above",
         parameters=(
             Parameter("width", "%", "command at which flow begins", 0.0, 10.0, 0.0, 1.5, 3.5),
-            Parameter("crack", "1",
-                      "0 for overlap, which every command loses; 1 for a stuck seat that cracks "
-                      "open",
-                      0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0)),
-            Parameter("driver", "1",
-                      "share of the width that is lost before the valve's play, not behind it: 0 "
-                      "for overlap of the seat, 1 for a driver with a least command",
-                      0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0)),
+            Parameter(
+                "crack",
+                "1",
+                "0 for overlap, which every command loses; 1 for a stuck seat that cracks open",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
+            Parameter(
+                "driver",
+                "1",
+                "share of the width that is lost before the valve's play, not behind it: 0 "
+                "for overlap of the seat, 1 for a driver with a least command",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
         ),
         source="Overlap of the spool or friction of the seat; 0 to 5 % of the stroke is usual "
         "without linearisation (ISA-75.25: dead band and resolution of control valves).",
         signature="Too little flow at every small command, none at the smallest: late in "
         "inspiration, and in lungs with high R and low C, which are ventilated with small "
         "commands.",
-        confusable=("leak", "command_rounding", "valve_hysteresis"), least=0.25,
+        confusable=("leak", "command_rounding", "valve_hysteresis"),
+        least=0.25,
         least_reason="a quarter of a percent of stroke, the resolution of drivers",
         special_case_of=("valve_shape",),
-    )  # fmt: skip
+    )
 
     rank = 2
 
@@ -105,17 +145,37 @@ class ValveHysteresis(Mechanism):
     """Rate-independent memory of the command."""
 
     description = Description(
-        name="valve_hysteresis", title="play of the inspiratory valve", site="inspiratory valve",
+        name="valve_hysteresis",
+        title="play of the inspiratory valve",
+        site="inspiratory valve",
         equation="u_effective = u - h z, h = width / 2, z = (1 - smooth) ((1 - give) clip(x, -1, "
         "1) + give tanh x) + smooth (s + (z before - s) exp(-|d| / h)), x = z before + d / h, d = "
         "u - u before, s = sign d",
         parameters=(
             Parameter("width", "%", "command lost at every reversal", 0.0, 15.0, 0.0, 2.0, 5.0),
-            Parameter("give", "1", "0 for slack, 1 for a drive that gives before it moves the seat",
-                      0.0, 1.0, 0.0, 0.0, 0.0, shape=True),
-            Parameter("smooth", "1",
-                      "1 for a lag that nears its width exponentially with the travel",
-                      0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0)),
+            Parameter(
+                "give",
+                "1",
+                "0 for slack, 1 for a drive that gives before it moves the seat",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+            ),
+            Parameter(
+                "smooth",
+                "1",
+                "1 for a lag that nears its width exponentially with the travel",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
         ),
         source="Play (backlash) operator: friction and slack between driver and seat, or opening "
         "and closing tables that differ. 3.8 % of full scale was measured on the PVP's valve. With "
@@ -123,10 +183,11 @@ class ValveHysteresis(Mechanism):
         "memory is that of the travel, not of time.",
         signature="After each reversal of the command flow stays where it was; error of one sign "
         "while the command rises and of the other while it falls.",
-        confusable=("valve_dead_band", "valve_delay"), least=0.3,
+        confusable=("valve_dead_band", "valve_delay"),
+        least=0.3,
         least_reason="a little more than the resolution of drivers",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
-    )  # fmt: skip
+    )
 
     rank = 1
     has_memory = True
@@ -150,22 +211,34 @@ class ValveDelay(Mechanism):
     """Command of the inspiratory valve, shifted in time."""
 
     description = Description(
-        name="valve_delay", title="dead time of the inspiratory valve", site="inspiratory valve",
+        name="valve_delay",
+        title="dead time of the inspiratory valve",
+        site="inspiratory valve",
         equation="q(t) = q_commanded(t - delay)",
         parameters=(
-            Parameter("delay", "s", "dead time",
-                      0.0, 0.15, 0.0, 0.04, 0.08, scan=tuple(0.01 * k for k in range(16)),
-                      kinked=True),
+            Parameter(
+                "delay",
+                "s",
+                "dead time",
+                0.0,
+                0.15,
+                0.0,
+                0.04,
+                0.08,
+                scan=tuple(0.01 * k for k in range(16)),
+                kinked=True,
+            ),
         ),
         source="Pure transport delay of driver, pilot and tubing; proportional valves of "
         "ventilators answer after 10 to 100 ms, and a delay of one to three samples is what fits "
         "of recorded breaths ask for.",
         signature="Pressure runs ahead of the recording after every edge of the command during "
         "inspiration, by one constant time.",
-        confusable=("valve_lag", "sensor_lag", "circuit_compliance"), least=0.008,
+        confusable=("valve_lag", "sensor_lag", "circuit_compliance"),
+        least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
-    )  # fmt: skip
+    )
 
     def dead_time(self, values: Values, time: Array) -> Array:
         """The delay, s."""
@@ -176,12 +249,23 @@ class ValveLag(Mechanism):
     """Flow of the valve follows the commanded flow through one lag or two."""
 
     description = Description(
-        name="valve_lag", title="lag of the inspiratory valve", site="inspiratory valve",
+        name="valve_lag",
+        title="lag of the inspiratory valve",
+        site="inspiratory valve",
         equation="tau dx/dt = q_commanded - x, second dq/dt = x - q",
         parameters=(
             Parameter("tau", "s", "time constant", 0.0, 0.2, 0.0, 0.04, 0.1),
-            Parameter("second", "s", "time constant of a lag behind the first, as of a pilot stage",
-                      0.0, 0.2, 0.0, 0.0, 0.0, shape=True),
+            Parameter(
+                "second",
+                "s",
+                "time constant of a lag behind the first, as of a pilot stage",
+                0.0,
+                0.2,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+            ),
         ),
         source="First-order actuator; time constants of 5 to 100 ms are usual for proportional "
         "solenoid valves.",
@@ -192,7 +276,7 @@ class ValveLag(Mechanism):
         least_reason="a quarter of a sample: less rounds no edge that a recording shows",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
         interchangeable=(("tau", "second"),),
-    )  # fmt: skip
+    )
     stateful = True
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
@@ -210,14 +294,34 @@ class ValveCurve(Mechanism):
     """Saturating or convex curve of the valve, linear at small commands."""
 
     description = Description(
-        name="valve_curve", title="curve of the inspiratory valve", site="inspiratory valve",
+        name="valve_curve",
+        title="curve of the inspiratory valve",
+        site="inspiratory valve",
         equation="q = gain u (1 + a x^m)^(-1/m), x = u / 100, a = (1 - loss)^-m - 1",
         parameters=(
-            Parameter("loss", "1",
-                      "share of the flow that is missing fully open; negative: flow gained",
-                      -1.0, 0.95, 0.0, 0.2, 0.5, share=True),
-            Parameter("power", "1", "m: 1 bends from the start, higher later",
-                      0.5, 4.0, 1.0, 1.0, 1.0, shape=True, grid=(1.0, 3.0)),
+            Parameter(
+                "loss",
+                "1",
+                "share of the flow that is missing fully open; negative: flow gained",
+                -1.0,
+                0.95,
+                0.0,
+                0.2,
+                0.5,
+                share=True,
+            ),
+            Parameter(
+                "power",
+                "1",
+                "m: 1 bends from the start, higher later",
+                0.5,
+                4.0,
+                1.0,
+                1.0,
+                1.0,
+                shape=True,
+                grid=(1.0, 3.0),
+            ),
         ),
         source="Flow through an orifice whose area is not proportional to the command, or whose "
         "pressure drop falls as flow rises; monotone for every loss and power. Public recordings "
@@ -225,9 +329,10 @@ class ValveCurve(Mechanism):
         signature="Error of one sign that grows with the command: during the first samples of "
         "inspiration, at high flow.",
         confusable=("turbulent_resistance", "supply_droop", "nonlinear_compliance"),
-        least=0.04, least_reason="linearised valves hold their curve to a few percent",
+        least=0.04,
+        least_reason="linearised valves hold their curve to a few percent",
         special_case_of=("valve_shape",),
-    )  # fmt: skip
+    )
 
     rank = 3
 
@@ -247,28 +352,59 @@ class ExhalationValveDelay(Mechanism):
     """
 
     description = Description(
-        name="exhalation_valve_delay", title="delay of the expiratory valve",
+        name="exhalation_valve_delay",
+        title="delay of the expiratory valve",
         site="expiratory valve",
         equation="opening slow do/dt = u_out(t - opening (1 - slow)) - o",
         parameters=(
-            Parameter("opening", "s", "mean delay of opening",
-                      0.0, 0.15, 0.0, 0.05, 0.1, scan=tuple(0.01 * k for k in range(16)),
-                      kinked=True),
-            Parameter("closing", "s", "dead time of closing",
-                      0.0, 0.15, 0.0, 0.0, 0.0, shape=True, kinked=True),
-            Parameter("slow", "1",
-                      "share of the opening's delay that is a lag: 0 for a dead time, 1 for a "
-                      "valve that opens slowly",
-                      0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0), share=True),
+            Parameter(
+                "opening",
+                "s",
+                "mean delay of opening",
+                0.0,
+                0.15,
+                0.0,
+                0.05,
+                0.1,
+                scan=tuple(0.01 * k for k in range(16)),
+                kinked=True,
+            ),
+            Parameter(
+                "closing",
+                "s",
+                "dead time of closing",
+                0.0,
+                0.15,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                kinked=True,
+            ),
+            Parameter(
+                "slow",
+                "1",
+                "share of the opening's delay that is a lag: 0 for a dead time, 1 for a "
+                "valve that opens slowly",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+                share=True,
+            ),
         ),
         source="Solenoid and diaphragm of the expiratory valve: 0 to 100 ms, of opening and "
         "closing apart. A diaphragm on a vented pilot opens as its pilot empties.",
         signature="Pressure stays up after the command to open, or falls slowly at first, whatever "
         "the lung; inspiration is not affected, unless closing is late too.",
-        confusable=("inertance", "sensor_lag"), least=0.008,
+        confusable=("inertance", "sensor_lag"),
+        least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("outlet_memory",),
-    )  # fmt: skip
+    )
     stateful = True
 
     def outlet_dead_time(self, values: Values, u_out: Array, time: Array) -> Array:

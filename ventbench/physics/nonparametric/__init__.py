@@ -30,47 +30,57 @@ NONPARAMETRIC_COMPONENTS = {
     component.name: component
     for component in (
         NonparametricComponent(
-            "f(u)", ("valve_shape",),
+            "f(u)",
+            ("valve_shape",),
             "flow of the inspiratory valve depends on the command in another way",
         ),
         NonparametricComponent(
-            "memory of u", ("command_memory", "command_plays", "supply_memory"),
+            "memory of u",
+            ("command_memory", "command_plays", "supply_memory"),
             "flow of the inspiratory valve depends on what the command was before",
         ),
         NonparametricComponent(
-            "f(p)", ("leak_shape",),
+            "f(p)",
+            ("leak_shape",),
             "gas leaves beside the lung, by the pressure at the airway",
         ),
         NonparametricComponent(
-            "f(Q)", ("flow_shape",),
+            "f(Q)",
+            ("flow_shape",),
             "the pressure drop of the airway depends on flow in another way",
         ),
         NonparametricComponent(
-            "R(V)", ("volume_resistance",),
+            "R(V)",
+            ("volume_resistance",),
             "the resistance of the airway depends on the volume of the lung",
         ),
         NonparametricComponent(
-            "R(direction)", ("direction_resistance",),
+            "R(direction)",
+            ("direction_resistance",),
             "the resistance of the airway is another one outwards than inwards",
         ),
         NonparametricComponent(
-            "f(V)", ("recoil_shape",),
+            "f(V)",
+            ("recoil_shape",),
             "the recoil of the lung depends on volume in another way",
         ),
         NonparametricComponent(
-            "memory of p", ("recoil_memory",),
+            "memory of p",
+            ("recoil_memory",),
             "the recoil of the lung depends on what its volume was before",
         ),
         NonparametricComponent(
-            "exhalation path", ("outlet_shape", "outlet_memory"),
+            "exhalation path",
+            ("outlet_shape", "outlet_memory"),
             "the expiratory valve conducts in another way, or opens slowly",
         ),
         NonparametricComponent(
-            "measurement", ("sensor_shape", "sensor_memory", "drift_shape"),
+            "measurement",
+            ("sensor_shape", "sensor_memory", "drift_shape"),
             "the sensor shows another pressure than that at the airway",
         ),
     )
-}  # fmt: skip
+}
 
 Number = Array | float
 
@@ -181,10 +191,16 @@ class FilterBank(BasisTerm):
 
 
 def coefficients(
-    at: Iterable[str], unit: str, meaning: str, low: float | Iterable[float],
-    high: float | Iterable[float], spread: float | Iterable[float], *,
-    follows: str | None = None, scan: tuple[float, ...] = (),
-) -> tuple[Parameter, ...]:  # fmt: skip
+    at: Iterable[str],
+    unit: str,
+    meaning: str,
+    low: float | Iterable[float],
+    high: float | Iterable[float],
+    spread: float | Iterable[float],
+    *,
+    follows: str | None = None,
+    scan: tuple[float, ...] = (),
+) -> tuple[Parameter, ...]:
     """Parameters ``c1``, ``c2`` and so on, which start at zero and have a prior around zero.
 
     The meaning, and where each acts, ``at``, are words. Bounds and ``spread``, the prior standard
@@ -200,8 +216,17 @@ def coefficients(
     rows = zip(at, repeated(low), repeated(high), repeated(spread), strict=True)
     return tuple(
         Parameter(
-            f"c{k}", unit, f"{meaning} {place}", bottom, top, 0.0, 0.0, 0.5 * width,
-            follows=follows, scan=scan, spread=width,
+            f"c{k}",
+            unit,
+            f"{meaning} {place}",
+            bottom,
+            top,
+            0.0,
+            0.0,
+            0.5 * width,
+            follows=follows,
+            scan=scan,
+            spread=width,
         )
         for k, (place, bottom, top, width) in enumerate(rows, 1)
-    )  # fmt: skip
+    )

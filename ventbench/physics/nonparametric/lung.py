@@ -25,16 +25,22 @@ class LeakShape(BasisTerm):
     """
 
     description = Description(
-        name="leak_shape", title="f(p): any leak at the airway", site="circuit",
+        name="leak_shape",
+        title="f(p): any leak at the airway",
+        site="circuit",
         equation="q_leak = f(p), f(0) = 0, df/dp straight between knots",
         parameters=coefficients(
-            (f"{p:g} cmH2O" for p in _LEAK_KNOTS), unit="mL/s per cmH2O",
-            meaning="slope of the leak at", low=-4.0, high=60.0, spread=10.0,
+            (f"{p:g} cmH2O" for p in _LEAK_KNOTS),
+            unit="mL/s per cmH2O",
+            meaning="slope of the leak at",
+            low=-4.0,
+            high=60.0,
+            spread=10.0,
         ),
         source="Smooth curve between fixed knots.",
         signature="Gas that is missing, the more the higher the pressure at the airway.",
         confusable=("leak", "viscoelasticity"),
-    )  # fmt: skip
+    )
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Tangent of the curve at the last pressure."""
@@ -53,17 +59,23 @@ class FlowShape(BasisTerm):
     """
 
     description = Description(
-        name="flow_shape", title="f(Q): any pressure drop of the airway", site="airway",
+        name="flow_shape",
+        title="f(Q): any pressure drop of the airway",
+        site="airway",
         equation="p = ... + R Q + f(Q), f(0) = df/dQ(0) = 0, df/dQ straight between knots",
         parameters=coefficients(
             (f"{side} {q:g} L/s" for side in ("inwards", "outwards") for q in _FLOW_KNOTS[1:]),
-            unit="cmH2O/(L/s)", meaning="resistance above R at", low=-15.0, high=120.0, spread=20.0,
+            unit="cmH2O/(L/s)",
+            meaning="resistance above R at",
+            low=-15.0,
+            high=120.0,
+            spread=20.0,
             follows="R",
         ),
         source="Smooth curve between fixed knots.",
         signature="Error that follows the flow into and out of the lung, at any volume.",
         confusable=("turbulent_resistance", "valve_curve"),
-    )  # fmt: skip
+    )
     absorbed = (1,)
 
     def network(self, values: Values, network: Network, view: View) -> Network:
@@ -83,16 +95,22 @@ class VolumeResistance(Lines):
     """A factor of R, straight between knots; it is 1 at V / C = 5 cmH2O and below: there R is R."""
 
     description = Description(
-        name="volume_resistance", title="R(V): resistance that depends on volume", site="airway",
+        name="volume_resistance",
+        title="R(V): resistance that depends on volume",
+        site="airway",
         equation="p = ... + R (1 + f(V / C)) Q, f straight between knots, f(5 cmH2O) = 0",
         parameters=coefficients(
-            (f"V / C = {s:g} cmH2O" for s in _VOLUME_KNOTS[1:]), unit="1",
-            meaning="resistance above R, over R, at", low=-0.8, high=6.0, spread=1.0,
+            (f"V / C = {s:g} cmH2O" for s in _VOLUME_KNOTS[1:]),
+            unit="1",
+            meaning="resistance above R, over R, at",
+            low=-0.8,
+            high=6.0,
+            spread=1.0,
         ),
         source="Airways widen as the lung fills, and narrow or close as it empties.",
         signature="The drop at edges of the flow depends on the volume at which they occur.",
         confusable=("turbulent_resistance", "nonlinear_compliance"),
-    )  # fmt: skip
+    )
     absorbed = (0,)
     knots, fixed = _VOLUME_KNOTS, _VOLUME_KNOTS[:1]
 
@@ -106,17 +124,22 @@ class DirectionResistance(BasisTerm):
     """A factor of R for flow out of the lung; R itself is that of inspiration."""
 
     description = Description(
-        name="direction_resistance", title="R(direction): another resistance outwards",
+        name="direction_resistance",
+        title="R(direction): another resistance outwards",
         site="airway",
         equation="p = ... + R Q inwards, R (1 + c) Q outwards",
         parameters=coefficients(
-            ("outwards",), unit="1", meaning="resistance above R, over R,", low=-0.8, high=6.0,
+            ("outwards",),
+            unit="1",
+            meaning="resistance above R, over R,",
+            low=-0.8,
+            high=6.0,
             spread=1.0,
         ),
         source="Airways narrow as pressure around them rises in expiration; one-way connectors.",
         signature="Expiration is slower or faster than the R of inspiration allows.",
         confusable=("exhalation_valve_delay", "turbulent_resistance"),
-    )  # fmt: skip
+    )
     absorbed = (1,)
 
     def network(self, values: Values, network: Network, view: View) -> Network:
@@ -143,17 +166,23 @@ class RecoilShape(BasisTerm):
     """
 
     description = Description(
-        name="recoil_shape", title="f(V): any recoil of the lung", site="alveolus",
+        name="recoil_shape",
+        title="f(V): any recoil of the lung",
+        site="alveolus",
         equation="P = integral of (1 + g(s)) / (1 + mean of g) ds up to s = V / C, g straight "
         "between knots, g(10 cmH2O) = 0",
         parameters=coefficients(
-            (f"V / C = {s:g} cmH2O" for s in _RECOIL_FREE), unit="1",
-            meaning="share by which the slope is higher at", low=-0.9, high=12.0, spread=1.0,
+            (f"V / C = {s:g} cmH2O" for s in _RECOIL_FREE),
+            unit="1",
+            meaning="share by which the slope is higher at",
+            low=-0.9,
+            high=12.0,
+            spread=1.0,
         ),
         source="Smooth curve between fixed knots; the recoil always rises with volume.",
         signature="Error that follows the volume of the lung, in inspiration and expiration alike.",
         confusable=("nonlinear_compliance",),
-    )  # fmt: skip
+    )
     absorbed = (0, 1)
 
     def network(self, values: Values, network: Network, view: View) -> Network:
@@ -183,17 +212,22 @@ class RecoilMemory(FilterBank):
     """
 
     description = Description(
-        name="recoil_memory", title="memory of p: any spectrum of relaxation", site="alveolus",
+        name="recoil_memory",
+        title="memory of p: any spectrum of relaxation",
+        site="alveolus",
         equation="P = V / C + sum_k S_k, dS_k/dt = c_k / C Q - S_k / tau_k",
         parameters=coefficients(
-            (f"{tau:g} s" for tau in _MEMORY_TAUS), unit="1",
-            meaning="elastance over that of the lung that relaxes within", low=-0.24, high=3.0,
+            (f"{tau:g} s" for tau in _MEMORY_TAUS),
+            unit="1",
+            meaning="elastance over that of the lung that relaxes within",
+            low=-0.24,
+            high=3.0,
             spread=0.5,
         ),
         source="Sum of fixed exponentials (generalised Maxwell body).",
         signature="Pressure creeps while volume is held, and lags behind slow changes.",
         confusable=("viscoelasticity", "leak"),
-    )  # fmt: skip
+    )
     taus = _MEMORY_TAUS
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:

@@ -25,16 +25,22 @@ class SensorShape(Lines):
     """
 
     description = Description(
-        name="sensor_shape", title="measurement: any curve of the pressure sensor", site="sensor",
+        name="sensor_shape",
+        title="measurement: any curve of the pressure sensor",
+        site="sensor",
         equation="y = p + f(p), f straight between knots, f(5 cmH2O) = f(20 cmH2O) = 0",
         parameters=coefficients(
-            (f"{p:g} cmH2O" for p in _SENSOR_KNOTS if p not in _SENSOR_FIXED), unit="cmH2O",
-            meaning="error of the reading at", low=-4.0, high=4.0, spread=1.5,
+            (f"{p:g} cmH2O" for p in _SENSOR_KNOTS if p not in _SENSOR_FIXED),
+            unit="cmH2O",
+            meaning="error of the reading at",
+            low=-4.0,
+            high=4.0,
+            spread=1.5,
         ),
         source="Straight lines between fixed knots; sensors that saturate, tables of calibration.",
         signature="Error that follows the pressure itself, whatever the flow is.",
         confusable=("nonlinear_compliance", "leak"),
-    )  # fmt: skip
+    )
     absorbed = (0, 1)
     rank = 2
     knots, fixed = _SENSOR_KNOTS, _SENSOR_FIXED
@@ -64,17 +70,22 @@ class SensorMemory(FilterBank):
     """A bank of first-order filters on the reading; a lasting pressure is shown as it is."""
 
     description = Description(
-        name="sensor_memory", title="measurement: any linear memory of the pressure sensor",
+        name="sensor_memory",
+        title="measurement: any linear memory of the pressure sensor",
         site="sensor",
         equation="y = p + sum_k c_k (s_k - p), tau_k ds_k/dt = p - s_k",
         parameters=coefficients(
-            (f"{1e3 * tau:g} ms" for tau in _MEMORY_TAUS), unit="1",
-            meaning="share of the reading that comes late by", low=-3.0, high=3.0, spread=1.0,
+            (f"{1e3 * tau:g} ms" for tau in _MEMORY_TAUS),
+            unit="1",
+            meaning="share of the reading that comes late by",
+            low=-3.0,
+            high=3.0,
+            spread=1.0,
         ),
         source="Sum of fixed exponentials; sampling lines, filters and their compensation.",
         signature="Edges of pressure are changed, in inspiration and expiration alike.",
         confusable=("sensor_lag", "circuit_compliance"),
-    )  # fmt: skip
+    )
     rank = 1
     taus = _MEMORY_TAUS
 
@@ -96,16 +107,22 @@ class DriftShape(Lines):
     """An offset of the reading; that of the first breath is zero, as PEEP absorbs it."""
 
     description = Description(
-        name="drift_shape", title="measurement: any drift of the sensor's zero", site="sensor",
+        name="drift_shape",
+        title="measurement: any drift of the sensor's zero",
+        site="sensor",
         equation="y = p + f(x), x = position of the breath in the recording, f(0) = 0",
         parameters=coefficients(
-            (f"position {x:g}" for x in _DRIFT_KNOTS[1:]), unit="cmH2O",
-            meaning="offset of the reading at", low=-8.0, high=8.0, spread=2.0,
+            (f"position {x:g}" for x in _DRIFT_KNOTS[1:]),
+            unit="cmH2O",
+            meaning="offset of the reading at",
+            low=-8.0,
+            high=8.0,
+            spread=2.0,
         ),
         source="Straight lines between fixed knots.",
         signature="An error that is the same at all samples of a breath and differs between them.",
         confusable=("sensor_drift",),
-    )  # fmt: skip
+    )
     absorbed = (0,)
     rank = 3
     knots, fixed = _DRIFT_KNOTS, _DRIFT_KNOTS[:1]

@@ -29,18 +29,22 @@ class ValveShape(Lines):
     """
 
     description = Description(
-        name="valve_shape", title="f(u): any curve of the inspiratory valve",
+        name="valve_shape",
+        title="f(u): any curve of the inspiratory valve",
         site="inspiratory valve",
         equation="q = gain (u + f(u)), f straight between knots, f(0) = f(20 %) = 0",
         parameters=coefficients(
-            (f"{u:g} %" for u in _VALVE_FREE), unit="%",
-            meaning="change of the effective command at", low=[-u for u in _VALVE_FREE],
-            high=_VALVE_FREE, spread=[0.5 * u for u in _VALVE_FREE],
+            (f"{u:g} %" for u in _VALVE_FREE),
+            unit="%",
+            meaning="change of the effective command at",
+            low=[-u for u in _VALVE_FREE],
+            high=_VALVE_FREE,
+            spread=[0.5 * u for u in _VALVE_FREE],
         ),
         source="Straight lines between fixed knots; each effective command stays positive.",
         signature="Error that follows the command, whatever flow and pressure are.",
         confusable=("valve_curve", "valve_dead_band", "command_rounding"),
-    )  # fmt: skip
+    )
     absorbed = (1,)
     rank = 5
     knots, fixed = _VALVE_KNOTS, _VALVE_FIXED
@@ -61,18 +65,22 @@ class CommandMemory(FilterBank):
     """
 
     description = Description(
-        name="command_memory", title="memory of u: any linear memory of the valve",
+        name="command_memory",
+        title="memory of u: any linear memory of the valve",
         site="inspiratory valve",
         equation="q = q_asked + sum_k c_k (s_k - q_asked), tau_k ds_k/dt = q_asked - s_k",
         parameters=coefficients(
-            (f"{1e3 * tau:g} ms" for tau in _COMMAND_TAUS), unit="1",
-            meaning="share of the flow that comes late by", low=[-6.0, -6.0, -3.0, -3.0],
-            high=[6.0, 6.0, 3.0, 3.0], spread=[2.0, 2.0, 1.0, 1.0],
+            (f"{1e3 * tau:g} ms" for tau in _COMMAND_TAUS),
+            unit="1",
+            meaning="share of the flow that comes late by",
+            low=[-6.0, -6.0, -3.0, -3.0],
+            high=[6.0, 6.0, 3.0, 3.0],
+            spread=[2.0, 2.0, 1.0, 1.0],
         ),
         source="Sum of fixed exponentials; close to any lag, rise or sag that is linear.",
         signature="Error that follows what the command was some time ago.",
         confusable=("valve_lag", "valve_delay", "supply_droop", "valve_hysteresis"),
-    )  # fmt: skip
+    )
     rank = 2
     taus = _COMMAND_TAUS
 
@@ -93,17 +101,22 @@ class CommandPlays(BasisTerm):
     """
 
     description = Description(
-        name="command_plays", title="memory of u: any hysteresis of the valve",
+        name="command_plays",
+        title="memory of u: any hysteresis of the valve",
         site="inspiratory valve",
         equation="u_effective = u + sum_k c_k (s_k - u), s_k = clip(s_k before, u -+ width_k / 2)",
         parameters=coefficients(
-            (f"{width:g} %" for width in _PLAYS_WIDTHS), unit="1",
-            meaning="share of the valve with a play of", low=-2.0, high=2.0, spread=0.7,
+            (f"{width:g} %" for width in _PLAYS_WIDTHS),
+            unit="1",
+            meaning="share of the valve with a play of",
+            low=-2.0,
+            high=2.0,
+            spread=0.7,
         ),
         source="Sum of plays of fixed widths; holds any hysteresis that knows no time.",
         signature="Error of one sign while the command rises and of the other while it falls.",
         confusable=("valve_hysteresis", "valve_dead_band"),
-    )  # fmt: skip
+    )
     rank = 4
     has_memory = True
 
@@ -126,17 +139,22 @@ class SupplyMemory(FilterBank):
     """A factor of the flow that depends on the flow before; to first order, any such factor."""
 
     description = Description(
-        name="supply_memory", title="memory of u: a factor by recent flow", site="supply",
+        name="supply_memory",
+        title="memory of u: a factor by recent flow",
+        site="supply",
         equation="q = q_valve (1 + sum_k c_k s_k / (0.5 L/s)), tau_k ds_k/dt = q_valve - s_k",
         parameters=coefficients(
-            (f"{tau:g} s" for tau in _SUPPLY_TAUS), unit="1",
+            (f"{tau:g} s" for tau in _SUPPLY_TAUS),
+            unit="1",
             meaning="share of the flow that is gained at a lasting 0.5 L/s, with the time constant",
-            low=-0.6, high=0.6, spread=0.3,
+            low=-0.6,
+            high=0.6,
+            spread=0.3,
         ),
         source="Second-order term of a Volterra series, with fixed exponentials.",
         signature="Flow is lost late in inspiration and in big breaths; after a pause it is back.",
         confusable=("supply_droop", "valve_curve"),
-    )  # fmt: skip
+    )
     rank = 3
     taus = _SUPPLY_TAUS
 
@@ -159,18 +177,23 @@ class OutletShape(Lines):
     """
 
     description = Description(
-        name="outlet_shape", title="exhalation path: any conductance of the expiratory valve",
+        name="outlet_shape",
+        title="exhalation path: any conductance of the expiratory valve",
         site="expiratory valve",
         equation="q_out = o (1 + f(p - PEEP)) (p - PEEP) / R_ex, o how far it is open, f straight "
         "between knots, f(5 cmH2O) = 0",
         parameters=coefficients(
-            (f"p - PEEP = {d:g} cmH2O" for d in _OUTLET_FREE), unit="1",
-            meaning="conductance above 1 / R_ex, times R_ex, at", low=-0.9, high=6.0, spread=1.0,
+            (f"p - PEEP = {d:g} cmH2O" for d in _OUTLET_FREE),
+            unit="1",
+            meaning="conductance above 1 / R_ex, times R_ex, at",
+            low=-0.9,
+            high=6.0,
+            spread=1.0,
         ),
         source="Straight lines between fixed knots, as of a diaphragm on a spring.",
         signature="Error during expiration only, whatever the inspiration was.",
         confusable=("exhalation_valve_delay", "inertance"),
-    )  # fmt: skip
+    )
     absorbed = (0,)
     rank = 1  # a factor of how far the valve is open, however late that is
     knots, fixed = _OUTLET_KNOTS, _OUTLET_FIXED
@@ -192,19 +215,24 @@ class OutletMemory(FilterBank):
     """
 
     description = Description(
-        name="outlet_memory", title="exhalation path: any slow opening of the expiratory valve",
+        name="outlet_memory",
+        title="exhalation path: any slow opening of the expiratory valve",
         site="expiratory valve",
         equation="q_out = o (p - PEEP) / R_ex, o = max(0, u_out + sum_k c_k (s_k - u_out)), tau_k "
         "ds_k/dt = u_out - s_k",
         parameters=coefficients(
-            (f"{1e3 * tau:g} ms" for tau in _OUTLET_TAUS), unit="1",
-            meaning="share of the opening that comes late by", low=-1.0, high=12.0, spread=2.0,
+            (f"{1e3 * tau:g} ms" for tau in _OUTLET_TAUS),
+            unit="1",
+            meaning="share of the opening that comes late by",
+            low=-1.0,
+            high=12.0,
+            spread=2.0,
             scan=(0.0, 4.0, 10.0),
         ),
         source="Sum of fixed exponentials.",
         signature="Error at the start of expiration, whatever the inspiration was.",
         confusable=("exhalation_valve_delay", "inertance"),
-    )  # fmt: skip
+    )
     taus = _OUTLET_TAUS
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:

@@ -90,12 +90,21 @@ class Imported:
 
 
 def import_recording(
-    path: str | Path | Table, *, columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None, layout: str | None = None, lung: str | None = None,
-    rate: float | None = None, split_breaths: bool = False, invert: Iterable[str] = (),
-    offsets: Mapping[str, float] | None = None, select: Mapping[str, str] | None = None,
-    skip_bad_breaths: bool = False, separator: str | None = None, decimal: str | None = None,
-) -> Imported:  # fmt: skip
+    path: str | Path | Table,
+    *,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    layout: str | None = None,
+    lung: str | None = None,
+    rate: float | None = None,
+    split_breaths: bool = False,
+    invert: Iterable[str] = (),
+    offsets: Mapping[str, float] | None = None,
+    select: Mapping[str, str] | None = None,
+    skip_bad_breaths: bool = False,
+    separator: str | None = None,
+    decimal: str | None = None,
+) -> Imported:
     """Read a recording of another laboratory.
 
     Args:
@@ -200,9 +209,11 @@ def import_recording(
         )
     u_in = np.where(np.isfinite(u_in), u_in, 0.0)
     samples = {
-        "u_in": u_in, "u_out": u_out, "pressure": values["pressure"],
+        "u_in": u_in,
+        "u_out": u_out,
+        "pressure": values["pressure"],
         **{name: values[name] for name in ("flow", "volume") if name in values},
-    }  # fmt: skip
+    }
     labelled = {**samples, "R": R, "C": C}
     pieces, left = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
     notes += left
@@ -445,9 +456,11 @@ def _invert(values: dict[str, Floats], other: dict[str, Floats], roles: Iterable
 
 
 def _check_signs(
-    table: Table, by_role: Mapping[str, str], values: Mapping[str, Floats],
+    table: Table,
+    by_role: Mapping[str, str],
+    values: Mapping[str, Floats],
     changes: Mapping[str, Conversion],
-) -> None:  # fmt: skip
+) -> None:
     """Refuse absolute pressure, and flow that is counted from the patient.
 
     Before anything is inferred from them: breaths and valves would be wrong too.
@@ -468,9 +481,13 @@ def _check_signs(
 
 
 def _sound(
-    table: Table, by_role: Mapping[str, str], samples: Mapping[str, NDArray[Any]], time: Floats,
-    pieces: list[Ints], skip: bool,
-) -> tuple[list[Ints], list[str]]:  # fmt: skip
+    table: Table,
+    by_role: Mapping[str, str],
+    samples: Mapping[str, NDArray[Any]],
+    time: Floats,
+    pieces: list[Ints],
+    skip: bool,
+) -> tuple[list[Ints], list[str]]:
     """Breaths that the schema can hold; refuse the others, or leave them out and name them."""
     rows, bad, problems = np.concatenate(pieces), dict[int, str](), list[str]()
     owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
@@ -530,9 +547,14 @@ def _suspicious(
 
 
 def _breaths(
-    source: str, pieces: list[Ints], time: Floats,
-    samples: Mapping[str, NDArray[Any]], R: Floats, C: Floats, notes: list[str],
-) -> Breaths:  # fmt: skip
+    source: str,
+    pieces: list[Ints],
+    time: Floats,
+    samples: Mapping[str, NDArray[Any]],
+    R: Floats,
+    C: Floats,
+    notes: list[str],
+) -> Breaths:
     rows, lengths = np.concatenate(pieces), np.array([len(piece) for piece in pieces])
     first = np.array([piece[0] for piece in pieces])
     parts = []
@@ -541,9 +563,17 @@ def _breaths(
         known = np.isfinite(at)
         at = np.interp(k, k[known], at[known]) if not known.all() else at
         parts.append(at - at[0])
-    columns = {name: values[rows].astype(np.int8 if name == "u_out" else float)
-               for name, values in samples.items()}  # fmt: skip
+    columns = {
+        name: values[rows].astype(np.int8 if name == "u_out" else float)
+        for name, values in samples.items()
+    }
     return arranged(
-        lengths, np.concatenate(parts), columns, breath_id=np.arange(1, len(pieces) + 1),
-        R=R[first].astype(float), C=C[first].astype(float), source=source, notes=tuple(notes),
-    )  # fmt: skip
+        lengths,
+        np.concatenate(parts),
+        columns,
+        breath_id=np.arange(1, len(pieces) + 1),
+        R=R[first].astype(float),
+        C=C[first].astype(float),
+        source=source,
+        notes=tuple(notes),
+    )

@@ -154,9 +154,13 @@ def _flatten(
 
 
 def _channels(
-    file: str, kind: str, names: Sequence[str], units: Sequence[str], rates: Sequence[float],
+    file: str,
+    kind: str,
+    names: Sequence[str],
+    units: Sequence[str],
+    rates: Sequence[float],
     values: Sequence[NDArray[Any]],
-) -> Table:  # fmt: skip
+) -> Table:
     """The channels that share the pressure's rate, or else the commonest."""
     rate = next(
         (r for name, r in zip(names, rates, strict=True) if USUAL.get(stem(name)) == "pressure"),

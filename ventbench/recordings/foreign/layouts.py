@@ -50,12 +50,30 @@ UNITS: dict[str, dict[str, Fraction]] = {
 
 #: Other spellings, without blanks and in lower case. Standard litres are taken as litres.
 _SPELLINGS = {
-    "lpm": "L/min", "slpm": "L/min", "slm": "L/min", "sl/min": "L/min", "nl/min": "L/min",
-    "lps": "L/s", "lmin-1": "L/min", "ls-1": "L/s", "mls-1": "mL/s", "mlps": "mL/s",
-    "cmh20": "cmH2O", "sec": "s", "seconds": "s",
-    "secs": "s", "msec": "ms", "millis": "ms", "milliseconds": "ms", "µs": "us", "μs": "us",
-    "percent": "%", "0..1": "1", "0-1": "1", "minutes": "min",
-}  # fmt: skip
+    "lpm": "L/min",
+    "slpm": "L/min",
+    "slm": "L/min",
+    "sl/min": "L/min",
+    "nl/min": "L/min",
+    "lps": "L/s",
+    "lmin-1": "L/min",
+    "ls-1": "L/s",
+    "mls-1": "mL/s",
+    "mlps": "mL/s",
+    "cmh20": "cmH2O",
+    "sec": "s",
+    "seconds": "s",
+    "secs": "s",
+    "msec": "ms",
+    "millis": "ms",
+    "milliseconds": "ms",
+    "µs": "us",
+    "μs": "us",
+    "percent": "%",
+    "0..1": "1",
+    "0-1": "1",
+    "minutes": "min",
+}
 
 
 @dataclass(frozen=True)
@@ -143,9 +161,19 @@ def _in_words(factor: Fraction) -> str:
 
 #: What a column may stand for.
 ROLES = (
-    "time", "pressure", "flow", "volume", "u_in", "u_out", "R", "C", "breath", "group", "target",
+    "time",
+    "pressure",
+    "flow",
+    "volume",
+    "u_in",
+    "u_out",
+    "R",
+    "C",
+    "breath",
+    "group",
+    "target",
     "unused",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -168,8 +196,15 @@ LAYOUTS: dict[str, Layout] = {
             "kaggle",
             "the public data of the Google Brain competition, which is ventbench's own schema",
             {
-                "time_step": "time", "breath_id": "breath", "R": "R", "C": "C", "u_in": "u_in",
-                "u_out": "u_out", "pressure": "pressure", "flow": "flow", "volume": "volume",
+                "time_step": "time",
+                "breath_id": "breath",
+                "R": "R",
+                "C": "C",
+                "u_in": "u_in",
+                "u_out": "u_out",
+                "pressure": "pressure",
+                "flow": "flow",
+                "volume": "volume",
             },
             required=("breath_id", "R", "C", "time_step", "u_in", "u_out"),
         ),
@@ -178,8 +213,15 @@ LAYOUTS: dict[str, Layout] = {
             "RespiraWorks test data as one table, a run and a test a recording; its valve commands "
             "are those of another ventilator and are left out",
             {
-                "time_step": "time", "run": "group", "test": "group", "breath": "breath", "R": "R",
-                "C": "C", "pressure": "pressure", "flow": "flow", "volume": "volume",
+                "time_step": "time",
+                "run": "group",
+                "test": "group",
+                "breath": "breath",
+                "R": "R",
+                "C": "C",
+                "pressure": "pressure",
+                "flow": "flow",
+                "volume": "volume",
                 "target": "target",
             },
             required=("run", "test", "breath", "cmd_inh_valve"),
@@ -190,8 +232,11 @@ LAYOUTS: dict[str, Layout] = {
             "logs of the People's Ventilator Project (`waveforms` of log2csv or log2mat); the flow "
             "out of the patient is no flow into the lung and is left out",
             {
-                "timestamp": "time", "pressure": "pressure", "control_in": "u_in",
-                "control_out": "u_out", "cycle_number": "breath",
+                "timestamp": "time",
+                "pressure": "pressure",
+                "control_in": "u_in",
+                "control_out": "u_out",
+                "cycle_number": "breath",
             },
             required=("timestamp", "pressure", "control_in", "control_out", "cycle_number"),
         ),
@@ -200,13 +245,16 @@ LAYOUTS: dict[str, Layout] = {
             "what a Servo ventilator exports as text, [REC] in the first line, in any language; "
             "inspirations are the phases in which more flows in than out",
             {
-                "time": "time", "pressure": "pressure", "flow": "flow", "volume": "volume",
+                "time": "time",
+                "pressure": "pressure",
+                "flow": "flow",
+                "volume": "volume",
                 "expiration": "u_out",
             },
             required=("time", "pressure", "flow", "expiration"),
         ),
     )
-}  # fmt: skip
+}
 
 _NAMES: dict[str, str] = {
     "time": "time timestep timestamp t zeit tempo temps tiempo clock datetime elapsed elapsedtime "
@@ -215,9 +263,12 @@ _NAMES: dict[str, str] = {
     "presion",
     "flow": "flow flowrate airflow q vdot fluss flusso debit flujo",
     "volume": "volume vol v volumen",
-    "u_in": "uin", "u_out": "uout", "R": "r", "C": "c",
+    "u_in": "uin",
+    "u_out": "uout",
+    "R": "r",
+    "C": "c",
     "breath": "breath breathid cyclenumber breathnumber",
-}  # fmt: skip
+}
 
 #: Roles of columns that are understood without a map, by the stem of their names.
 USUAL: dict[str, str] = {name: role for role, names in _NAMES.items() for name in names.split()}
@@ -242,9 +293,14 @@ _GAP = 5.0
 
 
 def find_breaths(
-    file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats],
-    keys: list[Ints], groups: list[Ints], layout: Layout | None,
-) -> tuple[list[Ints], str]:  # fmt: skip
+    file: str,
+    time: Floats,
+    values: Mapping[str, Floats],
+    other: Mapping[str, Floats],
+    keys: list[Ints],
+    groups: list[Ints],
+    layout: Layout | None,
+) -> tuple[list[Ints], str]:
     """Split a continuous recording where inspirations begin.
 
     Args:

@@ -210,8 +210,9 @@ def _table(file: str, rows: list[_Row], mark: str, note: str, packed: bool = Fal
             "give --separator"
         )
     if odd_cells:
-        said = [f"{name}: {len(at)} cells, such as {cell!r}" for name, (at, cell) in
-                odd_cells.items()]  # fmt: skip
+        said = [
+            f"{name}: {len(at)} cells, such as {cell!r}" for name, (at, cell) in odd_cells.items()
+        ]
         notes.append(f"Cells that are no numbers are blank ({'; '.join(said)}).")
     for number, cells in stray[:3]:
         notes.append(f"Line {number} is no row and was left out: {' '.join(cells)[:60]!r}.")
@@ -347,9 +348,10 @@ def _clock(cells: Any) -> Floats | None:
     seconds = parts[2].astype(float).to_numpy(float, na_value=np.nan)
     stopwatch = np.isnan(seconds)  # 05:23.450 is minutes and seconds
     hours, minutes, seconds = (
-        np.where(stopwatch, 0.0, hours), np.where(stopwatch, hours, minutes),
+        np.where(stopwatch, 0.0, hours),
+        np.where(stopwatch, hours, minutes),
         np.where(stopwatch, minutes, seconds),
-    )  # fmt: skip
+    )
     digits = parts[4].fillna("0")
     # After a colon stand milliseconds, after a mark decimals.
     scale = np.where(parts[3] == ":", 1000.0, 10.0 ** digits.str.len().to_numpy(float))

@@ -38,9 +38,14 @@ RIG_COUNT = 4
 
 #: Orders of magnitude of what a kind of rig has of its own: delays and lags, s; L/cmH2O.
 _KIND = {
-    "valve_delay": 0.02, "valve_lag": 0.01, "sensor_lag": 0.01, "closing_delay": 0.03,
-    "closing_lag": 0.01, "opening_delay": 0.05, "circuit_compliance": 0.0008,
-}  # fmt: skip
+    "valve_delay": 0.02,
+    "valve_lag": 0.01,
+    "sensor_lag": 0.01,
+    "closing_delay": 0.03,
+    "closing_lag": 0.01,
+    "opening_delay": 0.05,
+    "circuit_compliance": 0.0008,
+}
 
 
 @flax.struct.dataclass
@@ -352,9 +357,14 @@ def breath_errors(fitted: Fitted, data: InspirationData) -> Array:
 
 
 def loss(
-    fitted: Fitted, data: InspirationData, weight: Array, around: Centre, scales: Scales,
-    noise: Noise, config: FitConfig,
-) -> Array:  # fmt: skip
+    fitted: Fitted,
+    data: InspirationData,
+    weight: Array,
+    around: Centre,
+    scales: Scales,
+    noise: Noise,
+    config: FitConfig,
+) -> Array:
     """Negative logarithm of the posterior for each breath of weight one."""
     soft = config.softness
     error = breath_errors(fitted, data)
@@ -380,9 +390,14 @@ def _optimiser(config: FitConfig) -> optax.GradientTransformation:
 
 @partial(jax.jit, static_argnames="config")
 def _advance(
-    carry: tuple[Fitted, Any], data: InspirationData, weight: Array, around: Centre,
-    scales: Scales, noise: Noise, config: FitConfig,
-) -> tuple[tuple[Fitted, Any], Array]:  # fmt: skip
+    carry: tuple[Fitted, Any],
+    data: InspirationData,
+    weight: Array,
+    around: Centre,
+    scales: Scales,
+    noise: Noise,
+    config: FitConfig,
+) -> tuple[tuple[Fitted, Any], Array]:
     optimiser = _optimiser(config)
 
     def iterate(carry: tuple[Fitted, Any], _: None) -> tuple[tuple[Fitted, Any], Array]:

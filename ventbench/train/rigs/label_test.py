@@ -238,9 +238,12 @@ def _errors(
 
 
 def label_errors(
-    pooled: Pooled, left_out: Sequence[int], data: InspirationData, labels: Sequence[Lung],
+    pooled: Pooled,
+    left_out: Sequence[int],
+    data: InspirationData,
+    labels: Sequence[Lung],
     scales: Scales,
-) -> dict[int, list[float]]:  # fmt: skip
+) -> dict[int, list[float]]:
     """Median error of the breaths of some sessions under every label, cmH2O.
 
     Args:
@@ -258,14 +261,26 @@ def label_errors(
     out: dict[int, list[float]] = {index: [] for index in left_out}
     for number in range(len(labels)):
         groups = dataclasses.replace(data.groups, lung=jnp.full_like(data.groups.lung, number))
-        error = np.array([
-            np.min([
-                np.asarray(_errors(pooled, groups, jnp.asarray(gain * scales.rig_gain),
-                                   jnp.asarray(start), data))
-                for start in _STARTS
-            ], axis=0)
-            for gain in _GAINS
-        ])  # fmt: skip
+        error = np.array(
+            [
+                np.min(
+                    [
+                        np.asarray(
+                            _errors(
+                                pooled,
+                                groups,
+                                jnp.asarray(gain * scales.rig_gain),
+                                jnp.asarray(start),
+                                data,
+                            )
+                        )
+                        for start in _STARTS
+                    ],
+                    axis=0,
+                )
+                for gain in _GAINS
+            ]
+        )
         for index in left_out:
             own = np.median(error[:, session == index], axis=1)
             out[index].append(float(np.min(own + _GAIN_COST * np.abs(_GAINS))))
@@ -298,10 +313,13 @@ def label_tests(
     tests = []
     for index, row in enumerate(sessions.table):
         own = ids.index(row.lung)
-        (r, c), limits = values[:, index], [
-            interval(values[k, index], again[:, k, index] if len(again) else np.empty(0))
-            for k in range(2)
-        ]  # fmt: skip
+        (r, c), limits = (
+            values[:, index],
+            [
+                interval(values[k, index], again[:, k, index] if len(again) else np.empty(0))
+                for k in range(2)
+            ],
+        )
         apart = np.where(np.arange(len(ids)) == own, np.inf, errors[index])
         best = int(np.argmin(apart)) if len(ids) > 1 else None
         tests.append(

@@ -271,9 +271,13 @@ def _with_own(breaths: _Breaths, rigs: Floats, scale: float, steps: int) -> _Bre
         change = np.linalg.solve(normal, right[..., None])[..., 0]
         gain, start = np.clip(change, -LARGEST, LARGEST).T
         breaths = _Breaths(
-            breaths.data, breaths.at, breaths.weight, breaths.noise,
-            breaths.gain + gain, breaths.start + start,
-        )  # fmt: skip
+            breaths.data,
+            breaths.at,
+            breaths.weight,
+            breaths.noise,
+            breaths.gain + gain,
+            breaths.start + start,
+        )
     return breaths
 
 
@@ -443,8 +447,11 @@ def train_population(
     weight = np.where(np.arange(len(data.breaths)) < data.measured, 1.0, settings["reconstructed"])
     with compilation.float64():
         arranged = inspirations(data.breaths, known.sessions, data.labels)
-    rigs = [(session, lung) for lung, own in zip(known.lung_ids, known.rigs, strict=True)
-            for session in sorted(own)]  # fmt: skip
+    rigs = [
+        (session, lung)
+        for lung, own in zip(known.lung_ids, known.rigs, strict=True)
+        for session in sorted(own)
+    ]
     scored = jax.tree.map(lambda leaf: np.asarray(leaf)[0], known.members)
     sessions, lungs = [session for session, _ in rigs], [lung for _, lung in rigs]
     fitted = fit_population(scored, arranged, sessions, lungs, weight, progress=progress)

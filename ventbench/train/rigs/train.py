@@ -215,9 +215,13 @@ def _listed(data: RigRecordings, lungs: Sequence[str] | None) -> tuple[str, ...]
 
 
 def _arrange(
-    data: RigRecordings, table: Sessions, listed: tuple[str, ...], config: RigConfig,
-    scales: Scales, noise: Noise,
-) -> _Problem:  # fmt: skip
+    data: RigRecordings,
+    table: Sessions,
+    listed: tuple[str, ...],
+    config: RigConfig,
+    scales: Scales,
+    noise: Noise,
+) -> _Problem:
     weight = np.where(np.arange(len(data.breaths)) < data.measured, 1.0, config.reconstructed)
     weight = weight * np.where(np.isin(data.breaths.lung_ids, listed), 1.0, config.unlisted)
     longest = int(np.count_nonzero(data.breaths.inspiratory, axis=1).max())
@@ -258,9 +262,13 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
     done = 0.0
 
     def run(
-        name: str, what: str, weight: Floats, *, expiration: bool = False,
+        name: str,
+        what: str,
+        weight: Floats,
+        *,
+        expiration: bool = False,
         start: Fitted | None = None,
-    ) -> Fitted:  # fmt: skip
+    ) -> Fitted:
         nonlocal done
         cost = 0.5 if start is not None else 1.0
 
@@ -270,10 +278,15 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
                 shorter = min(config.fit.iterations, _RESAMPLED_ITERATIONS)
                 settings = dataclasses.replace(config.fit, iterations=shorter)
             fitted, _ = fit(
-                problem.inspirations, jnp.asarray(weight), problem.centre, problem.scales,
-                problem.noise, settings, start,
+                problem.inspirations,
+                jnp.asarray(weight),
+                problem.centre,
+                problem.scales,
+                problem.noise,
+                settings,
+                start,
                 lambda share: report(what, 0.95 * (done + cost * share) / total),
-            )  # fmt: skip
+            )
             if expiration:
                 pooled = fit_expiration(fitted.pooled, problem.whole, jnp.asarray(weight[:m]))
                 fitted = dataclasses.replace(fitted, pooled=pooled)

@@ -139,9 +139,13 @@ def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
         def step(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Any, Array]]:
             loop, memory = carry
             (loop, (memory, (x, kept))), pressure = rollouts.control_step(
-                varied, cells, policy, lambda _, after, *__: after.signals.scored,
-                (loop, (memory, None)), (breath, *now),
-            )  # fmt: skip
+                varied,
+                cells,
+                policy,
+                lambda _, after, *__: after.signals.scored,
+                (loop, (memory, None)),
+                (breath, *now),
+            )
             reward = -weight * jnp.abs(pressure - cells.pip) / REWARD_SCALE
             return (loop, memory), (x, kept, reward)
 
@@ -330,9 +334,13 @@ def step(state: State, action: Array) -> tuple[State, Array, Array, Array]:
 
     varied = env.vary(episode.plant, episode.cell, breath)
     (loop, _), (before, after) = rollouts.control_step(
-        varied, episode.cell, rollouts.commanded, pressures,
-        (state.progress.loop, None), (breath, index, 50.0 + 50.0 * action),
-    )  # fmt: skip
+        varied,
+        episode.cell,
+        rollouts.commanded,
+        pressures,
+        (state.progress.loop, None),
+        (breath, index, 50.0 + 50.0 * action),
+    )
     last = index == BREATH - 1
     reward = -episode.weight * jnp.abs(after - episode.cell.pip) / REWARD_SCALE
     scored = breath >= min(protocol.SCORED_BREATHS)

@@ -334,10 +334,15 @@ def _groups(names: Sequence[str], lungs: int) -> list[_Group]:
 
 
 def _train(
-    name: str, networks: Sequence[str] | None, out: Path | str, seeds: Sequence[int],
-    steps: int | None, method: Method | None, simulator: Given,
+    name: str,
+    networks: Sequence[str] | None,
+    out: Path | str,
+    seeds: Sequence[int],
+    steps: int | None,
+    method: Method | None,
+    simulator: Given,
     progress: Progress | None,
-) -> TrainedControllers:  # fmt: skip
+) -> TrainedControllers:
     began = time.perf_counter()
     trained_on, out = plants_to_train_on(simulator), Path(out)
     known = list(trained_on.names)

@@ -44,7 +44,6 @@ SLOW = re.compile(r"diagnose\(|train_|\bfit\(|ventbench\.score\(")
 #: with those before them, and with the page's own controller or diagnoser.
 QUICK = {"docs/mechanics.md": (1,), "docs/missing_physics.md": (2,)}
 WHOLE = {
-    "README.md": (2,),
     "docs/submitting.md": (1,),
     "docs/diagnosers.md": (1,),
     "docs/mechanics.md": (2,),
@@ -55,12 +54,14 @@ if importlib.util.find_spec("stable_baselines3"):  # no extra of ventbench bring
 
 #: Examples of ``--help`` that run as they are written.
 EXAMPLES = (
-    "ventbench lungs",
-    "ventbench stressors",
+    "ventbench list lungs",
+    "ventbench list stressors",
     "ventbench doctor",
     "ventbench simulate",
-    "ventbench open-loop",
-    "ventbench coverage",
+    "ventbench data open-loop",
+    "ventbench board coverage",
+    "ventbench list entries",
+    "ventbench list examples",
     "ventbench data import",
     "ventbench board show",
     "ventbench board new-key",

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import linalg
 
 from ventbench.base.arrays import Floats
+from ventbench.base.linear import cholesky
 from ventbench.diagnosis.evaluator import Evaluator, estimate_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
 from ventbench.diagnosis.in_time import SWINGS, in_time, of_some_breaths
@@ -226,7 +227,7 @@ def _log_posterior(scored: Scored) -> float:
 def _integrated_out(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
     """Log evidence of a term, and what is left of the products beside its coefficients."""
     at, sd = list(term.main), np.array(term.spread)
-    L = np.linalg.cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
+    L = cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
     R = linalg.solve_triangular(L, sd[:, None] * np.column_stack([G[at], b[at]]), lower=True)
     left = R.T @ R
     return evidence(G, b, (term,)), G - left[:-1, :-1], b - left[:-1, -1]

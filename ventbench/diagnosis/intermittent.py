@@ -14,8 +14,9 @@ were lost or late have no grid: each of them was followed or not (:mod:`.in_time
 
 The effect acts beside the mechanisms that the search has named. It is told if it predicts the
 held-out breaths better than these alone. A set of breaths that begins or ends at one breath of the
-recording is a change of the session and no such effect; one that commands predict is physics. The breaths that are affected are then set aside, or get the commands that reached the
-valve, and the rest of the diagnosis goes on without the effect.
+recording is a change of the session and no such effect; one that commands predict is physics. The
+breaths that are affected are then set aside, or get the commands that reached the valve, and the
+rest of the diagnosis goes on without the effect. Breaths that judge are none of them.
 """
 
 from __future__ import annotations
@@ -29,17 +30,14 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, fit_with_white_noise
-from ventbench.diagnosis.evidence import COMMANDS, told_posterior
+from ventbench.diagnosis.evidence import COMMANDS
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, linearise
-from ventbench.diagnosis.identification import IdentifiedModel, held_out
+from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.in_time import EXCHANGEABLE, Paths, command_p_value, follow
-from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.diagnosis.validation import order_p_value
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism
-from ventbench.plants.simulators import Simulators
-from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Data
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import Problem
@@ -82,31 +80,10 @@ class Intermittent:
     """An effect that acts in some breaths."""
 
     missing: MissingMechanism  #: its finding, with the ids of the breaths that are affected.
-    ids: NDArray[np.int_]  #: ids of the n breaths that were looked at, in order.
-    affected: Bools  #: which of them are, ``(n,)``.
+    affected: Bools  #: which of the n breaths are, ``(n,)``.
     #: commands that reached the valve, %, ``(n, T)``; None if the affected breaths are to be set
     #: aside.
     u_in: Floats | None
-    #: posterior of the search that found it; see :class:`~ventbench.diagnosis.findings.Findings`.
-    posterior: tuple[tuple[tuple[str, ...], float], ...] = ()
-
-    def leaves_enough(
-        self, breaths: Breaths, simulators: Simulators, settings: SelectionConfig
-    ) -> bool:
-        """Whether the diagnosis can go on without the effect."""
-        if self.u_in is not None:  # a table of pressures answers to its own commands alone
-            return self.u_in.shape == breaths.u_in.shape and simulators.kind != "pressures"
-        left = breaths.select(~self.affected)
-        return len(left) >= _LEFT * 2 and bool(held_out(left, settings.data).any())
-
-    def rest_of(self, breaths: Breaths) -> Breaths:
-        """Breaths of the same recording without the effect."""
-        known = np.isin(breaths.breath_id, self.ids)
-        if self.u_in is None:
-            return breaths.select(~np.isin(breaths.breath_id, self.missing.affected))
-        u_in = breaths.u_in.astype(float)
-        u_in[known] = self.u_in
-        return replace(breaths, u_in=u_in)
 
 
 class _Found(NamedTuple):
@@ -165,7 +142,7 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         float(gained.sum()),
         affected=tuple(int(i) for i in ids[affected]),
     )
-    return Intermittent(missing, ids, affected, u_in, told_posterior(conclusion.posterior))
+    return Intermittent(missing, affected, u_in)
 
 
 def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:

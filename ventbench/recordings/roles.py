@@ -14,6 +14,7 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.base.linear import solve
 from ventbench.recordings.breaths import Breaths
 
 SLOW = 0.5
@@ -338,7 +339,7 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
         )
         if s["qq"] == 0.0 or np.linalg.matrix_rank(A) < 3:
             continue
-        r, e, _ = np.linalg.solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
+        r, e, _ = solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
         if r <= 0.0 or e <= 0.0:
             continue
         fit = np.log([1000.0 * r, 1.0 / e])

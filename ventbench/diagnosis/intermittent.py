@@ -131,7 +131,7 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     affected, u_in, estimates = _everywhere(best, data)
     if affected.sum() < _FEWEST or (u_in is None and _is_change(affected, evaluator, data)):
         return None
-    if _is_commanded(best):
+    if u_in is None and _is_commanded(best):
         return None
     near = np.exp(-_CLOSE)
     missing = MissingMechanism(
@@ -154,19 +154,13 @@ def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:
 
 
 def _is_commanded(found: _Found) -> bool:
-    """Whether commands predict in which breaths, or how often, an effect acts."""
+    """Whether commands predict in which breaths an effect acts."""
     evaluator = found.evaluator
-    each: list[Floats] = []
-    for partition in (evaluator.training, evaluator.held_out):
-        if found.name in COMMANDS:
-            paths = _paths(evaluator, found.fitted, partition, found.share, found.strength)
-            each.append(paths.kept / np.maximum(paths.sent, 1.0))
-        else:
-            event = _Evidence.of(evaluator, found.fitted, partition, found.name)
-            each.append(event.chances(found.strength, found.share))
     both = evaluator.partition(_joined(evaluator.training.data, evaluator.held_out.data))
+    evidence = _Evidence.of(evaluator, found.fitted, both, found.name)
+    likely = evidence.chances(found.strength, found.share)
     pressure = evaluator.predict(found.fitted, both)[:, 0]
-    return command_p_value(np.concatenate(each), both.data, pressure) <= EXCHANGEABLE
+    return command_p_value(likely, both.data, pressure) <= EXCHANGEABLE
 
 
 def _joined(one: Data, other: Data) -> Data:

@@ -256,7 +256,7 @@ def few_breaths(count: int) -> str | None:
     """What fewer breaths than everything needs can still be used for; None if they are enough."""
     if not 0 < count < _TRAINING:
         return None
-    use = "`ventbench open-loop` and, with flow, `ventbench mechanics`"
+    use = "`ventbench data open-loop` and, with flow, `ventbench mechanics`"
     need = f"`train simulator` needs {_TRAINING}"
     if count >= _DIAGNOSIS:
         use = f"`ventbench diagnose`, {use}"

@@ -232,7 +232,7 @@ def _tables(
                 pressures[-1][place].append(milli.tolist())
                 commands[-1][place].append(np.round(10.0 * u_in).astype(int).tolist())
                 peak = max(peak, max(float(np.max(row.pressure)) for row in run))
-                passed &= bool(np.all(passes_safety_gate(inspired, pip, protocol.DT)))
+                passed &= all(passes_safety_gate(x.pressure, pip, protocol.DT) for x in run)
         safe.append(passed)
         peaks.append(round(peak, 3))
     return {

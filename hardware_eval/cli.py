@@ -19,6 +19,7 @@ from hardware_eval.commands import (
     Port,
     Yes,
     bench_on,
+    bringup,
     calibrate,
     calibration_of,
     known_by,
@@ -281,10 +282,11 @@ def conformance(
     from hardware_eval.wire import conformance as judge
 
     shown = told(json)
-    transport, clock = ev.carrier(port)
+    line = ev.connect(port, timeout=1.0)  # how long answers take is a clause of its own
+    transport = line.client.transport
     try:
         clauses = judge.conformance(
-            transport, clock, lambda clause: print(clause, file=shown, flush=True)
+            transport, line.clock, lambda clause: print(clause, file=shown, flush=True)
         )
     finally:
         transport.close()
@@ -473,6 +475,7 @@ def replay(
         raise typer.Exit(1)
 
 
+app.command()(bringup)
 app.command()(trial)
 app.command()(calibrate)
 

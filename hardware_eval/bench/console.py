@@ -115,9 +115,9 @@ class ConsoleOperator(Operator):
             EmergencyStop: as :meth:`confirm`, or if the terminal has gone.
             InputError: if there is no terminal, or it is no number.
         """
+        if self._terminal is None or self._yes:
+            raise InputError(f"{question}nobody is there to answer (no terminal, or --yes)")
         print(question, end="", flush=True)
-        if self._terminal is None:
-            raise InputError(f"{question}there is no terminal to answer at")
         self._react()
         typed = b""
         while not typed.endswith((b"\n", b"\r")):

@@ -30,6 +30,7 @@ from hardware_eval.realtime import Clock
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError, RefusedError
 from hardware_eval.wire.messages import CAUSES, Flag, Reading
 from ventbench.base.arrays import Floats
+from ventbench.base.errors import InputError
 from ventbench.task import protocol, waveform
 from ventbench.task.lungs import lung as parse_lung
 
@@ -64,6 +65,10 @@ class Operator:
     def confirm(self, question: str) -> bool:
         """Ask; False ends the session."""
         return True
+
+    def number(self, question: str) -> float:
+        """Ask for a number that a person reads or knows; InputError where there is none."""
+        raise InputError(f"{question}nobody is there to answer")
 
     def tell(self, text: str) -> None:
         """Say something."""

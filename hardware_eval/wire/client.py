@@ -28,6 +28,7 @@ from hardware_eval.realtime import Clock, RealClock, take_priority
 from hardware_eval.wire.messages import (
     PROTOCOL_VERSION,
     Arm,
+    Capability,
     Command,
     Counters,
     Event,
@@ -110,6 +111,10 @@ class RefusedError(LinkError):
         """Keep the device's answer."""
         super().__init__(message)
         self.refusal = refusal
+
+
+class UnconfirmedError(InputError):
+    """A real device may not be armed: nobody has confirmed what its valves and its sensor do."""
 
 
 class Transport(Protocol):
@@ -302,23 +307,33 @@ class Client:
     and RefusedError if the session is not open or the device refuses for another cause.
 
     Attributes:
+        transport: what carries the bytes.
         welcome: what the device told at the last :meth:`hello`; None before.
         reading: the newest reading; None before the first.
         counts: messages ``sent``, ``answered`` in time, ``unanswered`` and ``refused``; answers to
             none that waited (``unexpected``), such as late ones; ``sessions``, ``disconnections``;
             and bytes that were no message, by the name of their :class:`Fault`.
+        brought_up: device and calibration, as ``(device_id, calibration)``, that a person has
+            confirmed (:mod:`hardware_eval.bench.bringup`); without it no real device is armed.
     """
 
     def __init__(
-        self, transport: Transport, clock: Clock | None = None, timeout: float = ANSWER_TIMEOUT
+        self,
+        transport: Transport,
+        clock: Clock | None = None,
+        timeout: float = ANSWER_TIMEOUT,
+        emulated: bool = True,
     ) -> None:
         """Talk through a :class:`Link` or a loopback device.
 
-        The latter needs its own clock. An answer may take ``timeout``, s.
+        The latter needs its own clock. An answer may take ``timeout``, s. Only at a port where
+        software may be (``emulated``) a device is believed that says it is simulated.
         """
+        self.brought_up: tuple[bytes, bytes] | None = None
+        self._emulated = emulated
         self.welcome: Welcome | None = None
         self.reading: Reading | None = None
-        self._transport, self._clock, self._timeout = transport, clock or RealClock(), timeout
+        self.transport, self._clock, self._timeout = transport, clock or RealClock(), timeout
         self._parser = ParserState()
         self._session, self._sequence = 0, 0
         self.counts: Counter[str] = Counter()
@@ -340,11 +355,26 @@ class Client:
         self.heartbeat()
         return self.welcome
 
+    @property
+    def simulated(self) -> bool:
+        """Whether no valve moves, so that nobody need have confirmed what moves."""
+        says = self.welcome is not None and bool(self.welcome.capabilities & Capability.SIMULATED)
+        return says and self._emulated
+
     def arm(self) -> Reading:
         """Begin a run: clear the causes of venting; commands must follow within 80 ms.
 
         The device refuses while a cause of venting lasts.
+
+        Raises:
+            UnconfirmedError: if the device is real, and was not brought up as it is now.
         """
+        now = self.welcome and (self.welcome.device_id, self.welcome.calibration)
+        if not self.simulated and (now is None or now != self.brought_up):
+            raise UnconfirmedError(
+                "nobody has confirmed what the valves and the sensor of this device do, as it is "
+                "configured now: run `ventbench-hardware bringup --port PORT`; nothing was armed"
+            )
         return self._persist(Arm(), Reading)
 
     def command(self, u_in: float, u_out: int, timeout: float | None = None) -> Reading:
@@ -387,7 +417,7 @@ class Client:
         Raises:
             LinkError: if the port does not come back.
         """
-        self._transport.reopen()
+        self.transport.reopen()
         self._parser = ParserState()
         return self.hello(self._pressure_limit)
 
@@ -397,7 +427,7 @@ class Client:
             with contextlib.suppress(NoAnswerError, RefusedError, DisconnectedError):
                 self._ask(Vent(), Reading, self._timeout)  # else the watchdog vents
         finally:
-            self._transport.close()
+            self.transport.close()
 
     def round_trips(self) -> tuple[float, float]:
         """Median and longest time from message to answer of the last ten thousand, s, or NaN."""
@@ -418,7 +448,7 @@ class Client:
         frame = encode(Packet(self._session, self._sequence, message))
         begun = self._clock.now()
         try:
-            self._transport.write(frame)
+            self.transport.write(frame)
             self.counts["sent"] += 1
             answered = self._wait(begun + timeout)
         except DisconnectedError:
@@ -455,7 +485,7 @@ class Client:
             left = deadline - self._clock.now()
             if left <= 0.0:
                 return None
-            self._parser, events = feed_bytes(self._parser, self._transport.read(left))
+            self._parser, events = feed_bytes(self._parser, self.transport.read(left))
             answers = [message for event in events if (message := self._expected(event))]
             if answers:
                 return answers[-1]

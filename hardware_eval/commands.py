@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench
     from hardware_eval.results.evaluate import Line
+    from hardware_eval.wire.client import Client
 
 Port = Annotated[
     str,
@@ -41,12 +42,18 @@ def told(json: Path | None) -> TextIO:
 
 @contextlib.contextmanager
 def bench_on(
-    port: str, *, yes: bool, control: Path | None = None, confirmed: bool = True
+    port: str,
+    *,
+    yes: bool,
+    control: Path | None = None,
+    confirmed: bool = True,
+    kept: Path | None = None,
 ) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
     """A bench with a person at it; the line is released at the end.
 
     Real devices must have been brought up before, unless they need not be ``confirmed``. Any key is
-    the emergency stop, which ends the command with exit code 1.
+    the emergency stop, which ends the command with exit code 1. However it ends early, the message
+    says whether the lung is vented, and where ``kept`` lies what the same command continues.
     """
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench, EmergencyStop
@@ -54,15 +61,37 @@ def bench_on(
     from hardware_eval.results import evaluate as ev
 
     line = ev.connect(port, confirmed)
+    client = line.client
+
+    def ending(reason: str) -> str:
+        left = f"; what is done is in {kept}: the same command continues" if kept else ""
+        return f"{reason}; {client.ending()}{left}"
+
     try:
         person = ConsoleOperator(yes=yes, control=control, device=line.device)
-        with person.keys():
-            yield line, Bench(line.client, line.clock, DEFAULT, person), person
+        with _closing(client), person.keys():
+            yield line, Bench(client, line.clock, DEFAULT, person), person
     except EmergencyStop:
-        print("stopped: the operator pressed the emergency stop", file=sys.stderr)
+        print(ending("stopped: the operator pressed the emergency stop"), file=sys.stderr)
         raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        print(ending("interrupted"), file=sys.stderr)
+        raise
+    except BrokenPipeError as error:
+        raise InputError(ending("nobody reads this program's output any more")) from error
+    except OSError as error:
+        raise InputError(ending(f"{error.filename}: {error.strerror}")) from error
+    except InputError as error:
+        raise InputError(ending(str(error))) from error
+
+
+@contextlib.contextmanager
+def _closing(client: Client) -> Iterator[None]:
+    """Vent and release the line; a disk or an output that fails must not keep it from it."""
+    try:
+        yield
     finally:
-        line.client.close()
+        client.close()
 
 
 Calibrated = Annotated[

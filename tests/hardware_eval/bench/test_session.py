@@ -102,18 +102,32 @@ def silent(device: LoopbackDevice, after: float, steps: float) -> None:
     device.line.faults = (fault,)
 
 
-def test_a_step_without_an_answer_costs_a_scored_run_but_not_the_entry(
-    bench: Bench, device: LoopbackDevice
+@pytest.mark.parametrize("step", [0, 4])
+def test_a_step_without_an_answer_costs_no_run(
+    step: int, bench: Bench, device: LoopbackDevice
 ) -> None:
-    breath = protocol.BREATH_STEPS * protocol.DT
-    for kind, status in (("scored", "aborted"), ("ramp", "complete")):
-        silent(device, breath, 0.9)
-        controller = Scripted()
-        result = run_once(bench, run(kind=kind), controller)
-        assert math.isnan(result.breaths[1].pressure[0])
-        assert (result.status, result.held_up) == (status, status == "aborted")
-        # The controller is told that a breath begins, by the answer to the last command.
-        assert [row[0] for row in controller.rows].count(0.0) == protocol.BREATHS
+    whole = run_once(bench, run(), Scripted())
+    silent(device, (protocol.BREATH_STEPS + step) * protocol.DT, 0.9)
+    controller = Scripted()
+    result = run_once(bench, run(), controller)
+    # The controller is told that a breath begins, by the answer to the last command.
+    assert [row[0] for row in controller.rows].count(0.0) == protocol.BREATHS
+    assert len(controller.rows) == result.asked == 102 - (step > 0)
+    assert math.isnan(result.breaths[1].pressure[step]) == (step > 0)
+    assert (result.status, result.late_answers) == ("complete", 0)
+    assert result.error == pytest.approx(whole.error, abs=0.1)
+
+
+def test_a_run_of_too_few_readings_runs_again(bench: Bench, device: LoopbackDevice) -> None:
+    begins = device.clock.now() - device.start + 2.0 + protocol.DT - 0.002
+    steps = protocol.BREATH_STEPS + np.arange(2, 34, 4)
+    device.line.faults = tuple(
+        Fault(LineFaultKind.SILENT, begins + at * protocol.DT, begins + (at + 0.9) * protocol.DT)
+        for at in steps
+    )
+    result = run_once(bench, run(), Scripted())
+    assert (result.status, result.held_up) == ("aborted", True)
+    assert "8 of 68 scored steps have no pressure, 1 in a row" in result.reason
 
 
 def test_a_silent_line_ends_the_run_and_blames_neither_lung_nor_entry(

@@ -13,6 +13,7 @@ import pytest
 
 from hardware_eval.bench import session
 from hardware_eval.bench.controllers import ControllerFailedError, PIDController
+from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, RunResult, run_once
 from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
 from hardware_eval.bench.raw_log import RawLog, breaths, lines
@@ -325,6 +326,15 @@ def test_a_dry_run_finds_a_controller_that_is_unsafe(plan: Plan) -> None:
     assert len(problems) == 1
     assert "over pressure" in problems[0]
     assert errors == []
+
+
+def test_the_dry_run_has_the_fallback_of_the_run() -> None:
+    calm = make_plan(["pid"], [LUNG], pips=(10.0,), repeats=5, control_every=0)
+    problems, _ = session.dry_run(
+        calm, lambda run: Scripted(lambda step, u: 100.0), DEFAULT, fallback=FallbackSettings()
+    )
+    assert len(problems) == 1
+    assert "were outside the envelope" in problems[0]
 
 
 def test_a_result_without_scored_breaths_has_no_error() -> None:

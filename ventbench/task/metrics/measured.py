@@ -41,6 +41,12 @@ def filled(pressure: ArrayLike) -> Floats:
     return low + share * (high - low)
 
 
+def worst(pressure: ArrayLike) -> Floats:
+    """Pressures with the higher neighbour in each gap."""
+    low, high, _ = _neighbours(pressure)
+    return np.maximum(low, high)
+
+
 def mean_error(pressure: ArrayLike, target: ArrayLike) -> float:
     """Mean ``|p - p*|`` of a run's scored inspirations, cmH2O; NaN without any reading of one."""
     return float(np.mean(np.abs(filled(pressure) - np.asarray(target, float))))
@@ -48,8 +54,7 @@ def mean_error(pressure: ArrayLike, target: ArrayLike) -> float:
 
 def is_safe(pressure: ArrayLike, pip: float, dt: float) -> Bools:
     """Whether inspirations pass the safety gate whatever a gap hides; see there, ``(...)``."""
-    low, high, _ = _neighbours(pressure)
-    return passes_safety_gate(np.maximum(low, high), pip, dt)
+    return passes_safety_gate(worst(pressure), pip, dt)
 
 
 def highest(pressure: ArrayLike) -> float:

@@ -255,7 +255,7 @@ def evaluate(
         notes: for the record.
         rest: time at rest before each run, s.
         calibration: of the device, for the record.
-        fallback: takes over from entries that are late or leave their envelope; not in the dry run.
+        fallback: takes over from entries that are late or leave their envelope.
 
     Raises:
         InputError: if the log is of another plan, or the dry run finds the plan unsafe.
@@ -267,7 +267,11 @@ def evaluate(
     if dry and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
         problems, simulated = session.dry_run(
-            plan, controllers(submissions, plan.track, runner, real_time=False), settings, rest
+            plan,
+            controllers(submissions, plan.track, runner, real_time=False),
+            settings,
+            rest,
+            fallback,
         )
         if problems:
             raise InputError(

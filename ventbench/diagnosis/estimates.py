@@ -175,6 +175,9 @@ def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     """The plant of each lung, by label; it answers as :meth:`Evaluator.predict` does.
 
+    What changes in the course of the recording is as it is at its end: a simulator is used for
+    breaths to come. The parameter ``position`` (0 first breath, 1 last) then says so.
+
     Args:
         fitted: the model, fitted to any breaths of the lungs.
         evaluator: evaluator with which it was fitted.
@@ -189,6 +192,8 @@ def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     for R, C in np.unique(np.stack([data.R, data.C], axis=1), axis=0):
         breath = int(np.flatnonzero((data.R == R) & (data.C == C))[0])
         given = dict(zip(names, values[breath, columns], strict=True))
+        if any(mechanism(name).uses_position for name in fitted.names):
+            given["position"] = 1.0
         result[f"R{R:g}C{C:g}"] = predictor.plant(given)
     return result
 

@@ -13,6 +13,7 @@ from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
+from ventbench.diagnosis.validation import explained_share
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import (
     library,
@@ -214,8 +215,15 @@ def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
     )
 
 
-def oscillation(conclusion: Conclusion) -> MissingMechanism | None:
-    """The mechanism that a periodic input is; None if there is none, or no name for it."""
+def oscillation(
+    conclusion: Conclusion, left: tuple[float, float] = (0.0, 0.0)
+) -> MissingMechanism | None:
+    """The mechanism that a periodic input is; None if there is none, or no name for it.
+
+    Args:
+        conclusion: has the input.
+        left: error beside it, and what is shown to be no noise of that, cmH2O.
+    """
     effect = conclusion.unnamed
     source = None if effect is None else effect.swing
     if effect is None or source is None:
@@ -234,9 +242,11 @@ def oscillation(conclusion: Conclusion) -> MissingMechanism | None:
             "amplitude": Estimate(amplitude, unit, (amplitude - wide, amplitude + wide)),
             "frequency": Estimate(frequency, "Hz", (frequency - sd, frequency + sd)),
         },
-        dict(effect.places).get(effect.name, 1.0),
+        effect.probability,
         tuple(other for other in others if other != name),
         effect.nats,
+        worth=effect.worth,
+        explains=explained_share(effect.worth, *left),
     )
 
 

@@ -170,7 +170,7 @@ def conclude(
             swing, gained = _swing(evaluator, full, term)
             least = evaluator.settings.search.course_nats
             rival = unplaced_gain(evaluator, full, evaluator.held_out)
-            if passes_heldout_test(
+            if swing.worth >= evaluator.settings.residuals.negligible and passes_heldout_test(
                 gained, evaluator.settings.held_out_test, max(least, rival + least)
             ):
                 place = SWINGS[term.name][0]

@@ -328,9 +328,9 @@ def _conclude(
     # What each breath may have of its own: a start, as its first reading is noisy, and a gain.
     scattered = conclusion.gain_sd > 0.0
     own = np.stack([start, gain] if scattered else [start], axis=-1)
-    judged = 1.0  # efforts of breaths to come are unknown
+    judged = None  # efforts of breaths to come are unknown
     if not conclusion.full.hypothesis.breath_terms:
-        judged = judge.excess(pressures["after"], own, quiet_samples(breaths)).p_value
+        judged = judge.excess(pressures["after"], own, quiet_samples(breaths))
     adequacy = check_residuals(
         breaths.select(here),
         pressures["after"][here],

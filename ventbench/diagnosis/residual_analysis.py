@@ -343,6 +343,11 @@ class Excess(NamedTuple):
     size: float  #: root-mean-square beyond it where something moves, cmH2O.
     p_value: float  #: probability of as much by chance; 1 if it is not material.
 
+    @property
+    def outweighs_noise(self) -> bool:
+        """Whether more is shared than is noise, which few breaths may show without a small p."""
+        return self.size > self.noise
+
 
 def excess_over_noise(error: Floats, usable: Bools, quiet: Bools) -> Excess:
     """Compare errors with the noise that neighbouring readings show.

@@ -47,6 +47,7 @@ from ventbench.diagnosis.hypothesis import (
     varies_by_breath,
 )
 from ventbench.diagnosis.residual_analysis import (
+    Excess,
     amplitudes,
     errors,
     excess_over_noise,
@@ -323,7 +324,7 @@ def check_residuals(
     flow: Floats,
     volume: Floats,
     *,
-    judged: float = 1.0,
+    judged: Excess | None = None,
     gains_scatter: bool,
     settings: ResidualSettings,
 ) -> Adequacy:
@@ -337,7 +338,7 @@ def check_residuals(
         noise_sd: standard deviation of the measurement, cmH2O.
         flow: flow of the refitted simulator, mL/s, ``(n, T)``.
         volume: volume of the refitted simulator, mL, ``(n, T)``.
-        judged: p-value of the errors of breaths that are not here.
+        judged: what breaths that are not here show beyond noise.
         gains_scatter: whether gains that differ from breath to breath are no error.
         settings: levels and ranges.
     """
@@ -366,7 +367,7 @@ def check_residuals(
     shared = excess_over_noise(error - of_start - own_gain, usable, quiet_samples(breaths))
     p = [order_p_value(each, lungs, settings) for each in series.values()]
     p.append(min((region.p_value for region in regions), default=1.0))
-    p += [shared.p_value, judged]
+    p += [shared.p_value, 1.0 if judged is None else judged.p_value]
     significant = passes_fdr(np.array(p), settings.veto_level)
     whole = _mean_square(error - of_start, usable)
     # The simulator's own gain in units of the sensitivity, which may be that of another lung.
@@ -391,6 +392,7 @@ def check_residuals(
             changes.append(Change(name, number, float(how_much), drifts, p[k], float(worth)))
     changes.sort(key=lambda change: -change.worth)
     vetoed = bool(changes) or bool(significant[len(series) :].any())
+    vetoed |= judged is not None and judged.outweighs_noise
     excess = shared.size if significant[len(series) + 1] else 0.0
     return Adequacy(regions, tuple(changes), vetoed, shared.noise, excess)
 

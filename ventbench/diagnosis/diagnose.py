@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 import numpy as np
 
 from ventbench import mechanics
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
@@ -137,6 +138,7 @@ def diagnose(
     tell = progress or (lambda what, share: None)
     tell("simulating", _STARTED)
     by_flow = drive == "flow" or (drive == "auto" and flow_drive.lacks_commands(breaths))
+    compilation.keep()
     experiment = prepare(breaths, simulators, settings.data, by_flow=by_flow)
     excluded = () if patient else ("patient_effort",)
     if by_flow:
@@ -144,18 +146,19 @@ def diagnose(
         settings = flow_drive.without_ventilator(settings)
     told: list[MissingMechanism] = []
     posterior = None  # that of all breaths has all effects
-    while True:
-        alone = _identify(experiment, excluded, tell, settings)
-        posterior = posterior or alone.conclusion.posterior
-        if by_flow or len(told) == _MOST_INTERMITTENT:
-            break
-        tell("looking for effects of some breaths", _halfway(experiment))
-        left = _without_effect(experiment, alone)
-        if left is None:
-            break
-        experiment, missing = left
-        told.append(missing)
-    found = _conclude(experiment, alone, excluded, tell, settings)
+    with compilation.one_blas_thread():
+        while True:
+            alone = _identify(experiment, excluded, tell, settings)
+            posterior = posterior or alone.conclusion.posterior
+            if by_flow or len(told) == _MOST_INTERMITTENT:
+                break
+            tell("looking for effects of some breaths", _halfway(experiment))
+            left = _without_effect(experiment, alone)
+            if left is None:
+                break
+            experiment, missing = left
+            told.append(missing)
+        found = _conclude(experiment, alone, excluded, tell, settings)
     return replace(
         found,
         verdict="named" if told else found.verdict,

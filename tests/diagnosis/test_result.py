@@ -27,7 +27,7 @@ def test_the_interface():
         "delay": {"value": 0.041, "unit": "s", "ci95": [0.038, 0.044]}
     }
     assert mechanism["confidence"] == 0.97
-    assert mechanism["preferred_over_other_names"] == 0.97
+    assert mechanism["probability"] == 0.97
     assert mechanism["alternatives"] == ["valve_lag"]
     assert plain["slot"] is None
     assert len(plain["location"]) == len(found.location) > 0

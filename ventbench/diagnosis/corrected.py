@@ -10,7 +10,6 @@ absolute error rises. Errors in reports are measured on the same breaths, so tha
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -20,11 +19,10 @@ from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.experiment import Experiment, Judge, Split, open_loop_error
-from ventbench.diagnosis.findings import OpenLoopComparison, OpenLoopError, Stage
+from ventbench.diagnosis.findings import WHOLE, OpenLoopComparison, OpenLoopError, Stage
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.identification import IdentifiedModel
-from ventbench.diagnosis.residual_analysis import EDGE_SIZE
-from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings
+from ventbench.diagnosis.settings import CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.plants.corrected import Corrected
 from ventbench.recordings.breaths import Breaths
@@ -34,15 +32,6 @@ from ventbench.task.interfaces import Plant
 
 #: Length of what is reported as the beginning of inspiration, s.
 _BEGINNING = 0.2
-
-#: Share of the breaths, those that err most, without which it is asked whether more than noise is
-#: left: a wrong first reading puts a whole breath off, since every simulation starts there.
-_SET_ASIDE = 0.1
-
-#: Time after the start of expiration from which little moves, s; fewest quiet samples of a breath
-#: that show the sensor's scatter; times that scatter that the noise may have (it is coloured, and a
-#: converter rounds a quiet signal more than a moving one); least scatter, cmH2O.
-_QUIET_AFTER, _QUIET_SAMPLES, _QUIET_FACTOR, _LEAST_NOISE = 0.6, 10, 3.0, 0.05
 
 #: Plants of the lungs, by label.
 Plants = dict[str, Plant]
@@ -354,9 +343,9 @@ def compare_open_loop(
     breaths: Breaths,
     judge: Judge,
     pressures: dict[str, Floats],
-    noise_floor: float,
+    noise_sd: float,
     scatter_error: Floats | None = None,
-    sensor: float = float("nan"),
+    start: Floats | None = None,
 ) -> OpenLoopComparison:
     """Open-loop errors of a simulator before and after its correction.
 
@@ -365,19 +354,24 @@ def compare_open_loop(
         judge: has the readings of the breaths that no fit has seen.
         pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
             T)``.
-        noise_floor: standard deviation of the noise, cmH2O.
+        noise_sd: standard deviation of the readings, cmH2O.
         scatter_error: standard deviation of the pressure because gains or efforts differ from
             breath to breath, cmH2O, ``(n, T)``; None if nothing does.
-        sensor: that of :func:`sensor_noise`.
+        start: change of the pressure by the reading that a breath starts from, ``(n, T)``; None if
+            that is exact.
     """
     # The first sample is where every simulation starts.
-    inspiration = breaths.inspiratory & (breaths.time > 0) & judge.judging[:, None]
+    whole = breaths.valid & (breaths.time > 0) & judge.judging[:, None]
+    inspiration = breaths.inspiratory & whole
 
     def by_stage(mask: Bools) -> dict[str, OpenLoopError]:
         return {stage: judge.error(simulated, mask) for stage, simulated in pressures.items()}
 
-    whole = by_stage(inspiration)
+    def root(values: Floats | None) -> float:
+        return 0.0 if values is None else float(np.sqrt(np.mean(values[whole] ** 2)))
+
     parts = {
+        WHOLE: whole,
         f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
         "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
         "expiration": (breaths.u_out == 1) & breaths.valid & judge.judging[:, None],
@@ -385,74 +379,13 @@ def compare_open_loop(
     lungs = breaths.by_lung_index
     for name in lungs if len(lungs) > 1 else ():
         parts[f"lung {name}"] = inspiration & (breaths.lung_ids == name)[:, None]
-    groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
-    scatter = 0.0
-    if scatter_error is not None:
-        scatter = float(np.sqrt(np.mean(scatter_error[inspiration] ** 2)))
-    usual = _usual_error(*judge.by_breath(pressures["after"], inspiration))
+    errors = by_stage(inspiration)
     return OpenLoopComparison(
         judge.ids,
-        whole["before"],
-        whole["refit"],
-        whole["after"],
-        noise_floor,
-        groups,
-        scatter,
-        usual,
-        sensor,
+        errors["before"],
+        errors["refit"],
+        errors["after"],
+        noise_sd * float(np.hypot(1.0, root(start))),
+        {name: by_stage(mask) for name, mask in parts.items() if mask.any()},
+        root(scatter_error),
     )
-
-
-def _usual_error(squares: Floats, counts: Floats) -> float:
-    """Root mean square of errors without the breaths that err most, ``(k,)`` each."""
-    order = np.argsort(squares / np.maximum(counts, 1))
-    kept = order[: len(order) - math.ceil(_SET_ASIDE * len(order))] if len(order) > 2 else order
-    total = counts[kept].sum()
-    return float(np.sqrt(squares[kept].sum() / total)) if total else float("nan")
-
-
-def is_unexplained(
-    errors: OpenLoopComparison, settings: CorrectionSettings = DEFAULT.correction
-) -> bool:
-    """Whether the corrected simulator errs far more than the measurement and gains scatter."""
-    return bool(
-        min(errors.after.rmse, errors.usual) > settings.unexplained_ratio * errors.least_error
-        and errors.unexplained > settings.unexplained_error
-    )
-
-
-def sensor_noise(breaths: Breaths) -> float:
-    """Standard deviation of the sensor, cmH2O, by quiet readings alone; NaN if nothing is quiet.
-
-    Late in an expiration hardly anything moves, so that the scatter about a parabola shows the
-    sensor. A converter hides the scatter of a quiet signal; its step's own scatter is a floor.
-    """
-    late = (breaths.u_out == 1) & breaths.valid & np.isfinite(breaths.pressure)
-    scatter = []
-    for time, pressure, u_in, use in zip(
-        breaths.time, breaths.pressure, breaths.u_in, late, strict=True
-    ):
-        if use.sum() < _QUIET_SAMPLES:
-            continue
-        use = use & (time > time[use][0] + _QUIET_AFTER)
-        use &= np.abs(u_in - np.median(u_in[use]) if use.any() else u_in) < EDGE_SIZE
-        if use.sum() >= _QUIET_SAMPLES:
-            left = pressure[use] - np.polyval(np.polyfit(time[use], pressure[use], 2), time[use])
-            scatter.append(1.4826 * np.median(np.abs(left)))
-    if not scatter:
-        return float("nan")
-    step = np.diff(np.unique(breaths.pressure[late])).min(initial=np.inf) / np.sqrt(12.0)
-    return max(float(np.median(scatter)), float(step), _LEAST_NOISE)
-
-
-def noise_floor(noise_sd: float, sensor: float) -> float:
-    """Standard deviation of the measurement, cmH2O, which no simulator can beat.
-
-    The noise of a model that fits badly contains the model's own slow errors; the floor is never
-    more than a few times the scatter of the sensor.
-
-    Args:
-        noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
-        sensor: that of :func:`sensor_noise`; NaN if unknown.
-    """
-    return float(np.fmin(noise_sd, _QUIET_FACTOR * sensor))

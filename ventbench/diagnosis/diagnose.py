@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 import numpy as np
 
 from ventbench import mechanics
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
@@ -19,9 +20,6 @@ from ventbench.diagnosis.corrected import (
     Correction,
     compare_open_loop,
     correct,
-    is_unexplained,
-    noise_floor,
-    sensor_noise,
 )
 from ventbench.diagnosis.evidence import IN_TIME, told_posterior
 from ventbench.diagnosis.experiment import Experiment, Split, prepare
@@ -36,7 +34,7 @@ from ventbench.diagnosis.findings import (
 from ventbench.diagnosis.hypothesis import FittedModel, varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, identify, place_of_change
 from ventbench.diagnosis.intermittent import find
-from ventbench.diagnosis.residual_analysis import flow_and_volume, locate
+from ventbench.diagnosis.residual_analysis import flow_and_volume, locate, quiet_samples
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
@@ -46,6 +44,7 @@ from ventbench.diagnosis.simulator_comparison import (
     missing_mechanisms,
     refit_at_simulator_parameters,
 )
+from ventbench.diagnosis.unknown import explained, preference, unplaced_gain
 from ventbench.diagnosis.validation import check_residuals, detection_limits, explained_share
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import mechanism, parameter
@@ -139,6 +138,7 @@ def diagnose(
     tell = progress or (lambda what, share: None)
     tell("simulating", _STARTED)
     by_flow = drive == "flow" or (drive == "auto" and flow_drive.lacks_commands(breaths))
+    compilation.keep()
     experiment = prepare(breaths, simulators, settings.data, by_flow=by_flow)
     excluded = () if patient else ("patient_effort",)
     if by_flow:
@@ -146,18 +146,19 @@ def diagnose(
         settings = flow_drive.without_ventilator(settings)
     told: list[MissingMechanism] = []
     posterior = None  # that of all breaths has all effects
-    while True:
-        alone = _identify(experiment, excluded, tell, settings)
-        posterior = posterior or alone.conclusion.posterior
-        if by_flow or len(told) == _MOST_INTERMITTENT:
-            break
-        tell("looking for effects of some breaths", _halfway(experiment))
-        left = _without_effect(experiment, alone)
-        if left is None:
-            break
-        experiment, missing = left
-        told.append(missing)
-    found = _conclude(experiment, alone, excluded, tell, settings)
+    with compilation.one_blas_thread():
+        while True:
+            alone = _identify(experiment, excluded, tell, settings)
+            posterior = posterior or alone.conclusion.posterior
+            if by_flow or len(told) == _MOST_INTERMITTENT:
+                break
+            tell("looking for effects of some breaths", _halfway(experiment))
+            left = _without_effect(experiment, alone)
+            if left is None:
+                break
+            experiment, missing = left
+            told.append(missing)
+        found = _conclude(experiment, alone, excluded, tell, settings)
     return replace(
         found,
         verdict="named" if told else found.verdict,
@@ -208,18 +209,32 @@ def _identify(
 def _without_effect(
     experiment: Experiment, model: IdentifiedModel
 ) -> tuple[Experiment, MissingMechanism] | None:
-    """The experiment without an effect of some breaths, and that effect; None if there is none."""
+    """The experiment without an effect of some breaths, and that effect; None if there is none.
+
+    It competes with an error of some breaths that nobody can place.
+    """
     seen = experiment.uses.identifying
     some = find(model, experiment.seen, experiment.breaths.breath_id[seen])
     if some is None:
         return None
+    evaluator, full, nats = model.evaluator, model.conclusion.full, some.missing.nats
+    ahead = nats - unplaced_gain(evaluator, full, evaluator.held_out)
+    if ahead <= 0.0:
+        return None
+    worth, share = explained(evaluator, full, evaluator.held_out, nats)
+    missing = replace(
+        some.missing,
+        confidence=some.missing.confidence * preference(ahead),
+        worth=worth,
+        explains=share,
+    )
     affected, u_in = np.zeros(len(seen), bool), None
     affected[seen] = some.affected
     if some.u_in is not None:
         u_in = experiment.reached.copy()
         u_in[seen] = some.u_in
     left = experiment.without(affected, u_in)
-    return None if left is None else (left, some.missing)
+    return None if left is None else (left, missing)
 
 
 def _compare(
@@ -313,6 +328,12 @@ def _conclude(
         flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
     here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1) & seen)
     gain, start = recording_model.sensitivities(data)
+    # What each breath may have of its own: a start, as its first reading is noisy, and a gain.
+    scattered = conclusion.gain_sd > 0.0
+    own = np.stack([start, gain] if scattered else [start], axis=-1)
+    judged = None  # efforts of breaths to come are unknown
+    if not conclusion.full.hypothesis.breath_terms:
+        judged = judge.excess(pressures["after"], own, quiet_samples(breaths))
     adequacy = check_residuals(
         breaths.select(here),
         pressures["after"][here],
@@ -321,7 +342,8 @@ def _conclude(
         noise.sigma[0],
         flow[here],
         volume[here],
-        gains_scatter=conclusion.gain_sd > 0.0,
+        judged=judged,
+        gains_scatter=scattered,
         settings=settings.residuals,
     )
     # A simulator that is more than a lung and a valve may know the gains of its rigs, and gains
@@ -329,17 +351,14 @@ def _conclude(
     scatters = simulators.is_base_physics and not any(c.of == "gain" for c in adequacy.changes)
     gain_error = conclusion.gain_sd * np.abs(gain) * scatters
     scatter_error = np.hypot(gain_error, recording_model.effort_spread(data))
-    sensor = sensor_noise(breaths.select(seen))
     open_loop = compare_open_loop(
         breaths,
         judge,
         pressures,
-        noise_floor(float(noise.sigma[0]), sensor),
+        adequacy.noise if np.isfinite(adequacy.noise) else float(noise.sigma[0]),
         scatter_error,
-        sensor,
+        start,
     )
-    if adequacy.changes:  # breaths that err more because of a change are no outliers
-        open_loop = replace(open_loop, usual=open_loop.after.rmse)
     is_input = conclusion.unnamed is not None and conclusion.unnamed.swing is not None
     rejected = (bool(missing) or term is not None) and not _helps(
         experiment, correction, recording_model, open_loop, by_breath=is_input
@@ -356,11 +375,11 @@ def _conclude(
         settings=settings.residuals,
     )
     form, term = estimates.split_form(term, tuple(missing))
-    swings = None if term is None else estimates.oscillation(conclusion)
+    left = (open_loop.whole.rmse, adequacy.excess)
+    swings = None if term is None else estimates.oscillation(conclusion, left)
     term = term if swings is None else None
-    left = (open_loop.after.rmse, open_loop.unexplained if adequacy.vetoed else 0.0)
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
-    unnamed = unnamed or is_unexplained(open_loop, settings.correction) or adequacy.vetoed
+    unnamed = unnamed or adequacy.vetoed
     verdict: Verdict = "named" if missing or swings else "unnamed" if unnamed else "nothing_missing"
     limits: dict[str, float] = {}
     if verdict == "nothing_missing":

@@ -51,7 +51,7 @@ MUSCLES = ("cough", "unknown:muscles")
 
 #: Prior odds of a term, of an unknown at a place beside those of a name, and the power of the
 #: likelihood: no model has what neighbouring samples share.
-_ODDS, _PLACE, _WARMTH = 0.7, 0.1, 0.2
+_ODDS, _PLACE, WARMTH = 0.7, 0.1, 0.2
 
 #: Standard deviations of the logarithm of the breaths' gains that are compared.
 _SCATTERS = (0.003, SCATTER, 0.03, 0.1)
@@ -79,14 +79,21 @@ class Posterior:
     fitted: tuple[Scored, ...]  #: sets that were fitted, likeliest first.
     weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
 
+    def marginal(self, name: str) -> float:
+        """Posterior probability that a term acts, over all sets."""
+        return float(sum(weight for names, weight in self.weights.items() if name in names))
+
     def swaps(self, names: frozenset[str], name: str) -> dict[str, float]:
-        """Posterior odds of other names in the place of one of a set, the likeliest first."""
-        rest, own = names - {name}, self.weights[names]
-        odds = {
-            next(iter(other - rest)): weight / own
-            for other, weight in self.weights.items()
-            if len(other) == len(names) and rest < other and other != names
-        }
+        """Posterior odds of others in the place of one term of a set, the likeliest first.
+
+        One may stand in the place of several: equal delays of both valves are a late clock.
+        """
+        own = self.weights[names]
+        odds: dict[str, float] = {}
+        for other, weight in self.weights.items():
+            new = other - names
+            if name not in other and len(new) == 1:
+                odds[next(iter(new))] = odds.get(next(iter(new)), 0.0) + weight / own
         return dict(sorted(odds.items(), key=lambda pair: -pair[1]))
 
     def undecided(self, nats: float) -> Scored:
@@ -190,7 +197,7 @@ def enumerate_sets(
         else:
             value = evidence(G, b, terms)
         key = names_of(terms)
-        total = value + prior(key, _WARMTH)
+        total = value + prior(key, WARMTH)
         if len(key) == len(terms) and (key not in best or total > best[key][0]):
             best[key] = (total, terms)
         return value
@@ -221,7 +228,7 @@ def enumerate_sets(
 
 def _log_posterior(scored: Scored) -> float:
     """Log posterior of a set that was fitted, but for a constant, nats."""
-    return scored.evidence + prior(names_of(scored.terms), _WARMTH)
+    return scored.evidence + prior(names_of(scored.terms), WARMTH)
 
 
 def _integrated_out(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
@@ -491,11 +498,11 @@ def weigh(
     scored: Sequence[Scored], linear: Sequence[tuple[float, Set]]
 ) -> dict[frozenset[str], float]:
     """Posterior of each set of names; the likeliest that was not fitted is a nat behind."""
-    logs = {names_of(s.terms): _WARMTH * s.evidence for s in scored}
+    logs = {names_of(s.terms): WARMTH * s.evidence for s in scored}
     at = {}
     for value, terms in linear:
         names = names_of(terms)
-        at[names] = _WARMTH * (value - prior(names, _WARMTH))
+        at[names] = WARMTH * (value - prior(names, WARMTH))
     logs = {names: value + prior(names) for names, value in logs.items()}
     offset = max(logs.values()) - 1.0 - max(value + prior(k) for k, value in at.items())
     for names, value in at.items():

@@ -19,6 +19,7 @@ from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import flow_drive
 from ventbench.diagnosis.findings import OpenLoopError
+from ventbench.diagnosis.residual_analysis import Excess, amplitudes, excess_over_noise
 from ventbench.diagnosis.settings import DEFAULT, DataSettings
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
@@ -187,10 +188,20 @@ class Judge:
         """Error of predictions over the samples of a mask, ``(n, T)``; NaN if there is none."""
         return open_loop_error(self._recorded, predicted, where)
 
-    def by_breath(self, predicted: Floats, where: Bools) -> tuple[Floats, Floats]:
-        """Sum of squared errors of each judging breath, cmH2O^2, and their number, ``(k,)``."""
-        error = np.where(where, predicted - self._recorded, np.nan)[self.judging]
-        return np.nansum(error**2, axis=1), np.isfinite(error).sum(axis=1).astype(float)
+    def excess(self, predicted: Floats, own: Floats, quiet: Bools) -> Excess:
+        """What neighbouring errors share beyond noise; see :func:`.excess_over_noise`.
+
+        Args:
+            predicted: predictions, cmH2O, ``(n, T)``.
+            own: changes of the pressure by what each breath may have of its own, such as another
+                start than its first reading, which is noisy, ``(n, T, k)``.
+            quiet: where nothing moves, ``(n, T)``.
+        """
+        error = (self._recorded - predicted)[self.judging]
+        usable, own = np.isfinite(error), own[self.judging]
+        error = np.where(usable, error, 0.0)
+        error = error - np.einsum("ntk,nk->nt", own, amplitudes(error, usable, own))
+        return excess_over_noise(error, usable, quiet[self.judging])
 
     def log_likelihood(self, predicted: Floats, noise: Noise) -> float:
         """Log-likelihood of predictions, nats."""

@@ -411,14 +411,17 @@ def score(
                 by_seed.setdefault(key, []).append(outcome["score"])
             else:
                 path = Path(outcome["record"])
-                if not (leaderboard / canonical.RECORDS / path.name).exists():
+                kept = leaderboard / canonical.RECORDS / path.name
+                if not kept.exists():
                     store.add(leaderboard, path, simulators)
                 if secret:
-                    gate.sign(leaderboard, path.stem, secret)
+                    gate.sign(leaderboard, kept, secret)
                 records[key] = path.stem
         tell("records", at + 1, len(runs))
     content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))
     files.write_bytes(own.folder / RESULT, content)
+    if secret:
+        gate.sign(leaderboard, own.folder / RESULT, secret)
     return rounds.load(leaderboard, name)
 
 

@@ -20,11 +20,11 @@ from hardware_eval.commands import (
     Lung,
     Port,
     Yes,
+    baseline_of,
     bench_on,
     bringup,
     calibrate,
     calibration_of,
-    known_by,
     numbers,
     told,
     trial,
@@ -167,7 +167,7 @@ def run(
     def before_lung(bench: Bench, mounted: str) -> Sheet | None:
         if not selftest:
             return None
-        sheet = run_selftest(bench, mounted, **known_by(calibrated), skip=left_out)
+        sheet = run_selftest(bench, mounted, **baseline_of(calibrated), skip=left_out)
         files.write_json(out / f"selftest-{mounted}.json", sheet.as_dict())
         print(sheet, flush=True)
         return sheet
@@ -261,7 +261,7 @@ def selftest(
     label, simulators = scored_lung(lung).id, load_simulators(plant)
     left_out = chosen_parts(skip or ())
     with bench_on(port, yes=True) as (line, bench, _):
-        known = known_by(calibration_of(line, calibration))
+        known = baseline_of(calibration_of(line, calibration))
         sheet = run_selftest(bench, label, simulator=simulators, skip=left_out, **known)
     emit(sheet.as_dict(), json)
     print(sheet, file=told(json))

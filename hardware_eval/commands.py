@@ -154,13 +154,20 @@ def calibrate(
     with bench_on(port, yes=yes) as (line, bench, _):
         device = device_of(line.client)
         kept = calibration.load(out, device, stale=True).parts if out.exists() else {}
+        if part not in calibration.BASE and kept:
+            line.client.calibrate(calibration.Calibration(device, kept).correction())
         made = calibration.measure(bench, part, lung=label, reference=values)
+    dropped = [x for x in kept if part in calibration.BASE and x not in calibration.BASE]
+    kept = {kind: x for kind, x in kept.items() if kind not in dropped}
     saved = calibration.Calibration(device, {**kept, part: made}).save(out)
     emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
     to = told(json)
     print(made, file=to)
     if part == "leak":
         print(f"leak: {calibration.lost_flow(made, label)} mL/s of {label}", file=to)
+    if dropped:
+        print(f"measured by the readings of before, measure again: {', '.join(dropped)}", file=to)
+    print(f"readings are corrected to {saved.correction()}", file=to)
     print(f"{out}: {', '.join(saved.parts)}; SHA-256 {saved.sha256}", file=to)
 
 
@@ -212,7 +219,7 @@ def bringup(
 
 
 def calibration_of(line: Line, path: Path | None) -> Calibration | None:
-    """The calibration that a command is given.
+    """The calibration that a command is given; the line's readings are corrected from here on.
 
     Raises:
         InputError: if it is stale, was changed, or is of another device than the line's.
@@ -220,14 +227,17 @@ def calibration_of(line: Line, path: Path | None) -> Calibration | None:
     from hardware_eval.bench import calibrate as calibration
     from hardware_eval.bench.dated import device_of
 
-    return None if path is None else calibration.load(path, device_of(line.client))
+    if path is None:
+        return None
+    found = calibration.load(path, device_of(line.client))
+    line.client.calibrate(found.correction())
+    print(f"calibrated by {path}: {found.correction()}", file=sys.stderr)
+    return found
 
 
-def known_by(calibration: Calibration | None) -> dict[str, Any]:
+def baseline_of(calibration: Calibration | None) -> dict[str, Any]:
     """What a calibration tells a self-test."""
-    if calibration is None:
-        return {}
-    return {"valve": calibration.valve, "known": calibration.known_lung}
+    return {} if calibration is None else {"baseline": calibration.baseline()}
 
 
 def numbers(option: str, text: str | None) -> list[float]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from hardware_eval.bench.drive import Commands, Driven, drive
 from hardware_eval.bench.identity import (
+    Baseline,
     KnownLung,
     identified,
     leak,
@@ -70,6 +71,7 @@ LIMITS: dict[str, Limit] = {
         "cmH2O",
         "A vented lung rests at PEEP; an offset would go into every score.",
     ),
+    "peep": Limit(-0.5, 0.5, "cmH2O", "A vented lung rests where it did when PEEP was calibrated."),
     "sensor_noise": Limit(
         0.0,
         0.5,
@@ -278,6 +280,8 @@ _HELD, _FILLING, _FEEDBACK, _FILL = 20.0, 3.0, 15.0, (5.0, 7.0)
 _STILL_AFTER, _LEAK_ERROR, _WATCH = 15, 0.2, (4.0, 10.0)
 
 
+_NO_BASELINE = Baseline()
+
 #: Attempts at a part of the test that a busy host or a slow line ends.
 _ATTEMPTS = 10
 
@@ -331,8 +335,7 @@ def selftest(
     lung: str,
     *,
     simulator: Any = "frozen",
-    valve: tuple[float, float, float] | None = None,
-    known: KnownLung | None = None,
+    baseline: Baseline = _NO_BASELINE,
     skip: Collection[str] = (),
 ) -> Sheet:
     """Test a bench with a mounted lung.
@@ -343,9 +346,7 @@ def selftest(
         bench: device, clock, safety, operator.
         lung: its label.
         simulator: the simulators that know the lungs; see :func:`ventbench.load_simulators`.
-        valve: calibrated flow of the valve and its range, mL/s per %; used where the device
-            measures no flow.
-        known: the lung of a calibration.
+        baseline: what calibration told of the bench; its valve where no flow is measured.
         skip: parts to leave out, of :data:`PARTS`.
 
     Raises:
@@ -376,7 +377,7 @@ def selftest(
             driven[part].append(done)
         if part == "sensor" and driven[part]:
             noise = _at_rest(driven[part][0])[1]
-    sheet = judge(lung, driven, simulator=simulator, valve=valve, known=known, skipped=left_out)
+    sheet = judge(lung, driven, simulator=simulator, baseline=baseline, skipped=left_out)
     findings = list(sheet.findings)
     busy = any(x.held_up for x in everything)
     told = f"{repeated} part{'s' * (repeated != 1)} repeated: host or line was held up"
@@ -396,8 +397,7 @@ def judge(
     driven: Mapping[str, Sequence[Driven]],
     *,
     simulator: Any = "frozen",
-    valve: tuple[float, float, float] | None = None,
-    known: KnownLung | None = None,
+    baseline: Baseline = _NO_BASELINE,
     skipped: tuple[str, ...] = (),
 ) -> Sheet:
     """Judge what the programs of the parts brought; of the clock and the checks says nothing.
@@ -406,14 +406,13 @@ def judge(
         lung: the label.
         driven: of each part, in the order of its programs; shorter where a check ended it.
         simulator: see :func:`selftest`; None to ask none.
-        valve: see there.
-        known: see there.
+        baseline: see there.
         skipped: parts that were left out.
     """
-    findings, noise = _at_rest(driven["sensor"][0])
+    findings, noise = _at_rest(driven["sensor"][0], baseline.peep)
     findings = [] if "sensor" in skipped else findings
     if driven.get("leak"):
-        findings.append(_closed(driven["leak"][0], lung))
+        findings.append(_closed(driven["leak"][0], lung, baseline.leak))
     if driven.get("sweep"):
         findings += _sweep(driven["sweep"], noise, lung)
     probes = list(driven.get("lung", ()))
@@ -421,11 +420,11 @@ def judge(
         return Sheet(lung, tuple(findings), skipped=skipped)
     errors = {} if simulator is None else _errors(probes, simulator)
     found, R, C, gain = measured_lung(probes, lung, noise)
-    holds, alone, told = identified(probes, lung, valve)
+    holds, alone, told = identified(probes, lung, baseline.valve)
     label = math.nan if holds is None else float(holds)
     findings.append(Finding("identity", label, holds is not False, told))
     findings += _lung(lung, errors, R, C, gain, alone)
-    findings.append(span_finding(found, known))
+    findings.append(span_finding(found, baseline.lung))
     return Sheet(lung, tuple(findings), errors, R, C, skipped)
 
 
@@ -435,15 +434,17 @@ def judged(name: str, value: float, text: str) -> Finding:
     return Finding(name, value, bool(limit.low - 1e-12 <= value <= limit.high + 1e-12), text)
 
 
-def _at_rest(rest: Driven) -> tuple[list[Finding], float]:
-    """Findings, and the standard deviation of the noise, cmH2O."""
+def _at_rest(rest: Driven, peep: float | None = None) -> tuple[list[Finding], float]:
+    """Findings, and the standard deviation of the noise, cmH2O; PEEP as calibrated, if it was."""
     settled = rest.pressure[len(rest.pressure) // 2 :]
     if not settled.size or not np.isfinite(settled).all():
         return [Finding("sensor_zero", math.nan, False, "the sensor gives no pressure")], 0.0
     noise = white_noise(settled)
     mean = float(settled.mean())
     return [
-        judged("sensor_zero", mean, f"{mean:.2f} cmH2O at rest"),
+        judged("sensor_zero", mean, f"{mean:.2f} cmH2O at rest")
+        if peep is None
+        else judged("peep", mean - peep, f"{mean:.2f} cmH2O at rest, {peep:.2f} when calibrated"),
         judged("sensor_noise", noise, f"{noise:.2f} cmH2O of noise"),
     ], noise
 
@@ -479,11 +480,11 @@ def fill_and_close(filling: int) -> Commands:
     return commands
 
 
-def _closed(held: Driven, lung: str) -> Finding:
+def _closed(held: Driven, lung: str, calibrated: float = 0.0) -> Finding:
     closed, _ = hold(lung, 0.0)
     if len(held.pressure) < closed + 10:
         return Finding("leak", math.nan, False, "the lung could not be filled")
-    allowed = LIMITS["leak"].high
+    allowed = LIMITS["leak"].high + calibrated
     found = leak(held, closed, parse_lung(lung).C, allowed)
     told = f"loses {found.flow:.1f} mL/s at {found.pressure:.1f} cmH2O when closed"
     if beyond := found.sigmas > _SIGMAS:

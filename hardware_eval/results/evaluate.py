@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -110,6 +111,7 @@ VIRTUAL = "virtual:"
 def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
     """Open a port, say nothing, and return it with the clock it lives by; see :func:`connect`."""
     if not port.startswith(VIRTUAL):
+        _await(port)
         return Link(port), RealClock()
     from hardware_eval.emulation.emulator import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
@@ -118,6 +120,21 @@ def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
     lung = simulated_lung(port.removeprefix(VIRTUAL), noise=0.1, quantum=0.0703)
     device = LoopbackDevice(lung)
     return device, device.clock
+
+
+#: How long an emulator may take to compile its lung, s, and how often it is looked for.
+_COMPILES, _LOOK = 60.0, 0.2
+
+
+def _await(port: str) -> None:
+    """Wait for the link of an emulator, which makes it once its lung answers."""
+    if "://" in port or port.startswith("/dev/") or os.path.exists(port):
+        return
+    print(f"waiting for {port}: is an emulator starting? Ctrl-C ends this", file=sys.stderr)
+    looks = round(_COMPILES / _LOOK)
+    while looks and not os.path.exists(port):
+        time.sleep(_LOOK)
+        looks -= 1
 
 
 def connect(port: str, confirmed: bool = True, timeout: float = ANSWER_TIMEOUT) -> Line:

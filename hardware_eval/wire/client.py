@@ -19,6 +19,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 from typing import Protocol, TypeVar, cast
 
@@ -328,6 +329,35 @@ class Link:
         )
 
 
+@dataclass(frozen=True)
+class Correction:
+    """What calibration makes of readings: ``(reading - offset) / slope``."""
+
+    pressure: tuple[float, float] = (0.0, 1.0)  #: offset, cmH2O, and slope.
+    flow: tuple[float, float] = (0.0, 1.0)  #: offset, mL/s, and slope.
+    error: float = 0.0  #: half of the 95 % interval of a pressure within the range, cmH2O.
+
+    def of(self, reading: Reading) -> Reading:
+        """The reading, corrected."""
+        (zero, slope), (offset, gain) = self.pressure, self.flow
+        return replace(
+            reading,
+            pressure=(reading.pressure - zero) / slope,
+            flow=(reading.flow - offset) / gain,
+        )
+
+    def shown(self, pressure: float) -> float:
+        """What the device reads at a pressure, cmH2O."""
+        return self.pressure[0] + self.pressure[1] * pressure
+
+    def __str__(self) -> str:
+        (zero, slope), (offset, gain) = self.pressure, self.flow
+        return (
+            f"pressure (reading {-zero:+.2f}) / {slope:.4f}, within {self.error:.2f} cmH2O (95 %); "
+            f"flow (reading {-offset:+.1f}) / {gain:.4f}"
+        )
+
+
 class ClockWatch:
     """Compares the clocks of device and host, however late the host is.
 
@@ -410,6 +440,7 @@ class Client:
         self._round_trips: deque[float] = deque(maxlen=_REMEMBERED)
         self._pressure_limit: float | None = None
         self._watch = ClockWatch()
+        self._correction = Correction()
         self.vented = False
 
     def hello(self, pressure_limit: float | None = None) -> Welcome:
@@ -426,7 +457,8 @@ class Client:
         self._session, self._sequence = secrets.randbits(32), 0
         self._pressure_limit, self._watch = pressure_limit, ClockWatch()
         self.counts["sessions"] += 1
-        hello = Hello(PROTOCOL_VERSION, pressure_limit)
+        shown = None if pressure_limit is None else self._correction.shown(pressure_limit)
+        hello = Hello(PROTOCOL_VERSION, shown)
         try:
             self.welcome = self._persist(hello, Welcome, HELLOS)
         except NoAnswerError:
@@ -442,6 +474,16 @@ class Client:
             )
         self._persist(Heartbeat(), Reading)
         return self.welcome
+
+    def calibrate(self, correction: Correction) -> None:
+        """Correct all readings from here on, and open a session whose limit is so too.
+
+        The device compares what its sensor reads, so it is told the reading at its limit.
+        """
+        welcome = self.welcome or self.hello()
+        limit = self._pressure_limit or welcome.pressure_limit
+        self._correction = correction
+        self.hello(limit)
 
     @property
     def simulated(self) -> bool:
@@ -572,6 +614,7 @@ class Client:
         now = self._clock.now()
         self._round_trips.append(now - begun)
         if isinstance(answered, Reading):
+            answered = self._correction.of(answered)
             self.reading, self.vented = answered, answered.mode is not Mode.RUNNING
             if wrong := self._watch.see(answered.time, begun, now):
                 self._watch = ClockWatch()

@@ -188,6 +188,25 @@ def test_the_port_and_not_the_device_decides_what_is_emulated(tmp_path: Path) ->
         assert about["about"]["says_simulated"] is False
 
 
+def test_a_command_waits_for_an_emulator_that_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    port, waits = tmp_path / "lung", []
+
+    def sleep(seconds: float) -> None:
+        waits.append(seconds)
+        if len(waits) == 3:
+            port.touch()
+
+    monkeypatch.setattr(evaluate.time, "sleep", sleep)
+    monkeypatch.setattr(evaluate, "Link", lambda url: url)
+    assert evaluate.carrier(str(port))[0] == str(port)
+    assert "is an emulator starting" in capsys.readouterr().err
+    assert len(waits) == 3
+    evaluate.carrier("/dev/ttyACM7")  # a cable that is out is told at once
+    assert len(waits) == 3
+
+
 def commands() -> list[str]:
     text = "\n".join(re.findall(r"^```sh\n(.*?)^```", MANUAL.read_text("utf-8"), re.M | re.S))
     lines = [part.strip(" &") for line in text.splitlines() for part in line.split("&&")]

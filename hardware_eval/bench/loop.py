@@ -34,8 +34,9 @@ from hardware_eval.bench.plan import MEASURED, PERTURBED_BREATH, PERTURBED_STEP,
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.realtime import Clock
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError, RefusedError
-from hardware_eval.wire.messages import CAUSES, Flag, Reading
+from hardware_eval.wire.messages import CAUSES, Flag, Reading, Reason
 from ventbench.base.arrays import Floats
+from ventbench.base.errors import InputError
 from ventbench.task import protocol, waveform
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.task.metrics import measured
@@ -71,6 +72,10 @@ class Operator:
     def confirm(self, question: str) -> bool:
         """Ask; False ends the session."""
         return True
+
+    def number(self, question: str) -> float:
+        """Ask for a number that a person reads or knows; InputError where there is none."""
+        raise InputError(f"{question}nobody is there to answer")
 
     def tell(self, text: str) -> None:
         """Say something."""
@@ -319,7 +324,7 @@ class _Loop:
             reading = None
             self._unanswered += 1
         except RefusedError as error:
-            return self._ended("aborted", str(error))
+            return self._refused(error)
         target = float(waveform.target(step, run.pip))
         log.time.append((bench.clock.now() if reading is None else began) - start)
         # A controller must see each breath begin; what the last command's answer told is at most a
@@ -415,7 +420,8 @@ class _Loop:
         flags = getattr(error.refusal, "flags", Flag.NONE)
         if flags & _CAUSES:
             return self._vented_by_device(flags)
-        return self._ended("aborted", str(error))
+        lost = error.refusal.reason is Reason.SESSION  # arming opens it again
+        return self._ended("aborted", str(error), held_up=lost)
 
     def _disturb(self, breath: int, step: int) -> None:
         """Announce and undo the perturbation of a perturbed run."""

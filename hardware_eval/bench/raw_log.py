@@ -67,10 +67,14 @@ class RawLog:
             self.append(_CUT)
 
     def append(self, line: dict[str, Any]) -> None:
-        """Append one line and wait until it is on the disk."""
-        self._file.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        """Append one line and wait until it is on the disk; an OSError names the file."""
+        try:
+            self._file.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            error.filename = str(self.path)
+            raise
 
     def close(self) -> None:
         """Close the file."""

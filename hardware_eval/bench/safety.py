@@ -362,6 +362,9 @@ _SHOWS = 8.0
 #: pressure of a closed circuit may settle, s.
 _OPENS_S, _SETTLES_S = 0.6, 0.12
 
+#: Readings that stay equal for longer, s, are of a frozen sensor; of one that moves few are.
+_FROZEN_S = 0.08
+
 #: Volume that no test lung takes, mL.
 _LARGEST_VOLUME = 2500.0
 
@@ -396,7 +399,13 @@ def _values(
             state.volume / (C * (limit - protocol.PEEP)),
             state.volume > largest and not sample.u_out,
         ),
-        "disconnected": (share, not sample.u_out and share < settings.disconnected.threshold),
+        "disconnected": (
+            share,
+            not sample.u_out
+            and share < settings.disconnected.threshold
+            # A tube that is off shows ambient pressure; any other that does not move is frozen.
+            and not (still > _FROZEN_S and pressure > settings.low_pressure.threshold),
+        ),
         "software_delay": (sample.late, sample.late > settings.software_delay.threshold),
         "missed_deadlines": (sample.late, sample.late > settings.missed_deadlines.threshold),
         "stuck_sensor": (

@@ -233,7 +233,7 @@ def _tables(
                 )
                 commands[-1][place].append(np.round(10.0 * u_in).astype(int).tolist())
                 peak = max(peak, *(measured.highest(breath.pressure) for breath in run))
-                passed &= bool(np.all(measured.is_safe(inspired, pip, protocol.DT)))
+                passed &= all(measured.is_safe(x.pressure, pip, protocol.DT) for x in run)
         safe.append(passed)
         peaks.append(round(peak, 3) if math.isfinite(peak) else 0.0)
     return {

@@ -12,9 +12,9 @@ is monotonic in 1/C and in R, and its largest value over R and g lies at their e
 the flow changes. Every reading of the last steps gives such a bound, as does the volume that can be
 left of the breath before; the least of them holds. After the entry's command the safe controller
 closes the valve. The command is inside the envelope if then on no rig the pressure that remains is
-above the protocol's limit, and on none the pressure, with the readings before, is above it for
-longer than the safety gate allows. Each rig is judged by itself: a late valve shows a peak late and
-a quick one soon, but none shows it twice.
+above the protocol's limit, and on none the pressure, with the breath's readings before, is above it
+for longer than the safety gate allows. Each rig is judged by itself: a late valve shows a peak late
+and a quick one soon, but none shows it twice.
 
 A peak that a resistor makes in a step or two passes the gate, and on rigs that are all right it is
 here and there twice as high. No bound of R tells it without refusing commands that do no harm: it
@@ -39,7 +39,7 @@ from ventbench.mechanics.labels import APPARATUS, TOLERANCE_R
 from ventbench.task import protocol
 from ventbench.task.lungs import Lung
 from ventbench.task.metrics import measured
-from ventbench.task.metrics.score import longest_run, safety_limit
+from ventbench.task.metrics.score import safety_limit
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class FallbackSettings:
         delays: shares of a command's flow that the readings 1, 2 and 3 steps later show.
         noise: most by which a reading is too low, cmH2O.
         readings: newest readings that bound the future.
-        above: steps in a row that the pressure may be above the safety gate's limit.
+        above: steps of a breath that the pressure may be above the safety gate's limit.
         hand_back: answers in a row, in time and inside, after which the entry commands again.
     """
 
@@ -244,9 +244,8 @@ def is_inside(settings: FallbackSettings, state: FallbackState, pip: float, answ
         return False
     if len(state.pressures) <= settings.last:  # no reading tells the resistor's drop yet
         return True
-    seen = measured.worst(state.pressures[-settings.above - 1 :]) > limit
-    runs = longest_run(np.hstack([np.tile(seen, (len(above), 1)), above]))
-    return bool(runs.max() <= settings.above)
+    seen = int((measured.worst(state.pressures) > limit).sum())
+    return bool(seen + above.sum(axis=1).max() <= settings.above)
 
 
 def largest_inside(

@@ -22,7 +22,13 @@ import numpy as np
 
 from hardware_eval import realtime
 from hardware_eval.bench import fallback, safety
-from hardware_eval.bench.controllers import ControllerFailedError, LiveController
+from hardware_eval.bench.controllers import (
+    NONE,
+    ControllerFailedError,
+    Count,
+    Lateness,
+    LiveController,
+)
 from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.plan import MEASURED, PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
@@ -154,6 +160,7 @@ class RunResult:
         longest_answer: longest time that an answer took, s.
         outside: answers that the fallback refused.
         fallback, longest_fallback: steps that it commanded, in all and in a row.
+        beside: answers of an empty controller beside the entry.
     """
 
     status: str
@@ -169,6 +176,7 @@ class RunResult:
     outside: int = 0
     fallback: int = 0
     longest_fallback: int = 0
+    beside: Count = NONE
 
     @property
     def error(self) -> float:
@@ -198,6 +206,7 @@ class Bench:
     rest: float = REST_S  #: time at rest before each run, s.
     #: bounds of the controller that takes over; None for none.
     fallback: FallbackSettings | None = None
+    lateness: Lateness = field(default_factory=Lateness)  #: late answers, to tell whose they are.
 
 
 def run_once(
@@ -278,14 +287,19 @@ class _Loop:
 
         A score needs the pressures of its inspirations, and a controller that answered in time.
         """
-        outside = self._fallback.outside
-        if self._late_answers + outside > LATE_SHARE * self._asked:
+        outside, most = self._fallback.outside, max(LATE_SHARE * self._asked, 1.0)
+        own, empty = Count(self._late_answers, self._asked), self._controller.beside
+        of_host = self._bench.lateness.is_of_host(self._run.entry, own, empty)
+        if own.late + outside > most:
             left = f", {outside} were outside the envelope" if outside else ""
+            of_host &= outside <= most
+            beside = f"; of an empty controller beside it {empty}" if empty.asked else ""
             return self._ended(
-                "failed",
-                f"{self._late_answers} of {self._asked} answers took longer than "
-                f"{1e3 * ANSWER_BY:.0f} ms, the longest "
-                f"{1e3 * self._controller.longest_answer:.0f} ms{left}; {100 * LATE_SHARE:g} % may",
+                "aborted" if of_host else "failed",
+                f"{own} answers took longer than {1e3 * ANSWER_BY:.0f} ms, the longest "
+                f"{1e3 * self._controller.longest_answer:.0f} ms{beside}{left}; "
+                f"{100 * LATE_SHARE:g} % may",
+                held_up=of_host,
             )
         if self._run.kind not in MEASURED:
             return self._ended("complete", "")
@@ -435,6 +449,7 @@ class _Loop:
             self._fallback.outside,
             self._fallback.taken,
             self._fallback.longest,
+            self._controller.beside,
         )
 
 

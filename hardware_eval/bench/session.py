@@ -34,6 +34,9 @@ MAX_ATTEMPTS = 3
 #: Runs that a busy host or a slow line ends in a row before the session gives up.
 MAX_HELD_UP = 10
 
+#: What is said of a host that is late time and again.
+_BUSY = f" ({MAX_HELD_UP} times in a row: close other programs, allow real-time priority)"
+
 #: What a run's line in the log takes from its result as it is.
 _COUNTED = ("asked", "late_answers", "limited", "outside", "fallback", "longest_fallback")
 
@@ -128,10 +131,11 @@ def _runs(
             continue
         if result.status == "aborted":
             spoilt += 1
+            reason = f"{result.reason}{_BUSY if result.held_up else ''}"
             if spoilt >= MAX_ATTEMPTS or not bench.operator.confirm(
-                f"{result.reason}. Mend the bench; run it again?"
+                f"{reason}. Mend the bench; run it again?"
             ):
-                return result.reason
+                return reason
             continue
         spoilt = held_up = 0
         queue.pop(0)
@@ -208,6 +212,7 @@ def _one(
             **{name: getattr(result, name) for name in _COUNTED},
             "error": None if math.isnan(result.error) else result.error,
             "longest_answer": round(result.longest_answer, 6),
+            "beside": vars(result.beside),
             "trips": [vars(trip) for trip in result.trips],
         }
     )

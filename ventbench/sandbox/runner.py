@@ -228,6 +228,8 @@ class SandboxSession(Asked):
                 configuration(str(submission.folder), submission.label, allowance)
             )
             stack.callback(self._zygote.close)
+            if allowance.priority is not None and kernel.LINUX:
+                self._zygote.prefer(allowance.priority, allowance.patience_s)
             # Ended first: cells then leave by themselves, and the zygote need not kill.
             stack.callback(self._pipes.close_all)
             if budget is not None:

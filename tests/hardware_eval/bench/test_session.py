@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hardware_eval.bench import session
-from hardware_eval.bench.controllers import ControllerFailedError, PIDController
+from hardware_eval.bench.controllers import ControllerFailedError, Count, PIDController
 from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, RunResult, run_once
 from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
@@ -37,7 +37,7 @@ def run(pip: float = 20.0, **about: Any) -> PlannedRun:
 class Scripted:
     """A PID whose answers are changed at some steps of the run."""
 
-    longest_answer = 0.045
+    longest_answer, beside = 0.045, Count()
 
     def __init__(self, change: Callable[[int, float], float | None] = lambda step, u: u) -> None:
         self._pid, self._change, self._step = PIDController(GAINS), change, -1

@@ -1,8 +1,8 @@
 """Figures of measured inspirations, where the ventilator leaves some readings unanswered.
 
 A pressure has shape ``(..., T)``, cmH2O, NaN where there is no reading. An error takes the line
-between the neighbours of a gap; safety takes the higher of them, so that no gap hides what an
-inspiration did: one above the limit for four steps shows in one of them at least, if a gap has two.
+between the neighbours of a gap; safety takes the higher of them, so that a gap at a peak is counted
+as the peak. A peak within a gap, of two readings at most, is not seen.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def mean_error(pressure: ArrayLike, target: ArrayLike) -> float:
 
 
 def is_safe(pressure: ArrayLike, pip: float, dt: float) -> Bools:
-    """Whether inspirations pass the safety gate whatever a gap hides; see there, ``(...)``."""
+    """Whether breaths pass the safety gate, a gap as its higher neighbour; see there, ``(...)``."""
     return passes_safety_gate(worst(pressure), pip, dt)
 
 

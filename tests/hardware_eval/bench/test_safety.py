@@ -50,12 +50,12 @@ def test_healthy_breaths_trip_nothing() -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[int, SafetySample], SafetySample], float]] = {
-    "over_pressure": (lambda i, s: s._replace(pressure=36.0 + 0.01 * (i % 2)), 0.1),
+    "over_pressure": (lambda i, s: s._replace(pressure=36.0 + 0.01 * (i % 3)), 0.1),
     "peak_pressure": (lambda i, s: s._replace(pressure=66.0), 0.0),
     "over_volume": (lambda i, s: s._replace(flow=4000.0 if s.u_out == 0 else 0.0), 0.3),
     "disconnected": (
         lambda i, s: s._replace(
-            pressure=5.0 + 0.01 * (i % 2), u_in=90.0 if s.u_out == 0 else 0.0, applied=math.nan
+            pressure=5.0 + 0.01 * (i % 3), u_in=90.0 if s.u_out == 0 else 0.0, applied=math.nan
         ),
         0.4,
     ),
@@ -64,9 +64,9 @@ FAULTS: dict[str, tuple[Callable[[int, SafetySample], SafetySample], float]] = {
     "stuck_sensor": (lambda i, s: s._replace(pressure=12.0), 1.5),
     "no_reading": (lambda i, s: s._replace(pressure=math.nan), 0.06),
     "no_answer": (lambda i, s: s._replace(pressure=math.nan, answered=False), 0.06),
-    "low_pressure": (lambda i, s: s._replace(pressure=0.5 + 0.01 * (i % 2)), 0.5),
+    "low_pressure": (lambda i, s: s._replace(pressure=0.5 + 0.01 * (i % 3)), 0.5),
     "expiratory_valve": (
-        lambda i, s: s._replace(pressure=24.0 + 0.01 * (i % 2) if s.u_out else s.pressure),
+        lambda i, s: s._replace(pressure=24.0 + 0.01 * (i % 3) if s.u_out else s.pressure),
         1.0,
     ),
     "applied_command": (lambda i, s: s._replace(applied=s.u_in + 5.0), 0.1),

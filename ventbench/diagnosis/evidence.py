@@ -54,7 +54,7 @@ MUSCLES = ("cough", "unknown:muscles")
 _ODDS, _PLACE, _WARMTH = 0.7, 0.1, 0.2
 
 #: Standard deviations of the logarithm of the breaths' gains that are compared.
-_SCATTERS = (0.003, SCATTER, 0.03, 0.1)
+_SCATTERS = (0.003, SCATTER, 0.03, 0.06, 0.1, 0.17, 0.3)
 
 
 class Scored(NamedTuple):

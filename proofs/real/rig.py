@@ -36,7 +36,7 @@ RECORDING = "pvp_quicklung.csv"
 DONE = "part.json"
 
 #: Least cut of the error by named physics alone, %.
-CUT = 60.0
+CUT = 70.0
 
 #: Called with the part, its current step, and the finished share of the part.
 Progress = Callable[[str, str, float], None]

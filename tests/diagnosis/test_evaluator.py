@@ -106,12 +106,13 @@ def test_shared_parameters_are_transferred_and_breaths_start_at_their_first_read
     assert np.sqrt(np.mean(error**2)) < 0.5
 
 
-def test_each_breaths_own_gain_is_not_transferred(late):
+def test_breaths_to_come_have_the_median_gain_of_their_lung(late):
     own = dataclasses.replace(late, gain_sd=0.1)
     fitted = own.fit(DELAY, GAUSSIAN)
     assert len(np.unique(fitted.column("gain"))) == len(own.training.data)
     order = own.held_out.predictor.names
-    assert np.all(own.transferred_values(fitted, own.held_out)[:, order.index("gain")] == 22.8)
+    usual = own.transferred_values(fitted, own.held_out)[:, order.index("gain")]
+    np.testing.assert_allclose(usual, np.median(fitted.column("gain")))
     # Held-out breaths are fitted with a gain each, and can only be likelier.
     assert np.all(
         own.held_out_log_likelihood(fitted)

@@ -294,7 +294,7 @@ class Evaluator:
         """Values of shared parameters for other breaths of the same lungs, ``(n, P + 1)``.
 
         Parameters that differ from breath to breath, or that the model's predictor does not have,
-        are neutral. Breaths start at their first reading.
+        are neutral; gains are the median of the lung's. Breaths start at their first reading.
 
         Args:
             fitted: a model.
@@ -312,6 +312,10 @@ class Evaluator:
                 parameter = parameter_of(name)  # rounding must not carry a value beyond its bound
                 value = fitted.values[first, names.index(name)]
                 values[:, column] = np.clip(value, parameter.low, parameter.high)
+        if self.gain_sd and "gain" in fitted.problem.unknowns.paths:
+            # R and C of a lung are those beside its own gains: a breath to come has their median.
+            gains = np.where(same, fitted.column("gain"), np.nan)
+            values[:, partition.predictor.names.index("gain")] = np.nanmedian(gains, axis=1)
         return values
 
     def transferred(self, fitted: FittedModel, partition: Partition) -> dict[str, Floats]:

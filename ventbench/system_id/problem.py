@@ -387,7 +387,10 @@ def make_problem(
     groups = {"gain": np.arange(len(data))} if gain_sd else {}
     layout = make_unknowns(data, dict.fromkeys((*paths, *groups)), groups)
     values = parameter_values(data, names, fixed)
-    return Problem(data, partition.predictor, layout, values, noise, *layout.prior(gain_sd))
+    mean, precision = layout.prior(gain_sd)
+    if gain_sd:  # breaths scatter around the gain of their lung
+        mean[layout.of("gain")] = np.log(values[:, names.index("gain")])
+    return Problem(data, partition.predictor, layout, values, noise, mean, precision)
 
 
 def parameter_values(data: Data, names: tuple[str, ...], given: Mapping[str, ArrayLike]) -> Floats:

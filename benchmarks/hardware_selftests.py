@@ -1,11 +1,16 @@
-"""Error rates of the self-test on lungs that are not the simulators: the second rig generator.
+"""Error rates of the self-test on three families of lungs.
 
-Every lung has R, C, PEEP, valves and dead time of its own about one of the nine settings of a test
-lung, half of the resistors of 5 and 20 are parabolic, and sensor noise of 0.1 to 0.3 cmH2O and the
-converter's step lie on the pressure. The self-test's programs breathe on all lungs of a label side
-by side, in virtual time, watched by the checks; then each is judged as at a bench.
+- ``generator``: the second rig generator, which shares nothing with the simulators. Every lung has
+  R, C, PEEP, valves and dead time of its own about one of the nine settings of a test lung; half of
+  the resistors of 5 and 20 are parabolic.
+- ``population``: rigs drawn from the population that real sessions span, of the six scored lungs.
+- ``frozen``: the rigs of the frozen simulators, each member of the ensemble.
 
-    python benchmarks/hardware_selftests.py [--lungs 200] [--label R5C20 ...] [--out DIR]
+Sensor noise of 0.1 to 0.3 cmH2O and the converter's step lie on the pressure. The self-test's
+programs breathe on all lungs of a label side by side, in virtual time, watched by the checks; then
+each is judged as at a bench.
+
+    python benchmarks/hardware_selftests.py [--lungs 200] [--family FAMILY] [--label R5C20 ...]
 
 Prints the table of ``hardware_eval/README.md``: lungs that are refused, by label, and 95 %
 intervals (Clopper-Pearson). The folder keeps what is finished; the same command continues.
@@ -15,22 +20,24 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy import stats
 
 from hardware_eval.bench import safety, selftest
 from hardware_eval.bench.drive import Driven
-from hardware_eval.bench.identity import KnownLung, measured_lung, white_noise
+from hardware_eval.bench.identity import Baseline, KnownLung, measured_lung, white_noise
+from hardware_eval.bench.safety import VALVE_GAIN
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Effect
 from proofs.challenge.stranger.rig import Rig
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.resume import WorkFolder
+from ventbench.plants.rigs import load_rigs
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS, RECORDED_LUNGS
 from ventbench.task.lungs import lung as parse_lung
@@ -48,7 +55,11 @@ LEAK = 5.0
 #: What is wrong with a lung of the right label; one that creeps is as right as its twin.
 SENSORS = {"sensor 5 % high": 1.05, "sensor 5 % low": 0.95}
 CREEPS, LEAKS, STUCK = "right, creeping", "leak of 5 mL/s", "valve stuck"
+FAMILIES = ("generator", "population", "frozen")
 KINDS = ("right", CREEPS, "another lung", *SENSORS, LEAKS, STUCK)
+
+#: Those that a plant can be.
+PLANTS = ("right", "another lung", *SENSORS, STUCK)
 
 #: Share of the recoil that relaxes in lungs that creep or leak, rubber's and twice that, and the
 #: times in which it does, s.
@@ -63,35 +74,136 @@ PARTS_OF = {
 }
 
 
+class Lungs(Protocol):
+    """Lungs side by side, at rest; arrays of shape ``(n,)``."""
+
+    def hold(self, before: Floats, u_in: Floats, u_out: Floats) -> None:
+        """Hold commands, % and 0/1, for a control step; before them others were in force."""
+        ...
+
+    def pressure(self) -> Floats:
+        """Airway pressures, cmH2O."""
+        ...
+
+    def flow(self) -> Floats:
+        """Flows into the lungs, mL/s."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Mounted:
-    """Lungs side by side; arrays of shape ``(n,)``.
+    """What is mounted; arrays of shape ``(n,)``.
 
     Attributes:
-        base: the rigs, each value an array.
-        quadratic: parabolic part of the resistance, cmH2O/(L/s)^2.
-        leak: conductance, mL/s per sqrt(cmH2O).
-        creep: share of the recoil that relaxes.
-        time: in which it does, s.
+        begin: puts the lungs at rest.
+        gain: of the valve, mL/s per %.
         sensor: gain of the pressure sensor.
         flow: gain of the flow sensor.
         noise: standard deviation, cmH2O.
-        dead: dead time of the valve, steps of the integration.
     """
 
-    base: Base
-    quadratic: Floats
-    leak: Floats
-    creep: Floats
-    time: Floats
+    begin: Callable[[], Lungs]
+    gain: Floats
     sensor: Floats
     flow: Floats
     noise: Floats
-    dead: Ints
 
 
-def draw(settings: Sequence[str], fault: str, rng: np.random.Generator) -> Mounted:
-    """Draw a lung about each setting; the ranges of the base are those of the generator."""
+class Generated:
+    """Lungs of the generator; ``dead`` is the dead time of each valve, steps of integration."""
+
+    def __init__(self, base: Base, effects: dict[str, Effect], dead: Ints) -> None:
+        n = len(dead)
+        self._rig = Rig(base, effects, np.zeros(n), 0.03, np.zeros(n), np.zeros((2, n)))
+        self._rig.start(np.asarray(base.peep))
+        self._dead = dead
+
+    def hold(self, before: Floats, u_in: Floats, u_out: Floats) -> None:
+        """See :class:`Lungs`."""
+        for fine in range(FINE):
+            self._rig.advance(np.where(fine >= self._dead, u_in, before), u_out, 0.0, STEP)
+
+    def pressure(self) -> Floats:
+        """See :class:`Lungs`."""
+        return self._rig.shown()
+
+    def flow(self) -> Floats:
+        """See :class:`Lungs`."""
+        return 1e3 * self._rig.q
+
+
+class Plants:
+    """Plants with leaves ``(n, ...)``."""
+
+    def __init__(self, plants: Any, stuck: bool) -> None:
+        import jax
+        import jax.numpy as jnp
+
+        self._plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
+        start = jnp.full(jax.tree.leaves(plants)[0].shape[0], protocol.PEEP, jnp.float32)
+        self._state, self._signals = jax.vmap(lambda plant, x: plant.init(x, x))(plants, start)
+        self._open = 0.0 if stuck else 1.0
+        dt = jnp.float32(protocol.DT)
+        self._step = jax.jit(jax.vmap(lambda plant, state, u, out: plant.step(state, u, out, dt)))
+
+    def hold(self, before: Floats, u_in: Floats, u_out: Floats) -> None:
+        """See :class:`Lungs`."""
+        inputs = (np.float32(self._open * u_in), np.float32(u_out))
+        self._state, self._signals = self._step(self._plants, self._state, *inputs)
+
+    def pressure(self) -> Floats:
+        """See :class:`Lungs`."""
+        return np.asarray(self._signals.reading, float)
+
+    def flow(self) -> Floats:
+        """See :class:`Lungs`."""
+        return np.asarray(self._signals.flow, float)
+
+
+def draw(
+    family: str, settings: Sequence[str], fault: str, seed: int, rng: np.random.Generator
+) -> Mounted:
+    """Draw a lung of a family about each setting."""
+    n = len(settings)
+    begin, gain = (
+        _generated(settings, fault, rng)
+        if family == "generator"
+        else (
+            partial(Plants, _rigs(family, settings, seed), fault == STUCK),
+            np.full(n, VALVE_GAIN),
+        )
+    )
+    sensor, flow = np.full(n, SENSORS.get(fault, 1.0)), 1.0 + FLOW_GAIN * rng.standard_normal(n)
+    return Mounted(begin, gain, sensor, flow, rng.uniform(0.1, 0.3, n))
+
+
+def _rigs(family: str, settings: Sequence[str], seed: int) -> Any:
+    """A plant of each setting, leaves ``(n, ...)``: one of its rigs after the other, or drawn."""
+    import jax
+
+    rigs, place = load_rigs(), [lung.id for lung in LUNGS]
+    assert rigs.population is not None
+    assert rigs.sessions is not None
+    chosen = []
+    for k, setting in enumerate(settings):
+        lung = place.index(setting)
+        if family == "population":
+            drawn = rigs.population.rigs(seed.to_bytes(32, "big"), lung, len(settings))
+            chosen.append(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], drawn))
+            continue
+        member, session = (
+            k % rigs.members,
+            rigs.sessions[lung][k // rigs.members % len(rigs.sessions[lung])],
+        )
+        at = (member, session)
+        chosen.append(jax.tree.map(lambda leaf, at=at: np.asarray(leaf)[at], rigs.plants))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
+
+
+def _generated(
+    settings: Sequence[str], fault: str, rng: np.random.Generator
+) -> tuple[Callable[[], Lungs], Floats]:
+    """Lungs of the generator, whose ranges they have, and the gains of their valves."""
     n, lungs = len(settings), [parse_lung(setting) for setting in settings]
     R = np.array([x.R for x in lungs]) * rng.uniform(0.85, 1.15, n)
     C = np.array([x.C for x in lungs]) * rng.uniform(0.93, 1.07, n)
@@ -105,20 +217,17 @@ def draw(settings: Sequence[str], fault: str, rng: np.random.Generator) -> Mount
         "peep": rng.uniform(4.5, 5.5, n),
         "gain": gain,
     }
-    sensor = SENSORS.get(fault, 1.0)
     leak = LEAK / np.sqrt(20.0) if fault == LEAKS else 0.0
     creep = rng.uniform(*CREEP, n) * (fault in (CREEPS, LEAKS))
-    return Mounted(
-        Base(**values),
-        np.where(parabolic, R, 0.0),
-        np.full(n, leak),
-        creep,
-        rng.uniform(*CREEP_TIME, n),
-        np.full(n, sensor),
-        1.0 + FLOW_GAIN * rng.standard_normal(n),
-        rng.uniform(0.1, 0.3, n),
-        rng.integers(0, FINE, n),
-    )
+    quadratic: dict[str, Any] = {"quadratic": np.where(parabolic, R, 0.0)}
+    conductance: dict[str, Any] = {"conductance": np.full(n, leak)}
+    relaxing: dict[str, Any] = {"ratio": creep, "time": rng.uniform(*CREEP_TIME, n)}
+    effects = {
+        "viscoelasticity": Effect("viscoelasticity", "mild", "library", relaxing),
+        "turbulent_resistance": Effect("turbulent_resistance", "mild", "quadratic", quadratic),
+        "leak": Effect("leak", "mild", "orifice", conductance),
+    }
+    return partial(Generated, Base(**values), effects, rng.integers(0, FINE, n)), gain
 
 
 def driven(
@@ -126,25 +235,16 @@ def driven(
 ) -> list[dict[str, list[Driven]]]:
     """Run programs of the self-test on lungs that are mounted under a label; one result a lung."""
     n = len(mounted.noise)
-    quadratic: dict[str, Any] = {"quadratic": mounted.quadratic}
-    conductance: dict[str, Any] = {"conductance": mounted.leak}
-    relaxing: dict[str, Any] = {"ratio": mounted.creep, "time": mounted.time}
-    effects = {
-        "viscoelasticity": Effect("viscoelasticity", "mild", "library", relaxing),
-        "turbulent_resistance": Effect("turbulent_resistance", "mild", "quadratic", quadratic),
-        "leak": Effect("leak", "mild", "orifice", conductance),
-    }
-    rig = Rig(mounted.base, effects, np.zeros(n), 0.03, np.zeros(n), np.zeros((2, n)))
-    rig.start(np.asarray(mounted.base.peep))
+    lungs = mounted.begin()
     done: list[dict[str, list[Driven]]] = [{part: [] for part in only} for _ in range(n)]
     noises = [0.0] * n
     for part in only:
         each = [selftest.programs(label, noise)[part] for noise in noises]
         for k, (make, _, pip) in enumerate(each[0]):
             lengths = [programs[k][1] for programs in each]
-            for _ in range(round(selftest.rest_before(label) / STEP)):
-                rig.advance(np.zeros(n), np.ones(n), 0.0, STEP)
-            columns, trips = _program(rig, mounted, make, max(lengths), pip, label, rng)
+            for _ in range(round(selftest.rest_before(label) / protocol.DT)):
+                lungs.hold(np.zeros(n), np.zeros(n), np.ones(n))
+            columns, trips = _program(lungs, mounted, make, max(lengths), pip, label, rng)
             for i, steps in enumerate(lengths):
                 own = Driven(*columns[:, :steps, i], trips[i], False, 0)  # type: ignore[arg-type]
                 done[i][part].append(own)
@@ -154,7 +254,7 @@ def driven(
 
 
 def _program(
-    rig: Rig,
+    lungs: Lungs,
     mounted: Mounted,
     make: Any,
     steps: int,
@@ -169,9 +269,9 @@ def _program(
     u_in, u_out, before = zeros.copy(), np.ones(n), zeros.copy()
     rows = []
     for step in range(steps):
-        read = mounted.sensor * rig.shown() + mounted.noise * rng.standard_normal(n)
+        read = mounted.sensor * lungs.pressure() + mounted.noise * rng.standard_normal(n)
         read = np.round(read / QUANTUM) * QUANTUM
-        flow = 1e3 * mounted.flow * rig.q + FLOW_NOISE * rng.standard_normal(n)
+        flow = mounted.flow * lungs.flow() + FLOW_NOISE * rng.standard_normal(n)
         for i in range(n):
             now = step * protocol.DT
             sample = safety.SafetySample(
@@ -185,8 +285,7 @@ def _program(
         rows.append(
             (zeros + step * protocol.DT, read, flow, u_in.copy(), u_out.copy(), zeros, zeros)
         )
-        for fine in range(FINE):
-            rig.advance(np.where(fine >= mounted.dead, u_in, before), u_out, 0.0, STEP)
+        lungs.hold(before, u_in, u_out)
     trips = [tuple(trip.message for trip in state.trips) for state in watched]
     return np.moveaxis(np.array(rows), 0, 1), trips
 
@@ -196,7 +295,8 @@ def judged(
 ) -> dict[str, Any]:
     """Judge a lung; a valve of known ``gain``, mL/s per %, stands for a flow that is not there."""
     valve = None if gain is None else (gain, 0.98 * gain, 1.02 * gain)
-    judge = partial(selftest.judge, label, done, valve=valve, known=known)
+    baseline = Baseline(valve, known)
+    judge = partial(selftest.judge, label, done, baseline=baseline)
     sheet = judge(simulator=None)
     undecided = any(x.name == "lung" and not x.ok for x in sheet.findings)
     if undecided and parse_lung(label) in LUNGS:  # else the simulators have no say
@@ -228,15 +328,17 @@ def calibrated(done: dict[str, list[Driven]], label: str) -> KnownLung:
     return measured_lung(done["lung"], label, white_noise(done["sensor"][0].pressure))[0]
 
 
-def of_label(label: str, kind: str, lungs: int, blind: bool, seed: int) -> list[dict[str, Any]]:
+def of_label(
+    label: str, kind: str, family: str, lungs: int, blind: bool, seed: int
+) -> list[dict[str, Any]]:
     """Lungs of a kind that are mounted under a label, judged."""
     place = RECORDED_LUNGS.index(parse_lung(label))
     rng = np.random.default_rng([seed, place, KINDS.index(kind)])
     settings = [label] * lungs
     if kind == "another lung":
-        others = [x.id for x in RECORDED_LUNGS if x.id != label]
+        others = [x for x in labels_of(family) if x != label]
         settings = [others[k % len(others)] for k in range(lungs)]
-    mounted = draw(settings, kind, rng)
+    mounted = draw(family, settings, kind, seed, rng)
     known: Sequence[KnownLung | None] = [None] * lungs
     if kind in ("right", *SENSORS):  # its calibration, when the sensor was right
         sound = replace(mounted, sensor=np.ones(lungs))
@@ -244,9 +346,14 @@ def of_label(label: str, kind: str, lungs: int, blind: bool, seed: int) -> list[
         known = [calibrated(each, label) for each in first]
     results = []
     for k, own in enumerate(session(mounted, label, rng, blind, PARTS_OF.get(kind, ALL))):
-        gain = float(np.asarray(mounted.base.gain)[k]) if blind else None
+        gain = float(mounted.gain[k]) if blind else None
         results.append({"lung": settings[k], **judged(own, label, gain, known[k])})
     return results
+
+
+def labels_of(family: str) -> list[str]:
+    """Settings of which a family has lungs."""
+    return [x.id for x in (RECORDED_LUNGS if family == "generator" else LUNGS)]
 
 
 def interval(count: int, of: int) -> tuple[float, float]:
@@ -258,15 +365,19 @@ def interval(count: int, of: int) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lungs", type=int, default=200, help="of each label and kind")
+    parser.add_argument("--family", choices=FAMILIES, default=FAMILIES[0])
     parser.add_argument("--label", action="append", help="one of the nine; repeatable; all if not")
     parser.add_argument("--kind", action="append", choices=KINDS, help="repeatable; all if not")
     parser.add_argument("--blind", action="store_true", help="no flow sensor, a calibrated valve")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/selftests"), help="kept here")
     given = parser.parse_args()
-    kinds, labels = given.kind or KINDS, given.label or [x.id for x in RECORDED_LUNGS]
-    about = {"lungs": given.lungs, "blind": given.blind, "seed": given.seed}
-    work, began = WorkFolder(given.out, about), time.process_time()
+    possible = KINDS if given.family == "generator" else PLANTS
+    kinds, labels = given.kind or possible, given.label or labels_of(given.family)
+    if unfit := sorted(set(kinds) - set(possible)):
+        parser.error(f"{given.family} has no lungs of the kind {unfit[0]!r}")
+    about = {name: getattr(given, name) for name in ("family", "lungs", "blind", "seed")}
+    work, began = WorkFolder(given.out / given.family, about), time.process_time()
     table = {
         label: {
             kind: work.get(f"{label}-{KINDS.index(kind)}", partial(of_label, label, kind, **about))

@@ -9,38 +9,38 @@ of another one, was changed, or is stale.
 from __future__ import annotations
 
 import datetime
-import hashlib
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hardware_eval.bench import dated
+from hardware_eval.bench.bringup import at_open_tube, vented
 from hardware_eval.bench.drive import Commands, Driven, drive
 from hardware_eval.bench.identity import (
+    Baseline,
     Interval,
     KnownLung,
+    identified,
     interval,
     measured_lung,
     white_noise,
 )
 from hardware_eval.bench.loop import Bench
+from hardware_eval.bench.safety import VALVE_GAIN
 from hardware_eval.bench.selftest import hold, programs
-from hardware_eval.wire.client import Client
-from hardware_eval.wire.messages import Capability, Reading
-from ventbench.base import files
+from hardware_eval.wire.client import Correction
+from hardware_eval.wire.messages import Capability
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 
 FORMAT = "ventbench-calibration-1"
-
-#: Age from which a part is stale, days.
-STALE = 30.0
 
 #: What can be calibrated, and the units of reference and reading.
 PARTS = {
@@ -52,6 +52,30 @@ PARTS = {
     "leak": ("s", "cmH2O"),
     "lung": ("", ""),
 }
+
+#: What a sound bench reads of each part: least and largest, and what else it is.
+EXPECTED: dict[str, dict[str, tuple[float, float, str]]] = {
+    "zero": {"intercept": (-2.0, 2.0, "the sensor is not open to air, or its offset is wrong")},
+    "span": {
+        "slope": (0.9, 1.1, "the sensor is dead, swapped, or its slope is another part's"),
+        "intercept": (-2.0, 2.0, "its offset is wrong"),
+        "residual": (0.0, 0.02, "the readings lie on no line: it saturates, or was not steady"),
+    },
+    "peep": {"intercept": (-1.5, 1.5, "the PEEP valve is set otherwise, or the sensor is off")},
+    "valve": {
+        "slope": (0.4 * VALVE_GAIN, 2.0 * VALVE_GAIN, "the valve sticks, or the supply is off"),
+        "residual": (0.0, 0.1, "the flow lies on no line over the opening"),
+    },
+    "flow": {
+        "slope": (0.8, 1.25, "the sensor is dead, reversed, or of another unit"),
+        "intercept": (-30.0, 30.0, "its zero is off"),
+        "residual": (0.0, 0.03, "the readings lie on no line: it saturates, or was not steady"),
+    },
+    "leak": {"slope": (-2.0, 20.0, "mL/s are lost: look for the leak before it is calibrated")},
+}
+
+#: Parts that correct readings; the others were measured with what these correct.
+BASE = ("zero", "span", "flow")
 
 #: Openings of the valve, %, upwards; downwards they are the same.
 OPENINGS = (5.0, 10.0, 20.0, 30.0, 40.0)
@@ -127,6 +151,7 @@ class Part:
         reference, reading, error, above: the series, see :func:`fit`; units in :data:`PARTS`.
         by_hand: whether a person read the values.
         lung: label of the mounted lung; the series of ``lung`` is the logarithms of R and 1/C.
+        note: what the lung is by them, in words.
     """
 
     kind: str
@@ -137,6 +162,7 @@ class Part:
     above: tuple[int, ...]
     by_hand: bool
     lung: str = ""
+    note: str = ""
 
     @property
     def fit(self) -> Fit:
@@ -145,13 +171,28 @@ class Part:
             *(np.array(x, float) for x in (self.reference, self.reading, self.error, self.above))
         )
 
+    def problem(self) -> str:
+        """Why no bench reads so, as a sentence; empty if one may."""
+        line = self.fit
+        values = {"intercept": line.intercept.value, "slope": line.slope.value}
+        values["residual"] = line.residual / max(np.ptp(self.reading), 1.0)
+        if self.kind == "peep":
+            values["intercept"] -= self.reference[0]
+        if self.kind == "leak":
+            values["slope"] = lost_flow(self, self.lung).value
+        for name, (low, high, why) in EXPECTED.get(self.kind, {}).items():
+            if not low <= values[name] <= high:
+                unit = PARTS[self.kind][1]
+                return f"{name} {values[name]:.4g}, expected {low:g} to {high:g} ({unit}): {why}"
+        return ""
+
     def __str__(self) -> str:
         if self.kind == "lung":
             R, elastance = (
                 Interval(math.exp(x), math.exp(x - 1.96 * e), math.exp(x + 1.96 * e))
                 for x, e in zip(self.reading, self.error, strict=True)
             )
-            return f"lung: {self.lung} has R {R} cmH2O/(L/s), 1/C {elastance} cmH2O/L"
+            return f"lung: {self.lung} has R {R} cmH2O/(L/s), 1/C {elastance} cmH2O/L; {self.note}"
         own, (x, y) = self.fit, PARTS[self.kind]
         parts = [f"{self.kind}: {own.intercept} {y} at 0 {x}"]
         if math.isfinite(own.slope.value):
@@ -161,15 +202,8 @@ class Part:
         return f"{'; '.join(parts)}; residual {own.residual:.2g} {y}"
 
 
-def _vented(bench: Bench, readings: int) -> tuple[Floats, Floats]:
-    """Pressures and flows of a vented device, one each control step."""
-    client, clock, taken = bench.client, bench.clock, list[Reading]()
-    client.vent()
-    start = clock.now()
-    for step in range(readings):
-        clock.sleep_until(start + step * protocol.DT)
-        taken.append(client.heartbeat())
-    return np.array([x.pressure for x in taken]), np.array([x.flow for x in taken])
+#: A point of a series: reference, reading, standard error of the reading.
+Point = tuple[float, float, float]
 
 
 def _mean(values: Floats, least: float) -> tuple[float, float]:
@@ -189,7 +223,6 @@ def measure(
     *,
     lung: str,
     reference: Sequence[float] = (),
-    ask: Callable[[str], float] | None = None,
     now: datetime.datetime | None = None,
 ) -> Part:
     """Measure one part; a device that moves its valves does so watched, as in a self-test.
@@ -197,98 +230,132 @@ def measure(
     Args:
         bench: device, clock, safety, operator.
         kind: a key of :data:`PARTS`.
-        lung: label of the mounted lung, for ``valve`` and ``leak``.
+        lung: label of the mounted lung, for ``valve``, ``leak`` and ``lung``.
         reference: the reference's values: pressures of ``span``, cmH2O, flows of ``flow``, mL/s,
             openings of ``valve``, %, in the order in which they are set; PEEP by an instrument.
-        ask: asks a person for a number; needed for the valve of a device without a flow sensor.
         now: the time; that of the computer if not given.
 
     Raises:
-        InputError: if the device or the references cannot tell, or a check or the person stops it.
+        InputError: if the device or the references cannot tell, what they tell cannot be, or a
+            check or the person stops it.
         EmergencyStop: if the operator pressed the key.
         LinkError: if the device is lost.
     """
     if kind not in PARTS:
         raise InputError(f"{kind!r} cannot be calibrated; choose {', '.join(PARTS)}")
-    welcome = bench.client.welcome or bench.client.hello()
-    has_flow = bool(welcome.capabilities & Capability.FLOW)
-    by_hand = False
-
-    def confirmed(question: str) -> None:
-        if not bench.operator.confirm(question):
-            raise InputError(f"{kind}: not confirmed; nothing was measured")
-
-    if kind in ("zero", "peep"):
-        confirmed(
-            "open the sensor's tube to air. Is it open?"
-            if kind == "zero"
-            else f"set the lung to {lung}, PEEP valve as in use. Does it rest?"
-        )
-        level = reference[0] if reference else 0.0
-        rows = [_mean(_vented(bench, _READINGS)[0], _PRESSURE_ERROR) for _ in range(_MEANS)]
-        points = [(0.0, value - level, error) for value, error in rows]
-    elif kind in ("span", "flow"):
-        unit, flow = PARTS[kind][0], kind == "flow"
-        if flow and not has_flow:
-            raise InputError("flow: this device measures none")
-        if len(set(reference)) < 2:
-            raise InputError(f"{kind}: give two references at least, such as --reference 0,20,40")
-        points = []
-        for value in reference:
-            what = "send" if flow else "apply"
-            confirmed(f"{what} {value:g} {unit} {'through' if flow else 'to'} the sensor. Steady?")
-            read = _vented(bench, 2 * _READINGS)[int(flow)]
-            points.append((value, *_mean(read, _FLOW_ERROR if flow else _PRESSURE_ERROR)))
-    elif kind == "valve":
-        openings = [float(x) for x in reference] or [*OPENINGS, *OPENINGS[::-1]]
-        if len(set(openings)) < 2 or min(openings) < 0.0 or max(openings) > protocol.U_MAX:
-            raise InputError("valve: give two openings at least, within 0 to 100 %")
-        by_hand = not has_flow
-        if by_hand and ask is None:
-            raise InputError("valve: the device measures no flow, and nobody is there to read it")
-        confirmed(
-            f"set the lung to {lung} and connect it. Is it set?"
-            if has_flow
-            else "flow meter at the valve, tube open, no lung. Is it so?"
-        )
-        points = []
-        for opening, above in zip(openings, _above(openings), strict=True):
-            if has_flow:
-                flows = _puffed(bench, lung, opening, bool(above)).flow[-_COUNT:]
-                points.append((opening, *_mean(flows, _FLOW_ERROR)))
-            elif ask is not None:
-                _held_open(bench, lung, opening, bool(above))
-                flow = ask(f"the meter's steady flow at {opening:g} %, mL/s: ")
-                points.append((opening, flow, max(0.02 * abs(flow), 1.0)))  # as meters state it
-    elif kind == "lung":
-        confirmed(f"set the lung to {lung} and connect it. Is it set?")
-        done = {
-            part: [
-                _watched(drive(bench, lung, make(), steps, pip=pip), kind)
-                for make, steps, pip in programs(lung)[part]
-            ]
-            for part in ("sensor", "lung")
-        }
-        noise = white_noise(done["sensor"][0].pressure)
-        own = measured_lung(done["lung"], lung, max(noise, 1e-3))[0]
-        points = [(float(k), own.logarithms[k], own.errors[k]) for k in range(2)]
-        if not np.isfinite(points).all():
-            raise InputError("lung: neither R nor C can be measured here; see the self-test")
+    has_flow = bool((bench.client.welcome or bench.client.hello()).capabilities & Capability.FLOW)
+    if kind == "flow" and not has_flow:
+        raise InputError("flow: this device measures none")
+    by_hand = kind == "valve" and not has_flow
+    mounted = f"set the lung to {lung} and connect it. Is it set?"
+    question = {
+        "zero": "open the sensor's tube to air. Is it open?",
+        "peep": f"set the lung to {lung}, PEEP valve as in use. Does it rest?",
+        "valve": "flow meter at the valve, tube open, no lung. Is it so?" if by_hand else mounted,
+    }.get(kind, "" if kind in ("span", "flow") else mounted)
+    if question:
+        _confirmed(bench, kind, question)
+    if kind == "lung":
+        points, note = _lung_points(bench, lung)
     else:
-        confirmed(f"set the lung to {lung} and connect it. Is it set?")
-        noise = white_noise(_vented(bench, _READINGS)[0])
-        ((make, steps, pip),) = programs(lung, noise)[kind]
-        still = hold(lung, noise)[0]
-        closed = _watched(drive(bench, lung, make(), steps, pip=pip), kind)
-        time, pressure = closed.time[still:], closed.pressure[still:]
-        noise = max(white_noise(pressure), _PRESSURE_ERROR)
-        points = [(t - time[0], p, noise) for t, p in zip(time, pressure, strict=True)]
+        points, note = _SERIES[kind](bench, lung, reference), ""
     columns = zip(*points, strict=True)
     xs, ys, errors = (tuple(round(float(x), 6) for x in column) for column in columns)
-    date = (now or datetime.datetime.now(datetime.UTC)).isoformat(timespec="seconds")
-    above = (0,) * len(xs) if kind in ("zero", "peep", "leak", "lung") else _above(xs)
-    label = lung if kind == "lung" else ""
-    return Part(kind, date, xs, ys, errors, above, by_hand, label)
+    date = (now or dated.today()).isoformat(timespec="seconds")
+    above = _above(xs) if kind in ("span", "flow", "valve") else (0,) * len(xs)
+    label = lung if kind in ("lung", "leak") else ""
+    part = Part(kind, date, xs, ys, errors, above, by_hand, label, note)
+    if wrong := part.problem():
+        raise InputError(f"{kind}: {wrong}. Nothing was kept")
+    return part
+
+
+def _confirmed(bench: Bench, kind: str, question: str) -> None:
+    if not bench.operator.confirm(question):
+        raise InputError(f"{kind}: not confirmed; nothing was measured")
+
+
+def _level_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+    """Means of a sensor at one pressure."""
+    level = reference[0] if reference else 0.0
+    rows = [_mean(vented(bench, _READINGS)[0], _PRESSURE_ERROR) for _ in range(_MEANS)]
+    return [(level, *row) for row in rows]
+
+
+def _peep_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+    return _level_points(bench, lung, reference or (protocol.PEEP,))
+
+
+def _applied_points(kind: str, bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+    """Readings at pressures or flows that a person applies one after another."""
+    unit, flow = PARTS[kind][0], kind == "flow"
+    if len(set(reference)) < 2:
+        raise InputError(f"{kind}: give two references at least, such as --reference 0,20,40")
+    points = []
+    for value in reference:
+        what = "send" if flow else "apply"
+        where = "through" if flow else "to"
+        _confirmed(bench, kind, f"{what} {value:g} {unit} {where} the sensor. Steady?")
+        read = vented(bench, 2 * _READINGS)[int(flow)]
+        points.append((value, *_mean(read, _FLOW_ERROR if flow else _PRESSURE_ERROR)))
+    return points
+
+
+def _valve_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+    openings = [float(x) for x in reference] or [*OPENINGS, *OPENINGS[::-1]]
+    if len(set(openings)) < 2 or min(openings) < 0.0 or max(openings) > protocol.U_MAX:
+        raise InputError("valve: give two openings at least, within 0 to 100 %")
+    assert bench.client.welcome is not None
+    points = []
+    for opening, above in zip(openings, _above(openings), strict=True):
+        if bench.client.welcome.capabilities & Capability.FLOW:
+            flows = _puffed(bench, lung, opening, bool(above)).flow[-_COUNT:]
+            points.append((opening, *_mean(flows, _FLOW_ERROR)))
+        else:
+            _held_open(bench, lung, opening, bool(above))
+            flow = bench.operator.number(f"the meter's steady flow at {opening:g} %, mL/s: ")
+            points.append((opening, flow, max(0.02 * abs(flow), 1.0)))  # as meters state it
+    return points
+
+
+def _leak_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+    noise = white_noise(vented(bench, _READINGS)[0])
+    ((make, steps, pip),) = programs(lung, noise)["leak"]
+    still = hold(lung, noise)[0]
+    closed = _watched(drive(bench, lung, make(), steps, pip=pip), "leak")
+    time, pressure = closed.time[still:], closed.pressure[still:]
+    noise = max(white_noise(pressure), _PRESSURE_ERROR)
+    return [(t - time[0], p, noise) for t, p in zip(time, pressure, strict=True)]
+
+
+def _lung_points(bench: Bench, lung: str) -> tuple[list[Point], str]:
+    """Logarithms of R and 1/C, and what the lung is by them."""
+    done = {
+        part: [
+            _watched(drive(bench, lung, make(), steps, pip=pip), "lung")
+            for make, steps, pip in programs(lung)[part]
+        ]
+        for part in ("sensor", "lung")
+    }
+    noise = white_noise(done["sensor"][0].pressure)
+    own = measured_lung(done["lung"], lung, max(noise, 1e-3))[0]
+    points = [(float(k), own.logarithms[k], own.errors[k]) for k in range(2)]
+    if not np.isfinite(points).all():
+        raise InputError("lung: neither R nor C can be measured here; see the self-test")
+    holds, _, told = identified(done["lung"], lung, None)
+    if holds is False:
+        raise InputError(f"lung: {told}. Nothing was kept")
+    return points, told
+
+
+_SERIES: dict[str, Callable[[Bench, str, Sequence[float]], list[Point]]] = {
+    "zero": _level_points,
+    "peep": _peep_points,
+    "span": partial(_applied_points, "span"),
+    "flow": partial(_applied_points, "flow"),
+    "valve": _valve_points,
+    "leak": _leak_points,
+}
 
 
 def _watched(done: Driven, kind: str) -> Driven:
@@ -314,10 +381,7 @@ def _held_open(bench: Bench, lung: str, opening: float, above: bool) -> None:
     """Hold an opening for a person to read, tube and expiratory valve open."""
     steps, larger = round(_HOLD_S / protocol.DT), min(_LARGER * opening, protocol.U_MAX)
     held: Commands = lambda step, pressure: (larger if above and step < 10 else opening, 1)  # noqa: E731
-    # At an open tube there is no pressure, as it should be.
-    low = replace(bench.settings.low_pressure, duration=math.inf)
-    opened = replace(bench, settings=replace(bench.settings, low_pressure=low), rest=0.5)
-    _watched(drive(opened, lung, held, steps, pip=30.0), "valve")
+    _watched(drive(at_open_tube(bench), lung, held, steps, pip=30.0), "valve")
 
 
 @dataclass(frozen=True)
@@ -329,7 +393,8 @@ class Calibration:
     parts: dict[str, Part]  #: by kind.
     sha256: str = ""  #: of the content; identifies the calibration in records.
 
-    def _content(self) -> dict[str, Any]:
+    def save(self, path: Path) -> Calibration:
+        """Write it; returns it with its hash."""
         parts = {}
         for kind, part in self.parts.items():
             line = part.fit
@@ -338,14 +403,7 @@ class Calibration:
             }
             parts[kind] = {**vars(part), "units": PARTS[kind], **found, "residual": line.residual}
         content = {"format": FORMAT, "device": self.device, "parts": parts}
-        return json.loads(json.dumps(files.json_values(content)))
-
-    def save(self, path: Path) -> Calibration:
-        """Write it; returns it with its hash."""
-        content = self._content()
-        digest = _digest(content)
-        files.write_json(path, {**content, "sha256": digest})
-        return replace(self, sha256=digest)
+        return replace(self, sha256=dated.save(path, content))
 
     @property
     def valve(self) -> tuple[float, float, float] | None:
@@ -362,27 +420,37 @@ class Calibration:
         low, high = (flow - 2.0 * error) / opening, (flow + 2.0 * error) / opening
         return float(np.mean(flow / opening)), float(low.min()), float(high.max())
 
-    @property
-    def known_lung(self) -> KnownLung | None:
-        """The lung that was calibrated; None if none was."""
-        if (part := self.parts.get("lung")) is None:
-            return None
-        (R, elastance), (R_error, elastance_error) = part.reading, part.error
-        return KnownLung(part.lung, (R, elastance), (R_error, elastance_error))
+    def correction(self) -> Correction:
+        """What corrects the readings of the device."""
+        offset, slope, error = 0.0, 1.0, 0.0
+        if (part := self.parts.get("span")) is not None:
+            line = part.fit
+            offset, slope = line.intercept.value, line.slope.value
+            error = max(_half(line.intercept), protocol.SAFETY_PRESSURE * _half(line.slope))
+        if (part := self.parts.get("zero")) is not None:
+            zero = part.fit.intercept
+            offset, error = zero.value, math.hypot(error, _half(zero))
+        flow = (0.0, 1.0)
+        if (part := self.parts.get("flow")) is not None:
+            flow = part.fit.intercept.value, part.fit.slope.value
+        return Correction((offset, slope), flow, error)
+
+    def baseline(self) -> Baseline:
+        """What a self-test then expects of the bench."""
+        lung, peep, leak = None, None, 0.0
+        if (part := self.parts.get("lung")) is not None:
+            (R, elastance), (R_error, elastance_error) = part.reading, part.error
+            lung = KnownLung(part.lung, (R, elastance), (R_error, elastance_error))
+        if (part := self.parts.get("peep")) is not None:
+            peep = part.fit.intercept.value
+        if (part := self.parts.get("leak")) is not None:
+            leak = max(lost_flow(part, part.lung).value, 0.0)
+        return Baseline(self.valve, lung, peep, leak)
 
     def about(self) -> dict[str, Any]:
         """What a record says of it."""
-        return {"sha256": self.sha256, "dates": {k: x.date for k, x in self.parts.items()}}
-
-
-def _digest(content: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def device_of(client: Client) -> dict[str, str]:
-    """What a device says that it is."""
-    welcome = client.welcome or client.hello()
-    return {"device_id": welcome.device_id.hex(), "calibration": welcome.calibration.hex()}
+        dates = {k: x.date for k, x in self.parts.items()}
+        return {"sha256": self.sha256, "dates": dates, "readings": str(self.correction())}
 
 
 def load(
@@ -392,16 +460,15 @@ def load(
 
     Args:
         path: of the file.
-        device: of :func:`device_of`.
+        device: of :func:`hardware_eval.bench.dated.device_of`.
         now: the time; that of the computer if not given.
         stale: take stale parts too, to renew them one by one.
 
     Raises:
         InputError: if it is none, was changed, is of another device, or is stale.
     """
+    content = dated.load(path, FORMAT, device, "ventbench-hardware calibrate PART --port PORT")
     try:
-        content = json.loads(path.read_text("utf-8"))
-        digest = content.pop("sha256")
         parts = {
             kind: Part(
                 kind,
@@ -411,33 +478,24 @@ def load(
                 tuple(x["error"]),
                 tuple(x["above"]),
                 x["by_hand"],
-                x.get("lung", ""),
+                x["lung"],
+                x["note"],
             )
             for kind, x in content["parts"].items()
         }
-        dates = {kind: datetime.datetime.fromisoformat(x.date) for kind, x in parts.items()}
-        own = content["device"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is no calibration ({error}); make one by `calibrate`") from None
-    if digest != _digest(content) or content.get("format") != FORMAT:
-        raise InputError(f"{path} was changed after it was measured; measure it again")
-    if own != device:
-        raise InputError(
-            f"{path} is of device {own['device_id']} or of other settings of it, not of this "
-            f"{device['device_id']}; calibrate this one"
-        )
-    now = now or datetime.datetime.now(datetime.UTC)
-    for kind, date in dates.items():
-        age = (now - date).total_seconds() / 86400.0
-        if not stale and not -1.0 <= age <= STALE:
-            raise InputError(
-                f"{path}: {kind} is {age:.0f} days old, {STALE:g} are allowed; run "
-                f"`ventbench-hardware calibrate {kind}` again"
-            )
-    return Calibration(own, parts, digest)
+    for kind, part in () if stale else parts.items():
+        dated.check_age(part.date, f"{path}: {kind}", f"ventbench-hardware calibrate {kind}", now)
+    return Calibration(content["device"], parts, content["sha256"])
 
 
 def lost_flow(leak: Part, lung: str) -> Interval:
     """Leak of a closed lung by its fall of pressure and the label's C, mL/s."""
     slope, C = leak.fit.slope, parse_lung(lung).C
     return Interval(-C * slope.value, -C * slope.high, -C * slope.low)
+
+
+def _half(x: Interval) -> float:
+    """Half of a 95 % interval; 0 where there is none."""
+    return 0.5 * (x.high - x.low) if math.isfinite(x.high - x.low) else 0.0

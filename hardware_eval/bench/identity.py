@@ -17,16 +17,21 @@ from hardware_eval.bench.safety import VALVE_GAIN
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.mechanics import identify
-from ventbench.mechanics.labels import (
-    INFORMATIVE,
-    Estimate,
-    fits,
-    matching_settings,
-    value_text,
-)
+from ventbench.mechanics.labels import value_text
 from ventbench.recordings.breaths import make_breaths
 from ventbench.task import protocol
+from ventbench.task.lungs import RECORDED_LUNGS
 from ventbench.task.lungs import lung as parse_lung
+
+#: How far rigs lie from their label, as standard deviations of log R at 1 L/s and of log C: those
+#: of the population of rigs, between labels and within (R is 0.74 to 1.07 of the label on average,
+#: with 0.1; C 0.95 to 1.17, with 0.08). The 50 of R has no rig there.
+RIG_R, RIG_C = 0.2, 0.12
+
+#: Squared distance, in standard deviations of R and C, beyond which a lung is none of a label: one
+#: right lung in a thousand. Twice the logarithm of the odds from which two labels are told apart:
+#: 20 to 1.
+_FAR, _APART = 13.8, 6.0
 
 #: Steps from a command to the sample that its flow is in: at once, and two later as in the
 #: recordings.
@@ -56,10 +61,11 @@ def interval(mean: Any, error: Any, freedom: Any) -> Interval:
 def identified(
     probes: Sequence[Driven], lung: str, valve: tuple[float, float, float] | None
 ) -> tuple[bool | None, bool, str]:
-    """Judge a label by R and C.
+    """Judge a label by R and C, among all settings of a test lung.
 
-    A calibrated valve gives the flow of the inspirations, as many steps late as explains the
-    pressure best; its interval widens those of R and C.
+    The lung is of the setting that is nearest by the spread of rigs about their labels and the
+    errors of R and C. A calibrated valve gives the flow of the inspirations, as many steps late as
+    explains the pressure best; its interval widens those of R and C.
 
     Args:
         probes: whole breaths, four at least.
@@ -67,8 +73,8 @@ def identified(
         valve: flow of the valve and its range, mL/s per %; for devices without a flow.
 
     Returns:
-        Whether the label holds, None if nothing tells; whether it is the only known one that does;
-        and R and C with their intervals, in words.
+        Whether the label holds, None if nothing tells; whether no other known one may; and R and C
+        with their intervals, and what the lung is by them, in words.
     """
     label, count = parse_lung(lung), min(len(probe.time) for probe in probes)
     measured = all(np.isfinite(probe.flow).all() for probe in probes)
@@ -105,19 +111,29 @@ def identified(
         return None, False, "unknown: the flow does not explain the pressure"
     match = found.match
 
-    def widened(ends: tuple[float, float]) -> tuple[float, float]:
-        return ends[0] / wide, ends[1] * wide
-
-    R = Estimate(match.fitted_R, "cmH2O/(L/s)", widened(match.ci95_R))
-    C = Estimate(match.fitted_C, "mL/cmH2O", widened(match.ci95_C))
-    holds = fits(lambda flow: R, C, label)
-    settings = [x.id for x in matching_settings(lambda flow: R, C)]
-    told = f"R {value_text(R.value, R.ci95)}, C {value_text(C.value, C.ci95)}"
-    if not match.informative or not C.ci95[1] <= INFORMATIVE * C.ci95[0]:
+    R, C = match.fitted_R, match.fitted_C
+    told = f"R {value_text(R, match.ci95_R)}, C {value_text(C, match.ci95_C)}"
+    errors = [
+        math.log(high * wide**2 / low) / (2.0 * 1.96) if low > 0.0 else math.inf
+        for low, high in (match.ci95_R, match.ci95_C)
+    ]
+    if not R > 0.0 or not max(errors) < math.log(2.0):  # two settings are no further apart
         return None, False, f"{told}: too wide to tell"
-    if not holds:
-        told += f": may be {' or '.join(settings)}" if settings else ": no lung that is known"
-    return holds, holds and settings == [lung], told
+    spread = [math.hypot(rig, error) for rig, error in zip((RIG_R, RIG_C), errors, strict=True)]
+    away = {
+        x.id: (math.log(R / x.R) / spread[0]) ** 2 + (math.log(C / x.C) / spread[1]) ** 2
+        for x in RECORDED_LUNGS
+    }
+    nearest = min(away, key=lambda name: away[name])
+    other = min((name for name in away if name != lung), key=lambda name: away[name])
+    if away[nearest] > _FAR:
+        return False, False, f"{told}: no lung that is known, {nearest} is the nearest"
+    apart = away[other] - away[lung]
+    if abs(apart) < _APART:
+        return None, False, f"{told}: may be {lung} or {other}"
+    if apart < 0.0:
+        return False, False, f"{told}: it is {other}, not {lung}"
+    return True, True, f"{told}: R {R / label.R:.2f} and C {C / label.C:.2f} of the label's"
 
 
 def white_noise(pressure: Floats) -> float:
@@ -132,6 +148,16 @@ class KnownLung:
     lung: str  #: its label.
     logarithms: tuple[float, float]  #: of R, cmH2O/(L/s), and 1/C, cmH2O/L.
     errors: tuple[float, float]  #: their standard errors, by the noise of the sensor.
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What calibration told of a bench."""
+
+    valve: tuple[float, float, float] | None = None  #: flow and its range, mL/s per %.
+    lung: KnownLung | None = None  #: the lung that was mounted.
+    peep: float | None = None  #: pressure of a lung at rest, cmH2O.
+    leak: float = 0.0  #: what the bench loses with a lung at 20 cmH2O, mL/s.
 
 
 def measured_lung(

@@ -116,6 +116,10 @@ class LoopbackDevice:
         """Connect again; DisconnectedError if the cable is still out."""
         self._require_cable()
 
+    def raise_lines(self) -> bool:
+        """There are none."""
+        return False
+
     def unplug(self) -> None:
         """Pull the cable; what is on the way is lost."""
         self.plugged = False
@@ -382,6 +386,7 @@ def _emulate(given: argparse.Namespace) -> int:
     settings = DeviceSettings() if limit is None else DeviceSettings(limit)
     about = {name: getattr(given, name) for name in ("lung", "plant", "words", "seal")}
     sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
+    print("compiling the lung; the terminal appears when it answers", file=sys.stderr, flush=True)
     begun = time.monotonic()
     asked = {
         **about,
@@ -420,7 +425,7 @@ def _emulate(given: argparse.Namespace) -> int:
             hal.start(lambda: emulator.port.inbox.put(b""))
         print(emulator.terminal, flush=True)
         processes = ", ".join(f"{name} {number}" for name, number in hal.processes.items())
-        print(f"{hal.told} ({processes}); Ctrl-C ends it", file=sys.stderr, flush=True)
+        print(f"ready: {hal.told} ({processes}); Ctrl-C ends it", file=sys.stderr, flush=True)
         emulator.run(lambda: ended() or hal.lost)
         print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
     finally:

@@ -7,16 +7,19 @@ import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from hardware_eval.bench import session
+from hardware_eval import realtime
+from hardware_eval.bench import bringup, session
 from hardware_eval.bench.calibrate import Calibration
 from hardware_eval.bench.controllers import (
     ControllerFailedError,
+    EmptyController,
     LiveController,
     SubmissionController,
 )
@@ -26,9 +29,9 @@ from hardware_eval.bench.plan import UNDISTURBED, Plan, PlannedRun
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.bench.selftest import Sheet
-from hardware_eval.realtime import Clock, RealClock
+from hardware_eval.realtime import ENTRY_PRIORITY, Clock, RealClock
 from hardware_eval.results import record as records
-from hardware_eval.wire.client import Client, Link
+from hardware_eval.wire.client import ANSWER_TIMEOUT, Client, Link
 from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
 from ventbench.board import record
@@ -69,6 +72,8 @@ class Line:
     #: the device if it is emulated in this process, else None.
     device: LoopbackDevice | None = None
     port: str = "virtual"  #: what carries the bytes, see :func:`port_kind`.
+    #: the bring-up of a real device, see :mod:`hardware_eval.bench.bringup`; empty for software.
+    bringup: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def real(self) -> bool:
@@ -101,6 +106,9 @@ def port_kind(port: str) -> str:
     return "pseudo-terminal" if re.fullmatch(r"/dev/(pts/\d+|ttys\d+)", path) else "serial"
 
 
+#: Longest time that a session's empty controller lives, s.
+SESSION_S = 30 * 24 * 3600.0
+
 #: Begins a port that is an emulated device in this process, on a virtual clock.
 VIRTUAL = "virtual:"
 
@@ -108,6 +116,7 @@ VIRTUAL = "virtual:"
 def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
     """Open a port, say nothing, and return it with the clock it lives by; see :func:`connect`."""
     if not port.startswith(VIRTUAL):
+        _await(port)
         return Link(port), RealClock()
     from hardware_eval.emulation.emulator import LoopbackDevice
     from hardware_eval.emulation.simulated import simulated_lung
@@ -118,25 +127,44 @@ def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
     return device, device.clock
 
 
-def connect(port: str) -> Line:
-    """Open a port, and a session.
+#: How long an emulator may take to compile its lung, s, and how often it is looked for.
+_COMPILES, _LOOK = 60.0, 0.2
+
+
+def _await(port: str) -> None:
+    """Wait for the link of an emulator, which makes it once its lung answers."""
+    if "://" in port or port.startswith("/dev/") or os.path.exists(port):
+        return
+    print(f"waiting for {port}: is an emulator starting? Ctrl-C ends this", file=sys.stderr)
+    looks = round(_COMPILES / _LOOK)
+    while looks and not os.path.exists(port):
+        time.sleep(_LOOK)
+        looks -= 1
+
+
+def connect(port: str, confirmed: bool = True, timeout: float = ANSWER_TIMEOUT) -> Line:
+    """Open a port, and a session; a real device must have been brought up, if it shall be so.
+
+    An answer may take ``timeout``, s.
 
     It is a serial port or socket, in real time; or ``virtual:R20C50``, an emulated lung in this
     process on a virtual clock, where breaths take a fraction of a second.
 
     Raises:
         LinkError: if it cannot be opened, or no device answers.
-        InputError: if there is no such emulated lung.
+        InputError: if there is no such emulated lung, or a real device was not brought up.
     """
     transport, clock = carrier(port)
-    client = Client(transport, clock)
+    kind = port_kind(port)
+    client = Client(transport, clock, timeout, emulated=kind in EMULATED_PORTS)
     try:
         client.hello()
+        found = {} if client.simulated or not confirmed else bringup.load(client)
     except InputError:
         client.close()
         raise
     device = None if isinstance(transport, Link) else transport
-    return Line(client, clock, device, port_kind(port))
+    return Line(client, clock, device, kind, found)
 
 
 def device_about(line: Line) -> dict[str, Any]:
@@ -185,30 +213,45 @@ def begun_plan(out: Path) -> Mapping[str, Any] | None:
 
 
 def controllers(
-    submissions: Sequence[Submission], track: str, runner: Any, *, real_time: bool
+    submissions: Sequence[Submission],
+    track: str,
+    runner: Any,
+    *,
+    real_time: bool,
+    empty: EmptyController | None = None,
 ) -> Callable[[PlannedRun], LiveController]:
-    """A function that makes the controller of a run, in a process of its own as in scoring."""
+    """A function that makes the controller of a run, in a process of its own as in scoring.
+
+    An ``empty`` one runs beside each, if there is one.
+    """
     by_name = {submission.manifest.name: submission for submission in submissions}
 
     def make(run: PlannedRun) -> LiveController:
         lung = run.lung if track == "performance" else None
         task = Task(track, lung, protocol.DT, protocol.INSPIRATION_STEPS)
         try:
-            return SubmissionController(runner, by_name[run.entry], task, real_time=real_time)
+            return SubmissionController(
+                runner, by_name[run.entry], task, real_time=real_time, empty=empty
+            )
         except SubmissionError as error:
             raise ControllerFailedError(str(error)) from error
 
     return make
 
 
-def make_runner(sandbox: bool) -> Any:
-    """The sandbox of scoring, or this process for code that is trusted."""
+def make_runner(sandbox: bool, total_s: float = 120.0) -> Any:
+    """The sandbox of scoring, or this process for code that is trusted.
+
+    A run lasts 9 s and the loop does not wait; a controller silent for 2 s has failed. ``total_s``:
+    the longest time that one lives.
+    """
     if sandbox:
         from ventbench.sandbox.pipes import Allowance
         from ventbench.sandbox.runner import SandboxRunner
 
-        # A run lasts 9 s and the loop does not wait; a controller silent for 2 s has failed.
-        return SandboxRunner(allowance=Allowance(patience_s=2.0, total_s=120.0))
+        return SandboxRunner(
+            allowance=Allowance(patience_s=2.0, total_s=total_s, priority=ENTRY_PRIORITY)
+        )
     from ventbench.entries.cells import InProcessRunner
 
     return InProcessRunner()
@@ -249,7 +292,7 @@ def evaluate(
         notes: for the record.
         rest: time at rest before each run, s.
         calibration: of the device, for the record.
-        fallback: takes over from entries that are late or leave their envelope; not in the dry run.
+        fallback: takes over from entries that are late or leave their envelope.
 
     Raises:
         InputError: if the log is of another plan, or the dry run finds the plan unsafe.
@@ -261,7 +304,11 @@ def evaluate(
     if dry and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
         problems, simulated = session.dry_run(
-            plan, controllers(submissions, plan.track, runner, real_time=False), settings, rest
+            plan,
+            controllers(submissions, plan.track, runner, real_time=False),
+            settings,
+            rest,
+            fallback,
         )
         if problems:
             raise InputError(
@@ -269,6 +316,8 @@ def evaluate(
                 "sent to the bench; --no-dry-run skips this"
             )
     device = device_about(line)
+    if line.bringup:
+        device["about"]["bringup"] = dict(line.bringup)
     if calibration is not None:
         device["about"]["calibration_file"] = calibration.about()
     about = {
@@ -280,8 +329,19 @@ def evaluate(
         "simulated": simulated,
     }
     bench = Bench(line.client, line.clock, settings, operator, shows, rest, fallback)
-    make = controllers(submissions, plan.track, runner, real_time=line.real)
-    with RawLog(log_path) as log, _ends_by_exception(), _quick_switches():
+    with contextlib.ExitStack() as stack:
+        empty = None
+        if line.real:
+            empty = EmptyController(make_runner(sandbox, SESSION_S))
+            stack.callback(empty.close)
+            with realtime.priority() as granted:
+                about["priority"] = granted or realtime.has_priority()
+            if not about["priority"]:
+                operator.tell(f"{realtime.DENIED}; a busy host is late more often")
+        make = controllers(submissions, plan.track, runner, real_time=line.real, empty=empty)
+        log = stack.enter_context(RawLog(log_path))
+        stack.enter_context(_ends_by_exception())
+        stack.enter_context(_quick_switches())
         reason = session.run_plan(
             bench, plan, make, log, about=about, before_lung=lambda lung: before_lung(bench, lung)
         )

@@ -281,9 +281,7 @@ class _Search:
             self.scatters = view.scatters
             for terms in (terms for way in view.ways for _, terms in way[: self.settings.fits]):
                 self.attempt(view.around, view.noise, terms, view.base)
-        main = min(
-            views, key=lambda view: view.noise.sigma[0] * (1.0 - view.noise.ar[0] ** 2) ** 0.5
-        )
+        main = min(views, key=lambda view: float(view.noise.log_scale(data.weight).sum()))
         around, noise, self.scatters = main.around, main.noise, main.scatters
         self.muscles = [term for term in main.latent if term.name in (EFFORT, MUSCLES[0])]
         self.tried[frozenset()] = Scored.of(self.known(around, self.base, noise))

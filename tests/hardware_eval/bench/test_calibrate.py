@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import datetime
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 
 from hardware_eval.bench import calibrate
-from hardware_eval.bench.calibrate import Calibration, device_of, fit, load, measure
+from hardware_eval.bench.calibrate import Calibration, fit, load, measure
+from hardware_eval.bench.dated import device_of
+from hardware_eval.bench.identity import Baseline
 from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
-from hardware_eval.bench.selftest import selftest
+from hardware_eval.bench.selftest import Finding, selftest
+from hardware_eval.device.program import DeviceSettings
 from hardware_eval.emulation.electronics import Fault, FaultKind
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results.evaluate import Line
@@ -84,11 +90,14 @@ def test_a_meter_is_read_where_the_device_measures_no_flow() -> None:
     device = LoopbackDevice(hal)
     client = Client(device, device.clock)
     client.hello()
-    bench = Bench(client, device.clock, DEFAULT, Operator())
     shown = iter((228.0, 456.0, 240.0))
-    part = measure(
-        bench, "valve", lung=LUNG, reference=(10.0, 20.0, 10.0), ask=lambda question: next(shown)
-    )
+
+    class Reads(Operator):
+        def number(self, question: str) -> float:
+            return next(shown)
+
+    bench = Bench(client, device.clock, DEFAULT, Reads())
+    part = measure(bench, "valve", lung=LUNG, reference=(10.0, 20.0, 10.0))
     assert part.by_hand
     assert part.above == (0, 0, 1)
     assert part.reading == (228.0, 456.0, 240.0)
@@ -105,7 +114,7 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     slope = parts["valve"].fit.slope
     assert slope.value == pytest.approx(22.8, rel=0.02)  # the paper's valve
     parts["peep"] = measure(bench, "peep", lung=LUNG, reference=(5.0,), now=DAY)
-    assert parts["peep"].fit.intercept.value == pytest.approx(0.0, abs=0.05)
+    assert parts["peep"].fit.intercept.value == pytest.approx(5.0, abs=0.05)
     parts["leak"] = measure(bench, "leak", lung=LUNG, now=DAY)
     assert calibrate.lost_flow(parts["leak"], LUNG).low < 5.0
     parts["lung"] = measure(bench, "lung", lung=LUNG, now=DAY)
@@ -118,14 +127,17 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     saved = Calibration(own, parts).save(path)
     kept = load(path, own, now=DAY + datetime.timedelta(days=29))
     assert kept == saved
-    known = kept.known_lung
-    assert known is not None
-    assert known.lung == LUNG
-    assert np.exp(known.logarithms) == pytest.approx([5.0, 1000.0 / 20.0], rel=0.15)
-    sheet = selftest(bench, LUNG, simulator=None, known=known, skip=("leak", "sweep"))
-    (span,) = [x for x in sheet.findings if x.name == "sensor_span"]
-    assert span.ok
-    assert span.value == pytest.approx(1.0, abs=0.005)
+    baseline = kept.baseline()
+    assert baseline.lung is not None
+    assert baseline.lung.lung == LUNG
+    assert np.exp(baseline.lung.logarithms) == pytest.approx([5.0, 1000.0 / 20.0], rel=0.15)
+    assert "of the label's" in str(parts["lung"])
+    sheet = selftest(bench, LUNG, simulator=None, baseline=baseline, skip=("leak", "sweep"))
+    found = {x.name: x for x in sheet.findings}
+    assert found["sensor_span"].ok
+    assert found["sensor_span"].value == pytest.approx(1.0, abs=0.005)
+    assert found["peep"].ok
+    assert not judged_at(bench, replace(baseline, peep=5.7))["peep"].ok
     assert kept.valve == pytest.approx((slope.value,) * 3, rel=0.01)
     bent = replace(parts["valve"], reading=(228.0, 500.0, 228.0))  # not linear: 22.8 to 16.7
     mean, low, high = Calibration(own, {"valve": bent}).valve or (0.0,) * 3
@@ -141,6 +153,73 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match="was changed"):
         load(path, own, now=DAY)
+
+
+def judged_at(bench: Bench, baseline: Baseline) -> dict[str, Finding]:
+    sheet = selftest(bench, LUNG, baseline=baseline, skip=("leak", "sweep", "lung"))
+    return {x.name: x for x in sheet.findings}
+
+
+class Shows(Operator):
+    """A person whose references a sensor shows by a function."""
+
+    def __init__(self, hal: stand_in.Bench, shown: Callable[[float], float]) -> None:
+        self._hal, self._shown = hal, shown
+
+    def confirm(self, question: str) -> bool:
+        words = question.split()
+        self._hal.pressure = self._shown(float(words[1]) if words[0] == "apply" else 0.0)
+        return True
+
+
+@pytest.mark.parametrize(
+    ("kind", "shown", "message"),
+    [
+        ("span", lambda p: 3.0 - 0.0008 * p, "span: slope .*dead, swapped"),
+        ("span", lambda p: -p, "dead, swapped"),
+        ("span", lambda p: 2.77 * p, "another part's"),
+        ("span", lambda p: min(p, 30.0), "slope|saturates"),
+        ("span", lambda p: p + 3.0, "its offset"),
+        ("zero", lambda p: p + 3.0, "not open to air"),
+    ],
+)
+def test_a_sensor_that_cannot_be_is_refused_with_a_sentence(
+    kind: str, shown: Callable[[float], float], message: str
+) -> None:
+    hal = stand_in.Bench(noise=0.1)
+    device = LoopbackDevice(hal)
+    client = Client(device, device.clock)
+    client.hello()
+    bench = Bench(client, device.clock, DEFAULT, Shows(hal, shown))
+    with pytest.raises(InputError, match=message):
+        measure(bench, kind, lung=LUNG, reference=(0.0, 20.0, 40.0, 20.0, 0.0))
+
+
+@settings(max_examples=20)
+@given(st.floats(-1.5, 1.5), st.floats(0.92, 1.08), st.floats(5.0, 45.0), st.booleans())
+def test_readings_and_limits_are_corrected_by_what_was_calibrated(
+    offset: float, slope: float, pressure: float, again: bool
+) -> None:
+    """Whatever a sensor of the expected range shows, the corrected reading is the pressure."""
+    hal = stand_in.Bench()
+    device = LoopbackDevice(hal, DeviceSettings(50.0))
+    client = Client(device, device.clock)
+    client.hello(40.0)
+    bench = Bench(client, device.clock, DEFAULT, Shows(hal, lambda p: offset + slope * p))
+    own = device_of(client)
+    parts = {
+        kind: measure(bench, kind, lung=LUNG, reference=references)
+        for kind, references in (("span", (0.0, 20.0, 40.0)), ("zero", ()))
+    }
+    correction = Calibration(own, parts).correction()
+    client.calibrate(correction)
+    if again:
+        client.hello(40.0)
+    hal.pressure = offset + slope * pressure
+    assert client.heartbeat().pressure == pytest.approx(pressure, abs=0.03)
+    limit = device.service.state.pressure_limit  # the sensor's reading at the true limit
+    assert limit == pytest.approx(offset + slope * 40.0, abs=0.03)
+    assert 0.0 < correction.error < 0.3  # by three references
 
 
 def test_a_part_that_was_not_confirmed_is_not_measured(line: Line) -> None:

@@ -365,7 +365,9 @@ def check_residuals(
         "zero": sizes[:, 1],
         "error": size,
     }
-    shared = excess_over_noise(error - of_start - own_gain, usable, quiet_samples(breaths))
+    own = signals[..., [2, 0]] if gains_scatter else signals[..., [2]]
+    of_breath = np.einsum("ntk,nk->nt", own, amplitudes(error, usable, own))
+    shared = excess_over_noise(error - of_breath, usable, quiet_samples(breaths))
     p = [order_p_value(each, lungs, settings) for each in series.values()]
     p.append(min((region.p_value for region in regions), default=1.0))
     p += [shared.p_value, 1.0 if judged is None else judged.p_value]

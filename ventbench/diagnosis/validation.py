@@ -311,6 +311,7 @@ class Adequacy:
     vetoed: bool  #: whether "nothing is missing" would be wrong.
     #: root-mean-square of the noise by neighbouring readings, cmH2O; NaN if unknown.
     noise: float
+    at_rest: float  #: the same where nothing moves.
     #: root-mean-square beyond the noise where something moves, cmH2O; 0 if chance may do it.
     excess: float
 
@@ -364,7 +365,9 @@ def check_residuals(
         "zero": sizes[:, 1],
         "error": size,
     }
-    shared = excess_over_noise(error - of_start - own_gain, usable, quiet_samples(breaths))
+    own = signals[..., [2, 0]] if gains_scatter else signals[..., [2]]
+    of_breath = np.einsum("ntk,nk->nt", own, amplitudes(error, usable, own))
+    shared = excess_over_noise(error - of_breath, usable, quiet_samples(breaths))
     p = [order_p_value(each, lungs, settings) for each in series.values()]
     p.append(min((region.p_value for region in regions), default=1.0))
     p += [shared.p_value, 1.0 if judged is None else judged.p_value]
@@ -394,7 +397,7 @@ def check_residuals(
     vetoed = bool(changes) or bool(significant[len(series) :].any())
     vetoed |= judged is not None and judged.outweighs_noise
     excess = shared.size if significant[len(series) + 1] else 0.0
-    return Adequacy(regions, tuple(changes), vetoed, shared.noise, excess)
+    return Adequacy(regions, tuple(changes), vetoed, shared.noise, shared.at_rest, excess)
 
 
 def order_p_value(

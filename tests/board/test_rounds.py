@@ -32,7 +32,7 @@ from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
 
 from . import referee
-from .conftest import FROZEN, ROUND, SECRET, entry_folder, opened, put
+from .conftest import FROZEN, KEY, ROUND, SECRET, attest, entry_folder, opened, put
 from .test_verify import flip
 
 SPEED = Path(__file__).parents[2] / "docs" / "speed.md"
@@ -216,6 +216,7 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
     Of the other one's seeds, one is the entry itself, one a PID of half its gains, and one ends.
     """
     monkeypatch.setattr(official_runs, "bounds_of", _pid_bounds)
+    attest(fresh)
     baseline = fresh.parent / "submissions/pid_robust"
     code = (baseline / "controller.py").read_text()
     for seed, text in (
@@ -252,6 +253,7 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
                 places=[submissions],
                 load=lambda: simulators,
                 runner=InProcessRunner,
+                secret=KEY,
             )
 
     with monkeypatch.context() as broken:

@@ -69,7 +69,7 @@ CHECKED = {
     "constant": (2, "pressure stays at 5 cmH2O, so there is nothing to identify"),
     "kpa_unlabelled": (1, "PEEP 0.5 and PIP 2.13 cmH2O (medians) are no ventilator's"),
     "ms": (2, "Rates are 20 to 1000 Hz: pass --time-unit ms"),
-    "twobreaths": (0, "2 breaths: enough for `ventbench open-loop`"),
+    "twobreaths": (0, "2 breaths: enough for `ventbench data open-loop`"),
 }
 
 #: Files whose diagnosis says it; the rig is R20C20.

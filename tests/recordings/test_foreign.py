@@ -122,8 +122,8 @@ def test_kaggle_layout_is_read_as_it_is(tmp_path):
     np.testing.assert_array_equal(imported.breaths.u_in, recorded.u_in)
 
 
-def test_respiraworks_by_run_and_test(recordings_folder):
-    path = recordings_folder / "respiraworks_quicklung.parquet"
+def test_respiraworks_by_run_and_test(public_recordings):
+    path = public_recordings / "respiraworks_quicklung.parquet"
     imported = import_recording(path, select={"run": "2020-07-31-UFlow-Performance", "test": "4"})
     assert imported.breaths.lung_ids[0] == "R20C20"
     assert len(imported.breaths) >= 7
@@ -162,16 +162,6 @@ def test_runs_of_one_file_begin_before_their_numbers_change(tmp_path):
     assert breaths.volume is not None
     np.testing.assert_array_equal(breaths.u_out[0][breaths.valid[0]], target[5:405] < 17.5)
     assert import_runs(ventbench.example("concealed")) == {}
-
-
-@pytest.fixture
-def recordings_folder():
-    from ventbench.recordings import recordings_dir
-
-    folder = recordings_dir()
-    if folder is None or not (folder / "respiraworks_quicklung.parquet").is_file():
-        pytest.skip("the public recordings are not here")
-    return folder
 
 
 def test_breaths_from_pressure_alone_and_from_a_rate(tmp_path):

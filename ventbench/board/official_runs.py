@@ -427,11 +427,13 @@ def score(
         if not kept.exists():
             store.add(leaderboard, path, simulators)
         if secret:
-            gate.sign(leaderboard, path.stem, secret)
+            gate.sign(leaderboard, kept, secret)
         records[key] = path.stem
         tell("records", at + 1, len(runs))
     content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))
     files.write_bytes(own.folder / RESULT, content)
+    if secret:
+        gate.sign(leaderboard, own.folder / RESULT, secret)
     return rounds.load(leaderboard, name)
 
 

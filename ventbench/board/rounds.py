@@ -193,6 +193,9 @@ def load(leaderboard: Path, name: str) -> Round:
         OSError: if one cannot be read.
     """
     folder = leaderboard / ROUNDS / name
+    there = [file for file in canonical.ROUND_FILES if (folder / file).exists()]
+    if missing := set(canonical.ROUND_FILES[: len(there)]) - set(there):
+        raise InputError(f"{folder / min(missing)} is missing: {there[-1]} is there")
     opened = _toml(folder / OPENED, Opened)
     if opened.name != name or name == DEVELOPMENT:
         raise InputError(f"{folder / OPENED}, key name: {opened.name} is not the folder's name")
@@ -213,14 +216,13 @@ def load(leaderboard: Path, name: str) -> Round:
         return made
     value = schema.read_canonical(beacon.DECODER, folder / BEACON)
     beacon.check(value, opened.chain, made.number, str(folder / BEACON))
-    there = (folder / RESULT).exists()
-    result = schema.read_canonical(_RESULT, folder / RESULT) if there else None
+    result = schema.read_canonical(_RESULT, folder / RESULT) if RESULT in there else None
     return Round(folder, opened, frozen, value, result, made.frozen_sha256)
 
 
 def names(leaderboard: Path) -> list[str]:
     """Names of the rounds of a leaderboard."""
-    return sorted(path.parent.name for path in (leaderboard / ROUNDS).glob(f"*/{OPENED}"))
+    return sorted(path.name for path in (leaderboard / ROUNDS).glob("*") if path.is_dir())
 
 
 def load_all(leaderboard: Path) -> tuple[Round, ...]:

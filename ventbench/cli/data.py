@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,8 @@ from ventbench.cli.options import (
     bar,
     emit,
     known_lungs,
+    table_of,
+    told,
     waiting,
 )
 
@@ -28,6 +31,47 @@ app = typer.Typer(
     help="Check recordings, import those of others, or make new ones by exploring simulators.",
     no_args_is_help=True,
 )
+
+
+@app.command()
+def example(
+    name: Annotated[str, typer.Argument(help="A name of `ventbench list examples`.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Where to write it; default: NAME.csv in this folder."),
+    ] = None,
+) -> None:
+    """Write a made-up recording in the public schema, to try the other commands on.
+
+    Example: `ventbench data example concealed --out recording.csv`
+    """
+    from ventbench.base import files
+
+    source = files.example(name)
+    target = out or Path(source.name)
+    if target.exists():
+        raise InputError(f"{target} exists already; move it away or give another --out")
+    files.write_bytes(target, source.read_bytes())
+    typer.echo(f"wrote {target}")
+
+
+def examples(json: JsonFile = None) -> None:
+    """List the made-up recordings that `ventbench data example` writes.
+
+    Example: `ventbench list examples`
+    """
+    from ventbench.base import files
+
+    manifest = tomllib.loads(files.example("manifest.toml").read_text("utf-8"))["recordings"]
+    columns = ("example", "breaths", "label", "what it is")
+    rows = [
+        (Path(name).stem, str(about["breaths"]), about["label"], about["about"])
+        for name, about in manifest.items()
+    ]
+    values = [dict(zip(columns, row, strict=True)) for row in rows]
+    told({"examples": values}, json).print(
+        table_of("Recordings to try things on", columns, rows, left=columns)
+    )
 
 
 @app.command()

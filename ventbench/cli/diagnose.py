@@ -308,6 +308,3 @@ def isolability(
         console.print(table_of(title, columns, rows, left=["what would"]))
     if found.confused:
         raise typer.Exit(1)
-
-
-COMMANDS = (diagnose, mechanics, isolability)

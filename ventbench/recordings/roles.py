@@ -14,6 +14,7 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.base.linear import solve
 from ventbench.recordings.bad_samples import MEASURED
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.headers import UNITS
@@ -332,7 +333,7 @@ def few_breaths(count: int) -> str | None:
     """What fewer breaths than everything needs can still be used for; None if they are enough."""
     if not 0 < count < _TRAINING:
         return None
-    use = "`ventbench open-loop` and, with flow, `ventbench mechanics`"
+    use = "`ventbench data open-loop` and, with flow, `ventbench mechanics`"
     need = f"`train simulator` needs {_TRAINING}"
     if count >= _DIAGNOSIS:
         use = f"`ventbench diagnose`, {use}"
@@ -472,7 +473,7 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
         )
         if s["qq"] == 0.0 or np.linalg.matrix_rank(A) < 3:
             continue
-        r, e, _ = np.linalg.solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
+        r, e, _ = solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
         if r <= 0.0 or e <= 0.0:
             continue
         fit = np.log([1000.0 * r, 1.0 / e])

@@ -262,15 +262,38 @@ def log_likelihood(table: CrossProducts, fitted: RegressionFit) -> Floats:
 
     Offsets and the scatter of drifts are integrated out.
     """
-    pick = [*fitted.columns, -1]
-    products = table.products[:, fitted.grid][:, pick][:, :, pick]
-    towards = np.append(fitted.coefficients, -1.0)
-    square = np.einsum("i,bij,j->b", towards, products, towards)
+    square = _squares(table, fitted)
     return (
         table.constant[:, fitted.grid]
         - table.freedom * np.log(fitted.sigma)
         - 0.5 * square / fitted.sigma**2
     )
+
+
+#: Residual of a breath over the median one, as a ratio of variances, beyond which it counts less.
+_BOUND = 6.0
+
+
+def bounded(table: CrossProducts) -> CrossProducts:
+    """Bound the influence of breaths that no model of the others explains."""
+    if len(table) < 4:
+        return table
+    columns = (*range(len(BASE)), *columns_of("turbulent_resistance"))
+    fitted = fit(table, np.ones(len(table), bool), columns)
+    square = _squares(table, fitted) / np.maximum(table.freedom, 1.0)
+    weight = np.minimum(1.0, _BOUND * np.median(square) / np.maximum(square, 1e-12))
+    if (weight == 1.0).all():
+        return table
+    products = table.products * weight[:, None, None, None]
+    return CrossProducts(products, table.freedom * weight, table.constant * weight[:, None])
+
+
+def _squares(table: CrossProducts, fitted: RegressionFit) -> Floats:
+    """Sum of the squared innovations of each breath, cmH2O2, ``(b,)``."""
+    pick = [*fitted.columns, -1]
+    products = table.products[:, fitted.grid][:, pick][:, :, pick]
+    towards = np.append(fitted.coefficients, -1.0)
+    return np.einsum("i,bij,j->b", towards, products, towards)
 
 
 def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:

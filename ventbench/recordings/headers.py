@@ -200,7 +200,8 @@ def _meaning(text: str, unit: str | None) -> tuple[str | None, str, bool]:
     measured = [q for q in UNITS if unit is not None and _key(unit) in _spelled(q)]
     *devices, last = [_words(part) for part in _PATH.split(text) if part.strip(" _-")] or [[]]
     # A device may have any name.
-    words = [w for part in devices if all(map(_KINDS.get, part)) for w in part] + last
+    spoken = [part for part in devices if all(w in _KINDS or w in _LETTERS for w in part)]
+    words = [word for part in spoken for word in part] + last
     if "".join(words) in _KINDS:
         words = ["".join(words)]
     letters = [w for w in words if w in _LETTERS and w not in _KINDS]

@@ -41,6 +41,12 @@ _END, _PEAK = 0.1, 0.6
 #: they contradict each other: leaks and drifts of a sensor make less.
 _OF_ONE_LUNG, _CONTRADICTS = 0.9, 1.4
 
+#: A clock jumps over rows with a step of so many usual ones.
+_JUMP = 2.5
+
+#: Least inspiratory rows that tell whose commands pressures follow, and ratio of the variances.
+_NUMBERED, _FOLLOWS = 200, 0.6
+
 #: Saturation: fewest readings and share of them at the level, times as many as at the next level,
 #: and largest step from it as a share of the range (a square wave leaves its top by a larger one).
 _READINGS, _SHARE, _TIMES, _STEP = 10, 0.004, 3.0, 0.15
@@ -121,7 +127,9 @@ def breath_figures(
         "u_in_inside": mean(u_in, inside),
         "u_in_outside": mean(u_in, ~inside),
         "u_in": np.maximum.reduceat(u_in, starts),
+        "missing": _missing(time, starts, breath),
     }
+    out |= _commands_of(time, pressure, np.where(inside, u_in, np.nan), starts, breath)
     for name in ("pressure", "flow"):
         if name in samples:
             for side, sign in (("high", 1.0), ("low", -1.0)):
@@ -131,6 +139,44 @@ def breath_figures(
     if "flow" in samples:
         out |= _regression(time, pressure, samples["flow"], samples.get("volume"), starts, breath)
     return out
+
+
+def _missing(time: Floats, starts: Ints, breath: Ints) -> Floats:
+    """Rows that the clock of each breath jumps over."""
+    steps = np.where(np.diff(breath, prepend=-1) == 0, np.diff(time, prepend=np.nan), np.nan)
+    known = steps[np.isfinite(steps)]
+    if len(known) == 0:
+        return np.zeros(len(starts))
+    usual = float(np.median(known))
+    jumps = np.where(steps > _JUMP * usual, np.round(steps / max(usual, 1e-9)) - 1.0, 0.0)
+    return np.add.reduceat(jumps, starts)
+
+
+#: Breaths whose commands may stand beside a pressure: its own, the one before, the one after.
+_SHIFTS = (0, -1, 1)
+
+
+def _commands_of(
+    time: Floats, pressure: Floats, u_in: Floats, starts: Ints, breath: Ints
+) -> dict[str, Floats]:
+    """Cross products of p = a u + b V + c over inspirations, with the commands of three breaths."""
+    within = np.arange(len(time)) - starts[breath]
+    lengths = np.diff(starts, append=len(time))
+    dt = np.where(within > 0, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0)
+    volume = np.cumsum(np.nan_to_num(u_in) * dt)
+    volume -= volume[starts][breath]
+    sums = {}
+    for shift in _SHIFTS:
+        other = np.clip(breath + shift, 0, len(starts) - 1)
+        at = np.minimum(starts[other] + within, len(time) - 1)
+        good = (other == breath + shift) & (within < lengths[other])
+        good &= np.isfinite(u_in[at]) & np.isfinite(pressure) & np.isfinite(u_in)
+        columns = (u_in[at], volume[at], np.ones(len(time)), pressure)
+        columns = [np.where(good, x, 0.0) for x in columns]
+        for i, a in enumerate(columns):
+            for j, b in enumerate(columns[i:], i):
+                sums[f"shift{shift}:{i}{j}"] = np.add.reduceat(a * b, starts)
+    return sums
 
 
 def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
@@ -253,6 +299,12 @@ def findings(
             )
         )
     found += _volumes(figures)
+    found += _numbering(figures, R, C)
+    if missing := int(figures["missing"].sum()):
+        some = int((figures["missing"] > 0).sum())
+        what = f"the clock jumps over {missing} rows in {some} of {len(spans)} breaths"
+        advice = "What was commanded meanwhile is unknown: leave such breaths out, or record again."
+        found.append(Finding("time_step", what, advice, value=missing))
     inverted = _agree((figures["inside"] - figures["outside"])[moves], 0.0)
     if inverted and not any(f.column == "flow" for f in found):
         what = "pressure is higher while u_out is 1 than while it is 0, so 0 and 1 are exchanged"
@@ -336,6 +388,35 @@ def _volumes(figures: Mapping[str, Floats]) -> list[Finding]:
     advice = "Say which is wrong: --map NAME=unused leaves it out, "
     advice += f"{' or '.join(units) or 'a unit such as --flow-unit L/min'} corrects it."
     return [Finding("volume", what, advice, "refused", factor)]
+
+
+def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding]:
+    """Pressures that follow the commands of the breath before, or after, by far better."""
+    left = dict.fromkeys(_SHIFTS, 0.0)
+    rows = dict.fromkeys(_SHIFTS, 0.0)
+    for label in np.unique(np.stack([R, C]), axis=1).T:
+        own = (label[0] == R) & (label[1] == C)
+        for shift in _SHIFTS:
+            A = np.zeros((4, 4))
+            for i in range(4):
+                for j in range(i, 4):
+                    A[i, j] = A[j, i] = figures[f"shift{shift}:{i}{j}"][own].sum()
+            solved = np.linalg.lstsq(A[:3, :3], A[:3, 3], rcond=1e-9)[0]
+            left[shift] += max(float(A[3, 3] - A[:3, 3] @ solved), 0.0)
+            rows[shift] += A[2, 2]
+    if min(rows.values()) < _NUMBERED:
+        return []
+    variance = {shift: left[shift] / rows[shift] for shift in _SHIFTS}
+    best = min(variance, key=lambda shift: variance[shift])
+    if best == 0 or variance[best] > _FOLLOWS * variance[0] or variance[0] < _MOVES**2:
+        return []
+    which = "before" if best < 0 else "after"
+    what = (
+        f"pressures follow the commands of the breath {which} (to {variance[best] ** 0.5:.2g} "
+        f"cmH2O, those of their own to {variance[0] ** 0.5:.2g}), so their numbers are off by one"
+    )
+    advice = "Put the pressures of each breath beside its own commands."
+    return [Finding("breath_id", what, advice, "refused", float(best))]
 
 
 def _commands(figures: Mapping[str, Floats]) -> list[Finding]:

@@ -7,6 +7,7 @@ resampled or smoothed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -51,8 +52,9 @@ _STANDS_STILL, _PRECISE = 0.2, 0.005
 _WRAPS = (2.0**16, 2.0**24, 2.0**31, 2.0**32, *(10.0**k for k in range(2, 10)), 60.0, 3600.0)
 _WRAPS += (43_200.0, 86_400.0, 3_600_000.0, 86_400_000.0)
 
-#: Share of the rows from which blanks of a column are those of a slower rate, and longest of them.
-_SPARSE, _BRIDGED = 0.05, 0.25
+#: Share of the rows from which blanks of a column are those of a slower rate, longest of them that
+#: is bridged, s, and share of the column's range that is a jump.
+_SPARSE, _BRIDGED, _JUMP = 0.05, 0.25, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,8 +181,9 @@ def import_recording(
         for role, name in by_role.items()
         if role != "breath" and not (role == "time" and rate is not None)
     }
-    table, raw, said = _once(table, raw)
-    notes += said
+    for step in (_once, _together):
+        table, raw, said = step(table, raw)
+        notes += said
     measured = {role: raw[role] for role in (*MEASURED, "u_in") if role in raw}
     bad = find_bad_samples(measured, tuple(missing))
     raw |= without(measured, bad)
@@ -489,6 +492,7 @@ def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:
                 numbers[k] = float(word)
             except ValueError:
                 shown = [str(x) for x in dict.fromkeys(values.tolist()) if x][:2]
+                shown.sort(key=lambda x: not re.match("open|on|true|yes|high|1", x, re.IGNORECASE))
                 option = ",".join(f"{x}={1 - n}" for n, x in enumerate(shown))
                 raise InputError(
                     f"{table.file}, column {name}: its cells are no numbers, such as {shown[0]!r}; "
@@ -505,6 +509,24 @@ def _once(table: Table, raw: dict[str, Floats]) -> tuple[Table, dict[str, Floats
     count, first = int(repeats.sum()), table.place(int(np.argmax(repeats)))
     said = f"{count} rows that repeat the row before were left out, the first in {first}."
     return _rows(table, ~repeats), {k: x[~repeats] for k, x in raw.items()}, [said]
+
+
+def _together(table: Table, raw: dict[str, Floats]) -> tuple[Table, dict[str, Floats], list[str]]:
+    """The rows of the slowest measured column, where it comes more slowly than the others.
+
+    Between, it would be invented, and would lag behind the others where it jumps. Commands are not
+    thinned, and without a clock no rows can be missed.
+    """
+    known = [np.isfinite(raw[role]) for role in MEASURED if role in raw]
+    shares = [float(x.mean()) for x in known if x.any()]
+    if not shares or min(shares) > 1.0 - _SPARSE or "u_in" in raw or "time" not in raw:
+        return table, raw, []
+    both = np.logical_and.reduce([x for x in known if x.any()])
+    if both.mean() < 0.9 * min(shares):
+        return table, raw, []
+    count = len(both) - int(both.sum())
+    said = [f"{count} rows were left out in which only some of the measured columns are known."]
+    return _rows(table, both), {name: x[both] for name, x in raw.items()}, said
 
 
 def _of_file(bad: BadSamples, table: Table, by_role: Mapping[str, str]) -> str:
@@ -553,28 +575,29 @@ def _few(items: Sequence[str]) -> str:
 
 
 def _bridge(values: dict[str, Floats], time: Floats, by_role: Mapping[str, str]) -> list[str]:
-    """Interpolate the blanks of columns that come at a slower rate than the rows."""
+    """Interpolate the blanks of columns that come at a slower rate than the rows, but no jumps."""
     said = []
     for role in (role for role in (*MEASURED, "u_in") if role in values):
         known = np.isfinite(values[role])
         if known.mean() > 1.0 - _SPARSE or known.sum() < 2:
             continue
         at = np.flatnonzero(known)
-        every = float(np.median(np.diff(at)))
-        if every < 2:
+        if (every := float(np.median(np.diff(at)))) < 2:
             continue
-        bridged = np.interp(np.arange(len(known)), at, values[role][at])
-        if role == "u_in":  # a command stays until the next
-            bridged = values[role][at][np.searchsorted(at, np.arange(len(known)), side="right") - 1]
-        before = np.searchsorted(at, np.arange(len(known)), side="right") - 1
+        own, rows = values[role][at], np.arange(at[0], at[-1] + 1)
+        before = np.searchsorted(at, rows, side="right") - 1
         after = np.minimum(before + 1, len(at) - 1)
-        near = (before >= 0) & (at[after] - at[np.maximum(before, 0)] <= 2.0 * every)
-        near &= ~(time[at[after]] - time[at[np.maximum(before, 0)]] > _BRIDGED)
-        values[role] = np.where(known | ~near, values[role], bridged)
-        said.append(
-            f"{by_role.get(role, role)} is known in one of {every:g} rows; between, it was "
-            + ("held." if role == "u_in" else "interpolated.")
-        )
+        near = at[after] - at[before] <= 2.0 * every
+        near &= ~(time[at[after]] - time[at[before]] > _BRIDGED)
+        if role == "u_in":  # a command stays until the next
+            bridged = own[before]
+        else:
+            bridged = np.interp(rows, at, own)
+            near &= np.abs(own[after] - own[before]) <= _JUMP * np.ptp(own)
+        values[role] = values[role].copy()
+        values[role][rows] = np.where(known[rows] | near, bridged, np.nan)
+        how = "held" if role == "u_in" else "interpolated except where it jumps"
+        said.append(f"{by_role.get(role, role)} is known in one of {every:g} rows; it was {how}.")
     return said
 
 

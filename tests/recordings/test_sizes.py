@@ -110,7 +110,7 @@ def test_it_is_refused_before_it_is_unpacked(
 
 def test_a_header_must_not_claim_what_is_not_there(tmp_path: Path) -> None:
     pytest.importorskip("pyedflib")
-    with pytest.raises(InputError, match="claims 1000 samples, which are not in it"):
+    with pytest.raises(InputError, match="claims 1000 samples that are not in it"):
         read_table(edf(tmp_path, "10", 100))
 
 

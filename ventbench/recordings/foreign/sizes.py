@@ -105,7 +105,9 @@ def check_edf(file: str) -> None:
     samples = max(records, 0) * sum(counts)
     check_samples(file, samples)
     if 256 * (1 + signals) + width * samples > os.path.getsize(file):
-        raise InputError(f"{file}: its header claims {samples} samples, which are not in it")
+        raise InputError(
+            f"{file} cannot be read as EDF: its header claims {samples} samples that are not in it"
+        )
 
 
 def check_wfdb(file: str) -> None:

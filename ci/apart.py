@@ -18,8 +18,17 @@ from ventbench.board import canonical
 TITLE = "Records apart from what vouches for them"
 LEADERBOARD = "leaderboard"
 
-#: Folders with the code that judges: the pinned key of the beacon, the gate, replay and workflows.
-JUDGES = (".github/", "ci/", "ventbench/board/")
+#: Where the code that judges lies: the beacon's key, the gate, metrics, sandbox and plants, their
+#: data, the packages that compute them, and the workflows.
+JUDGES = (
+    ".github/",
+    "ci/",
+    "ventbench/",
+    "data/",
+    "requirements.lock",
+    "pyproject.toml",
+    "Makefile",
+)
 
 #: Files of a round that are written with its records.
 _WITH_RECORDS = {*canonical.ROUND_FILES[-2:], "result.sig"}

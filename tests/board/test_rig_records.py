@@ -333,3 +333,15 @@ def test_accepting_is_what_ranks(board, tmp_path):
     assert not frames.load_tracks(folder)[1].ranked
     accept(folder)
     assert len(frames.load_tracks(folder)[1].ranked) == 4
+
+
+def test_an_entry_below_its_bounds_is_named(board, drafts):
+    """Bounds without a witness worth the name: whoever leads there attains less."""
+    record, own = opened(drafts["pid_robust"]), rounds.load(board, ROUND)
+    assert verify._wrong_reference([record], own) == []
+    rigs = record.headroom
+    for lead, found in ((0.09, 0), (0.11, 1)):
+        lower = dataclasses.replace(rigs, error=rigs.attainable - lead)
+        problems = verify._wrong_reference([dataclasses.replace(record, headroom=lower)], own)
+        assert len(problems) == found
+        assert all("less than the least error of any commands" in text for text in problems)

@@ -45,10 +45,11 @@ from ventbench.entries.runs import pip_columns
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import protocol
 from ventbench.task.draws import Draws
-from ventbench.task.metrics.score import normalised
+from ventbench.task.metrics.score import LEAST_HEADROOM, normalised
 
-#: Most that errors of bounds may differ from what their commands give, cmH2O.
-BOUNDS_TOLERANCE = 1e-9
+#: Most that errors of bounds may differ from what their commands give, cmH2O, and that an entry
+#: may lie below them: what no cell tells apart.
+BOUNDS_TOLERANCE, BOUNDS_LEAD = 1e-9, LEAST_HEADROOM
 
 #: Loads the frozen simulators.
 Load = Callable[[], ReplayPlants]
@@ -366,8 +367,9 @@ def _wrong_bounds(own: Round, simulators: ReplayPlants) -> list[str]:
     plants, cells = rigs.cells(drawn, protocol.PIPS)
     attained = references.witness_errors(bounds, plants, cells) - bounds.attainable
     pid = references.pid_errors(plants, cells, bounds.gains) - bounds.pid
+    path = own.folder / rounds.BOUNDS
     if max(np.abs(attained).max(), np.abs(pid).max()) > BOUNDS_TOLERANCE:
-        return [f"{own.folder / rounds.BOUNDS}: its commands or PIDs do not attain its errors"]
+        return [f"{path}: its commands or PIDs do not attain its errors"]
     return []
 
 
@@ -381,12 +383,24 @@ def _wrong_reference(group: Sequence[Record], own: Round | None) -> list[str]:
         return [f"record {group[0].sha256}, key headroom: {error}"]
     assert reference is not None
     tables = {"attainable": reference.attainable, "pid": reference.pid}
-    return [
+    below = [
+        f"record {score.sha256} ({score.name}): attains {lead:.3f} cmH2O less than the least error "
+        "of any commands in a cell; its bounds are none"
+        for score in group
+        if (lead := _lead(score)) > BOUNDS_LEAD
+    ]
+    return below + [
         f"record {score.sha256}, key headroom.{key}: not the reference errors of its draws"
         for score in group
         for key, table in tables.items()
         if not np.array_equal(getattr(score.headroom, key), np.moveaxis(table, 1, 0))
     ]
+
+
+def _lead(score: Record) -> float:
+    """By how much a record lies below the bounds of a cell, cmH2O, at most."""
+    lead = score.headroom.attainable - score.headroom.error
+    return float(np.nan_to_num(lead, nan=-np.inf).max())
 
 
 def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> ReplayPlants | None:

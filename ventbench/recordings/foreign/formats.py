@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError, require
+from ventbench.recordings.foreign import sizes
 from ventbench.recordings.foreign.tables import (
     RATES,
     Table,
@@ -84,6 +86,7 @@ def _parquet(file: str) -> Table:
     from pyarrow import parquet
 
     try:
+        sizes.check_parquet(file)
         frame = parquet.read_table(file).to_pandas()
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{file} cannot be read ({str(error).splitlines()[0]})") from None
@@ -107,8 +110,11 @@ def _matlab(file: str) -> Table:
     from scipy.io import loadmat
 
     try:
+        sizes.check_matlab(file)
         content = loadmat(file, simplify_cells=True)
-    except (ValueError, NotImplementedError, OSError, TypeError) as error:
+    except InputError:
+        raise
+    except (ValueError, NotImplementedError, OSError, TypeError, zlib.error) as error:
         raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
     return _variables(file, content)
 
@@ -208,6 +214,7 @@ def _edf(file: str) -> Table:
     require("pyedflib", extra="formats", what="EDF files")
     from pyedflib import highlevel
 
+    sizes.check_edf(file)
     try:
         signals, headers, _ = highlevel.read_edf(file)
     except (OSError, ValueError) as error:
@@ -227,6 +234,7 @@ def _wfdb(file: str) -> Table:
         import wfdb
 
         try:
+            sizes.check_wfdb(file)
             record = wfdb.rdrecord(file.removesuffix(".hea"), smooth_frames=False)
         except (OSError, ValueError, IndexError) as error:
             raise InputError(
@@ -367,15 +375,12 @@ def _of_topics(file: str, topics: dict[str, list[dict[str, Any]]], kind: str) ->
     used = {topic: rows for topic, rows in topics.items() if 2 * len(rows) >= most}
     names = {key for rows in used.values() for key in rows[0]} - {"time"}
     unique = len(used) == 1 or sum(len(rows[0]) - 1 for rows in used.values()) == len(names)
-    rows = sorted(
-        (
-            {"time": row["time"]}
-            | {k if unique else f"{topic}/{k}": x for k, x in row.items() if k != "time"}
-            for topic, rows in used.items()
-            for row in rows
-        ),
-        key=lambda row: row["time"],
-    )
+    at: dict[float, dict[str, Any]] = {}
+    for topic, messages in used.items():
+        for row in messages:
+            own = {k if unique or k == "time" else f"{topic}/{k}": x for k, x in row.items()}
+            at.setdefault(row["time"], {}).update(own)
+    rows = [at[time] for time in sorted(at)]
     columns = dict.fromkeys(key for row in rows for key in row)
     left = [topic for topic in topics if topic not in used]
     table = _of_values(file, {key: [row.get(key) for row in rows] for key in columns}, kind)

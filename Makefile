@@ -41,7 +41,7 @@ test: check ## ruff, arrows between rooms and the fast tests
 	$(PY) -m pytest -n auto --dist loadfile $(PYTEST_ARGS)
 	@echo "The fast tests passed. 'make test-slow' runs the proofs that take minutes."
 
-test-slow: setup ## the tests that take minutes
+test-slow: setup $(VENV)/.validator ## the tests that take minutes
 	$(PY) -m pytest -n auto -m slow $(PYTEST_ARGS)
 
 check: setup ## ruff, arrows between rooms and how big they are, changing nothing
@@ -79,6 +79,11 @@ wheel: setup ## wheel and source archive in dist/, checked
 	$(PY) -m build --no-isolation --outdir dist
 	$(PY) -m twine check --strict dist/*
 	$(VENV)/bin/check-wheel-contents dist/*.whl
+
+# What checks croissant.json has a dependency without a wheel, so that it is no part of the lock.
+$(VENV)/.validator: $(READY)
+	$(PY) -m uv pip install --quiet --python $(PY) mlcroissant
+	@touch $@
 
 clean: ## remove what was built; .venv, runs and records stay
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis

@@ -8,52 +8,18 @@ Prints it; ``--write`` puts it where it belongs. Usage:
 from __future__ import annotations
 
 import argparse
-import math
 import re
 from pathlib import Path
-from typing import Any
 
-from ventbench.board.frames import load_board
+from ventbench.board import frames
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "README.md"
 
 
 def markdown() -> str:
-    """The ranked entries as a table, a line for each, by the first track that ranks it."""
-    performance = ["performance", "rank", "error"]
-    robustness = ["robustness", "rank", "stress", "runs survived"]
-    titles = ["entry", *performance, *robustness]
-    board = load_board(ROOT / "leaderboard")
-    shown: Any = board[board["status"].isin(["ranked", "practice"])]
-    newest = shown[shown["draws"] == shown["draws"].iloc[0]]
-    cells: dict[str, dict[str, list[str]]] = {}
-    for row in newest.to_dict(orient="records"):
-        ranked = row["status"] == "ranked"
-        ranks = f"{row['rank']}" if ranked else "practice"
-        if ranked and row["rank_low"] != row["rank_high"]:
-            ranks += f" ({row['rank_low']} to {row['rank_high']})"
-        limits = f"[{row['normalised_low']:.1f}, {row['normalised_high']:.1f}]"
-        stress = row["stress_cmH2O"]
-        told = (
-            [f"{row['score_cmH2O']:.3f}"]
-            if row["track"] == "performance"
-            else [f"{stress:.2f}", f"{100 * row['stress_survived']:.0f} %"]
-            if math.isfinite(stress)
-            else ["", ""]
-        )
-        score = f"**{row['normalised']:.1f}** {limits}"
-        cells.setdefault(row["name"], {})[row["track"]] = [score, ranks, *told]
-    lines = [titles, ["---"] * len(titles)]
-    for name, tracks in cells.items():
-        lines.append(
-            [
-                name,
-                *tracks.get("performance", [""] * len(performance)),
-                *tracks.get("robustness", [""] * len(robustness)),
-            ]
-        )
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    """The table of the leaderboard of this repository."""
+    return frames.markdown(frames.load_tracks(ROOT / "leaderboard"))
 
 
 def main() -> None:

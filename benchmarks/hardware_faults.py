@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from hardware_eval.bench.controllers import ControllerFailedError, PIDController
+from hardware_eval.bench.controllers import ControllerFailedError, Count, PIDController
 from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, run_once
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
@@ -55,7 +55,7 @@ class Troubled:
         trouble: called with its command from then on; gives the command that is sent.
     """
 
-    longest_answer = 0.0
+    longest_answer, beside = 0.0, Count()
 
     def __init__(
         self, device: LoopbackDevice, lung: str, moment: float, trouble: Callable[[float], Any]

@@ -22,7 +22,7 @@ LEADERBOARD = "leaderboard"
 JUDGES = (".github/", "ci/", "ventbench/board/")
 
 #: Files of a round that are written with its records.
-_WITH_RECORDS = set(canonical.ROUND_FILES[-2:])
+_WITH_RECORDS = {*canonical.ROUND_FILES[-2:], "result.sig"}
 
 
 def problems(paths: Iterable[str]) -> list[str]:

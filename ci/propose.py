@@ -63,8 +63,10 @@ def add(
         if not isinstance(new, Record) or new.header.draws.sha256 != own.commitment:
             raise InputError(f"{path.name} is no record of round {name}")
         if secret:
-            gate.sign(leaderboard, new.sha256, secret)
+            gate.sign(leaderboard, store.path_of(leaderboard, new.sha256), secret)
         added.append(new)
+    if secret:
+        gate.sign(leaderboard, own.folder / rounds.RESULT, secret)
     return added
 
 

@@ -67,6 +67,15 @@ def told_to_end() -> Callable[[], bool]:
 #: Priority among real-time processes: below the kernel's own threads.
 PRIORITY = 40
 
+#: Priority of an entry's process: the loop that asks it comes first.
+ENTRY_PRIORITY = PRIORITY - 1
+
+#: What a person is told where the system grants none.
+DENIED = (
+    "real-time priority is denied: it needs root, or a line such as `@users - rtprio 50` in "
+    "/etc/security/limits.conf"
+)
+
 #: Priority of a device: its guard comes before a host on the same machine.
 DEVICE_PRIORITY = PRIORITY + 1
 

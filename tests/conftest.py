@@ -9,14 +9,17 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from ventbench.recordings.read import VARIABLE, recordings_dir
 
-#: Set by `.ci/run` where the recordings are: then no test may skip for want of them.
-REQUIRED = "VENTBENCH_REQUIRE_RECORDINGS"
+#: Set by `.ci/run` and the workflows: a test that skips has then failed, whatever it lacks; but for
+#: those that need the public recordings, which not every machine may have.
+REQUIRED = "VENTBENCH_REQUIRE_ALL"
+NO_RECORDINGS = "no public recordings"
 
 #: ``submission.toml`` of the submissions that tests write.
 MANIFEST = """\
@@ -106,6 +109,28 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     return result
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+    """Report a test that skipped as failed where every test has to run."""
+    return _required((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
+    """Report a file that skipped as a whole as failed where every test has to run."""
+    return _required((yield))
+
+
+def _required(report: Any) -> Any:
+    if report.skipped and os.environ.get(REQUIRED) and not hasattr(report, "wasxfail"):
+        *_, reason = report.longrepr
+        if NO_RECORDINGS in reason and VARIABLE not in os.environ:
+            return report
+        report.outcome = "failed"
+        report.longrepr = f"{report.nodeid} did not run, and {REQUIRED} is set: {reason}"
+    return report
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_once() -> None:
     """Share compiled functions between workers, runs and checkouts, in the user's cache folder."""
@@ -152,10 +177,7 @@ def public_recordings() -> Path:
     """Folder of the public recordings; the test is skipped where they are not."""
     folder = recordings_dir()
     if folder is None:
-        missing = f"no public recordings: set {VARIABLE} to their folder"
-        if os.environ.get(REQUIRED):
-            pytest.fail(f"{missing} ({REQUIRED} is set)")
-        pytest.skip(missing)
+        pytest.skip(f"{NO_RECORDINGS}: set {VARIABLE} to their folder")
     return folder
 
 

@@ -84,7 +84,7 @@ CASES = {
     "simulate --lung R20C50 --controls huge.csv": "line 3, column u_in: '1e400'",
     "simulate --lung R20C50 --controls word.csv": "line 3, column u_in: 'open'",
     "simulate --lung R20C50 --controls over.csv": "over.csv",
-    "open-loop nan.csv": "all pressures are blank; fill them in",
+    "data open-loop nan.csv": "all pressures are blank; fill them in",
     "mechanics back.csv": "back.csv",
     "mechanics empty.csv": "the file is empty",
     "diagnose semicolons.csv --out out": "separated by commas",
@@ -99,7 +99,7 @@ CASES = {
     "board add noise.json --folder folder": "noise.json is not JSON: it is no text",
     "board add other.json --folder folder": "other.json",
     "board withdraw 123 --reason x --folder folder": "holds no single record",
-    "headroom --check noise.json": "not a file of reference errors: it is no .npz archive; make it",
+    "board headroom --check noise.json": "not a file of reference errors: it is no .npz archive",
     "tune pid --lung R1": "R1",
     "train ppo --lung R1C1 --out o": "R1C1",
 }

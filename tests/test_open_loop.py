@@ -1,4 +1,4 @@
-"""The open-loop test of a recording, as a function and as ``ventbench open-loop``."""
+"""The open-loop test of a recording, as a function and as ``ventbench data open-loop``."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_the_command_writes_what_the_function_finds(breaths, tmp_path):
     for name in ("lab.csv", "lab.parquet"):
         write(breaths, tmp_path / name)
         out = tmp_path / "out.json"
-        text = run("open-loop", tmp_path / name, "--json", out)
+        text = run("data", "open-loop", tmp_path / name, "--json", out)
         result = json.loads(out.read_text())
         assert result == as_json(load(tmp_path / name))
         for lung_id in ("R5C20", "R20C50"):
@@ -143,7 +143,7 @@ def test_the_command_writes_what_the_function_finds(breaths, tmp_path):
 @pytest.mark.parametrize("kind", ["frozen", "hybrid", "physics"])
 def test_the_command_knows_all_kinds(breaths, tmp_path, kind):
     write(breaths, tmp_path / "lab.csv")
-    text = run("open-loop", tmp_path / "lab.csv", "--plant", kind, "--json", "-")
+    text = run("data", "open-loop", tmp_path / "lab.csv", "--plant", kind, "--json", "-")
     result = json.loads(text[text.index("{") : text.rindex("\n}") + 2])
     assert result["plant"] == kind
     assert f"of the {kind} simulators" in text
@@ -152,18 +152,18 @@ def test_the_command_knows_all_kinds(breaths, tmp_path, kind):
 def test_bad_recordings_are_refused_in_one_line(breaths, tmp_path):
     text = tmp_path / "text.csv"
     text.write_text("a,b\n1,2\n")
-    assert "missing columns" in run("open-loop", text, code=2)
-    assert "no such file" in run("open-loop", tmp_path / "none.csv", code=2)
+    assert "missing columns" in run("data", "open-loop", text, code=2)
+    assert "no such file" in run("data", "open-loop", tmp_path / "none.csv", code=2)
     write(replace(breaths, C=np.full(6, 30.0)), tmp_path / "lab.csv")
-    message = run("open-loop", tmp_path / "lab.csv", code=2)
+    message = run("data", "open-loop", tmp_path / "lab.csv", code=2)
     assert "lung R5C30, for which there is no simulator; known are R5C10" in message
     u_in = breaths.u_in.copy()
     u_in[2, 7] = 104.2
     write(replace(breaths, u_in=u_in), tmp_path / "lab.csv")
-    message = run("open-loop", tmp_path / "lab.csv", code=2)
+    message = run("data", "open-loop", tmp_path / "lab.csv", code=2)
     assert "line 89, column u_in: 104.2 is outside 0..100" in message
-    assert "R5C20" in run("open-loop", tmp_path / "lab.csv", "--clip")
-    message = run("open-loop", tmp_path / "lab.csv", "--clip", "--plant", "magic", code=2)
+    assert "R5C20" in run("data", "open-loop", tmp_path / "lab.csv", "--clip")
+    message = run("data", "open-loop", tmp_path / "lab.csv", "--clip", "--plant", "magic", code=2)
     assert "--plant 'magic': there is no such file" in message
 
 
@@ -171,7 +171,7 @@ def test_the_public_recordings_give_the_held_out_errors_of_the_manifest(
     simulators, public_recordings, tmp_path
 ):
     out = tmp_path / "out.json"
-    run("open-loop", public_recordings / MEASURED, "--json", out)
+    run("data", "open-loop", public_recordings / MEASURED, "--json", out)
     result = json.loads(out.read_text())
     assert len(result["lungs"]) == 9
     for name in LUNG_IDS:

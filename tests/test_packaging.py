@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -269,3 +270,35 @@ def test_every_slow_test_exists() -> None:
     for line in listed:
         file, _, name = line.partition("[")[0].partition("::")
         assert f"def {name.rpartition('::')[2]}(" in (ROOT / file).read_text("utf-8"), line
+
+
+@pytest.mark.slow
+def test_the_readme_runs_from_top_to_bottom(wheel: Path, tmp_path: Path) -> None:
+    """Every block, in order, in one empty folder, from the wheel; its packages are here already."""
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "wheel")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    text = (ROOT / "README.md").read_text("utf-8")
+    ran = 0
+    for language, block in re.findall(r"^```(sh|python)\n(.*?)^```", text, re.M | re.S):
+        if "make " in block:  # how a contributor runs the tests, this one among them
+            continue
+        source = re.sub(r"^pip install .*", "", block, flags=re.M)
+        command = (
+            [sys.executable, "-c"] if language == "python" else ["bash", "-euo", "pipefail", "-c"]
+        )
+        done = subprocess.run(
+            [*command, source],
+            cwd=folder,
+            env={
+                **os.environ,
+                "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+                "PYTHONPATH": str(tmp_path / "wheel"),
+            },
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, f"{block}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
+        ran += 1
+    assert ran == 5

@@ -1,4 +1,4 @@
-"""``ventbench lungs``, ``simulate`` and ``train simulator``, and the exit codes of the program."""
+"""``list lungs``, ``simulate`` and ``train simulator``, and the exit codes of the program."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def columns(text: str) -> dict[str, np.ndarray]:
 
 
 def test_lungs_lists_the_six_with_their_errors():
-    text = run("lungs")
+    text = run("list", "lungs")
     for name, about in frozen.load().lungs().items():
         (line,) = [line for line in text.splitlines() if line.startswith(f"│ {name} ")]
         for kind in ("own_rig", "unseen_rig", "held_out"):
@@ -138,7 +138,7 @@ def test_the_shell_completes_entries_lungs_and_plants():
 
 
 def test_lungs_tells_which_sessions_are_not_scored():
-    text = " ".join(run("lungs").split())
+    text = " ".join(run("list", "lungs").split())
     official = frozen.load()
     six = [i for i in official.rejected if official.sessions.table[i].lung in official.lung_ids]
     assert six
@@ -147,7 +147,7 @@ def test_lungs_tells_which_sessions_are_not_scored():
 
 
 def test_lungs_as_json():
-    assert json.loads(run("lungs", "--json", "-")) == frozen.load().lungs()
+    assert json.loads(run("list", "lungs", "--json", "-")) == frozen.load().lungs()
 
 
 def test_coverage_of_a_published_entry(monkeypatch):
@@ -156,7 +156,7 @@ def test_coverage_of_a_published_entry(monkeypatch):
     counts = {name: {"recorded_commands": [100] * 5 + [0] * 5} for name in LUNG_IDS}
     simulators = SimpleNamespace(lungs=lambda: counts)
     monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
-    shares = json.loads(run("coverage", record, "--json", "-"))
+    shares = json.loads(run("board", "coverage", record, "--json", "-"))
     assert set(shares) == set(LUNG_IDS)
     assert all(0.0 <= share["wide_open"] <= share["sparse"] <= 1.0 for share in shares.values())
     assert max(share["sparse"] for share in shares.values()) > 0.0

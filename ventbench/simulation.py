@@ -1,6 +1,6 @@
 """What simulators answer to valve commands: of a file, and of recorded breaths.
 
-The second is the open-loop test of ``ventbench open-loop``: how far the answers stray from the
+The second is the open-loop test of ``ventbench data open-loop``: how far the answers stray from the
 recorded pressures.
 """
 
@@ -309,7 +309,7 @@ class OpenLoopReport:
         return f"<OpenLoopReport of {self.plant}: {breaths} breaths, {len(self.lungs)} lungs>"
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values of ``ventbench open-loop --json``."""
+        """JSON values of ``ventbench data open-loop --json``."""
         return {
             "plant": self.plant,
             "simulators": self.simulators,

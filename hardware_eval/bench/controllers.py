@@ -1,17 +1,72 @@
-"""Controllers in real time: a submission in its process, and the protocol's PID in this one."""
+"""Controllers in real time: a submission in its process, and the protocol's PID in this one.
+
+Beside a submission runs one that computes nothing, in a sandbox of its own, asked at the same
+moments: what it is late by, the host is. An entry is blamed for late answers only if they are more
+than chance would make of a host that is late as often as it is for the empty one (Fisher's exact
+test).
+"""
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
+
+from scipy import stats
 
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.realtime import take_priority
 from ventbench.base.arrays import Floats
+from ventbench.entries.folder import open_submission
+from ventbench.entries.scaffold import contents
+from ventbench.task import protocol
 from ventbench.task.interfaces import Task
+
+#: Chance of late answers by the host alone below which an entry is to blame; asked after each run.
+CHANCE = 0.001
+
+
+@dataclass(frozen=True)
+class Count:
+    """Answers that were asked for, and those of them that came late."""
+
+    late: int = 0
+    asked: int = 0
+
+    def __add__(self, other: Count) -> Count:
+        return Count(self.late + other.late, self.asked + other.asked)
+
+    def __sub__(self, other: Count) -> Count:
+        return Count(self.late - other.late, self.asked - other.asked)
+
+    def __str__(self) -> str:
+        return f"{self.late} of {self.asked}"
+
+
+NONE = Count()  #: no answers.
+
+
+@dataclass
+class Lateness:
+    """Late answers of a session, which tell a slow entry from a busy host."""
+
+    host: Count = NONE  #: of the empty controller, in all attempts at runs.
+    entries: dict[str, Count] = field(default_factory=dict)  #: of each entry, by name.
+
+    def is_of_host(self, entry: str, own: Count, empty: Count) -> bool:
+        """Count an attempt at a run; whether the host alone may be to blame for what is late."""
+        self.host += empty
+        own = self.entries[entry] = self.entries.get(entry, NONE) + own
+        if not self.host.asked:
+            return False
+        table = [[x.late, x.asked - x.late] for x in (own, self.host)]
+        chance: Any = stats.fisher_exact(table, alternative="greater")[1]
+        return bool(chance >= CHANCE)
 
 
 class ControllerFailedError(Exception):
@@ -24,6 +79,11 @@ class LiveController(Protocol):
     @property
     def longest_answer(self) -> float:
         """Longest time that an answer took so far, s."""
+        ...
+
+    @property
+    def beside(self) -> Count:
+        """Answers of the empty controller beside it."""
         ...
 
     def act(self, row: Floats, budget: float) -> float | None:
@@ -50,6 +110,55 @@ class LiveController(Protocol):
 MakeController = Callable[[PlannedRun], LiveController]
 
 
+#: A controller that computes nothing.
+_EMPTY = b"""class Controller:
+    def reset(self, task):
+        pass
+
+    def act(self, observation):
+        return 0.0
+"""
+
+
+class EmptyController:
+    """A submission that computes nothing, asked beside others to time the host.
+
+    Args:
+        runner: as that of the entries, but for a whole session.
+    """
+
+    def __init__(self, runner: Any) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="ventbench-empty-")
+        folder = Path(self._folder.name) / "empty"
+        folder.mkdir()
+        for name, content in (contents("empty", "other") | {"controller.py": _EMPTY}).items():
+            (folder / name).write_bytes(content)
+        task = Task("robustness", None, protocol.DT, protocol.INSPIRATION_STEPS)
+        self._session = runner.start(open_submission(str(folder)), [task])
+        self._thread = ThreadPoolExecutor(1, "empty", initializer=take_priority)
+        self._pending: Future[bool] | None = None
+        self.count = NONE  #: its answers up to now; one under way is not among them.
+
+    def ask(self, row: Floats, budget: float) -> None:
+        """Ask it, without waiting; what it has not answered by the next time was late."""
+        if self._pending is not None:
+            late = not self._pending.done() or self._pending.result()
+            self.count += Count(late, 1)
+            if not self._pending.done():
+                return
+        self._pending = self._thread.submit(self._is_late, row, time.perf_counter() + budget)
+
+    def _is_late(self, row: Floats, until: float) -> bool:
+        self._session.act(row)
+        return time.perf_counter() > until
+
+    def close(self) -> None:
+        """End it."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        self._session.close()
+        self._folder.cleanup()
+
+
 class SubmissionController:
     """A submission in its process, asked by a thread so that the loop need not wait for it.
 
@@ -58,11 +167,21 @@ class SubmissionController:
         submission: whose code runs.
         task: what the controller is told.
         real_time: whether ``budget`` holds; else answers are waited for.
+        empty: runs beside it; None for none.
     """
 
-    def __init__(self, runner: Any, submission: Any, task: Task, *, real_time: bool = True) -> None:
+    def __init__(
+        self,
+        runner: Any,
+        submission: Any,
+        task: Task,
+        *,
+        real_time: bool = True,
+        empty: EmptyController | None = None,
+    ) -> None:
         self._session = runner.start(submission, [task])
-        self._real_time = real_time
+        self._real_time, self._empty = real_time, empty
+        self._before = NONE if empty is None else empty.count
         self._label = submission.manifest.name
         # A thread that waits for a pipe.
         begin = take_priority if real_time else None
@@ -77,9 +196,16 @@ class SubmissionController:
         waits = 0.0 if self._pending is None else time.perf_counter() - self._asked
         return max(self._longest, waits)
 
+    @property
+    def beside(self) -> Count:
+        """Answers of the empty controller beside it."""
+        return NONE if self._empty is None else self._empty.count - self._before
+
     def act(self, row: Floats, budget: float) -> float | None:
         """Ask for the next command; an answer to an earlier observation is dropped."""
         began = time.perf_counter()
+        if self._empty is not None:
+            self._empty.ask(row, budget)
         if self._pending is not None:
             if self._result(self._pending, budget) is None:
                 return None
@@ -120,7 +246,7 @@ class PIDController:
         gains: P, I and D, %/cmH2O.
     """
 
-    longest_answer = 0.0
+    longest_answer, beside = 0.0, NONE
 
     def __init__(self, gains: tuple[float, float, float]) -> None:
         self._gains = gains

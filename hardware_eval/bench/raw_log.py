@@ -7,6 +7,7 @@ one stays where it is; the next session says so in the line that follows, and re
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.loop import BreathLog
-from hardware_eval.bench.plan import PlannedRun
+from hardware_eval.bench.plan import PlannedRun, complete_runs
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, make_breaths
 from ventbench.task.lungs import lung as parse_lung
@@ -122,7 +123,7 @@ class LoggedBreath:
     run: PlannedRun  #: what ran.
     attempt: int  #: how often the run had been begun before, from 0.
     breath: int  #: its place in the run, from 0.
-    complete: bool  #: whether its run was finished and no check had tripped.
+    complete: bool  #: whether its run was finished, no check had tripped, and it can be scored.
     log: BreathLog  #: what happened.
 
 
@@ -133,11 +134,7 @@ def breaths(path: Path) -> list[LoggedBreath]:
         InputError: as of :func:`lines`.
     """
     logged = list(lines(path))
-    finished = {
-        (line["run"], line["attempt"])
-        for line in logged
-        if line["type"] == "run" and line["status"] == "complete"
-    }
+    finished = complete_runs(logged)
     return [
         LoggedBreath(
             PlannedRun(
@@ -161,7 +158,8 @@ def recording(path: Path, kinds: Sequence[str]) -> Breaths:
         kinds: kinds of runs that are taken.
 
     Returns:
-        Breaths of equally many samples, those of most breaths: without what a check cut short.
+        Breaths of equally many samples, those of most breaths: without what a check cut short or
+        what begins without a reading; later readings that are missing are blank.
 
     Raises:
         InputError: if there is no such breath.
@@ -169,7 +167,7 @@ def recording(path: Path, kinds: Sequence[str]) -> Breaths:
     taken = [b for b in breaths(path) if b.run.kind in kinds and len(b.log.time) > 1]
     lengths = [len(b.log.time) for b in taken]
     usual = max(set(lengths), key=lengths.count, default=0)
-    taken = [b for b in taken if len(b.log.time) == usual and np.isfinite(b.log.pressure).all()]
+    taken = [b for b in taken if len(b.log.time) == usual and math.isfinite(b.log.pressure[0])]
     if not taken:
         raise InputError(f"{path} holds no whole breath of {', '.join(kinds)}")
     labels = [parse_lung(b.run.lung) for b in taken]
@@ -186,5 +184,5 @@ def recording(path: Path, kinds: Sequence[str]) -> Breaths:
         np.clip(stacked("u_in"), 0.0, 100.0),
         stacked("u_out"),
         stacked("pressure"),
-        flow=flow if np.isfinite(flow).all() else None,
+        flow=flow if np.isfinite(flow[np.isfinite(stacked("pressure"))]).all() else None,
     )

@@ -11,6 +11,7 @@ from dataclasses import asdict
 from typing import Any
 
 from hardware_eval.bench.controllers import ControllerFailedError, MakeController, control_pid
+from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import (
     REST_S,
     Bench,
@@ -32,6 +33,9 @@ MAX_ATTEMPTS = 3
 
 #: Runs that a busy host or a slow line ends in a row before the session gives up.
 MAX_HELD_UP = 10
+
+#: What is said of a host that is late time and again.
+_BUSY = f" ({MAX_HELD_UP} times in a row: close other programs, allow real-time priority)"
 
 #: What a run's line in the log takes from its result as it is.
 _COUNTED = ("asked", "late_answers", "limited", "outside", "fallback", "longest_fallback")
@@ -127,10 +131,11 @@ def _runs(
             continue
         if result.status == "aborted":
             spoilt += 1
+            reason = f"{result.reason}{_BUSY if result.held_up else ''}"
             if spoilt >= MAX_ATTEMPTS or not bench.operator.confirm(
-                f"{result.reason}. Mend the bench; run it again?"
+                f"{reason}. Mend the bench; run it again?"
             ):
-                return result.reason
+                return reason
             continue
         spoilt = held_up = 0
         queue.pop(0)
@@ -207,6 +212,7 @@ def _one(
             **{name: getattr(result, name) for name in _COUNTED},
             "error": None if math.isnan(result.error) else result.error,
             "longest_answer": round(result.longest_answer, 6),
+            "beside": vars(result.beside),
             "trips": [vars(trip) for trip in result.trips],
         }
     )
@@ -220,7 +226,11 @@ def _run_line(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[s
 
 
 def dry_run(
-    plan: Plan, make_controller: MakeController, settings: SafetySettings, rest: float = REST_S
+    plan: Plan,
+    make_controller: MakeController,
+    settings: SafetySettings,
+    rest: float = REST_S,
+    fallback: FallbackSettings | None = None,
 ) -> tuple[list[str], list[tuple[str, str, float, float]]]:
     """Run every distinct run of a plan once on the frozen simulators, by the code of a bench.
 
@@ -232,6 +242,7 @@ def dry_run(
         make_controller: makes the controller of a run.
         settings: of the safety.
         rest: time at rest before each run, s.
+        fallback: takes over as it will on the bench.
 
     Returns:
         What went wrong, one sentence each, empty if the plan is safe there; and entry, lung, PIP
@@ -253,7 +264,7 @@ def dry_run(
             device, mounted = LoopbackDevice(simulated_lung(run.lung)), run.lung
             client = Client(device, device.clock)
             client.hello()
-            bench = Bench(client, device.clock, settings, Operator(), rest=rest)
+            bench = Bench(client, device.clock, settings, Operator(), (), rest, fallback)
         try:
             controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
         except ControllerFailedError as error:

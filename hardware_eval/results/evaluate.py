@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from hardware_eval import realtime
 from hardware_eval.bench import bringup, session
 from hardware_eval.bench.calibrate import Calibration
 from hardware_eval.bench.controllers import (
     ControllerFailedError,
+    EmptyController,
     LiveController,
     SubmissionController,
 )
@@ -27,7 +29,7 @@ from hardware_eval.bench.plan import UNDISTURBED, Plan, PlannedRun
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.bench.selftest import Sheet
-from hardware_eval.realtime import Clock, RealClock
+from hardware_eval.realtime import ENTRY_PRIORITY, Clock, RealClock
 from hardware_eval.results import record as records
 from hardware_eval.wire.client import ANSWER_TIMEOUT, Client, Link
 from hardware_eval.wire.messages import Capability
@@ -103,6 +105,9 @@ def port_kind(port: str) -> str:
             return "pseudo-terminal"
     return "pseudo-terminal" if re.fullmatch(r"/dev/(pts/\d+|ttys\d+)", path) else "serial"
 
+
+#: Longest time that a session's empty controller lives, s.
+SESSION_S = 30 * 24 * 3600.0
 
 #: Begins a port that is an emulated device in this process, on a virtual clock.
 VIRTUAL = "virtual:"
@@ -208,30 +213,45 @@ def begun_plan(out: Path) -> Mapping[str, Any] | None:
 
 
 def controllers(
-    submissions: Sequence[Submission], track: str, runner: Any, *, real_time: bool
+    submissions: Sequence[Submission],
+    track: str,
+    runner: Any,
+    *,
+    real_time: bool,
+    empty: EmptyController | None = None,
 ) -> Callable[[PlannedRun], LiveController]:
-    """A function that makes the controller of a run, in a process of its own as in scoring."""
+    """A function that makes the controller of a run, in a process of its own as in scoring.
+
+    An ``empty`` one runs beside each, if there is one.
+    """
     by_name = {submission.manifest.name: submission for submission in submissions}
 
     def make(run: PlannedRun) -> LiveController:
         lung = run.lung if track == "performance" else None
         task = Task(track, lung, protocol.DT, protocol.INSPIRATION_STEPS)
         try:
-            return SubmissionController(runner, by_name[run.entry], task, real_time=real_time)
+            return SubmissionController(
+                runner, by_name[run.entry], task, real_time=real_time, empty=empty
+            )
         except SubmissionError as error:
             raise ControllerFailedError(str(error)) from error
 
     return make
 
 
-def make_runner(sandbox: bool) -> Any:
-    """The sandbox of scoring, or this process for code that is trusted."""
+def make_runner(sandbox: bool, total_s: float = 120.0) -> Any:
+    """The sandbox of scoring, or this process for code that is trusted.
+
+    A run lasts 9 s and the loop does not wait; a controller silent for 2 s has failed. ``total_s``:
+    the longest time that one lives.
+    """
     if sandbox:
         from ventbench.sandbox.pipes import Allowance
         from ventbench.sandbox.runner import SandboxRunner
 
-        # A run lasts 9 s and the loop does not wait; a controller silent for 2 s has failed.
-        return SandboxRunner(allowance=Allowance(patience_s=2.0, total_s=120.0))
+        return SandboxRunner(
+            allowance=Allowance(patience_s=2.0, total_s=total_s, priority=ENTRY_PRIORITY)
+        )
     from ventbench.entries.cells import InProcessRunner
 
     return InProcessRunner()
@@ -272,7 +292,7 @@ def evaluate(
         notes: for the record.
         rest: time at rest before each run, s.
         calibration: of the device, for the record.
-        fallback: takes over from entries that are late or leave their envelope; not in the dry run.
+        fallback: takes over from entries that are late or leave their envelope.
 
     Raises:
         InputError: if the log is of another plan, or the dry run finds the plan unsafe.
@@ -284,7 +304,11 @@ def evaluate(
     if dry and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
         problems, simulated = session.dry_run(
-            plan, controllers(submissions, plan.track, runner, real_time=False), settings, rest
+            plan,
+            controllers(submissions, plan.track, runner, real_time=False),
+            settings,
+            rest,
+            fallback,
         )
         if problems:
             raise InputError(
@@ -305,8 +329,19 @@ def evaluate(
         "simulated": simulated,
     }
     bench = Bench(line.client, line.clock, settings, operator, shows, rest, fallback)
-    make = controllers(submissions, plan.track, runner, real_time=line.real)
-    with RawLog(log_path) as log, _ends_by_exception(), _quick_switches():
+    with contextlib.ExitStack() as stack:
+        empty = None
+        if line.real:
+            empty = EmptyController(make_runner(sandbox, SESSION_S))
+            stack.callback(empty.close)
+            with realtime.priority() as granted:
+                about["priority"] = granted or realtime.has_priority()
+            if not about["priority"]:
+                operator.tell(f"{realtime.DENIED}; a busy host is late more often")
+        make = controllers(submissions, plan.track, runner, real_time=line.real, empty=empty)
+        log = stack.enter_context(RawLog(log_path))
+        stack.enter_context(_ends_by_exception())
+        stack.enter_context(_quick_switches())
         reason = session.run_plan(
             bench, plan, make, log, about=about, before_lung=lambda lung: before_lung(bench, lung)
         )

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import jax
 import pytest
+from threadpoolctl import threadpool_info
 from typer.testing import CliRunner
 
 from ventbench.base import compilation
@@ -32,6 +33,23 @@ def test_it_is_made_and_used(monkeypatch, tmp_path, setting):
     compilation.keep()
     assert (tmp_path / "a" / "b").is_dir()
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "a" / "b")  # type: ignore[attr-defined]
+
+
+def test_a_folder_that_jax_was_told_stays(monkeypatch, tmp_path, setting):
+    monkeypatch.delenv("VENTBENCH_CACHE", raising=False)
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    compilation.keep()
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path)  # type: ignore[attr-defined]
+
+
+def test_linear_algebra_takes_one_thread_where_it_is_asked_to():
+    def threads() -> set[int]:
+        return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+    before = threads()
+    with compilation.one_blas_thread():
+        assert threads() == {1}
+    assert threads() == before
 
 
 def test_a_score_keeps_what_it_compiles(monkeypatch, tmp_path, setting):

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.board import build, canonical, create, record, rounds, store
-from ventbench.board.record import Record
+from ventbench.board import build, canonical, create, gate, record, rounds, store
+from ventbench.board.record import Record, Withdrawal
 from ventbench.board.replay import Replayed, ReplayPlants, replay
 from ventbench.entries import reference as references
 from ventbench.entries.cells import InProcessRunner
@@ -48,6 +48,9 @@ ENTERED = {
         ("robust", "leaky", "later", "fails", "absent", "uneven", "zero", "soft"), "pid_robust"
     ),
 }
+
+#: Secret key of the leaderboards of the tests.
+KEY = "01" * 32
 
 #: Text that must never be anything but text.
 HOSTILE = (
@@ -280,13 +283,47 @@ def put(folder: Path, made: create.Draft, simulators: ReplayPlants | None = None
 
 
 def accept(folder: Path) -> None:
-    """Vouch for all records that say that they are official, as their maintainers would."""
+    """Vouch for all that says that it is official, as maintainers would, and close the round."""
+    listed = [record.load(path, strict=False) for path in store.record_paths(folder)]
     lines = [
-        f'[[second_runs]]\nrecord = "{score.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
-        for path in store.record_paths(folder)
-        if isinstance(score := record.load(path, strict=False), Record) and score.official
+        f'[[second_runs]]\nrecord = "{one.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
+        for one in listed
+        if isinstance(one, Withdrawal) or (isinstance(one, Record) and one.official)
     ]
-    (folder / canonical.ATTESTATIONS).write_text("".join(lines))
+    attest(folder, "".join(lines))
+    close(folder)
+
+
+def attest(folder: Path, lines: str = "", secret: str = KEY) -> None:
+    """Write and sign the list of keys and second runs."""
+    path = folder / canonical.ATTESTATIONS
+    path.write_text(lines + lines_of(secret))
+    gate.sign(folder, path, secret)
+
+
+def close(folder: Path) -> None:
+    """Write and sign the result of the round: the first record of each entry, or that it failed."""
+    path = folder / "rounds" / ROUND / rounds.RESULT
+    own, scored = rounds.load(folder, ROUND), dict[str, str]()
+    if own.frozen is None or own.result is None:
+        return
+    for one in store.in_order(map(store.read_record, store.record_paths(folder))):
+        if isinstance(one, Record) and one.header.draws.season == ROUND:
+            scored.setdefault(f"{one.name} ({one.track})", one.sha256)
+    runs = {f"{x.name} ({track})" for x in own.frozen.entries for track in x.tracks}
+    failed = dict.fromkeys(sorted(runs - set(scored)), "it was not run")
+    result = {"bounds": own.result.bounds, "records": scored, "failed": failed, "seeds": {}}
+    path.write_bytes(canonical.canonical(result))
+    gate.sign(folder, path, KEY)
+
+
+def lines_of(secret: str) -> str:
+    """Lines of attestations.toml for a secret."""
+    public = gate._private(secret).public_key().public_bytes_raw()
+    return (
+        f'[[keys]]\nid = "{gate.key_id(public)}"\npublic = "{public.hex()}"\n'
+        'added = 2026-11-23\nholder = "a test"\n'
+    )
 
 
 def opened(made: create.Draft) -> Record:

@@ -13,25 +13,9 @@ from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, gate, store
 from ventbench.board.verify import verify
 
-from .conftest import accept, put
+from .conftest import KEY, accept, attest, lines_of, put
 
 pytest.importorskip("cryptography")
-
-SECRET = "01" * 32
-
-
-@pytest.fixture(scope="module")
-def keys() -> str:
-    """Lines of attestations.toml for :data:`SECRET`."""
-    return lines_of(SECRET)
-
-
-def lines_of(secret: str) -> str:
-    public = gate._private(secret).public_key().public_bytes_raw()
-    return (
-        f'[[keys]]\nid = "{gate.key_id(public)}"\npublic = "{public.hex()}"\n'
-        'added = 2026-11-23\nholder = "a test"\n'
-    )
 
 
 def status(folder: Path) -> dict[str, str]:
@@ -42,7 +26,8 @@ def status(folder: Path) -> dict[str, str]:
 @pytest.fixture
 def unsigned(leaderboard: Path) -> Path:
     """A leaderboard whose records say "official", and nobody else does."""
-    (leaderboard / canonical.ATTESTATIONS).unlink()
+    for path in (leaderboard / canonical.ATTESTATIONS, *leaderboard.rglob("*.sig")):
+        path.unlink()
     return leaderboard
 
 
@@ -53,7 +38,8 @@ def sha_of(folder: Path, name: str) -> str:
 def test_official_is_not_self_declared(unsigned: Path, simulators) -> None:
     assert all(score.official for score in store.load(unsigned).scores if score.name != "home")
     assert set(status(unsigned).values()) == {"not official"}
-    assert verify(unsigned, lambda: simulators).problems == []
+    (problem,) = verify(unsigned, lambda: simulators).problems
+    assert "result.json is signed by no key" in problem
     build.build(unsigned, unsigned.parent / "site")
     page = (unsigned.parent / "site" / "index.html").read_text()
     assert "not official: no key of this leaderboard has signed the record" in page
@@ -62,15 +48,17 @@ def test_official_is_not_self_declared(unsigned: Path, simulators) -> None:
     assert status(unsigned)["softer"] == "ranked", "control"
 
 
-def test_a_signed_record_is_official(unsigned: Path, keys: str, simulators) -> None:
-    (unsigned / canonical.ATTESTATIONS).write_text(keys)
+def test_a_signed_record_is_official(unsigned: Path, simulators) -> None:
+    attest(unsigned)
     for name in ("softer", "home"):
-        gate.sign(unsigned, sha_of(unsigned, name), SECRET)
+        gate.sign(unsigned, store.path_of(unsigned, sha_of(unsigned, name)), KEY)
     found = status(unsigned)
     assert found["softer"] == "ranked"
     assert found["harder"] == "not official"
     assert found["home"] == "not official", "a signature gives nobody a sandbox"
-    assert verify(unsigned, lambda: simulators).problems == []
+    problems = "\n".join(verify(unsigned, lambda: simulators).problems)
+    assert problems.count("is signed by no key") == 6, "five records of the round, and its result"
+    assert f"{sha_of(unsigned, 'softer')}.json" not in problems
 
 
 def test_an_unsigned_record_does_not_take_the_place_of_a_signed_one(
@@ -85,10 +73,10 @@ def test_an_unsigned_record_does_not_take_the_place_of_a_signed_one(
     assert dict(zip(board["record"], board["status"], strict=True)) == {old: "ranked"}
 
 
-def test_wrong_signatures_are_named(unsigned: Path, keys: str, simulators) -> None:
-    (unsigned / canonical.ATTESTATIONS).write_text(keys)
+def test_wrong_signatures_are_named(unsigned: Path, simulators) -> None:
+    attest(unsigned)
     softer, harder = (sha_of(unsigned, name) for name in ("softer", "harder"))
-    path = gate.sign(unsigned, softer, SECRET)
+    path = gate.sign(unsigned, store.path_of(unsigned, softer), KEY)
     good = path.read_bytes()
     values = json.loads(good)
 
@@ -99,7 +87,7 @@ def test_wrong_signatures_are_named(unsigned: Path, keys: str, simulators) -> No
         return "\n".join(x for x in found if path.parent.name in x or "attestations.toml" in x)
 
     wrong = {
-        "signs another record": {"record": harder},
+        "signs another file": {"record": harder},
         "the signature is not by key": {"signature": "0" * 128},
         "is not in attestations.toml": {"key": "0" * 16},
         "key signature": {"signature": "0"},
@@ -113,13 +101,14 @@ def test_wrong_signatures_are_named(unsigned: Path, keys: str, simulators) -> No
     assert "too large" in problem()
     path.write_bytes(good)
     # The signature of one record is none of another.
-    moved = gate.signature_path(unsigned, harder)
+    moved = gate.signature_path(store.path_of(unsigned, harder))
     moved.write_bytes(canonical.canonical(values | {"record": harder}))
     assert "the signature is not by key" in problem()
     moved.unlink()
-    (unsigned / canonical.ATTESTATIONS).write_text(keys.replace(json.loads(good)["key"], "0" * 16))
+    attestations = unsigned / canonical.ATTESTATIONS
+    attestations.write_text(lines_of(KEY).replace(json.loads(good)["key"], "0" * 16))
     assert "attestations.toml: key" in problem()
-    (unsigned / canonical.ATTESTATIONS).write_text(lines_of("02" * 32))
+    attest(unsigned, secret="02" * 32)
     assert "is not in attestations.toml" in problem()
 
 
@@ -138,19 +127,19 @@ def test_lists_are_checked(leaderboard: Path, simulators) -> None:
     assert any("is a link" in x for x in verify(leaderboard, lambda: simulators).problems)
 
 
-def test_only_a_listed_key_signs(unsigned: Path, keys: str) -> None:
-    (unsigned / canonical.ATTESTATIONS).write_text(keys)
-    sha256 = sha_of(unsigned, "softer")
+def test_only_a_listed_key_signs(unsigned: Path) -> None:
+    attest(unsigned)
+    record = store.path_of(unsigned, sha_of(unsigned, "softer"))
     with pytest.raises(InputError, match="is not in"):
-        gate.sign(unsigned, sha256, "02" * 32)
+        gate.sign(unsigned, record, "02" * 32)
     with pytest.raises(InputError, match="not a key of 64") as refused:
-        gate.sign(unsigned, sha256, "very secret")
+        gate.sign(unsigned, record, "very secret")
     assert "very secret" not in str(refused.value)
 
 
-def test_without_the_library_there_is_advice(unsigned: Path, keys: str, monkeypatch) -> None:
-    (unsigned / canonical.ATTESTATIONS).write_text(keys)
-    gate.sign(unsigned, sha_of(unsigned, "softer"), SECRET)
+def test_without_the_library_there_is_advice(unsigned: Path, monkeypatch) -> None:
+    attest(unsigned)
+    gate.sign(unsigned, store.path_of(unsigned, sha_of(unsigned, "softer")), KEY)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     with pytest.raises(InputError, match=r"pip install 'ventbench\[attest\]'"):
         store.load(unsigned)
@@ -166,7 +155,9 @@ def test_a_new_key_signs(unsigned: Path, monkeypatch) -> None:
     (unsigned / canonical.ATTESTATIONS).write_text(made[made.index("[[keys]]") :])
     monkeypatch.setitem(os.environ, gate.SECRET, secret)
     name = sha_of(unsigned, "softer")
-    signed = CliRunner().invoke(app, ["board", "sign", name[:12], "--folder", str(unsigned)])
-    assert signed.exit_code == 0
-    assert f"signed {name}" in signed.output
+    for named in (name[:12], str(unsigned / canonical.ATTESTATIONS)):
+        signed = CliRunner().invoke(app, ["board", "sign", named, "--folder", str(unsigned)])
+        assert signed.exit_code == 0
+        assert signed.output.startswith("signed ")
+    assert (unsigned / "records" / f"{name}.sig").is_file()
     assert status(unsigned)["softer"] == "ranked"

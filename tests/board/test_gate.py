@@ -169,7 +169,7 @@ def test_only_a_bench_log_ranks_hardware(leaderboard: Path, template) -> None:
         'added = 2026-11-23\nholder = "a test"\n'
     )
     listed.write_text(before + key)
-    gate.sign(leaderboard, made.sha256, SECRET)
+    gate.sign(leaderboard, store.path_of(leaderboard, made.sha256), SECRET)
     assert row().rank is None
     second = f'[[second_runs]]\nrecord = "{made.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
     listed.write_text(before + key + second)
@@ -211,7 +211,8 @@ def test_invented_stress_has_no_rank(leaderboard: Path, drafts, simulators) -> N
 
 
 def test_what_a_record_says_of_itself_ranks_nothing(leaderboard: Path, drafts) -> None:
-    (leaderboard / canonical.ATTESTATIONS).unlink()
+    for path in (leaderboard / canonical.ATTESTATIONS, *leaderboard.rglob("*.sig")):
+        path.unlink()
     evidence = store.load(leaderboard).evidence
     for name in ("softer", "robust", "pid_best"):
         item = opened(drafts[name])

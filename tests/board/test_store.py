@@ -15,7 +15,7 @@ from ventbench.board import canonical, create, ranking, store
 from ventbench.board.verify import verify
 
 from ..textbook_rigs import TextbookRigs
-from .conftest import put
+from .conftest import accept, put
 
 
 def performance(folder: Path) -> ranking.Track:
@@ -66,6 +66,9 @@ def test_an_entry_is_replaced_once_it_is_withdrawn(leaderboard: Path, draft, sim
     with pytest.raises(InputError, match=f"the entry has record {old.sha256[:12]}; withdraw that"):
         put(leaderboard, made, simulators)
     store.withdraw(leaderboard, old.sha256, "a bug")
+    with pytest.raises(InputError, match="withdraw that"):  # nobody who may do so has signed it
+        put(leaderboard, made, simulators)
+    accept(leaderboard)
     new = put(leaderboard, made, simulators)
     entry = next(x for x in performance(leaderboard).ranked if x.record.name == "softer")
     assert entry.record.sha256 == new.sha256
@@ -92,6 +95,8 @@ def test_verify_reports_a_replacement_that_add_refuses(
 def test_a_withdrawn_record_is_listed_with_its_reason(leaderboard: Path) -> None:
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     store.withdraw(leaderboard, old.sha256[:10], "its <b>authors</b> found a bug")
+    assert "softer" in [x.record.name for x in performance(leaderboard).ranked], "unsigned"
+    accept(leaderboard)
     track = performance(leaderboard)
     assert "softer" not in [x.record.name for x in track.ranked]
     (entry,) = [x for x in track.unranked if x.record.name == "softer"]

@@ -201,4 +201,4 @@ def test_exploits_may_not_be_skipped():
     testing = [job for job in jobs if "make" in str(job["steps"])]
     assert len(testing) == 2
     for job in testing:
-        assert job["env"]["VENTBENCH_REQUIRE_SANDBOX"] == "1"
+        assert job["env"]["VENTBENCH_REQUIRE_ALL"] == "1"

@@ -4,11 +4,13 @@ noise. The rig of these tests is that of :mod:`.made`, plain numpy without any f
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.identification import without_saturated
+from ventbench.diagnosis.experiment import below, saturation
+from ventbench.diagnosis.residual_analysis import excess_over_noise, quiet_samples
 from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
 from ventbench.diagnosis.validation import Adequacy, check_residuals, order_p_value, passes_fdr
 from ventbench.recordings import join
@@ -19,7 +21,7 @@ BREATHS, LEVEL = 28, DEFAULT.residuals.veto_level
 GROUPS = np.zeros(BREATHS, np.int64)
 
 #: Enough permutations for the level of the veto.
-FEWER = dataclasses.replace(DEFAULT.residuals, flips=500)
+FEWER = dataclasses.replace(DEFAULT.residuals, flips=1000)
 
 
 def checked(
@@ -115,14 +117,13 @@ def test_saturated_readings_are_left_out():
     recorded = made.breaths(n=BREATHS)
     top = float(np.quantile(recorded.pressure, 0.95))
     clipped = dataclasses.replace(recorded, pressure=np.minimum(recorded.pressure, top))
-    kept, saturated = without_saturated(clipped)
+    saturated = saturation(clipped)
     assert saturated == pytest.approx((top, 0.05), rel=0.01)
+    kept = below(clipped, top)
     np.testing.assert_array_equal(np.isnan(kept.pressure), recorded.pressure >= top)
     step = np.round(recorded.pressure / 0.07) * 0.07
     for whole in (recorded, dataclasses.replace(recorded, pressure=step)):
-        same, nothing = without_saturated(whole)
-        assert nothing is None
-        assert same is whole
+        assert saturation(whole) is None
 
 
 def test_a_sensor_that_saturates_on_one_lung_does_so_on_all():
@@ -133,6 +134,76 @@ def test_a_sensor_that_saturates_on_one_lung_does_so_on_all():
     clipped = dataclasses.replace(both, pressure=np.minimum(both.pressure, top))
     seldom = np.count_nonzero(other.pressure >= top)
     assert 0 < seldom < 0.01 * other.pressure.size
-    assert without_saturated(clipped[20:])[1] is None
-    kept, _ = without_saturated(clipped)
-    np.testing.assert_array_equal(np.isnan(kept.pressure), both.pressure >= top)
+    assert saturation(clipped[20:]) is None
+    assert saturation(clipped) == pytest.approx((top, np.mean(both.pressure >= top)))
+
+
+#: Noise without any error of the simulator, ``(n, T)``, by kind: where gas flows and at which time.
+Kind = Callable[[np.random.Generator, np.ndarray, np.ndarray], np.ndarray]
+
+
+def _autoregressive(rng: np.random.Generator, flow: np.ndarray, _: np.ndarray) -> np.ndarray:
+    each = 0.15 * rng.standard_normal(flow.shape)
+    for k in range(1, each.shape[1]):
+        each[:, k] += 0.7 * each[:, k - 1]
+    return each
+
+
+def _hum(rng: np.random.Generator, _: np.ndarray, time: np.ndarray) -> np.ndarray:
+    phase = rng.uniform(0.0, 2.0 * np.pi, (len(time), 1))
+    hum = 0.2 * np.sin(2.0 * np.pi * 50.0 * time + phase)
+    return hum + 0.1 * rng.standard_normal(time.shape)
+
+
+NOISES: dict[str, Kind] = {
+    "white": lambda rng, flow, time: 0.2 * rng.standard_normal(flow.shape),
+    "Student's t of 3": lambda rng, flow, time: 0.12 * rng.standard_t(3, flow.shape),
+    "grows with flow": lambda rng, flow, time: (
+        (0.08 + 0.8e-3 * np.abs(flow)) * rng.standard_normal(flow.shape)
+    ),
+    "autoregressive": _autoregressive,
+    "hum of the mains": _hum,
+    "small": lambda rng, flow, time: 0.03 * rng.standard_normal(flow.shape),
+}
+
+
+def world(kind: str, seed: int, *, step: float = 0.0) -> tuple[np.ndarray, ...]:
+    """Errors of a perfect simulator, where they are known and where nothing moves, ``(n, T)``."""
+    recorded = made.breaths(n=BREATHS)
+    u_in, u_out = recorded.u_in, np.asarray(recorded.u_out)
+    pressure, flow, _ = made.answer(u_in, u_out, recorded.dt, 22.0, 47.5)
+    read = pressure + NOISES[kind](np.random.default_rng(seed), flow, recorded.time)
+    if step:
+        read = step * np.round(read / step)
+    return read - pressure, recorded.valid, quiet_samples(recorded)
+
+
+@pytest.mark.parametrize("kind", NOISES)
+def test_noise_of_any_kind_is_noise(kind):
+    """In 28 breaths, a fine or a coarse converter, and in 5, whose quiet ends tell little."""
+    found = [excess_over_noise(*world(kind, k, step=0.5 * (k % 2))) for k in range(40)]
+    few = [excess_over_noise(*(x[:5] for x in world(kind, k))) for k in range(40)]
+    alarms = sum(each.p_value <= LEVEL for each in found)
+    alarms += sum(each.outweighs_noise or each.p_value <= LEVEL for each in few)
+    print(f"{kind}: {alarms} of {len(found + few)} false alarms")
+    assert alarms <= 3
+
+
+def test_five_readings_in_one_of_five_breaths_outweigh_the_noise():
+    """A plug of five readings: "nothing is missing" was said beside 0.88 cmH2O for 0.18."""
+    error, usable, quiet = (x[:5].copy() for x in world("white", 0))
+    error[1, 1:6] += [5.1, 4.5, 4.3, 4.6, 4.6]
+    assert excess_over_noise(error, usable, quiet).outweighs_noise
+
+
+@pytest.mark.parametrize("kind", NOISES)
+def test_an_error_of_some_breaths_that_lasts_is_none(kind):
+    """A plug that opens: 1.2 cmH2O more for a quarter of a second, in each sixth breath."""
+    error, usable, quiet = world(kind, 0)
+    held = np.arange(BREATHS)[:, None] % 6 == 0
+    time = made.breaths(n=BREATHS).time
+    plug = np.where(held & (time > 0.2) & (time < 0.45), 1.2, 0.0)
+    assert excess_over_noise(error + 2.0 * plug, usable, quiet).p_value <= LEVEL
+    alone = excess_over_noise((error + 2.0 * plug)[:1], usable[:1], quiet[:1])
+    slow = kind == "autoregressive"  # which the quiet end of one breath cannot tell
+    assert slow or alone.p_value <= LEVEL, "and in one breath alone"

@@ -42,7 +42,7 @@ def test_every_mechanism_has_a_sentence():
         text = report_text.missing_mechanism(MissingMechanism(name, values, 0.8, (), 10.0))
         assert item.description.title in text.lower()
         assert text.count("[") == len(known)
-        assert text.endswith("held-out evidence 10 nats; preferred over other names: 80 %.")
+        assert text.endswith("held-out evidence 10 nats; posterior probability of 80 %.")
         for p in known[1:]:
             assert p.meaning in text
     assert parameter("valve_delay.delay").meaning == "dead time"
@@ -53,10 +53,11 @@ def test_a_named_mechanism():
     said = report_text.sentences(found)
     loop = found.open_loop
     assert said[0] == (
-        "Missing in the physics simulator: dead time of the inspiratory valve (odds above a "
-        "million to one on held-out breaths); mending it takes the error on 4 breaths set aside "
+        "Missing in the physics simulator: dead time of the inspiratory valve (posterior "
+        "probability of 97 %); mending it takes the error on 4 breaths set aside "
         f"from {loop.refit.rmse:.2f} (R and C refitted; {loop.before.rmse:.2f} as given) to "
-        f"{loop.after.rmse:.2f} cmH2O, and hardly more than the noise of 0.20 is left."
+        f"{loop.after.rmse:.2f} cmH2O, and of the {loop.whole.rmse:.2f} over whole breaths, hardly "
+        "more than the noise of 0.20 is left."
     )
     assert said[1].startswith(
         "Dead time of the inspiratory valve (valve_delay): 41 ms [38, 44]; held-out evidence 212"
@@ -134,9 +135,8 @@ def test_places(place, text):
 def test_other_verdicts():
     said = report_text.sentences(made.unnamed(12))
     assert (
-        "that is not in the library of mechanisms (odds above a million to one on held-out "
-        "breaths); its place in the model is R(V) (resistance of the airway); mending it takes the "
-        "error"
+        "that is not in the library of mechanisms (held-out evidence 41 nats); its place in the "
+        "model is R(V) (resistance of the airway); mending it takes the error"
     ) in said[0]
     assert any("83 % of the squared error above the noise" in text for text in said)
     nothing = made.nothing(12)
@@ -145,7 +145,7 @@ def test_other_verdicts():
     assert "; it errs by " in said[0]
     assert not any("corrected" in text for text in said)
     both = dataclasses.replace(made.diagnosis(12), nonparametric=made.unnamed(12).nonparametric)
-    assert "valve, and an effect that is not in the library (odds" in report_text.verdict(both)
+    assert "valve, and an effect that is not in the library (posterior" in report_text.verdict(both)
     assert "; mending them takes" in report_text.answer(both)
     assert report_text.nonparametric_term(both).startswith(
         "In addition to these mechanisms, a nonparametric term for R(V) (resistance of the airway) "
@@ -168,8 +168,9 @@ def test_other_verdicts():
     )
     own = dataclasses.replace(term, name="f(u)", form_of=("valve_delay",))
     bent = dataclasses.replace(made.diagnosis(12), form=own)
-    assert "inspiratory valve, in another form than the library's (odds" in report_text.verdict(
-        bent
+    assert (
+        "inspiratory valve, in another form than the library's (posterior"
+        in report_text.verdict(bent)
     )
     assert "; mending it takes" in report_text.answer(bent)
     assert report_text.nonparametric_term(bent).startswith(
@@ -234,8 +235,8 @@ def test_what_stays_unexplained_is_told_first():
     assert first == (
         "Something is missing in the physics simulator, but the recording singles out neither a "
         "mechanism nor a place in the model; mending it is worth nothing on the 4 breaths set "
-        "aside, where the error stays at 1.60 cmH2O, and 1.55 cmH2O stay unexplained beyond the "
-        "noise of 0.41."
+        "aside, where the error stays at 1.60 cmH2O, and of the 1.60 over whole breaths, 1.55 "
+        "cmH2O stay unexplained beyond the noise of 0.41."
     )
     assert any("differs from breath to breath by about 13 %" in text for text in others)
     place = ErrorRegion("volume", 0.0, 50.0, "mL", 0.8, 0.001, 0.9)
@@ -287,9 +288,9 @@ def test_doubts_stand_in_the_first_sentence():
     (sure,) = found.mechanisms
     high = parameter("valve_delay.delay").high
     for changed, doubt in (
-        ({"confidence": 0.33}, "valve_delay is preferred over other names at 33 % only"),
+        ({"confidence": 0.33}, "valve_delay has a posterior probability of 33 % only"),
         ({"worth": 0.01}, "valve_delay is worth less than 0.02 cmH2O"),
-        ({"explains": 0.2}, "valve_delay explains 20 % of the error that is no noise"),
+        ({"explains": 0.2}, "valve_delay explains 20 % of what is no noise"),
         (
             {"parameters": {"delay": Estimate(high, "s", (0.9 * high, high))}},
             "the strength of valve_delay is at the end of its range",
@@ -298,9 +299,11 @@ def test_doubts_stand_in_the_first_sentence():
         doubtful = dataclasses.replace(sure, **changed)
         first = report_text.sentences(dataclasses.replace(found, mechanisms=(sure, doubtful)))[0]
         assert f"(uncertain: {doubt})" in first
-        assert "million" not in first
-    earned = dataclasses.replace(found, mechanisms=(dataclasses.replace(sure, worth=0.4),))
-    assert "a million to one" in report_text.answer(earned)
+        assert ("the nearest in the library is dead time" in first) is ("explains" in changed)
+    earned = dataclasses.replace(sure, worth=0.4, confidence=0.9999)
+    assert "(posterior probability above 99 %)" in report_text.answer(
+        dataclasses.replace(found, mechanisms=(earned,))
+    )
 
 
 def test_expiration_counts():
@@ -315,19 +318,26 @@ def test_expiration_counts():
             dataclasses.replace(found, open_loop=dataclasses.replace(loop, groups=groups))
         )
 
-    assert "in inspiration, and from 1.13 to 0.19 in expiration, and hardly" in answer(1.13, 0.19)
+    assert "in inspiration, and from 1.13 to 0.19 in expiration, and of the" in answer(1.13, 0.19)
     assert "from 0.46 to 0.49 in expiration, where it gets worse" in answer(0.46, 0.49)
 
 
-def test_noise_above_that_of_quiet_readings_is_said():
-    """Pattern 7: the estimate of the noise had absorbed the fault, 0.44 for 0.18."""
+def test_what_is_unexplained_follows_from_the_numbers_beside_it():
+    """Over whole breaths: an error in expiration alone is as unexplained as one in inspiration."""
     found = made.diagnosis(12)
-    loop = dataclasses.replace(found.open_loop, noise_floor=0.44, sensor_noise=0.18)
-    assert "0.44 (quiet readings scatter by 0.18: some of it may be" in report_text.answer(
-        dataclasses.replace(found, open_loop=loop)
+    whole = {"after": OpenLoopError(0.5, 1.3)}
+    loop = dataclasses.replace(
+        found.open_loop,
+        noise_floor=0.3,
+        scatter_error=0.4,
+        groups=found.open_loop.groups | {"whole breath": whole},
     )
-    loop = dataclasses.replace(loop, noise_floor=0.2)
-    assert "quiet" not in report_text.answer(dataclasses.replace(found, open_loop=loop))
+    assert loop.unexplained == pytest.approx(1.2)
+    text = report_text.answer(dataclasses.replace(found, open_loop=loop))
+    assert text.endswith(
+        "of the 1.30 over whole breaths, 1.20 cmH2O stay unexplained beyond the noise of 0.30 and "
+        "the 0.40 of what differs from breath to breath."
+    )
 
 
 def test_what_vetoes_nothing_is_told_first():
@@ -350,7 +360,7 @@ def test_what_vetoes_nothing_is_told_first():
         "p < 0.01)"
     )
     named = dataclasses.replace(made.diagnosis(12), changes=(drift,))
-    assert "on held-out breaths), and the zero of the" in report_text.verdict(named)
+    assert "probability of 97 %), and the zero of the" in report_text.verdict(named)
     saturated = dataclasses.replace(made.nothing(12), saturated=(31.0, 0.045))
     assert report_text.verdict(saturated).startswith(
         "The pressure sensor saturates at 31.0 cmH2O (4 % of the readings, which are left out); by "
@@ -363,14 +373,6 @@ def test_what_vetoes_nothing_is_told_first():
         "No mechanism is shown to be missing in the physics simulator, but the simulated pressure "
         "is 0.8 cmH2O too low where the volume is 0 to 50 mL (p = 0.03)"
     )
-
-
-@pytest.mark.parametrize(
-    ("nats", "text"),
-    [(4.6, "odds of 99 to one"), (7.1, "odds of 1,200 to one"), (14.0, "a million to one")],
-)
-def test_odds(nats, text):
-    assert text in report_text.odds(nats)
 
 
 def test_what_would_change_the_answer():
@@ -400,7 +402,7 @@ def test_a_change_is_told_with_its_breaths_and_what_else_it_may_be():
     found = dataclasses.replace(made.diagnosis(12), mechanisms=(step,))
     said = "the valve's gain falls by 25 % from breath 37 on"
     assert report_text.verdict(found).startswith(
-        f"Missing in the physics simulator: {said}, or drift of the valve's gain (odds"
+        f"Missing in the physics simulator: {said}, or drift of the valve's gain (posterior"
     )
     assert said in report_text.headline(found)
     text = report_text.missing_mechanism(step)

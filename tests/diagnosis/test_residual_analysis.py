@@ -9,18 +9,17 @@ import pytest
 
 from ventbench.diagnosis.corrected import (
     compare_open_loop,
-    is_unexplained,
-    noise_floor,
     open_loop_error,
-    sensor_noise,
 )
+from ventbench.diagnosis.experiment import Judge
 from ventbench.diagnosis.residual_analysis import (
-    MIN_EXCESS,
     axes,
     before,
+    excess_over_noise,
     locate,
     p_values,
     profiles,
+    quiet_samples,
     round_edges,
     since_edge,
     statistic,
@@ -114,8 +113,7 @@ def test_an_error_of_changing_sign_is_found_by_its_square():
 def test_a_drift_is_found_over_the_breaths():
     places = with_error(4, lambda b: np.linspace(-0.6, 0.6, len(b))[:, None] * np.ones((1, 80)))
     early, late = sorted((p for p in places if p.axis == "breath number"), key=lambda p: p.low)
-    assert early.low == 1
-    assert late.high == 60
+    assert (early.low, late.high) == (0, 59), "ids of the first and the last breath"
     assert early.mean_error < -0.2 < 0.2 < late.mean_error
 
 
@@ -136,15 +134,14 @@ def test_an_error_of_volume_is_found_along_it():
     assert place.mean_error == pytest.approx(0.5, abs=0.1)
 
 
-def test_noise_that_differs_a_little_from_place_to_place_is_no_place():
-    """A quarter more variance in expiration stays below what is material; three times do not."""
-    assert MIN_EXCESS > 0.25
-    for seed, times, wanted in ((8, 1.25, False), (9, 3.0, True)):
-        recorded, pressure, flow, volume = exact(seed, n=200)
-        noise = SD * np.random.default_rng(seed).standard_normal(pressure.shape)
-        noise *= np.where(recorded.u_out == 1, np.sqrt(times), 1.0)
-        seen = dataclasses.replace(recorded, pressure=pressure + noise)
-        assert bool(locate(seen, pressure, SD, flow, volume)) == wanted
+@pytest.mark.parametrize("times", [1.25, 9.0])
+def test_noise_that_differs_from_place_to_place_is_no_place(times):
+    """However large it is where gas flows: neighbouring readings share nothing of it."""
+    recorded, pressure, flow, volume = exact(8, n=200)
+    noise = SD * np.random.default_rng(8).standard_normal(pressure.shape)
+    noise *= np.where(recorded.u_out == 0, np.sqrt(times), 1.0)
+    seen = dataclasses.replace(recorded, pressure=pressure + noise)
+    assert locate(seen, pressure, SD, flow, volume) == ()
 
 
 def test_gaps_and_few_breaths():
@@ -209,7 +206,7 @@ def test_samples_are_sorted_by_what_acted_before_them():
     k = opening.bins[i, j]
     assert opening.edges[k] <= recorded.u_in[i, j - 1] < opening.edges[k + 1]
     assert by_name["flow"].bins[i, j] >= 0
-    assert by_name["breath number"].edges.tolist() == [0, 1, 2, 4, 5, 6]
+    assert by_name["breath number"].edges.tolist() == [-1, 0, 1, 3, 4, 5]
 
 
 def test_time_since_an_edge():
@@ -277,7 +274,7 @@ def test_only_inspiration_of_held_out_breaths_counts(breaths):
     for x in given.values():
         x[~held] += 100.0
         x[:, 0] += 100.0  # where every simulation starts
-    found = compare_open_loop(breaths, held, given, 0.2)
+    found = compare_open_loop(breaths, Judge(breaths, held), given, 0.2)
     assert found.held_out_breaths == (2, 102)
     assert (found.before.mae, found.before.rmse) == pytest.approx((3.0, 3.0))
     assert (found.refit.mae, found.after.rmse) == pytest.approx((2.0, 1.0))
@@ -285,30 +282,29 @@ def test_only_inspiration_of_held_out_breaths_counts(breaths):
     assert found.groups["expiration"]["refit"].mae == pytest.approx(4.0)
 
 
-def test_one_breath_that_starts_wrong_is_not_what_stays_unexplained(breaths):
-    held = np.ones(8, bool)
-    given = answers(breaths)
-    given["after"] = breaths.pressure + 0.1
-    assert not is_unexplained(compare_open_loop(breaths, held, given, 0.1))
-    given["after"][3] += 8.0  # a wrong first reading
-    off = compare_open_loop(breaths, held, given, 0.1)
-    assert off.after.rmse > 2.0
-    assert off.usual == pytest.approx(0.1)
-    assert not is_unexplained(off)
-    given["after"][5] += 8.0
-    assert is_unexplained(compare_open_loop(breaths, held, given, 0.1)), "two of eight are more"
+def test_a_breath_that_starts_wrong_is_no_error_of_the_simulator(breaths):
+    """Its first reading is off, and every simulation starts there."""
+    inspired = (breaths.u_out == 0).astype(float)
+    judge, start = Judge(breaths, np.ones(8, bool)), inspired[..., None]
+    rng, quiet = np.random.default_rng(0), quiet_samples(breaths)
+    predicted = breaths.pressure + 0.1 * rng.standard_normal(breaths.pressure.shape)
+    assert judge.excess(predicted, start, quiet).p_value == 1.0
+    predicted[3] += 8.0 * inspired[3]
+    assert judge.excess(predicted, start, quiet).p_value == 1.0
+    predicted[5] += 3.0 * inspired[5] * np.sin(6.0 * breaths.time[5])
+    assert judge.excess(predicted, start, quiet).p_value < 0.01, "no start explains that"
 
 
-def test_what_gains_scatter_is_not_unexplained(breaths):
-    held = np.ones(8, bool)
-    given = answers(breaths)
-    assert is_unexplained(compare_open_loop(breaths, held, given, 0.1))
-    scatter = np.full(breaths.pressure.shape, 0.9)
-    known = compare_open_loop(breaths, held, given, 0.1, scatter_error=scatter)
-    assert known.scatter_error == pytest.approx(0.9)
-    assert known.least_error == pytest.approx(np.hypot(0.1, 0.9))
-    assert known.unexplained == pytest.approx(np.sqrt(1.0 - 0.82))
-    assert not is_unexplained(known)
+def test_what_is_known_to_scatter_is_not_unexplained(breaths):
+    """Neither gains that differ nor the noise of the reading that each breath starts from."""
+    judge, given = Judge(breaths, np.ones(8, bool)), answers(breaths)
+    given["after"] = breaths.pressure + 1.0
+    scatter, start = np.full(breaths.pressure.shape, 0.9), np.full(breaths.pressure.shape, 2.0)
+    found = compare_open_loop(breaths, judge, given, 0.1, scatter, start)
+    assert found.scatter_error == pytest.approx(0.9)
+    assert found.noise_floor == pytest.approx(0.1 * np.sqrt(5.0))
+    assert found.unexplained == pytest.approx(np.sqrt(1.0 - 0.81 - 0.05))
+    assert compare_open_loop(breaths, judge, given, 0.1).unexplained == pytest.approx(0.99**0.5)
 
 
 def test_parts_of_the_breath_and_lungs(breaths):
@@ -317,8 +313,9 @@ def test_parts_of_the_breath_and_lungs(breaths):
     early = breaths.time <= 0.2
     given["after"][early] += 4.0
     given["before"][breaths.lung_ids == "R5C10"] += 5.0
-    found = compare_open_loop(breaths, held, given, 0.2)
+    found = compare_open_loop(breaths, Judge(breaths, held), given, 0.2)
     assert list(found.groups) == [
+        "whole breath",
         "first 0.2 s of inspiration",
         "rest of inspiration",
         "expiration",
@@ -343,7 +340,7 @@ def test_one_lung_is_no_part_and_gaps_do_not_count(breaths):
     given["after"][2] = np.nan
     given["after"][:, 10:15] = 1e6
     holes = dataclasses.replace(one, pressure=pressure)
-    found = compare_open_loop(holes, np.ones(4, bool), given, 0.2)
+    found = compare_open_loop(holes, Judge(holes, np.ones(4, bool)), given, 0.2)
     assert not [name for name in found.groups if name.startswith("lung")]
     assert found.after.mae == pytest.approx(1.0)
 
@@ -372,14 +369,17 @@ def test_sentence_and_chart_have_one_mean():
     assert checked
 
 
-def test_the_floor_of_the_noise_is_the_sensors_not_that_of_a_bad_fit():
+def test_the_noise_is_the_sensors_not_that_of_a_bad_fit():
     recorded, pressure, *_ = exact(13, n=30)
-    settled = np.where(recorded.u_out == 1, 5.0, pressure)
-    noise = coloured(np.random.default_rng(14), pressure.shape, 0.6)
-    seen = dataclasses.replace(recorded, pressure=settled + noise)
-    sensor = sensor_noise(seen)
-    assert sensor == pytest.approx(SD, rel=0.4)
-    assert noise_floor(SD, sensor) == pytest.approx(SD), "a good fit's noise stands"
-    assert noise_floor(2.5, sensor) == pytest.approx(3.0 * SD, rel=0.4)
-    inspired = dataclasses.replace(seen, u_out=np.zeros_like(seen.u_out))
-    assert noise_floor(2.5, sensor_noise(inspired)) == 2.5, "nothing is quiet"
+    usable, quiet = recorded.valid, quiet_samples(recorded)
+    error = coloured(np.random.default_rng(14), pressure.shape, 0.6)
+    assert excess_over_noise(error, usable, quiet).noise == pytest.approx(SD, rel=0.1)
+    sign = np.where(np.arange(30) % 2, 1.0, -1.0)[:, None]
+    bad = 2.5 * sign * np.sin(np.pi * recorded.time) * (recorded.time < 1.0)
+    found = excess_over_noise(error + bad, usable, quiet)
+    assert found.noise == pytest.approx(SD, rel=0.2)
+    assert found.p_value < 0.01
+    moves = usable & ~quiet
+    assert found.size == pytest.approx(np.sqrt(np.mean(bad[moves] ** 2)), rel=0.1)
+    everywhere = excess_over_noise(error, usable, np.zeros_like(quiet))
+    assert everywhere.noise < 0.8 * SD, "nothing is quiet: what neighbours share is none"

@@ -8,8 +8,8 @@ import json
 import numpy as np
 import pytest
 
+from ventbench.diagnosis.experiment import never_fitted
 from ventbench.diagnosis.findings import OpenLoopError
-from ventbench.diagnosis.identification import never_fitted
 from ventbench.mechanics.labels import Estimate
 from ventbench.plants.catalog import load_simulators
 from ventbench.simulation import read_controls
@@ -27,7 +27,7 @@ def test_the_interface():
         "delay": {"value": 0.041, "unit": "s", "ci95": [0.038, 0.044]}
     }
     assert mechanism["confidence"] == 0.97
-    assert mechanism["preferred_over_other_names"] == 0.97
+    assert mechanism["probability"] == 0.97
     assert mechanism["alternatives"] == ["valve_lag"]
     assert plain["slot"] is None
     assert len(plain["location"]) == len(found.location) > 0

@@ -35,7 +35,7 @@ def test_commands_attain_the_bounds(published):
     drawn = rigs.draws(20)
     about = references.settings(rigs.about, drawn.about())
     if about["simulators"] != published.about["simulators"]:
-        pytest.skip("the bounds are of other simulators: run `ventbench headroom` again")
+        pytest.fail("the bounds are of other simulators: run `ventbench board headroom` again")
     assert published.about == about
     plants, cells = rigs.cells(drawn, protocol.PIPS)
     # Every fourth draw.

@@ -344,6 +344,24 @@ def test_labels_by_pressure_alone():
     assert bent.source == "pressure"
 
 
+@pytest.mark.parametrize(
+    ("label", "R", "C"), [((5.0, 20.0), 10.0, 20.0), ((20.0, 20.0), 12.0, 20.0)]
+)
+def test_tolerances_do_not_add_up_to_another_lung(label, R, C):
+    """R 10 for 5 and R 12 for 20 were taken: tubes, interval, gain and label at their ends."""
+    assert not label_match(pretended(R, C, label=label)).label_matches
+    assert not label_match(pretended(20.0, 34.0, label=(20.0, 50.0))).label_matches
+
+
+@pytest.mark.parametrize("of_C", [(19.0, 21.0), (9.0, 11.0)])
+def test_an_unknown_resistance_contradicts_no_label(of_C):
+    """R 1 [0, 200] "does not match" said more than the fit knew."""
+    R, C = Estimate(1.0, "cmH2O/(L/s)", (0.0, 200.0)), Estimate(20.0, "mL/cmH2O", of_C)
+    match = match_label(lung("R5C20"), lambda _: R, C, "pressure", 1.2)
+    assert not match.label_matches
+    assert label_texts(match)[0] == "unknown"
+
+
 def one_way(breaths: Breaths) -> Breaths:
     """The flow sensor has no sign: what leaves is counted as coming in."""
     assert breaths.flow is not None

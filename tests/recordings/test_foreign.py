@@ -16,7 +16,7 @@ from ventbench.base.errors import InputError
 from ventbench.cli.data import app
 from ventbench.recordings import check, load, write
 from ventbench.recordings.foreign import import_recording, import_runs
-from ventbench.recordings.foreign.layouts import UNITS, conversion
+from ventbench.recordings.headers import UNITS, conversion
 
 RATE, PERIOD = 50.0, 3.0
 
@@ -122,8 +122,8 @@ def test_kaggle_layout_is_read_as_it_is(tmp_path):
     np.testing.assert_array_equal(imported.breaths.u_in, recorded.u_in)
 
 
-def test_respiraworks_by_run_and_test(recordings_folder):
-    path = recordings_folder / "respiraworks_quicklung.parquet"
+def test_respiraworks_by_run_and_test(public_recordings):
+    path = public_recordings / "respiraworks_quicklung.parquet"
     imported = import_recording(path, select={"run": "2020-07-31-UFlow-Performance", "test": "4"})
     assert imported.breaths.lung_ids[0] == "R20C20"
     assert len(imported.breaths) >= 7
@@ -164,25 +164,18 @@ def test_runs_of_one_file_begin_before_their_numbers_change(tmp_path):
     assert import_runs(ventbench.example("concealed")) == {}
 
 
-@pytest.fixture
-def recordings_folder():
-    from ventbench.recordings import recordings_dir
-
-    folder = recordings_dir()
-    if folder is None or not (folder / "respiraworks_quicklung.parquet").is_file():
-        pytest.skip("the public recordings are not here")
-    return folder
-
-
 def test_breaths_from_pressure_alone_and_from_a_rate(tmp_path):
     made = waveforms()
     path = tmp_path / "p.txt"
     path.write_text("\n".join(f"{p:.3f}\t1" for p in made["pressure"]))
-    imported = import_recording(path, columns={"1": "pressure"}, rate=RATE, lung="R20C50")
+    with pytest.raises(InputError, match=r"--map 2=flow; or, if none of them is, --map 2=unused"):
+        import_recording(path, columns={"1": "pressure"}, rate=RATE, lung="R20C50")
+    columns = {"1": "pressure", "2": "unused"}
+    imported = import_recording(path, columns=columns, rate=RATE, lung="R20C50")
     assert len(imported.breaths) == 4
     assert "where pressure rises" in " ".join(imported.understood)
     with pytest.raises(InputError, match="--rate 50"):
-        import_recording(path, columns={"1": "pressure"}, lung="R20C50")
+        import_recording(path, columns=columns, lung="R20C50")
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
                 "score pid_best",
                 "score pid_best --plant physics",
                 "score pid_robust --stress 1",
-                "transfer pid_best",
+                "board transfer pid_best",
                 "adversary pid_robust --plant physics",
             )
         ),

@@ -70,19 +70,20 @@ def test_same_optimum_as_scipy(found):
     assert mine.minimum.cost == pytest.approx(theirs.cost, abs=2e-3)
 
 
-def test_likelihood_against_the_whole_covariance():
+@pytest.mark.parametrize(("ar", "slow"), [(0.6, 1.0), (0.9, 0.7), (0.0, 1.0)])
+def test_likelihood_against_the_whole_covariance(ar, slow):
+    """A sample that is not measured does not count, wherever it lies."""
     rng = np.random.default_rng(1)
-    noise = Noise((0.3,), (0.6,), np.inf)
+    noise = Noise((0.3,), (ar,), np.inf, (slow,))
     lag = np.abs(np.subtract.outer(np.arange(20), np.arange(20)))
-    cov: Any = 0.09 * 0.6**lag
+    cov: Any = 0.09 * (slow * ar**lag + (1.0 - slow) * np.eye(20))
     residual = rng.multivariate_normal(np.zeros(20), cov, size=3)[:, None]
-    expected = [stats.multivariate_normal.logpdf(r[0], np.zeros(20), cov) for r in residual]
-    np.testing.assert_allclose(noise.log_likelihood(residual, np.ones((3, 1, 20))), expected)
-    # A sample that is not measured does not count.
-    weight = np.ones((3, 1, 20))
-    weight[:, :, 7:] = 0.0
-    short = [stats.multivariate_normal.logpdf(r[0, :7], np.zeros(7), cov[:7, :7]) for r in residual]
-    np.testing.assert_allclose(noise.log_likelihood(residual * weight, weight), short)
+    for weight in (np.ones((3, 1, 20)), (rng.random((3, 1, 20)) < 0.7).astype(float)):
+        expected = []
+        for r, kept in zip(residual[:, 0], weight[:, 0] > 0, strict=True):
+            some = cov[np.ix_(kept, kept)]
+            expected.append(stats.multivariate_normal.logpdf(r[kept], np.zeros(kept.sum()), some))
+        np.testing.assert_allclose(noise.log_likelihood(residual * weight, weight), expected)
 
 
 def test_noise_is_a_density():
@@ -97,15 +98,16 @@ def test_noise_is_a_density():
 
 def test_noise_is_estimated_in_spite_of_misfits():
     rng = np.random.default_rng(2)
-    fresh = rng.normal(size=(50, 1, 80)) * 0.2 * np.sqrt(1 - 0.25)
-    residual = np.zeros_like(fresh)
-    residual[..., 0] = rng.normal(0, 0.2, (50, 1))
-    for t in range(1, 80):
-        residual[..., t] = 0.5 * residual[..., t - 1] + fresh[..., t]
-    residual[:3] += 4.0
-    noise = robust_noise(residual, np.ones_like(residual))
-    assert noise.sigma[0] == pytest.approx(0.2, rel=0.15)
-    assert 0.4 < noise.ar[0] < 0.85
+    apart = np.abs(np.subtract.outer(np.arange(80), np.arange(80)))
+    for ar, slow in ((0.5, 1.0), (0.9, 0.6)):
+        cov = 0.04 * (slow * ar**apart + (1.0 - slow) * np.eye(80))
+        residual = rng.multivariate_normal(np.zeros(80), cov, size=80)[:, None]
+        residual[:3] += 4.0
+        noise = robust_noise(residual, np.ones_like(residual))
+        assert noise.sigma[0] == pytest.approx(0.2, rel=0.15)
+        for lag in (1, 2, 4):
+            told = noise.slow[0] * noise.ar[0] ** lag
+            assert told == pytest.approx(slow * ar**lag, abs=0.08)
 
 
 def test_outlying_breaths_do_not_move_a_robust_fit(found):

@@ -51,12 +51,18 @@ def folder() -> Path:
 
 
 def keep() -> None:
-    """Keep from here on what JAX compiles, and use what is kept; quietly without a folder."""
+    """Keep from here on what JAX compiles, and use what is kept; quietly without a folder.
+
+    A folder that was chosen before, by JAX's own setting, stays.
+    """
     _hand_back()
     if os.environ.get("VENTBENCH_CACHE") == "":
         return
     import jax
 
+    chosen = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if chosen is not None and "VENTBENCH_CACHE" not in os.environ:
+        return
     try:
         place = folder()
         place.mkdir(parents=True, exist_ok=True)
@@ -64,6 +70,17 @@ def keep() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+def one_blas_thread() -> AbstractContextManager[object]:
+    """Context in which each call of linear algebra takes one thread.
+
+    Matrices of a fit are small: more threads wait for each other, which on a busy machine takes
+    several times the processor time that the products do.
+    """
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(limits=1, user_api="blas")
 
 
 def is_warm() -> bool:

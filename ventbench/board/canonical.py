@@ -42,6 +42,9 @@ ROUND_FILES = (
 #: Of a round too: what the maintainers say of entries.
 NOTES = "notes.toml"
 
+#: Files that nothing else binds and a key signs, besides withdrawals: in the leaderboard's folder.
+SIGNED = (ATTESTATIONS, f"{ROUNDS}/*/{ROUND_FILES[-1]}", f"{ROUNDS}/*/{NOTES}")
+
 #: What a build writes: the page of the board, its CSV, pages of rounds, and pages of entries.
 INDEX, CSV = "index.html", "leaderboard.csv"
 BUILT = re.compile(
@@ -50,8 +53,9 @@ BUILT = re.compile(
 )
 
 _PART = re.compile(
-    rf"{RECORDS}/[0-9a-f]{{64}}\.(json|actions|sig)|"
-    rf"{ROUNDS}/{ROUND_NAME}/({'|'.join(map(re.escape, (*ROUND_FILES, NOTES)))})"
+    rf"attestations\.(toml|sig)|{RECORDS}/[0-9a-f]{{64}}\.(json|actions|sig)|"
+    rf"{ROUNDS}/{ROUND_NAME}/"
+    rf"((result|notes)\.sig|{'|'.join(map(re.escape, (*ROUND_FILES, NOTES)))})"
 )
 
 
@@ -115,7 +119,7 @@ def _only_text_keys(value: Any) -> None:
 
 def named(name: str) -> bool:
     """Whether a relative path may be one of a leaderboard: of a record, a round, attestations."""
-    return name == ATTESTATIONS or _PART.fullmatch(name) is not None
+    return _PART.fullmatch(name) is not None
 
 
 def walk(folder: Path) -> tuple[set[str], list[str]]:

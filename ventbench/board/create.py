@@ -153,7 +153,7 @@ def _headroom(score: Score, drawn: Draws) -> dict[str, Any]:
     if reference is None:
         raise InputError(
             f"{score.submission.label}: there are no reference errors of these simulators and "
-            "draws; make them with `ventbench headroom`"
+            "draws; make them with `ventbench board headroom`"
         )
     tables = {
         "error": score.controllable,

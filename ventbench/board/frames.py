@@ -363,6 +363,40 @@ def csv_text(tracks: Sequence[Track]) -> str:
     return output.getvalue()
 
 
+def markdown(tracks: Sequence[Track]) -> str:
+    """The newest ranked entries as a table of Markdown, a line for each, by the first track."""
+    performance = ["performance", "rank", "error"]
+    robustness = ["robustness", "rank", "stress", "runs survived"]
+    titles = ["entry", *performance, *robustness]
+    shown = [line for line in lines(tracks) if line.status in ("ranked", "practice")]
+    cells: dict[str, dict[str, list[str]]] = {}
+    for line in (x for x in shown if x.track.draws == shown[0].track.draws):
+        track, status, row = line
+        ranks = f"{row.rank}" if status == "ranked" else status
+        if row.ranks and row.ranks[0] != row.ranks[1]:
+            ranks += f" ({_ranks(line)})"
+        stress, score = _stress(line), row.normalised and row.normalised.score
+        if track.name == "performance":
+            told = [f"{row.error.value:.3f}" if row.error else ""]
+        elif stress:
+            survived = _of_stress(lambda t: t.survived_share)(line)
+            told = [f"{stress.value:.2f}", f"{100 * survived:.0f} %"]
+        else:
+            told = ["", ""]
+        text = f"**{score.value:.1f}** [{score.low:.1f}, {score.high:.1f}]" if score else ""
+        cells.setdefault(row.record.name, {})[track.name] = [text, ranks, *told]
+    table = [titles, ["---"] * len(titles)]
+    table += [
+        [
+            name,
+            *tracks.get("performance", [""] * len(performance)),
+            *tracks.get("robustness", [""] * len(robustness)),
+        ]
+        for name, tracks in cells.items()
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in table)
+
+
 def csv_row(line: Line) -> dict[str, Any]:
     """One line of the CSV by column: text, or a whole number."""
     return {key: _csv_cell(key, value) for key, value in _values(line).items()}

@@ -189,15 +189,15 @@ class _Signature(schema.Table, frozen=True):
 
 
 def attested(folder: Path, records: Mapping[str, str | None]) -> tuple[frozenset[str], list[str]]:
-    """Find the records of a leaderboard that somebody who may do so vouches for.
+    """Find what somebody who may do so vouches for: records, withdrawals, results and notes.
 
     Args:
         folder: of the leaderboard.
         records: SHA-256 of all of its records, and for hardware ones that of the raw recording.
 
     Returns:
-        Hashes of the records that are signed or were run again, and of hardware records with a
-        bench log; and a sentence for each signature or line of the list that is wrong.
+        Hashes of the files that are signed or listed, and of hardware records with a bench log; and
+        a sentence for each signature or line of the list that is wrong.
 
     Raises:
         InputError: if there are signatures and no library to check them with.
@@ -227,21 +227,30 @@ def attested(folder: Path, records: Mapping[str, str | None]) -> tuple[frozenset
             problems.append(f"{path}: record {log.record} is not of recording {log.recording[:12]}")
         else:
             vouched.add(log.record)
-    for sha256 in records:
-        path = signature_path(folder, sha256)
+    signed = {sha256: folder / RECORDS / f"{sha256}{canonical.RECORD_SUFFIX}" for sha256 in records}
+    signed |= {files.sha256(path): path for path in statements(folder)}
+    for sha256, file in signed.items():
+        path = signature_path(file)
         if not path.is_file() or path.is_symlink():
             continue
         try:
             check_signature(path, sha256, keys)
-            if records[sha256] is None:  # no key has seen a bench
+            if records.get(sha256) is None:  # no key has seen a bench
                 vouched.add(sha256)
         except InputError as error:
             problems.append(str(error))
     return frozenset(vouched), problems
 
 
+def statements(folder: Path) -> list[Path]:
+    """Files of a leaderboard that nothing binds but a signature: lists, results and notes."""
+    made = (path for name in canonical.SIGNED for path in sorted(folder.glob(name)))
+    plain = (path for path in made if path.is_file() and not path.is_symlink())
+    return [path for path in plain if path.stat().st_size <= schema.MAX_BYTES]
+
+
 def check_signature(path: Path, sha256: str, keys: dict[str, Key]) -> None:
-    """Check the signature of a record, named by its SHA-256, by one of some keys, by id.
+    """Check the signature of a file, named by its SHA-256, by one of some keys, by id.
 
     Raises:
         InputError: if it is not such a signature, or there is no library to check it with.
@@ -250,7 +259,7 @@ def check_signature(path: Path, sha256: str, keys: dict[str, Key]) -> None:
         raise InputError(f"{path} is no signature: it is too large")
     signature = schema.read_canonical(_SIGNATURE, path)
     if signature.record != sha256:
-        raise InputError(f"{path} signs another record, {signature.record[:12]}")
+        raise InputError(f"{path} signs another file, {signature.record[:12]}")
     key = keys.get(signature.key)
     if key is None:
         raise InputError(f"{path}: key {signature.key} is not in {ATTESTATIONS}")
@@ -262,8 +271,8 @@ def check_signature(path: Path, sha256: str, keys: dict[str, Key]) -> None:
         raise InputError(f"{path}: the signature is not by key {key.id}") from None
 
 
-def sign(folder: Path, sha256: str, secret: str) -> Path:
-    """Sign a record of a leaderboard by a secret, 64 hexadecimal digits; return the path.
+def sign(folder: Path, signed: Path, secret: str) -> Path:
+    """Sign a file of a leaderboard by a secret, 64 hexadecimal digits; return the path.
 
     Raises:
         InputError: if the secret is not a key, its public key is not one of the leaderboard's, or
@@ -276,9 +285,10 @@ def sign(folder: Path, sha256: str, secret: str) -> Path:
     if own is None or own.public != public.hex():
         where = folder / ATTESTATIONS
         raise InputError(f"the public key of {SECRET}, {key_id(public)}, is not in {where}")
+    sha256 = files.sha256(signed)
     signature = private.sign(_message(sha256)).hex()
     content = canonical.canonical({"key": own.id, "record": sha256, "signature": signature})
-    path = signature_path(folder, sha256)
+    path = signature_path(signed)
     files.write_bytes(path, content)
     return path
 
@@ -304,9 +314,9 @@ def key_id(public: bytes) -> str:
     return hashlib.sha256(public).hexdigest()[:16]
 
 
-def signature_path(folder: Path, sha256: str) -> Path:
-    """Where the signature of a record lies."""
-    return folder / RECORDS / f"{sha256}{SIGNATURE_SUFFIX}"
+def signature_path(signed: Path) -> Path:
+    """Where the signature of a file lies."""
+    return signed.with_suffix(SIGNATURE_SUFFIX)
 
 
 def _message(sha256: str) -> bytes:

@@ -95,11 +95,12 @@ class Replayed:
 
 @jax.jit
 def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
-    """Airway pressures for commands ``(N, L, ..., B, S)``, of that shape; cells ``(L, ...)``."""
+    """Airway pressures of breaths for commands ``(N, L, ..., B, S)``; cells ``(L, ...)``."""
 
     def run(commands: Array, plant: Plant, cells: Scenario) -> Array:
         script = Script(commands.reshape(*commands.shape[:-2], -1))
-        return rollouts.closed_loop(plant, script, cells)[0].pressure
+        phases = rollouts.closed_loop(plant, script, cells, whole=True)
+        return jnp.concatenate([phase.pressure for phase in phases], axis=-1)
 
     return jax.vmap(jax.vmap(run), (0, None, None))(requested, plants, cells)
 
@@ -113,7 +114,9 @@ def pressures(
     requested: Floats,
     draws: Draws | None,
 ) -> Floats:
-    """Airway pressures that commands of L lungs give, cmH2O, shape of ``requested``.
+    """Airway pressures that commands of L lungs give, cmH2O, ``(N, L, 1 + K, P, BREATHS, steps)``.
+
+    Whole breaths of ``BREATH_STEPS`` steps.
 
     Args:
         simulators: L lungs.
@@ -147,7 +150,8 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
         by_member = np.asarray(_members(plants, cells, jnp.asarray(requested[:, :, None])))
     deviation = np.std(by_member[:, :, :, 0], axis=0, ddof=1)
     assert deviation.shape[1] == lungs
-    return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
+    scored = deviation[..., protocol.SCORED_BREATHS, : protocol.INSPIRATION_STEPS]
+    return np.mean(scored, axis=(-2, -1))
 
 
 def draws_of(header: ScoreHeader, simulators: ReplayPlants, rounds: Mapping[str, Round]) -> Draws:
@@ -189,11 +193,12 @@ def replay(
 
 
 def _measure(
-    cells: Scenario, draws: Draws, requested: Floats, pressure: Floats, spread: Floats
+    cells: Scenario, draws: Draws, requested: Floats, breaths: Floats, spread: Floats
 ) -> Replayed:
     pip, dt = np.asarray(cells.pip), np.asarray(cells.dt)
+    pressure = breaths[..., : protocol.INSPIRATION_STEPS]
     errors = run_error(pressure, pip[..., None, None])
-    gate = passes_safety_gate(pressure, pip[..., None], dt[..., None])
+    gate = passes_safety_gate(breaths, pip[..., None], dt[..., None])
     above = pressure > safety_limit(pip[..., None, None])
     return Replayed(
         nominal=errors[:, 0],

@@ -358,6 +358,8 @@ def read_canonical(decoder: msgspec.json.Decoder[T], path: Path) -> T:
         InputError: naming the first key that is wrong, or if it is not canonical.
         OSError: if it cannot be read.
     """
+    if path.stat().st_size > MAX_BYTES:
+        raise InputError(f"{path} has more than {MAX_BYTES} bytes")
     content = path.read_bytes()
     canonical.parse(content, str(path))
     return decoded(decoder, content, str(path))

@@ -46,7 +46,11 @@ class Store:
     @property
     def evidence(self) -> Evidence:
         """What stands behind the records."""
-        taken = {x.withdraws: x.reason for x in self.records if isinstance(x, Withdrawal)}
+        taken = {
+            x.withdraws: x.reason
+            for x in self.records
+            if isinstance(x, Withdrawal) and x.sha256 in self.attested
+        }
         drawn = {x.name: x for x in self.rounds if x.value is not None}
         return Evidence(self.attested, taken, drawn)
 
@@ -66,6 +70,11 @@ def record_paths(folder: Path) -> list[Path]:
         )
     paths = sorted((folder / RECORDS).glob(f"*{record.SUFFIX}"))
     return [path for path in paths if canonical.named(f"{RECORDS}/{path.name}")]
+
+
+def path_of(folder: Path, sha256: str) -> Path:
+    """Where a record of a leaderboard lies."""
+    return folder / RECORDS / f"{sha256}{record.SUFFIX}"
 
 
 def load(folder: Path) -> Store:
@@ -146,6 +155,20 @@ def find_record(
     return matches[0]
 
 
+def find_signed(folder: Path, named: str) -> Path:
+    """Find a file that a key signs: by its path, or the beginning of a record's hash.
+
+    Raises:
+        InputError: if it is no such file, or several of them.
+    """
+    if (path := Path(named)) in gate.statements(folder):
+        return path
+    matches = sorted((folder / RECORDS).glob(f"{named}*{record.SUFFIX}"))
+    if len(matches) != 1:
+        raise InputError(f"{folder} holds no single record that begins with {named!r}")
+    return matches[0]
+
+
 def require_replay(
     score: Record,
     commands: bytes,
@@ -188,7 +211,10 @@ def add(
     added = record.load(path)
     if isinstance(added, Withdrawal):
         raise InputError(f"{path} is a withdrawal; use ventbench board withdraw")
-    problems = conflicts([*store.records, added], start=len(store.records))
+    counting = [
+        x for x in store.records if not isinstance(x, Withdrawal) or x.sha256 in store.attested
+    ]
+    problems = conflicts([*counting, added], start=len(counting))
     if problems:
         raise InputError(f"{path}: {'; '.join(problems)}")
     if isinstance(added, Record):  # a hardware record has measured pressures, and no commands
@@ -206,7 +232,8 @@ def add(
 def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
     """Take a record back, named by the beginning of its SHA-256, for a reason that the page shows.
 
-    It stays in the history, its entry is no longer ranked.
+    It stays in the history, and its entry is no longer ranked once a key has signed the withdrawal,
+    or a reviewed line of the list names it.
 
     Raises:
         InputError: if there is no such record, no reason, or it was withdrawn before.
@@ -223,8 +250,7 @@ def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
 
 
 def _write(folder: Path, added: AnyRecord, content: bytes) -> None:
-    path = folder / RECORDS / f"{added.sha256}{record.SUFFIX}"
-    files.write_bytes(path, content)
+    files.write_bytes(path_of(folder, added.sha256), content)
 
 
 def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:

@@ -1,4 +1,10 @@
-"""Everything that files can show: hashes, signatures, rounds, ranks, the replay of all commands.
+"""A board is what follows from frozen lists and signed inputs, byte for byte.
+
+Inputs are bound: a record by its name, the files of a round by the next one, and what nothing
+binds, a result, a withdrawal, the maintainers' notes, by a signature. Everything else is derived
+anew: each frozen entry has a record or a signed failure, commands give figures by replay, figures
+give ranks, ranks give pages, CSV and the table of the README. What is there must be that, and no
+file more or less.
 
 Nothing stops at the first problem: each names its file, and the key or line in it. Replay proves
 that errors follow from commands; who computed them is for :mod:`ventbench.board.official_runs`.
@@ -6,6 +12,7 @@ that errors follow from commands; who computed them is for :mod:`ventbench.board
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,12 +20,13 @@ from typing import Any
 
 import numpy as np
 
+from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, gate, ranking, rounds, store
+from ventbench.board import build, canonical, frames, gate, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.official_runs import STRESS_TOLERANCE, folders
-from ventbench.board.record import AnyRecord, Record
+from ventbench.board.record import AnyRecord, Record, Withdrawal
 from ventbench.board.replay import (
     Replayed,
     ReplayPlants,
@@ -48,6 +56,12 @@ Load = Callable[[], ReplayPlants]
 #: Told how many records of how many have been replayed.
 Progress = Callable[[int, int], None]
 
+#: What was derived before, by hashes of all that it follows from.
+Kept = dict[Any, Any]
+
+#: Marks of the board's table in the README beside a leaderboard.
+_TABLE = re.compile(r"<!-- board -->\n(.*?)\n<!-- end -->", re.S)
+
 
 @dataclass
 class Report:
@@ -65,14 +79,28 @@ class Report:
     notes: list[str] = field(default_factory=list)
 
 
-def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Report:
-    """Verify a leaderboard; ``progress`` is called after each record.
+def verify(
+    folder: Path,
+    load: Load,
+    *,
+    site: Path | None = None,
+    progress: Progress | None = None,
+    kept: Kept | None = None,
+) -> Report:
+    """Verify a leaderboard.
+
+    Args:
+        folder: of the leaderboard.
+        load: gives the simulators.
+        site: folder of its built pages; the leaderboard's own if pages lie in it.
+        progress: called after each record.
+        kept: what earlier calls of this process derived; for many boards that differ little.
 
     Raises:
         InputError: if there is no leaderboard.
         OSError: if a file cannot be read.
     """
-    report = Report()
+    report, kept = Report(), {} if kept is None else kept
     paths = store.record_paths(folder)
     if not paths:
         raise InputError(f"{folder} holds no leaderboard: there is no record in {RECORDS}/")
@@ -84,24 +112,34 @@ def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Rep
             report.problems.append(str(error))
     entries = store.in_order(read)
     report.records = len(entries)
-    report.problems += _strange_files(folder, entries, whole=len(entries) == len(paths))
+    plain, odd = canonical.walk(folder)
+    if site is None and any(map(canonical.BUILT.fullmatch, plain)):
+        site = folder
+    inputs = {x for x in plain if site != folder or not canonical.BUILT.fullmatch(x)}
+    report.problems += [f"{folder / x} is no plain file or folder; remove it" for x in odd]
+    report.problems += _strange_files(folder, inputs, entries, whole=len(entries) == len(paths))
     report.problems += store.conflicts(entries)
     vouched, problems = gate.attested(folder, store.measured(entries))
     report.problems += problems if len(entries) == len(paths) else []
-    leaderboard = Store(folder, entries, vouched, tuple(_rounds(folder, load, report)))
-    by_draw = _check_replay(leaderboard, load, report, progress)
-    if not report.problems:  # else whatever is wrong has been said, and moves the ranks
+    leaderboard = Store(folder, entries, vouched, tuple(_rounds(folder, load, report, kept)))
+    report.problems += [] if problems else _unsigned(leaderboard)
+    for own in leaderboard.rounds:
+        report.problems += _unaccounted(own, leaderboard)
+    by_draw = _check_replay(leaderboard, load, report, progress, kept)
+    if not report.problems:  # else whatever is wrong has been said, and moves ranks and pages
         report.problems += _check_ranks(leaderboard, by_draw)
+        report.problems += _check_shown(leaderboard, site, folder.parent / "README.md", kept)
     return report
 
 
-def _strange_files(folder: Path, entries: Sequence[AnyRecord], *, whole: bool) -> list[str]:
+def _strange_files(
+    folder: Path, plain: set[str], entries: Sequence[AnyRecord], *, whole: bool
+) -> list[str]:
     """Files that belong to no record of the leaderboard: none of them may be published.
 
     If the entries are not the whole, nobody knows which commands the others name.
     """
-    plain, odd = canonical.walk(folder)
-    problems = [f"{folder / name} is neither a plain file nor a folder; remove it" for name in odd]
+    problems = []
     named = {entry.sha256 for entry in entries}
     commands = {entry.header.actions.sha256 for entry in entries if isinstance(entry, Record)}
     for name in sorted(plain - {ATTESTATIONS}):
@@ -112,11 +150,120 @@ def _strange_files(folder: Path, entries: Sequence[AnyRecord], *, whole: bool) -
             of = commands if path.suffix == canonical.ACTIONS_SUFFIX else named
             if path.stem not in of:
                 problems.append(f"{folder / name} belongs to no record; remove it")
+    signatures = {gate.signature_path(path) for path in gate.statements(folder)}
+    others = (folder / x for x in sorted(plain) if x.endswith(canonical.SIGNATURE_SUFFIX))
+    return problems + [
+        f"{path} signs no file; remove it"
+        for path in others
+        if path not in signatures and path.parent.name != RECORDS
+    ]
+
+
+def _unsigned(leaderboard: Store) -> list[str]:
+    """Withdrawals and statements that nobody vouches for who may do so."""
+    folder = leaderboard.folder
+    nobody = not gate.read_list(folder).keys  # who could sign a list without keys?
+    paths = [x for x in gate.statements(folder) if not nobody or x.name != ATTESTATIONS] + [
+        store.path_of(leaderboard.folder, x.sha256)
+        for x in leaderboard.records
+        if isinstance(x, Withdrawal)
+    ]
+    return [
+        f"{path} is signed by no key of {ATTESTATIONS}"
+        for path in paths
+        if files.sha256(path) not in leaderboard.attested
+    ]
+
+
+def _unaccounted(own: Round, leaderboard: Store) -> list[str]:
+    """Where a round's result is not what its frozen list and the records of its draws give.
+
+    Each frozen entry has one record or one failure on each of its tracks, its seeds have a score or
+    a failure, and there is no other record of these draws; but a correction, once it is withdrawn.
+    """
+    path, result = own.folder / rounds.RESULT, own.result
+    drawn = {x.sha256: x for x in leaderboard.scores if x.header.draws.season == own.name}
+    if result is None:
+        return [f"{path} is missing: records are of the round's draws"] if drawn else []
+    runs = {
+        f"{entry.name} ({track})": (entry, track)
+        for entry in (own.frozen.entries if own.frozen else ())
+        for track in entry.tracks
+    }
+    problems = [
+        f"{path}: {key} has {'both a record and a failure' if key in result.failed else 'neither'}"
+        for key in runs
+        if (key in result.records) == (key in result.failed)
+    ]
+    withdrawn, corrected = leaderboard.evidence.withdrawn, set[str]()
+    for key, sha256 in result.records.items():
+        found, at = drawn.pop(sha256, None), store.path_of(leaderboard.folder, sha256)
+        if key not in runs:
+            problems.append(f"{path}, key records: {key} was not frozen")
+        elif found is None:
+            missing = f"{at} is missing: the record of {key} in round {own.name}"
+            problems += [] if at.exists() else [missing]  # what cannot be read was named
+        elif (found.name, found.track, found.header.submission.sha256) != (
+            runs[key][0].name,
+            runs[key][1],
+            runs[key][0].sha256,
+        ):
+            problems.append(f"{path}, key records: {at} is not of {key} as it was frozen")
+        elif found.official and sha256 not in leaderboard.attested:
+            problems.append(f"{at}, of round {own.name}, is signed by no key of {ATTESTATIONS}")
+        if sha256 in withdrawn:
+            corrected.add(key)
+    problems += [
+        f"{store.path_of(leaderboard.folder, x.sha256)} is not in {path}"
+        for x in drawn.values()
+        if f"{x.name} ({x.track})" not in corrected
+    ]
+    seeds = [key for key in (*result.failed, *result.seeds) if key not in runs]
+    problems += [
+        f"{path}, keys failed and seeds: {key} was not frozen"
+        for key in seeds
+        if key.partition(", seed ")[0] not in runs
+    ]
+    return problems + [
+        f"{path}, key seeds: {key} has no record" for key in set(result.seeds) - set(result.records)
+    ]
+
+
+def _check_shown(leaderboard: Store, site: Path | None, readme: Path, kept: Kept) -> list[str]:
+    """Pages, CSV and table of the README that are not what the board gives."""
+    problems = []
+    there = _TABLE.search(readme.read_text("utf-8")) if readme.is_file() else None
+    if there and there[1] != frames.markdown(ranking.board(leaderboard)):
+        problems.append(f"{readme}: its table is not that of the board")
+    if site is None:
+        return problems
+    plain, _ = canonical.walk(leaderboard.folder)
+    inputs = {x: (leaderboard.folder / x).read_bytes() for x in filter(canonical.named, plain)}
+    state = tuple(sorted((name, canonical.digest(content)) for name, content in inputs.items()))
+    expected = inputs | _once(kept, ("pages", state), build.content, leaderboard)
+    found, odd = canonical.walk(site)
+    for name in sorted({*expected, *found, *odd}):
+        if name not in found:
+            what = "is missing" if name in expected else "is no plain file"
+        elif name not in expected:
+            what = "is no page of this board; remove it"
+        elif (site / name).read_bytes() != expected[name]:
+            what = "is not what the records give; build it again"
+        else:
+            continue
+        problems.append(f"{site / name} {what}")
     return problems
 
 
+def _once(kept: Kept, key: Any, make: Callable[..., Any], *of: Any) -> Any:
+    """Derive something, if it was not derived before."""
+    if key not in kept:
+        kept[key] = make(*of)
+    return kept[key]
+
+
 def _check_replay(
-    leaderboard: Store, load: Load, report: Report, progress: Progress | None
+    leaderboard: Store, load: Load, report: Report, progress: Progress | None, kept: Kept
 ) -> dict[str, Floats]:
     """Replay records and note in the report what differs.
 
@@ -134,13 +281,17 @@ def _check_replay(
         if simulators is None:
             continue
         try:
-            drawn = draws_of(header, simulators, leaderboard.evidence.rounds)
+            known = leaderboard.evidence.rounds
+            own = known.get(header.draws.season)
+            basis = (group[0].basis[:2], own and own.commitment)
+            drawn = _once(kept, basis, draws_of, header, simulators, known)
         except InputError as error:
             report.problems += [f"record {score.sha256}, {error}" for score in group]
             continue
-        own = leaderboard.evidence.rounds.get(header.draws.season)
         report.problems += _wrong_reference(group, own)
-        by_draw |= _replay_group(leaderboard.folder, group, simulators, drawn, report, progress)
+        by_draw |= _replay_group(
+            leaderboard.folder, group, simulators, drawn, report, progress, kept
+        )
     return by_draw
 
 
@@ -164,7 +315,7 @@ def _check_ranks(leaderboard: Store, by_draw: Mapping[str, Floats]) -> list[str]
     return problems
 
 
-def _rounds(folder: Path, load: Load, report: Report) -> Iterator[Round]:
+def _rounds(folder: Path, load: Load, report: Report, kept: Kept) -> Iterator[Round]:
     """Read the rounds, newest first, and note what is wrong with them.
 
     Entries stay as they were ranked until the next round is open.
@@ -172,7 +323,13 @@ def _rounds(folder: Path, load: Load, report: Report) -> Iterator[Round]:
     made: list[Round] = []
     for name in rounds.names(folder):
         try:
-            made.append(rounds.load(folder, name))
+            own = rounds.load(folder, name)
+            made.append(own)
+            entered = {x.name for x in own.frozen.entries} if own.frozen else set[str]()
+            report.problems += [
+                f"{own.folder / canonical.NOTES}, key entries: {x} was not frozen"
+                for x in set(own.notes()) - entered
+            ]
         except (InputError, OSError) as error:
             report.problems.append(str(error))
     made.sort(key=lambda x: x.opened.closes, reverse=True)
@@ -193,7 +350,9 @@ def _rounds(folder: Path, load: Load, report: Report) -> Iterator[Round]:
                     f"{named[0]} is not what was frozen in round {own.name}, {entry.sha256[:12]}"
                 )
         if own.result is not None:
-            report.problems += _wrong_bounds(own, simulators)
+            state = (own.commitment, own.result.bounds, files.sha256(own.folder / rounds.BOUNDS))
+            about = canonical.canonical(simulators.about())
+            report.problems += _once(kept, (state, about), _wrong_bounds, own, simulators)
 
 
 def _wrong_bounds(own: Round, simulators: ReplayPlants) -> list[str]:
@@ -266,18 +425,22 @@ def _replay_group(
     drawn: Draws,
     report: Report,
     progress: Progress | None,
+    kept: Kept,
 ) -> dict[str, Floats]:
     """Replay records over the same draws; see :func:`_check_replay`."""
-    sound, requested = [], []
+    requested: dict[str, Floats] = {}
     by_draw: dict[str, Floats] = {}
     for score in group:
         try:
-            requested.append(store.load_commands(score, folder / RECORDS))
-            sound.append(score)
+            requested[score.sha256] = store.load_commands(score, folder / RECORDS)
         except (InputError, OSError) as error:
             report.problems.append(str(error))
-    runs = replay(simulators, group[0].pips, requested, drawn)
-    for score, replayed in zip(sound, runs, strict=True):
+    about = canonical.canonical(simulators.about()), drawn.commitment
+    todo = [x for x in requested if (*about, x) not in kept]
+    again = replay(simulators, group[0].pips, [requested[x] for x in todo], drawn)
+    for score in (x for x in group if x.sha256 in requested):
+        key = (*about, score.sha256)
+        replayed = kept[key] if key in kept else kept.setdefault(key, next(again))
         report.replayed += 1
         report.deviation = max(report.deviation, deviation(score, replayed))
         path = folder / RECORDS / f"{score.sha256}{canonical.RECORD_SUFFIX}"

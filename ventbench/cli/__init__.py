@@ -6,6 +6,8 @@ Heavy packages are imported inside the commands, so that ``ventbench --help`` an
 
 from __future__ import annotations
 
+import typer
+
 from ventbench.cli import (
     board,
     data,
@@ -19,14 +21,36 @@ from ventbench.cli import (
 )
 
 app = options.program("ventbench", "A benchmark for the control of mechanical ventilators.")
+listing = typer.Typer(
+    name="list",
+    help="List the lungs, stressors, submissions and examples.",
+    no_args_is_help=True,
+)
 
-for _module in (score, simulators, diagnose):
-    for _command in _module.COMMANDS:
-        app.command(_command.__name__.replace("_", "-"))(_command)
-app.command()(doctor.doctor)
-app.add_typer(train.tune)
-for _module in (train, board, round, data):
-    app.add_typer(_module.app)
+#: Groups of `ventbench --help`, the commands of each, and where the commands of the groups belong.
+_PANELS = {
+    "Controllers": (score.score, score.new, score.check, score.adversary),
+    "Recordings": (diagnose.diagnose, diagnose.mechanics, diagnose.isolability),
+    "Simulators and pictures": (simulators.simulate, simulators.view, simulators.report),
+    "This machine": (doctor.doctor,),
+}
+_GROUPS = {
+    listing: (simulators.lungs, score.stressors, score.entries, data.examples),
+    data.app: (simulators.open_loop,),
+    board.app: (simulators.coverage, score.transfer, score.headroom),
+}
+for _panel, _commands in _PANELS.items():
+    for _command in _commands:
+        app.command(rich_help_panel=_panel)(_command)
+for _group, _commands in _GROUPS.items():
+    for _command in _commands:
+        _group.command()(_command)
+app.add_typer(train.tune, rich_help_panel="Controllers")
+app.add_typer(train.app, rich_help_panel="Controllers")
+app.add_typer(data.app, rich_help_panel="Recordings")
+app.add_typer(listing, rich_help_panel="Simulators and pictures")
+app.add_typer(board.app, rich_help_panel="Leaderboard")
+app.add_typer(round.app, rich_help_panel="Leaderboard")
 
 
 def main() -> None:

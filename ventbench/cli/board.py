@@ -93,21 +93,35 @@ def withdraw(
 ) -> None:
     """Withdraw a record: it stays in the history, but its entry is no longer ranked.
 
+    A withdrawal counts once a key of the leaderboard has signed it: with the key in the environment
+    variable VENTBENCH_SIGNING_KEY that is done here, else by `ventbench board sign`.
+
     Example: `ventbench board withdraw 3f2a91 --reason "the authors found a bug"`
     """
-    from ventbench.board import store
+    import os
+
+    from ventbench.board import gate, store
 
     withdrawal = store.withdraw(folder, record, reason)
     typer.echo(f"withdrew {withdrawal.withdraws}")
-    typer.echo("next: ventbench board build")
+    secret = os.environ.get(gate.SECRET, "")
+    if secret:
+        gate.sign(folder, store.path_of(folder, withdrawal.sha256), secret)
+    typer.echo(f"next: ventbench board {'build' if secret else f'sign {withdrawal.sha256[:12]}'}")
 
 
 @app.command()
 def sign(
-    record: Annotated[str, typer.Argument(help="SHA-256 of the record, or the beginning of it.")],
+    record: Annotated[
+        str,
+        typer.Argument(
+            help="SHA-256 of the record or withdrawal, or its beginning; or the path of "
+            "attestations.toml, or of result.json or notes.toml of a round."
+        ),
+    ],
     folder: Folder = FOLDER,
 ) -> None:
-    """Sign a record with the secret key in the environment variable VENTBENCH_SIGNING_KEY.
+    """Sign a file with the secret key in the environment variable VENTBENCH_SIGNING_KEY.
 
     Whoever signs says that the record's code gave its commands: run `board verify --rerun` first.
 
@@ -120,8 +134,8 @@ def sign(
     secret = os.environ.get(gate.SECRET, "")
     if not secret:
         raise InputError(f"environment variable {gate.SECRET} holds no key")
-    sha256 = store.find_record(store.load(folder), record).sha256
-    typer.echo(f"signed {sha256}: {gate.sign(folder, sha256, secret)}")
+    signed = store.find_signed(folder, record)
+    typer.echo(f"signed {signed}: {gate.sign(folder, signed, secret)}")
     typer.echo("next: ventbench board build")
 
 
@@ -178,9 +192,18 @@ def verify(
     source: Sources = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes of --rerun.")] = 1,
     scheduler: Scheduler = None,
+    site: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Built pages to compare; default: those in the folder, if any."
+        ),
+    ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Check every hash and signature, and replay every record.
+    """Derive the board anew from frozen lists and signed records, and compare all that is there.
+
+    Every entry that was frozen must have a record or a signed failure, every record must replay,
+    and results, ranks, pages, CSV and the README's table must be what follows.
 
     With --rerun, the code that each record names by its hashes runs again, and its commands must
     be the recorded ones to 0.001 %. Records whose code is not at hand are listed.
@@ -197,7 +220,7 @@ def verify(
     if records and not rerun:
         raise InputError("records are chosen for --rerun; without it all are verified")
     with bar("replaying records") as replaying:
-        report = verifier.verify(folder, frozen.load, progress=replaying)
+        report = verifier.verify(folder, frozen.load, site=site, progress=replaying)
     if rerun and not report.problems:  # else the records are not what they were
         _rerun(report, folder, records or [], source or [], jobs, scheduler)
     console = told(dataclasses.asdict(report), json)

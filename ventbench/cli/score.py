@@ -249,7 +249,7 @@ def transfer(
     Columns: the reference rig of each lung, which the nominal score uses; the same rig in the other
     members of the ensemble; the lung's other rigs; the rig on which no entry of ours was trained.
 
-    Example: `ventbench transfer pid_best residual_mlp --json transfer.json`
+    Example: `ventbench board transfer pid_best residual_mlp --json transfer.json`
     """
     from ventbench.entries import scoring as transfers
     from ventbench.entries.cells import runner_of
@@ -369,7 +369,7 @@ def headroom(
     for without a grid's edge, on the rigs of the training. Takes minutes; the same command
     continues.
 
-    Example: `ventbench headroom --check data/bounds-v2.npz`
+    Example: `ventbench board headroom --check data/bounds-v2.npz`
     """
     import numpy as np
 
@@ -426,7 +426,7 @@ def headroom(
 def stressors(json: JsonFile = None) -> None:
     """List the stressors, which are missing physics, and their strengths.
 
-    Example: `ventbench stressors`
+    Example: `ventbench list stressors`
     """
     import dataclasses
 
@@ -442,6 +442,22 @@ def stressors(json: JsonFile = None) -> None:
     console = told({"version": VERSION, "stressors": lines, "pairs": pairs}, json)
     console.print(table_of(f"Stressors, version {VERSION}", columns, rows, left=columns[:4]))
     console.print("Pairs, both mild: " + ", ".join(" + ".join(pair) for pair in PAIRS))
+
+
+def entries(json: JsonFile = None) -> None:
+    """List the submissions that come with ventbench: names that `ventbench score` takes.
+
+    Example: `ventbench list entries`
+    """
+    from ventbench.entries.folder import bundled, open_submission
+
+    manifests = [open_submission(name).manifest for name in bundled()]
+    columns = ("submission", "family", "tracks", "what it is")
+    rows = [(m.name, m.family, ", ".join(m.tracks), m.description) for m in manifests]
+    values = [dict(zip(columns, row, strict=True)) for row in rows]
+    told({"entries": values}, json).print(
+        table_of("Submissions that come with ventbench", columns, rows, left=columns)
+    )
 
 
 def adversary(
@@ -506,6 +522,3 @@ def adversary(
         files.write_text(out / "adversary.txt", text + "\n")
     if any(one.severity is not None for one in found):
         raise typer.Exit(1)
-
-
-COMMANDS = (score, transfer, new, check, headroom, stressors, adversary)

@@ -1,7 +1,4 @@
-"""``ventbench lungs``, ``coverage``, ``simulate``, ``open-loop``, ``view``, ``report``.
-
-What simulators are and answer, and pictures of the runs that were scored on them.
-"""
+"""What simulators are, what they answer, how far from recordings, and pictures of scored runs."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ def lungs(json: JsonFile = None) -> None:
     rigs that are scored on their own breaths, of the lung on breaths of rigs that the fit has not
     seen, and of all breaths that bear the label, each by the rig of its clock.
 
-    Example: `ventbench lungs`
+    Example: `ventbench list lungs`
     """
     from ventbench.plants import frozen
 
@@ -79,7 +76,7 @@ def coverage(
 
     Where there are few recorded samples a simulator follows its prior, and a score is worth less.
 
-    Example: `ventbench coverage leaderboard/records/RECORD.json`
+    Example: `ventbench board coverage leaderboard/records/RECORD.json`
     """
     from dataclasses import asdict
 
@@ -174,7 +171,7 @@ def open_loop(
     cmH2O; the simulation starts at the first recorded pressure. For held-out errors, a member of
     the ensemble that was not trained on a breath simulates it.
 
-    Example: `ventbench open-loop recording.csv --json errors.json`
+    Example: `ventbench data open-loop recording.csv --json errors.json`
     """
     import numpy as np
 
@@ -280,6 +277,3 @@ def report(
 
     loaded, scores = _read(runs)
     typer.echo(f"wrote {pages.write_report(out or runs[0] / 'report.html', loaded, scores)}")
-
-
-COMMANDS = (lungs, coverage, simulate, open_loop, view, report)

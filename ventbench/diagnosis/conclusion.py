@@ -24,6 +24,7 @@ from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior, Scored
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
 from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
 from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
+from ventbench.diagnosis.unknown import preference, unplaced_gain
 from ventbench.diagnosis.validation import (
     is_consistent,
     is_needed,
@@ -41,7 +42,7 @@ Progress: TypeAlias = Callable[[str], None]
 _NEAR, _LISTED = 0.05, 2
 
 #: Least posterior probability of an effect of some breaths that is looked for.
-_LOOKED_FOR = 0.1
+_LOOKED_FOR = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class Alternatives:
     """Alternative explanations of the effect of a selected mechanism."""
 
     names: tuple[str, ...]  #: other mechanisms, the likeliest first.
-    confidence: float  #: posterior probability of the selected mechanism among these.
+    confidence: float  #: posterior probability of the selected mechanism, over all sets.
     models: tuple[FittedModel, ...]  #: models with an alternative in its place.
 
 
@@ -62,6 +63,8 @@ class Swing:
     course: Floats  #: expected course in each training breath, cmH2O or a share, ``(n, T)``.
     noise: Noise  #: noise beside it.
     held_out_log_likelihood: Floats  #: of each held-out breath with it, nats, ``(h,)``.
+    #: root-mean-square error that it takes from held-out breaths, cmH2O.
+    worth: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +77,9 @@ class UnnamedEffect:
     nats: float  #: held-out log-likelihood that it gains.
     #: posterior weight of each place, the largest first.
     places: tuple[tuple[str, float], ...] = ()
+    #: root-mean-square error that it takes from held-out breaths, cmH2O; NaN if unknown.
+    worth: float = float("nan")
+    probability: float = 1.0  #: posterior probability that it acts.
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +161,17 @@ def conclude(
             None,
             gains[term],
             _places(found, names, component_of(term), term),
+            worths[term],
+            found.marginal(term),
         )
     noise = full.noise
     for term in best.terms:
         if unnamed is None and term.name in SWINGS:
             swing, gained = _swing(evaluator, full, term)
-            if passes_heldout_test(
-                gained, evaluator.settings.held_out_test, evaluator.settings.search.course_nats
+            least = evaluator.settings.search.course_nats
+            rival = unplaced_gain(evaluator, full, evaluator.held_out)
+            if swing.worth >= evaluator.settings.residuals.negligible and passes_heldout_test(
+                gained, evaluator.settings.held_out_test, max(least, rival + least)
             ):
                 place = SWINGS[term.name][0]
                 unnamed = UnnamedEffect(
@@ -170,6 +180,8 @@ def conclude(
                     swing,
                     float(gained.sum()),
                     _places(found, names, place, term.name),
+                    swing.worth,
+                    found.marginal(term.name) * preference(float(gained.sum()) - rival),
                 )
                 noise = swing.noise
     return Conclusion(
@@ -357,9 +369,13 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
     told = frequency * (1 + int(np.argmax(power)))
     # Where it is likeliest at an end, no parabola says more than the range.
     sd = told / frequency * min(float(max(curvature, 1e-9) ** -0.5), float(np.ptp(near)))
-    nats = evaluator.held_out_log_likelihood(beside) + at(frequency, beside, held_out)[0]
+    gain, _, change, _ = at(frequency, beside, held_out)
+    nats = evaluator.held_out_log_likelihood(beside) + gain
     gained = nats - evaluator.held_out_log_likelihood(fitted)
-    return Swing(told, sd, course, beside.noise, nats), gained
+    less = replace(held_out.data, measured=held_out.data.measured - change[:, None])
+    after = _square(replace(evaluator, held_out=Partition(less, held_out.predictor)), beside)
+    worth = float(np.sqrt(_square(evaluator, fitted)) - np.sqrt(after))
+    return Swing(told, sd, course, beside.noise, nats, worth), gained
 
 
 def _places(
@@ -391,7 +407,7 @@ def _alternatives(
         if other != EFFORT and EFFORT not in named.names:
             hypothesis = named.hypothesis.without(name).plus(Hypothesis((other,)))
             models.append(evaluator.fit(hypothesis, named.noise, named))
-    return Alternatives(others[:_LISTED], 1.0 / (1.0 + sum(odds.values())), tuple(models))
+    return Alternatives(others[:_LISTED], found.marginal(name), tuple(models))
 
 
 def _is_unresolved(evaluator: Evaluator, whole: FittedModel) -> bool:

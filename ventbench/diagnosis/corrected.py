@@ -10,7 +10,6 @@ absolute error rises. Errors in reports are measured on the same breaths, so tha
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -19,14 +18,13 @@ import numpy as np
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.findings import OpenLoopComparison, OpenLoopError, Stage
+from ventbench.diagnosis.experiment import Experiment, Judge, Split, open_loop_error
+from ventbench.diagnosis.findings import WHOLE, OpenLoopComparison, OpenLoopError, Stage
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
-from ventbench.diagnosis.identification import IdentifiedModel, Split
-from ventbench.diagnosis.residual_analysis import EDGE_SIZE
-from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings
+from ventbench.diagnosis.identification import IdentifiedModel
+from ventbench.diagnosis.settings import CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.plants.corrected import Corrected
-from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Data
 from ventbench.system_id.problem import parameter_of, parameter_values
@@ -34,15 +32,6 @@ from ventbench.task.interfaces import Plant
 
 #: Length of what is reported as the beginning of inspiration, s.
 _BEGINNING = 0.2
-
-#: Share of the breaths, those that err most, without which it is asked whether more than noise is
-#: left: a wrong first reading puts a whole breath off, since every simulation starts there.
-_SET_ASIDE = 0.1
-
-#: Time after the start of expiration from which little moves, s; fewest quiet samples of a breath
-#: that show the sensor's scatter; times that scatter that the noise may have (it is coloured, and a
-#: converter rounds a quiet signal more than a moving one); least scatter, cmH2O.
-_QUIET_AFTER, _QUIET_SAMPLES, _QUIET_FACTOR, _LEAST_NOISE = 0.6, 10, 3.0, 0.05
 
 #: Plants of the lungs, by label.
 Plants = dict[str, Plant]
@@ -72,29 +61,23 @@ class Correction:
 
 
 def correct(
-    breaths: Breaths,
-    data: Data,
-    split: Split,
-    before: Floats,
+    experiment: Experiment,
     recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None,
-    simulators: Simulators,
 ) -> Correction:
     """Correct a simulator by the difference of the models of the recording and of itself.
 
     A simulator that is not the base model stays as it is if the correction raises its mean error on
     the breaths of the fits. Likelihoods of coloured noise excuse slow errors, which a learned
-    simulator may not make; the mean error does not. The judging breaths choose among the rest.
+    simulator may not make; the mean error does not. The judge chooses among the rest.
 
     Args:
-        breaths: n recorded ones.
-        data: the same as fits see them.
-        split: their uses.
-        before: pressures of the simulator, cmH2O, ``(n, T)``.
+        experiment: n breaths, and what is diagnosed.
         recording_model: identified from the recording.
         simulator_model: identified from the simulator's response; None for the base model.
-        simulators: what was diagnosed.
     """
+    breaths, data, split = experiment.breaths, experiment.data, experiment.uses
+    before, simulators = experiment.before, experiment.simulators
     if simulator_model is None:
         pressures, plants, notes = _base_model(breaths, data, split, before, recording_model)
     else:
@@ -109,7 +92,7 @@ def correct(
     unchanged = simulator_model is not None and bool(errors[1] >= errors[0])
     if unchanged:
         pressures, notes = dict.fromkeys(pressures, before), []  # notes on the correction
-    refitted, chosen = choose(breaths, split, pressures)
+    refitted, chosen = choose(breaths, experiment.judge, pressures)
     if unchanged:
         given_everywhere: dict[str, Stage] = dict.fromkeys(chosen, "before")
         refitted = chosen = given_everywhere
@@ -125,8 +108,11 @@ def correct(
             "diagnosis."
         )
         return Correction(final, errors, {}, chosen, unchanged, (*notes, note))
+    # Plants of one kind can be run together: the base model is the library's physics here.
     given = {
-        name: simulators.plant_of_breath(breaths, int(index[0]))
+        name: simulators.plant(name)
+        if simulators.is_base_physics
+        else simulators.plant_of_breath(breaths, int(index[0]))
         for name, index in breaths.by_lung_index.items()
     }
     result: Plants = {}
@@ -146,13 +132,13 @@ _NOTE_ON_DRIFT = (
 
 
 def choose(
-    breaths: Breaths, split: Split, pressures: dict[str, Floats]
+    breaths: Breaths, judge: Judge, pressures: dict[str, Floats]
 ) -> tuple[dict[str, Stage], dict[str, Stage]]:
     """Choose the refitted and the corrected simulator of each lung, by its judging breaths.
 
     Args:
         breaths: n recorded breaths.
-        split: their uses; a lung without judging breaths follows those of all lungs together.
+        judge: has the readings; a lung without judging breaths follows those of all lungs together.
         pressures: pressures of the candidates ``before``, ``refit`` and ``after``, cmH2O, ``(n,
             T)`` each.
 
@@ -161,24 +147,25 @@ def choose(
         worse, and the one that stands for the corrected simulator, both by label.
     """
     # What reports measure: inspirations, from the second sample on.
-    judged = breaths.inspiratory & (breaths.time > 0) & split.judging[:, None]
+    judged = breaths.inspiratory & (breaths.time > 0)
     refitted: dict[str, Stage] = {}
     corrected: dict[str, Stage] = {}
-    for name in breaths.by_lung_index:
-        mask = judged & (breaths.lung_ids == name)[:, None]
-        mask = mask if mask.any() else judged
+    for name, index in breaths.by_lung_index.items():
+        mask = judged
+        if judge.judging[index].any():
+            mask = judged & (breaths.lung_ids == name)[:, None]
         best: Stage = "before"
-        if _is_no_worse(breaths, pressures["refit"], pressures[best], mask):
+        if _is_no_worse(judge, pressures["refit"], pressures[best], mask):
             best = "refit"
         refitted[name] = corrected[name] = best
-        if _is_no_worse(breaths, pressures["after"], pressures[best], mask):
+        if _is_no_worse(judge, pressures["after"], pressures[best], mask):
             corrected[name] = "after"
     return refitted, corrected
 
 
-def _is_no_worse(breaths: Breaths, trial: Floats, current: Floats, mask: Bools) -> bool:
+def _is_no_worse(judge: Judge, trial: Floats, current: Floats, mask: Bools) -> bool:
     """Whether neither error rises; a simulator whose pressures are unknown never wins."""
-    new, old = (open_loop_error(breaths.pressure, p, mask) for p in (trial, current))
+    new, old = (judge.error(pressure, mask) for pressure in (trial, current))
     if not np.isfinite(old.rmse):
         return bool(np.isfinite(new.rmse))
     return bool(new.rmse <= old.rmse and new.mae <= old.mae)
@@ -352,123 +339,53 @@ def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, 
     return start
 
 
-def open_loop_error(recorded: Floats, simulated: Floats, mask: Bools) -> OpenLoopError:
-    """Error over the samples of a mask, all ``(n, T)``; NaN if there is none."""
-    error = (simulated - recorded)[mask & np.isfinite(recorded) & np.isfinite(simulated)]
-    if error.size == 0:
-        return OpenLoopError(float("nan"), float("nan"))
-    return OpenLoopError(float(np.mean(np.abs(error))), float(np.sqrt(np.mean(error**2))))
-
-
 def compare_open_loop(
     breaths: Breaths,
-    held_out: Bools,
+    judge: Judge,
     pressures: dict[str, Floats],
-    noise_floor: float,
+    noise_sd: float,
     scatter_error: Floats | None = None,
-    sensor: float = float("nan"),
+    start: Floats | None = None,
 ) -> OpenLoopComparison:
     """Open-loop errors of a simulator before and after its correction.
 
     Args:
         breaths: n recorded breaths of T samples.
-        held_out: breaths that no fit has seen, ``(n,)``.
+        judge: has the readings of the breaths that no fit has seen.
         pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
             T)``.
-        noise_floor: standard deviation of the noise, cmH2O.
+        noise_sd: standard deviation of the readings, cmH2O.
         scatter_error: standard deviation of the pressure because gains or efforts differ from
             breath to breath, cmH2O, ``(n, T)``; None if nothing does.
-        sensor: that of :func:`sensor_noise`.
+        start: change of the pressure by the reading that a breath starts from, ``(n, T)``; None if
+            that is exact.
     """
     # The first sample is where every simulation starts.
-    inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
+    whole = breaths.valid & (breaths.time > 0) & judge.judging[:, None]
+    inspiration = breaths.inspiratory & whole
 
     def by_stage(mask: Bools) -> dict[str, OpenLoopError]:
-        return {
-            stage: open_loop_error(breaths.pressure, simulated, mask)
-            for stage, simulated in pressures.items()
-        }
+        return {stage: judge.error(simulated, mask) for stage, simulated in pressures.items()}
 
-    whole = by_stage(inspiration)
+    def root(values: Floats | None) -> float:
+        return 0.0 if values is None else float(np.sqrt(np.mean(values[whole] ** 2)))
+
     parts = {
+        WHOLE: whole,
         f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
         "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
-        "expiration": (breaths.u_out == 1) & breaths.valid & held_out[:, None],
+        "expiration": (breaths.u_out == 1) & breaths.valid & judge.judging[:, None],
     }
     lungs = breaths.by_lung_index
     for name in lungs if len(lungs) > 1 else ():
         parts[f"lung {name}"] = inspiration & (breaths.lung_ids == name)[:, None]
-    ids = tuple(int(i) for i in breaths.breath_id[held_out])
-    groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
-    scatter = 0.0
-    if scatter_error is not None:
-        scatter = float(np.sqrt(np.mean(scatter_error[inspiration] ** 2)))
-    error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
-    usual = _usual_error(error)
+    errors = by_stage(inspiration)
     return OpenLoopComparison(
-        ids,
-        whole["before"],
-        whole["refit"],
-        whole["after"],
-        noise_floor,
-        groups,
-        scatter,
-        usual,
-        sensor,
+        judge.ids,
+        errors["before"],
+        errors["refit"],
+        errors["after"],
+        noise_sd * float(np.hypot(1.0, root(start))),
+        {name: by_stage(mask) for name, mask in parts.items() if mask.any()},
+        root(scatter_error),
     )
-
-
-def _usual_error(error: Floats) -> float:
-    """Root mean square of errors ``(n, T)`` without the breaths that err most."""
-    squares, counts = np.nansum(error**2, axis=1), np.isfinite(error).sum(axis=1)
-    order = np.argsort(squares / np.maximum(counts, 1))
-    kept = order[: len(order) - math.ceil(_SET_ASIDE * len(order))] if len(order) > 2 else order
-    total = counts[kept].sum()
-    return float(np.sqrt(squares[kept].sum() / total)) if total else float("nan")
-
-
-def is_unexplained(
-    errors: OpenLoopComparison, settings: CorrectionSettings = DEFAULT.correction
-) -> bool:
-    """Whether the corrected simulator errs far more than the measurement and gains scatter."""
-    return bool(
-        min(errors.after.rmse, errors.usual) > settings.unexplained_ratio * errors.least_error
-        and errors.unexplained > settings.unexplained_error
-    )
-
-
-def sensor_noise(breaths: Breaths) -> float:
-    """Standard deviation of the sensor, cmH2O, by quiet readings alone; NaN if nothing is quiet.
-
-    Late in an expiration hardly anything moves, so that the scatter about a parabola shows the
-    sensor. A converter hides the scatter of a quiet signal; its step's own scatter is a floor.
-    """
-    late = (breaths.u_out == 1) & breaths.valid & np.isfinite(breaths.pressure)
-    scatter = []
-    for time, pressure, u_in, use in zip(
-        breaths.time, breaths.pressure, breaths.u_in, late, strict=True
-    ):
-        if use.sum() < _QUIET_SAMPLES:
-            continue
-        use = use & (time > time[use][0] + _QUIET_AFTER)
-        use &= np.abs(u_in - np.median(u_in[use]) if use.any() else u_in) < EDGE_SIZE
-        if use.sum() >= _QUIET_SAMPLES:
-            left = pressure[use] - np.polyval(np.polyfit(time[use], pressure[use], 2), time[use])
-            scatter.append(1.4826 * np.median(np.abs(left)))
-    if not scatter:
-        return float("nan")
-    step = np.diff(np.unique(breaths.pressure[late])).min(initial=np.inf) / np.sqrt(12.0)
-    return max(float(np.median(scatter)), float(step), _LEAST_NOISE)
-
-
-def noise_floor(noise_sd: float, sensor: float) -> float:
-    """Standard deviation of the measurement, cmH2O, which no simulator can beat.
-
-    The noise of a model that fits badly contains the model's own slow errors; the floor is never
-    more than a few times the scatter of the sensor.
-
-    Args:
-        noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
-        sensor: that of :func:`sensor_noise`; NaN if unknown.
-    """
-    return float(np.fmin(noise_sd, _QUIET_FACTOR * sensor))

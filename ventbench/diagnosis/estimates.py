@@ -13,6 +13,7 @@ from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
+from ventbench.diagnosis.validation import explained_share
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import (
     library,
@@ -175,6 +176,9 @@ def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     """The plant of each lung, by label; it answers as :meth:`Evaluator.predict` does.
 
+    What changes in the course of the recording is as it is at its end: a simulator is used for
+    breaths to come. The parameter ``position`` (0 first breath, 1 last) then says so.
+
     Args:
         fitted: the model, fitted to any breaths of the lungs.
         evaluator: evaluator with which it was fitted.
@@ -189,6 +193,8 @@ def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     for R, C in np.unique(np.stack([data.R, data.C], axis=1), axis=0):
         breath = int(np.flatnonzero((data.R == R) & (data.C == C))[0])
         given = dict(zip(names, values[breath, columns], strict=True))
+        if any(mechanism(name).uses_position for name in fitted.names):
+            given["position"] = 1.0
         result[f"R{R:g}C{C:g}"] = predictor.plant(given)
     return result
 
@@ -209,8 +215,15 @@ def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
     )
 
 
-def oscillation(conclusion: Conclusion) -> MissingMechanism | None:
-    """The mechanism that a periodic input is; None if there is none, or no name for it."""
+def oscillation(
+    conclusion: Conclusion, left: tuple[float, float] = (0.0, 0.0)
+) -> MissingMechanism | None:
+    """The mechanism that a periodic input is; None if there is none, or no name for it.
+
+    Args:
+        conclusion: has the input.
+        left: error beside it, and what is shown to be no noise of that, cmH2O.
+    """
     effect = conclusion.unnamed
     source = None if effect is None else effect.swing
     if effect is None or source is None:
@@ -229,9 +242,11 @@ def oscillation(conclusion: Conclusion) -> MissingMechanism | None:
             "amplitude": Estimate(amplitude, unit, (amplitude - wide, amplitude + wide)),
             "frequency": Estimate(frequency, "Hz", (frequency - sd, frequency + sd)),
         },
-        dict(effect.places).get(effect.name, 1.0),
+        effect.probability,
         tuple(other for other in others if other != name),
         effect.nats,
+        worth=effect.worth,
+        explains=explained_share(effect.worth, *left),
     )
 
 

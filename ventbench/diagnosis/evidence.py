@@ -18,9 +18,10 @@ import numpy as np
 from scipy import linalg
 
 from ventbench.base.arrays import Floats
+from ventbench.base.linear import cholesky
 from ventbench.diagnosis.evaluator import Evaluator, estimate_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
-from ventbench.diagnosis.in_time import SWINGS, in_time
+from ventbench.diagnosis.in_time import SWINGS, in_time, of_some_breaths
 from ventbench.diagnosis.linearised import (
     CONSTANT,
     EFFORT,
@@ -50,7 +51,7 @@ MUSCLES = ("cough", "unknown:muscles")
 
 #: Prior odds of a term, of an unknown at a place beside those of a name, and the power of the
 #: likelihood: no model has what neighbouring samples share.
-_ODDS, _PLACE, _WARMTH = 0.7, 0.1, 0.2
+_ODDS, _PLACE, WARMTH = 0.7, 0.1, 0.2
 
 #: Standard deviations of the logarithm of the breaths' gains that are compared.
 _SCATTERS = (0.003, SCATTER, 0.03, 0.1)
@@ -78,14 +79,21 @@ class Posterior:
     fitted: tuple[Scored, ...]  #: sets that were fitted, likeliest first.
     weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
 
+    def marginal(self, name: str) -> float:
+        """Posterior probability that a term acts, over all sets."""
+        return float(sum(weight for names, weight in self.weights.items() if name in names))
+
     def swaps(self, names: frozenset[str], name: str) -> dict[str, float]:
-        """Posterior odds of other names in the place of one of a set, the likeliest first."""
-        rest, own = names - {name}, self.weights[names]
-        odds = {
-            next(iter(other - rest)): weight / own
-            for other, weight in self.weights.items()
-            if len(other) == len(names) and rest < other and other != names
-        }
+        """Posterior odds of others in the place of one term of a set, the likeliest first.
+
+        One may stand in the place of several: equal delays of both valves are a late clock.
+        """
+        own = self.weights[names]
+        odds: dict[str, float] = {}
+        for other, weight in self.weights.items():
+            new = other - names
+            if name not in other and len(new) == 1:
+                odds[next(iter(new))] = odds.get(next(iter(new)), 0.0) + weight / own
         return dict(sorted(odds.items(), key=lambda pair: -pair[1]))
 
     def undecided(self, nats: float) -> Scored:
@@ -189,7 +197,7 @@ def enumerate_sets(
         else:
             value = evidence(G, b, terms)
         key = names_of(terms)
-        total = value + prior(key, _WARMTH)
+        total = value + prior(key, WARMTH)
         if len(key) == len(terms) and (key not in best or total > best[key][0]):
             best[key] = (total, terms)
         return value
@@ -220,13 +228,13 @@ def enumerate_sets(
 
 def _log_posterior(scored: Scored) -> float:
     """Log posterior of a set that was fitted, but for a constant, nats."""
-    return scored.evidence + prior(names_of(scored.terms), _WARMTH)
+    return scored.evidence + prior(names_of(scored.terms), WARMTH)
 
 
 def _integrated_out(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
     """Log evidence of a term, and what is left of the products beside its coefficients."""
     at, sd = list(term.main), np.array(term.spread)
-    L = np.linalg.cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
+    L = cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
     R = linalg.solve_triangular(L, sd[:, None] * np.column_stack([G[at], b[at]]), lower=True)
     left = R.T @ R
     return evidence(G, b, (term,)), G - left[:-1, :-1], b - left[:-1, -1]
@@ -273,9 +281,7 @@ class _Search:
             self.scatters = view.scatters
             for terms in (terms for way in view.ways for _, terms in way[: self.settings.fits]):
                 self.attempt(view.around, view.noise, terms, view.base)
-        main = min(
-            views, key=lambda view: view.noise.sigma[0] * (1.0 - view.noise.ar[0] ** 2) ** 0.5
-        )
+        main = min(views, key=lambda view: float(view.noise.log_scale(data.weight).sum()))
         around, noise, self.scatters = main.around, main.noise, main.scatters
         self.muscles = [term for term in main.latent if term.name in (EFFORT, MUSCLES[0])]
         self.tried[frozenset()] = Scored.of(self.known(around, self.base, noise))
@@ -310,7 +316,7 @@ class _Search:
         noise = self.known(around, chosen.fitted, noise, chosen.terms, loose=True).left
         if len(own) < self.settings.most_terms:
             known = self.known(around, chosen.fitted, noise, chosen.terms)
-            more = enumerate_sets(known, (), 1, self.settings.beam)
+            more = enumerate_sets(known, self.events(known), 1, self.settings.beam)
             for terms in [t for _, t in more if t and not names_of(t) & own][:3]:
                 if names_of(terms) | own not in self.tried:
                     self.attempt(around, noise, (*chosen.terms, *terms), chosen.fitted)
@@ -320,6 +326,12 @@ class _Search:
                 self.attempt(around, noise, rest, chosen.fitted)
             if term.name in basis_terms():
                 self.name(term.name, rest, noise)
+            if term.name in EVENTS and names_of(rest) in self.tried:  # its breaths, beside the rest
+                left = self.tried[names_of(rest)]
+                known = self.known(self.around(left.fitted), left.fitted, noise, rest)
+                for other in self.events(known):
+                    if other.name == term.name:
+                        self.attempt(known.around, noise, (*rest, other), left.fitted)
             for other in self.muscles if term.name == MUSCLES[-1] else ():
                 if names_of((*rest, other)) not in self.tried:
                     self.attempt(around, noise, (*rest, other), self.base)
@@ -339,6 +351,11 @@ class _Search:
         for term in terms[: self.settings.fits - 1]:
             if names_of(rest) | {term.name} not in self.tried:
                 self.attempt(around, noise, (*rest, term), left.fitted)
+
+    def events(self, known: Known) -> list[Term]:
+        """Effects of some breaths beside a fit."""
+        partition = Partition(self.data, self.predictor)
+        return of_some_breaths(known, partition, self.excluded, self.evaluator.settings)
 
     def around(self, fitted: FittedModel) -> Simulated:
         """All candidates, simulated around a fit."""
@@ -481,11 +498,11 @@ def weigh(
     scored: Sequence[Scored], linear: Sequence[tuple[float, Set]]
 ) -> dict[frozenset[str], float]:
     """Posterior of each set of names; the likeliest that was not fitted is a nat behind."""
-    logs = {names_of(s.terms): _WARMTH * s.evidence for s in scored}
+    logs = {names_of(s.terms): WARMTH * s.evidence for s in scored}
     at = {}
     for value, terms in linear:
         names = names_of(terms)
-        at[names] = _WARMTH * (value - prior(names, _WARMTH))
+        at[names] = WARMTH * (value - prior(names, WARMTH))
     logs = {names: value + prior(names) for names, value in logs.items()}
     offset = max(logs.values()) - 1.0 - max(value + prior(k) for k, value in at.items())
     for names, value in at.items():

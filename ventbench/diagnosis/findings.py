@@ -21,6 +21,9 @@ Verdict = Literal["named", "nothing_missing", "unnamed"]
 Stage = Literal["before", "refit", "after"]
 
 
+#: Name of the group of all samples but the first of each breath.
+WHOLE = "whole breath"
+
 #: What may have an order in time: the valve's gain, the zero of the pressure, the errors' size.
 Quantity = Literal["gain", "zero", "error"]
 
@@ -31,8 +34,8 @@ class MissingMechanism:
 
     name: str  #: name in the library.
     parameters: dict[str, Estimate]  #: estimates by short name.
-    #: how far the name is preferred over other names, 0..1: its posterior probability if one of the
-    #: compared mechanisms acts. It says nothing of effects that none of them is.
+    #: posterior probability that it acts, 0..1, over all sets of names, of unknowns at places and,
+    #: of what differs from breath to breath, of an error that nobody can place.
     confidence: float
     #: mechanisms that the recording cannot distinguish from it, the likeliest first.
     alternatives: tuple[str, ...]
@@ -121,19 +124,15 @@ class OpenLoopComparison:
     before: OpenLoopError  #: error of the simulator as given.
     refit: OpenLoopError  #: error after R, C, R_ex and PEEP are refitted.
     after: OpenLoopError  #: error of the corrected simulator.
-    noise_floor: float  #: root-mean-square error of a perfect simulator, cmH2O.
+    #: root-mean-square error of a perfect simulator over whole breaths, cmH2O: the noise of the
+    #: readings, the first of which it starts from.
+    noise_floor: float
     #: errors of parts of the breath and of lungs, by group and stage, such as ``{"lung R5C10":
     #: {"before": OpenLoopError(...), ...}}``.
     groups: dict[str, dict[str, OpenLoopError]]
     #: root-mean-square error, cmH2O, that a breath to come has because the valve's gain or an
     #: effort differs from breath to breath; 0 if nothing does.
     scatter_error: float = 0.0
-    #: root-mean-square error of the corrected simulator, cmH2O, without the tenth of the breaths
-    #: that err most; NaN if unknown.
-    usual: float = float("nan")
-    #: standard deviation of quiet readings, cmH2O, which no missing physics can raise; NaN if
-    #: nothing is quiet.
-    sensor_noise: float = float("nan")
 
     @property
     def least_error(self) -> float:
@@ -141,10 +140,14 @@ class OpenLoopComparison:
         return float(np.hypot(self.noise_floor, self.scatter_error))
 
     @property
+    def whole(self) -> OpenLoopError:
+        """Error of the corrected simulator over whole breaths."""
+        return self.groups.get(WHOLE, {}).get("after", self.after)
+
+    @property
     def unexplained(self) -> float:
-        """Usual error of the corrected simulator beyond noise and scatter, cmH2O."""
-        usual = self.usual if np.isfinite(self.usual) else self.after.rmse
-        beyond = usual**2 - self.least_error**2
+        """Error of the corrected simulator over whole breaths, beyond noise and scatter, cmH2O."""
+        beyond = self.whole.rmse**2 - self.least_error**2
         return float(np.sqrt(max(beyond, 0.0))) if np.isfinite(beyond) else float("nan")
 
 
@@ -199,7 +202,8 @@ class Findings:
     lungs: tuple[LungMatch, ...]  #: one for each lung of the recording.
     request: BreathRequest | None  #: breaths to record next, or None if nothing is open.
     traces: Traces  #: pressures of all breaths.
-    plants: dict[str, Plant]  #: the corrected simulator of each lung, by label.
+    #: the corrected simulator of each lung, by label, as the rig is at the end of the recording.
+    plants: dict[str, Plant]
     simulator: str  #: name of what was diagnosed, such as ``physics``.
     #: standard deviation of the measurement noise, cmH2O, and its correlation between neighbouring
     #: samples.

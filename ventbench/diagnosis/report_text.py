@@ -31,8 +31,11 @@ from ventbench.mechanics.labels import Estimate
 from ventbench.physics import mechanism, parameter
 from ventbench.physics.catalogue import events
 
-#: Odds beyond these are called sure: no model is so right that larger ones mean anything.
-_SURE_ODDS = 1e6
+#: Probability that is said at most, as no model is so right that more means anything.
+_MOST_SURE = 0.99
+
+#: Share of the error that is no noise below which a name is the nearest in the library.
+_NEAREST = 0.8
 
 #: From this number of effects on, a headline counts them instead of naming them.
 _SEVERAL = 3
@@ -46,7 +49,7 @@ _FEW_BREATHS = 10
 #: Places of less weight than this are told from the likeliest one; the others are one answer.
 _LEAST_WEIGHT = 0.05
 
-#: Preference over other names below which a name is weak: another one, or all others, have more.
+#: Posterior probability below which a name is weak.
 _WEAK = 0.5
 
 #: A strength this near to the end of its range, as a share of the range, stands there.
@@ -57,7 +60,7 @@ def sentences(findings: Findings) -> list[str]:
     """Everything a reader should know, the most important first."""
     texts = [answer(findings), *map(missing_mechanism, findings.mechanisms)]
     texts += [effect(findings), *alternatives(findings), nonparametric_term(findings)]
-    texts += [remaining(findings), *map(lung, findings.lungs), visible(findings)]
+    texts += [remaining(findings), *map(lung, findings.lungs)]
     texts += [scatter(findings), request(findings)]
     texts += [*would_change(findings), *findings.notes]
     return [text for text in texts if text]
@@ -117,7 +120,7 @@ def verdict(findings: Findings) -> str:
         if term is not None:
             return (
                 f"Something is missing in {simulator} that is not in the library of mechanisms "
-                f"({odds(term.nats)}); its place in the model is {_places(term)}{besides}"
+                f"({evidence(term.nats)}); its place in the model is {_places(term)}{besides}"
             )
         if findings.changes:
             return (
@@ -140,17 +143,17 @@ def verdict(findings: Findings) -> str:
 def sureness(findings: Findings) -> str:
     """How sure the names are, or the place without a name, in words.
 
-    Odds say that a term of that kind acts. They are given only where nothing speaks against the
-    name or its strength; else that is said in their place.
+    A probability stands only where nothing speaks against the name or its strength; else that is
+    said in its place.
     """
     doubts = [doubt for missing in findings.mechanisms for doubt in _doubts(missing, findings)]
     if doubts:
         return f"uncertain: {'; '.join(doubts)}"
-    nats = [mechanism.nats for mechanism in findings.mechanisms]
-    if not nats:
-        return odds(findings.nonparametric.nats) if findings.nonparametric is not None else ""
-    each = "each at " if len(nats) > 1 else ""
-    return f"{each}{odds(min(nats))}"
+    if not findings.mechanisms:
+        term = findings.nonparametric
+        return "" if term is None else evidence(term.nats)
+    each = "each at " if len(findings.mechanisms) > 1 else ""
+    return f"{each}{posterior(min(missing.confidence for missing in findings.mechanisms))}"
 
 
 def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
@@ -158,8 +161,7 @@ def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
     doubts = []
     about = mechanism(missing.name).description.strength
     if missing.confidence < _WEAK:
-        share = f"{100 * missing.confidence:.0f} %"
-        doubts.append(f"{missing.name} is preferred over other names at {share} only")
+        doubts.append(f"{missing.name} has a {posterior(missing.confidence)} only")
     if about.name in missing.parameters:
         value, near = missing.parameters[about.name].value, _AT_END * (about.high - about.low)
         if min(value - about.low, about.high - value) < near and about.neutral != value:
@@ -167,9 +169,8 @@ def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
     least = findings.settings.residuals.negligible
     if missing.worth < least:
         doubts.append(f"{missing.name} is worth less than {least:g} cmH2O")
-    if missing.explains < _WEAK:
-        share = f"{100 * missing.explains:.0f} %"
-        doubts.append(f"{missing.name} explains {share} of the error that is no noise")
+    if missing.explains < _NEAREST:
+        doubts.append(f"{missing.name} explains {_percent(missing.explains)} of what is no noise")
     return doubts
 
 
@@ -188,13 +189,20 @@ def change(found: Change) -> str:
     return f"{what} {how}, {probability(found.p_value)})"
 
 
-def odds(nats: float) -> str:
-    """Held-out evidence as odds; 4.6 nats are odds of 100 to one."""
-    if nats >= math.log(_SURE_ODDS):
-        return "odds above a million to one on held-out breaths"
-    value = math.exp(max(nats, 0.0))
-    digits = 10 ** max(int(math.log10(value)) - 1, 0)
-    return f"odds of {round(value / digits) * digits:,.0f} to one on held-out breaths"
+def evidence(nats: float) -> str:
+    """Held-out log-likelihood in words."""
+    return f"held-out evidence {nats:.0f} nats"
+
+
+def posterior(share: float) -> str:
+    """Posterior probability in words."""
+    if share > _MOST_SURE:
+        return f"posterior probability above {_percent(_MOST_SURE)}"
+    return f"posterior probability of {_percent(share)}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
 
 
 def worth(findings: Findings) -> str:
@@ -204,18 +212,16 @@ def worth(findings: Findings) -> str:
     """
     errors = findings.open_loop
     after, noise = rounded(errors.after.rmse, 2), rounded(errors.noise_floor, 2)
-    if errors.noise_floor > findings.settings.residuals.absorbed * errors.sensor_noise:
-        quiet = rounded(errors.sensor_noise, 2)
-        noise = f"{noise} (quiet readings scatter by {quiet}: some of it may be unexplained too)"
+    noise = f"the noise of {noise}"
     if errors.scatter_error:
         scatter = rounded(errors.scatter_error, 2)
         noise = f"{noise} and the {scatter} of what differs from breath to breath"
-    beyond = rounded(errors.unexplained, 2)
-    left = f"{beyond} cmH2O stay unexplained beyond the noise of {noise}"
+    whole = f"of the {rounded(errors.whole.rmse, 2)} over whole breaths"
+    left = f"{whole}, {rounded(errors.unexplained, 2)} cmH2O stay unexplained beyond {noise}"
     if not math.isfinite(errors.unexplained):
-        left = f"the noise is {noise}"
+        left = f"there is {noise}"
     elif errors.unexplained < 0.5 * errors.least_error:
-        left = f"hardly more than the noise of {noise} is left"
+        left = f"{whole}, hardly more than {noise} is left"
     count = len(errors.held_out_breaths)
     out = errors.groups.get("expiration", {})
     before_out, after_out = (
@@ -275,7 +281,8 @@ def would_change(findings: Findings) -> list[str]:
     if findings.verdict == "nothing_missing":
         texts.append(
             "Breaths of another kind, such as short pulses, long holds or a second lung, may show "
-            "what these cannot."
+            "what these cannot; diagnosis.json lists the smallest strength of each mechanism that "
+            "would have been seen."
         )
     elif findings.open_loop.unexplained > findings.open_loop.least_error and not _swings(findings):
         texts.append(
@@ -308,21 +315,6 @@ def remaining(findings: Findings) -> str:
         return ""
     region = max(findings.remaining, key=lambda region: region.share)
     return f"After the correction, {error_phrase(region, findings.noise[0])}."
-
-
-def visible(findings: Findings) -> str:
-    """Which strengths would have been seen where nothing is missing."""
-    seen, unseen = [], []
-    for name, limit in visible_strengths(findings).items():
-        if limit:
-            seen.append(f"{name} {limit}")
-        else:
-            unseen.append(name)
-    if not seen and not unseen:
-        return ""
-    text = f"This recording would have shown: {', '.join(seen)}." if seen else ""
-    hidden = f" It would not have shown {_listed(unseen, 'or')} of any strength." if unseen else ""
-    return f"{text}{hidden}".strip()
 
 
 def visible_strengths(findings: Findings) -> dict[str, str]:
@@ -376,6 +368,8 @@ def told(missing: MissingMechanism, *, others: bool = False) -> str:
     rivals = [title(name) for name in rivals if mechanism(name).uses_position]
     if missing.affected or missing.name in events():  # places that are alike are one answer
         rivals = [title(name) for name in missing.alternatives if others]
+    if missing.explains < _NEAREST:
+        text = f"an effect to which the nearest in the library is {text}"
     if rivals:
         text = f"{text}, or {_listed(rivals, 'or')}"
     return f"{text}, in {breaths_in_words(missing.affected)}" if missing.affected else text
@@ -402,12 +396,10 @@ def missing_mechanism(missing: MissingMechanism) -> str:
     start = capital(about.title)
     if missing.changed and not missing.simulator_values:
         start += ", which the simulator has with another strength"
-    preferred = f"preferred over other names: {100 * missing.confidence:.0f} %"
-    evidence = f"held-out evidence {missing.nats:.0f} nats"
     values_in_words = "; ".join(values)
     return (
-        f"{start} ({missing.name}){': ' if values else ''}{values_in_words}; {evidence}; "
-        f"{preferred}."
+        f"{start} ({missing.name}){': ' if values else ''}{values_in_words}; "
+        f"{evidence(missing.nats)}; {posterior(missing.confidence)}."
     )
 
 
@@ -446,8 +438,8 @@ def request(findings: Findings) -> str:
     what = f"distinguish between {_listed(wanted.why)}"
     if len(wanted.why) == 1:
         what = f"test {wanted.why[0]}"
-    evidence = f"expected evidence {wanted.nats:.0f} nats; {_deciding(findings):g} decide"
-    return f"{text} These breaths {what} ({evidence})."
+    expected = f"expected evidence {wanted.nats:.0f} nats; {_deciding(findings):g} decide"
+    return f"{text} These breaths {what} ({expected})."
 
 
 def nonparametric_term(findings: Findings) -> str:

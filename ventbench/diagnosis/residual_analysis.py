@@ -9,11 +9,13 @@ makes it (Westfall and Young, Resampling-Based Multiple Testing, 1993).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.linear import solve
 from ventbench.diagnosis.findings import ErrorRegion
 from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
 from ventbench.recordings.breaths import Breaths
@@ -34,6 +36,18 @@ _EDGE_TIMES = np.array([0.0, 0.035, 0.07, 0.105, 0.15, 0.2, 0.3, 0.5, 1.0, 3.0])
 
 #: Change of the inspiratory valve's command that is an edge, percentage points.
 EDGE_SIZE = 5.0
+
+#: Time after the start of expiration from which little moves, s.
+_QUIET_AFTER = 0.6
+
+#: Share of the samples from which a range is no place.
+_MOST = 0.9
+
+#: Random signs of innovations.
+_FLIPS = 1000
+
+#: Directions that a breath's samples tell apart by less than this share are one.
+_RIDGE = 1e-3
 
 #: Axis of the time since a valve's edge.
 EDGE = "time since a valve edge"
@@ -85,8 +99,9 @@ def locate(
     """Find the ranges of phase, command, pressure and other quantities in which a simulator errs.
 
     There are two tests for each range, over breaths: whether the mean error is zero, and whether
-    the squared error exceeds that outside the range, which catches errors whose sign changes from
-    breath to breath. The p-values are corrected for all ranges of all axes and for both tests: if
+    neighbouring errors share more than outside the range, which catches errors whose sign changes
+    from breath to breath. Noise that grows with flow has larger squares, but neighbours of it share
+    nothing. The p-values are corrected for all ranges of all axes and for both tests: if
     nothing is missing, the probability that any region is returned is ``settings.level``.
 
     Args:
@@ -127,8 +142,8 @@ def locate(
         own = slice(offset, offset + len(axis))
         offset += len(axis)
         for first, last in _runs(p_value[own] <= settings.level, sign[own], axis.merge):
-            if axis.merge and len(axis) > 1 and _is_whole_axis(axis, usable, first, last):
-                continue  # the whole of an axis is no place
+            if axis.merge and len(axis) > 1 and _is_most_of_axis(axis, usable, first, last):
+                continue  # nearly the whole of an axis is no place
             inside = usable & (axis.bins >= first) & (axis.bins <= last)
             share = squares[inside].sum() / max(float(squares.sum()), 1e-12)
             regions.append(
@@ -183,6 +198,15 @@ def errors(breaths: Breaths, simulated: Floats) -> tuple[Floats, Bools]:
     difference = breaths.pressure - np.asarray(simulated, float)
     usable = breaths.valid & np.isfinite(difference)
     return np.where(usable, difference, 0.0), usable
+
+
+def quiet_samples(breaths: Breaths) -> Bools:
+    """Where nothing moves: late in expiration while the inspiratory valve rests, ``(n, T)``."""
+    out = (breaths.u_out == 1) & breaths.valid
+    opened = np.where(out, breaths.time, np.inf).min(axis=1, keepdims=True)
+    late = out & (breaths.time > opened + _QUIET_AFTER)
+    rest = np.ma.median(np.ma.masked_array(breaths.u_in, ~late), axis=1).filled(0.0)
+    return late & (np.abs(breaths.u_in - rest[:, None]) < EDGE_SIZE)
 
 
 def statistic(
@@ -271,13 +295,13 @@ def _sums(axis: Axis, values: Floats, usable: Bools) -> tuple[Floats, Floats]:
 
 
 def _test_columns(axis: Axis, error: Floats, usable: Bools) -> tuple[Floats, Floats, Floats]:
-    """Mean error, and excess of the mean square over that outside, by breath and range; weights.
+    """Mean error, and excess of the shared square over that outside, by breath and range; weights.
 
     "Outside" is the rest of the same breath or, if the range is the whole breath, other breaths.
     The mean of the others is as uncertain as the range's own, for which a weight below one makes
     the statistic smaller.
     """
-    square = np.where(usable, error**2, 0.0)
+    square = np.where(usable, shared_square(error, usable), 0.0)
     total, count = _sums(axis, square, usable)
     inside = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
     all_count = usable.sum(axis=1, keepdims=True)
@@ -299,6 +323,94 @@ def _test_columns(axis: Axis, error: Floats, usable: Bools) -> tuple[Floats, Flo
     return _breath_means(axis, error, usable), inside - outside, weight
 
 
+def shared_square(error: Floats, usable: Bools) -> Floats:
+    """Product of each error with the mean of its neighbours, cmH2O^2, ``(n, T)``.
+
+    Its mean is the variance of what they share, and zero for white noise of any size.
+    """
+    near, count = np.zeros(error.shape), np.zeros(error.shape)
+    known = np.where(usable, error, 0.0)
+    for ahead, behind in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+        near[:, ahead] += known[:, behind]
+        count[:, ahead] += usable[:, behind]
+    return known * near / np.maximum(count, 1.0)
+
+
+class Excess(NamedTuple):
+    """What neighbouring readings of an error share beyond what those of the sensor do."""
+
+    noise: float  #: root-mean-square of the noise, cmH2O; NaN if unknown.
+    size: float  #: root-mean-square beyond it where something moves, cmH2O.
+    p_value: float  #: probability of as much by chance; 1 if it is not material.
+
+    @property
+    def outweighs_noise(self) -> bool:
+        """Whether more is shared than is noise, which few breaths may show without a small p."""
+        return self.size > self.noise
+
+
+def excess_over_noise(error: Floats, usable: Bools, quiet: Bools) -> Excess:
+    """Compare errors with the noise that neighbouring readings show.
+
+    With the second difference ``d`` of three readings, ``d^2 / 6`` is the variance of white noise,
+    whatever its tails and however it grows with flow, and ``r^2 - d^2 / 6`` has the mean zero. What
+    readings share late in expiration, where nothing moves (slow noise of the sensor, hum), they may
+    share everywhere: there, two coefficients of an autoregression are estimated. Beside it, the
+    sign of each innovation is as likely as the other: random flips give the p-value of the sum of
+    products of neighbours.
+
+    Args:
+        error: errors of n breaths of T samples, zero where unknown, cmH2O, ``(n, T)``.
+        usable: where they are known.
+        quiet: where nothing moves.
+    """
+    rows = [(error[b, own], quiet[b, own]) for b, own in enumerate(usable) if own.sum() > 2]
+    if not rows:
+        return Excess(float("nan"), 0.0, 1.0)
+    now = np.concatenate([r[2:] for r, _ in rows])
+    before = np.concatenate([np.stack([r[1:-1], r[:-2]]) for r, _ in rows], axis=1)
+    white = (now - 2.0 * before[0] + before[1]) ** 2 / 6.0
+    rests = np.concatenate([q[:-2] for _, q in rows])  # all three do
+    moves = np.concatenate([~(q[2:] | q[:-2]) for _, q in rows])
+    shared, memory = 0.0, np.zeros(2)
+    if rests.any():
+        least = max(float(white[rests].sum()), 1e-12)
+        shared = max(float(np.sum(before[0, rests] ** 2)) / least - 1.0, 0.0)
+        power = before[:, rests] @ before[:, rests].T
+        memory = solve(power + 1e-9 * np.eye(2), before[:, rests] @ now[rests])
+    expected = (1.0 + shared) * white
+    noise = float(np.sqrt(expected[moves | rests].mean())) if (moves | rests).any() else np.nan
+    if not moves.any():
+        return Excess(noise, 0.0, 1.0)
+    size = float(np.mean((before[0] ** 2 - expected)[moves]))
+    if size <= MIN_EXCESS * noise**2:
+        return Excess(noise, float(np.sqrt(max(size, 0.0))), 1.0)
+    innovation = now - memory @ before
+    pairs = moves[1:] & moves[:-1]
+    pairs[np.cumsum([len(r) - 2 for r, _ in rows])[:-1] - 1] = False  # of two breaths
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_FLIPS, len(innovation)))
+    products = innovation[1:] * innovation[:-1] * pairs
+    by_chance = (signs[:, 1:] * signs[:, :-1]) @ products
+    above = np.count_nonzero(by_chance >= products.sum() * (1.0 - 1e-12))
+    return Excess(noise, float(np.sqrt(size)), (1.0 + above) / (1.0 + _FLIPS))
+
+
+def amplitudes(error: Floats, usable: Bools, signals: Floats) -> Floats:
+    """Least-squares amplitude of each signal in each breath, ``(n, k)``.
+
+    Args:
+        error: errors of n breaths, zero where unknown, cmH2O, ``(n, T)``.
+        usable: where they are known.
+        signals: what each breath may have of its own, ``(n, T, k)``.
+    """
+    weighted = np.where(usable[..., None], signals, 0.0)
+    scale = np.sqrt(np.maximum((weighted**2).sum(axis=1), 1e-12))
+    normal = np.einsum("nti,ntj->nij", weighted, weighted) / (scale[:, :, None] * scale[:, None])
+    right = np.einsum("nti,nt->ni", weighted, error) / scale
+    normal = normal + _RIDGE * np.eye(signals.shape[-1])
+    return solve(normal, right[..., None])[..., 0] / scale
+
+
 def _nanmean(values: Floats) -> Floats:
     """Mean over the first axis without NaN; unlike NumPy's it does not warn of empty columns."""
     known = np.isfinite(values)
@@ -317,9 +429,9 @@ def _runs(significant: Bools, sign: Floats, merge: bool) -> list[tuple[int, int]
     return runs
 
 
-def _is_whole_axis(axis: Axis, usable: Bools, first: int, last: int) -> bool:
+def _is_most_of_axis(axis: Axis, usable: Bools, first: int, last: int) -> bool:
     used = axis.bins[usable & (axis.bins >= 0)]
-    return bool(used.size) and first <= used.min() and last >= used.max()
+    return bool(used.size) and bool(np.mean((used >= first) & (used <= last)) > _MOST)
 
 
 def axes(breaths: Breaths, pressure: Floats, flow: Floats, volume: Floats) -> tuple[Axis, ...]:
@@ -416,7 +528,12 @@ def _parts(breaths: Breaths) -> list[Axis]:
     cuts = np.round(np.linspace(0, n, count + 1))
     number = np.repeat(np.arange(n)[:, None], breaths.time.shape[1], axis=1)
     bins = np.where(breaths.valid, np.searchsorted(cuts, number, side="right") - 1, -1)
-    return [Axis("breath number", "1", cuts, bins)] if count > 1 else []
+    # Breaths that are not here keep their numbers.
+    edges = breaths.breath_id[np.maximum(cuts.astype(int) - 1, 0)].astype(float)
+    edges[0] -= 1.0
+    if np.any(np.diff(breaths.breath_id) < 0):  # numbers that begin anew
+        edges = cuts
+    return [Axis("breath number", "1", edges, bins)] if count > 1 else []
 
 
 def _lungs(breaths: Breaths) -> list[Axis]:

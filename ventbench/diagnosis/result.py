@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import html
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ventbench.base import VERSION, errors, files
+from ventbench.base.compilation import float64
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import (
     ErrorRegion,
@@ -17,8 +18,11 @@ from ventbench.diagnosis.findings import (
     NonparametricTerm,
 )
 from ventbench.physics import mechanism
+from ventbench.physics.model import Physics
+from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import save_plants
 from ventbench.system_id.data import Floats
+from ventbench.task.interfaces import Plant
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,6 +62,20 @@ class Diagnosis(Findings):
         Rows are the breaths of ``traces.breaths``: those of the recording that could be used.
         """
         return self.traces.after
+
+    def plants_at(self, position: float) -> dict[str, Plant]:
+        """The corrected simulators as the rig was at one moment of the recording, by label.
+
+        :attr:`plants` are those at its end, which ``corrected.json`` holds. Both are the same where
+        nothing changes in the course of the recording.
+
+        Args:
+            position: 0 for the first breath, 1 for the last.
+        """
+        with float64():
+            return {
+                lung: at_position(plant, float(position)) for lung, plant in self.plants.items()
+            }
 
     def to_frame(self) -> pd.DataFrame:
         """The missing mechanisms as a table, one row a parameter.
@@ -196,10 +214,18 @@ class Diagnosis(Findings):
         return files.json_values(plain)
 
 
+def at_position(plant: Any, position: float) -> Any:
+    """A plant at a position of the recording; the same one if nothing changes in it."""
+    if isinstance(plant, Corrected):
+        return replace(plant, with_mechanisms=at_position(plant.with_mechanisms, position))
+    changes = isinstance(plant, Physics) and "position" in plant.names
+    return plant.having(position=position) if changes else plant
+
+
 def _mechanism(missing: MissingMechanism) -> dict[str, Any]:
     plain = asdict(missing)
     return plain | {
-        "preferred_over_other_names": missing.confidence,
+        "probability": missing.confidence,
         "simulator_has": plain.pop("simulator_values"),
         "first_breath": plain.pop("breaths"),
         "affected_breaths": plain.pop("affected"),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "evidence-1"
+VERSION = "evidence-2"
 
 
 @dataclass(frozen=True)
@@ -127,11 +127,6 @@ class CorrectionSettings:
     #: error of such a refit over that of the reported parameters, below which the corrected
     #: simulator has the refit's parameters.
     drift_ratio: float = 0.98
-    #: error of the corrected simulator over the measurement noise from which something is missing,
-    #: named or not.
-    unexplained_ratio: float = 2.0
-    #: least root-mean-square error beyond the noise, cmH2O, for the same.
-    unexplained_error: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -161,9 +156,6 @@ class ResidualSettings:
     #: root-mean-square error, cmH2O, below which an effect is worth nothing: the step of a
     #: converter of 12 bits over 80 cmH2O.
     negligible: float = 0.02
-    #: times the scatter of quiet readings from which the model's noise may hold part of what is
-    #: missing. Coloured noise scatters about a parabola by a quarter less than at all.
-    absorbed: float = 1.5
 
 
 @dataclass(frozen=True)

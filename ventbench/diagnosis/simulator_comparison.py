@@ -185,11 +185,12 @@ def with_sensor_noise(
     from scipy import signal  # here, as it takes long to import
 
     rng = np.random.default_rng(seed)
-    sigma, ar = noise.sigma[0], noise.ar[0]
-    fresh = rng.normal(0.0, sigma * np.sqrt(1.0 - ar**2), response.shape)
-    fresh[:, 0] = rng.normal(0.0, sigma, len(fresh))
+    sigma, ar, slow = noise.sigma[0], noise.ar[0], noise.slow[0]
+    fresh = rng.normal(0.0, sigma * np.sqrt(slow * (1.0 - ar**2)), response.shape)
+    fresh[:, 0] = rng.normal(0.0, sigma * np.sqrt(slow), len(fresh))
     coloured = signal.lfilter([1.0], [1.0, -ar], fresh)
-    return data.with_pressure(np.nan_to_num(response) + coloured)
+    white = rng.normal(0.0, sigma * np.sqrt(1.0 - slow), response.shape)
+    return data.with_pressure(np.nan_to_num(response) + coloured + white)
 
 
 def refit_base_parameters(

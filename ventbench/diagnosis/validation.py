@@ -16,7 +16,11 @@ breath starts from, and a shift ``z`` of the zero, by least squares. If nothing 
 are exchangeable: the order of ``a_b``, of ``z_b`` and of the size of ``r_b`` says nothing. A test
 by ranks asks that (after Pettitt, Applied Statistics 28, 1979), and permutations of the breaths of
 each lung give its p-value whatever the noise. Scatter of gains that has an order is thus no noise.
-The rest is tested along all axes (:func:`~ventbench.diagnosis.residual_analysis.locate`).
+The rest is tested along all axes (:func:`~ventbench.diagnosis.residual_analysis.locate`), and
+against the noise itself.
+
+Noise is what neighbouring readings do not share (:func:`~.residual_analysis.excess_over_noise`),
+whatever its tails and however it grows with flow.
 
 "Nothing is missing" is worth as much as the recording could tell. The effect of a mechanism on the
 prediction, less what a refit absorbs, is a template (see :func:`~.hypothesis.linearise`). Its power
@@ -42,7 +46,14 @@ from ventbench.diagnosis.hypothesis import (
     linearise,
     varies_by_breath,
 )
-from ventbench.diagnosis.residual_analysis import errors, locate
+from ventbench.diagnosis.residual_analysis import (
+    Excess,
+    amplitudes,
+    errors,
+    excess_over_noise,
+    locate,
+    quiet_samples,
+)
 from ventbench.diagnosis.settings import (
     DEFAULT,
     HeldOutTestSettings,
@@ -56,9 +67,6 @@ from ventbench.recordings.breaths import Breaths
 #: Gain on the testing breaths that is expected at a detection limit, nats: twice the bound of the
 #: held-out test, since the gain itself scatters; and strengths at which the effect is simulated.
 _NATS, _ROUNDS = 2.0 * DEFAULT.held_out_test.threshold, 2
-
-#: Directions that a breath's samples tell apart by less than this share are one.
-_RIDGE = 1e-3
 
 
 def is_plausible(fitted: FittedModel, name: str, settings: PlausibilitySettings) -> bool:
@@ -301,6 +309,10 @@ class Adequacy:
     #: significant and material orders in time, the largest effect first.
     changes: tuple[Change, ...]
     vetoed: bool  #: whether "nothing is missing" would be wrong.
+    #: root-mean-square of the noise by neighbouring readings, cmH2O; NaN if unknown.
+    noise: float
+    #: root-mean-square beyond the noise where something moves, cmH2O; 0 if chance may do it.
+    excess: float
 
 
 def check_residuals(
@@ -312,6 +324,7 @@ def check_residuals(
     flow: Floats,
     volume: Floats,
     *,
+    judged: Excess | None = None,
     gains_scatter: bool,
     settings: ResidualSettings,
 ) -> Adequacy:
@@ -325,16 +338,17 @@ def check_residuals(
         noise_sd: standard deviation of the measurement, cmH2O.
         flow: flow of the refitted simulator, mL/s, ``(n, T)``.
         volume: volume of the refitted simulator, mL, ``(n, T)``.
+        judged: what breaths that are not here show beyond noise.
         gains_scatter: whether gains that differ from breath to breath are no error.
         settings: levels and ranges.
     """
     error, usable = errors(breaths, simulated)
     signals = np.stack([gain, np.ones_like(gain), start], axis=-1)  # (n, T, 3)
-    amplitudes = _amplitudes(error, usable, signals)
-    rest = error - np.einsum("ntk,nk->nt", signals, amplitudes)
+    sizes = amplitudes(error, usable, signals)
+    rest = error - np.einsum("ntk,nk->nt", signals, sizes)
     size = np.sqrt(_mean_square(rest, usable))
-    of_start = signals[..., 2] * amplitudes[:, 2:]
-    own_gain = signals[..., 0] * amplitudes[:, :1] if gains_scatter else 0.0
+    of_start = signals[..., 2] * sizes[:, 2:]
+    own_gain = signals[..., 0] * sizes[:, :1] if gains_scatter else 0.0
     regions = locate(
         breaths,
         simulated + of_start + own_gain,
@@ -346,16 +360,18 @@ def check_residuals(
     )
     lungs = np.unique(breaths.lung_ids, return_inverse=True)[1]
     series: dict[Quantity, Floats] = {
-        "gain": amplitudes[:, 0],
-        "zero": amplitudes[:, 1],
+        "gain": sizes[:, 0],
+        "zero": sizes[:, 1],
         "error": size,
     }
+    shared = excess_over_noise(error - of_start - own_gain, usable, quiet_samples(breaths))
     p = [order_p_value(each, lungs, settings) for each in series.values()]
     p.append(min((region.p_value for region in regions), default=1.0))
+    p += [shared.p_value, 1.0 if judged is None else judged.p_value]
     significant = passes_fdr(np.array(p), settings.veto_level)
     whole = _mean_square(error - of_start, usable)
     # The simulator's own gain in units of the sensitivity, which may be that of another lung.
-    gain_here = np.median(_amplitudes(np.where(usable, simulated, 0.0), usable, signals)[:, 0])
+    gain_here = np.median(amplitudes(np.where(usable, simulated, 0.0), usable, signals)[:, 0])
     offsets = {"gain": max(float(gain_here), 0.1), "error": 0.0}
     changes = []
     for k, (name, each) in enumerate(series.items()):
@@ -375,7 +391,10 @@ def check_residuals(
             number = int(breaths.breath_id[first])
             changes.append(Change(name, number, float(how_much), drifts, p[k], float(worth)))
     changes.sort(key=lambda change: -change.worth)
-    return Adequacy(regions, tuple(changes), bool(changes) or bool(significant[-1]))
+    vetoed = bool(changes) or bool(significant[len(series) :].any())
+    vetoed |= judged is not None and judged.outweighs_noise
+    excess = shared.size if significant[len(series) + 1] else 0.0
+    return Adequacy(regions, tuple(changes), vetoed, shared.noise, excess)
 
 
 def order_p_value(
@@ -410,16 +429,6 @@ def passes_fdr(p_values: Floats, level: float) -> Bools:
     from scipy.stats import false_discovery_control
 
     return np.asarray(false_discovery_control(p_values) <= level)
-
-
-def _amplitudes(error: Floats, usable: Bools, signals: Floats) -> Floats:
-    """Least-squares amplitude of each signal in each breath, ``(n, k)``."""
-    weighted = np.where(usable[..., None], signals, 0.0)
-    scale = np.sqrt(np.maximum((weighted**2).sum(axis=1), 1e-12))
-    normal = np.einsum("nti,ntj->nij", weighted, weighted) / (scale[:, :, None] * scale[:, None])
-    right = np.einsum("nti,nt->ni", weighted, error) / scale
-    normal = normal + _RIDGE * np.eye(signals.shape[-1])
-    return np.linalg.solve(normal, right[..., None])[..., 0] / scale
 
 
 def _step_or_line(values: Floats, groups: Ints) -> tuple[int, Floats, bool]:

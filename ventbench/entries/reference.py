@@ -2,7 +2,7 @@
 
 ``data/bounds-v2.npz`` holds both for the nominal cells and the development draws,
 with the commands that attain the bound: whoever applies them gets the same errors.
-``ventbench headroom`` makes the file again, and those of other draws.
+``ventbench board headroom`` makes the file again, and those of other draws.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from ventbench.task.metrics import score as metric
 #: The published file for the development draws.
 FILE = "bounds-v2.npz"
 
-#: Its SHA-256, as `ventbench headroom` prints it: a change of the bounds is a change of this line.
+#: Its SHA-256, as `ventbench board headroom` prints it: new bounds are a change of this line.
 SHA256 = "6b21e912e7f3dcc153932d124ebb00a69c4561c819b3eb49d307a31a2f8df90c"
 
 #: By how much a second optimiser may do better, cmH2O: a tenth of the least headroom.
@@ -132,7 +132,8 @@ def load(path: Path) -> Reference:
         # numpy takes whatever it does not know for a pickle.
         why = "it is no .npz archive" if "pickle" in str(error) else error
         raise InputError(
-            f"{path} is not a file of reference errors: {why}; make it with `ventbench headroom`"
+            f"{path} is not a file of reference errors: {why}; make it with "
+            "`ventbench board headroom`"
         ) from error
     return Reference(about, **arrays)
 
@@ -188,7 +189,8 @@ def reference_of(
         return None
     raise InputError(
         f"the reference errors are of simulators {str(own['simulators'])[:12]} and draws {has}, "
-        f"not of {str(wanted['simulators'])[:12]} and {needed}; make them with `ventbench headroom`"
+        f"not of {str(wanted['simulators'])[:12]} and {needed}; make them with "
+        "`ventbench board headroom`"
     )
 
 

@@ -30,6 +30,7 @@ from ventbench.mechanics.regression import (
     TIMES,
     CrossProducts,
     RegressionFit,
+    bounded,
     columns_of,
     course,
     covariance,
@@ -45,6 +46,7 @@ from ventbench.mechanics.term_selection import (
     delay,
     select_terms,
 )
+from ventbench.recordings.bad_samples import clean, isolated
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.roles import check_roles, find_saturation
 from ventbench.system_id.fit import t_quantile
@@ -194,7 +196,7 @@ def identify(
     Raises:
         InputError: if neither is recorded, or too little of a lung to tell R from C.
     """
-    lungs, done = [], 0
+    breaths, lungs, done = clean(breaths), [], 0
     for name, part in breaths.by_lung().items():
         lungs.append(_identify_lung(name, part))
         done += len(part)
@@ -241,6 +243,7 @@ def _doubted(lung: Mechanics, shown: dict[str, int], count: int) -> Mechanics:
 
 
 def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
+    breaths, unlikely = _without_unlikely(breaths)
     measured = segments(breaths)
     if not measured:
         raise InputError(
@@ -248,7 +251,7 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
             "record longer pieces"
         )
     at_lung, delayed_by = delay(measured)
-    table = cross_products(at_lung)
+    table = bounded(cross_products(at_lung))
     selected = select_terms(table)
     full = _fit_lung(table, selected, at_lung, breaths)
     plain = _fit_lung(table, _quadratic_resistance(table), at_lung, breaths)
@@ -256,7 +259,7 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     best = _best_for_label(full, plain, label)
     source = "pressure and flow" if breaths.flow is not None else "pressure and volume"
     noise = float(full.fitted.sigma / np.sqrt(1.0 - full.fitted.autocorrelation**2))
-    notes = tuple(_notes(breaths, at_lung, table, noise))
+    notes = (*unlikely, *_notes(breaths, at_lung, table, noise))
     samples = sum(len(segment) for segment in at_lung)
     problem = problem_with(breaths, best.resistance(0.0), best.compliance())
     shows = {fault: term in [s.name for s in selected] for fault, term in _FITTED.items()}
@@ -297,6 +300,37 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     )
 
 
+def _without_unlikely(breaths: Breaths) -> tuple[Breaths, list[str]]:
+    """Breaths without single samples that no lung explains, and a note on them.
+
+    What R and C leave of the pressure is smooth up to noise, whatever else the lung does: a sample
+    that stands out of what its neighbours leave is a wrong pressure or a wrong flow. That of the
+    two is left out which stands out of its own neighbours by more.
+    """
+    if breaths.flow is None or not (measured := segments(breaths)):
+        return breaths, []
+    table = cross_products(measured, range(len(BASE)))
+    fitted = fit(bounded(table), np.ones(len(table), bool), range(len(BASE)))
+    r, elastance = fitted.coefficients[:2] / 1000.0
+    flow = np.where(breaths.valid, breaths.flow, np.nan)
+    volume = np.cumsum(np.nan_to_num(flow) * breaths.dt, axis=1)
+    left = (breaths.pressure - r * flow - elastance * volume)[breaths.valid]
+    out = np.zeros(breaths.valid.shape, bool)
+    out[breaths.valid] = isolated(left)
+    count = int(out.sum())
+    if not count:
+        return breaths, []
+
+    def stands_out(values: Floats) -> Floats:
+        padded = np.pad(values, ((0, 0), (1, 1)), mode="edge")
+        return np.abs(values - 0.5 * (padded[:, 2:] + padded[:, :-2]))
+
+    of_flow = out & (r * stands_out(flow) > stands_out(breaths.pressure))
+    note = f"{count} samples that neither their neighbours nor the lung explain were left out."
+    pressure = np.where(out & ~of_flow, np.nan, breaths.pressure)
+    return replace(breaths, pressure=pressure, flow=np.where(of_flow, np.nan, breaths.flow)), [note]
+
+
 def _fit_lung(
     table: CrossProducts,
     selected: tuple[SelectedTerm, ...],
@@ -306,8 +340,13 @@ def _fit_lung(
     columns = (*range(len(BASE)), *(term.column for term in selected))
     fitted = fit(table, np.ones(len(table), bool), columns)
     # A flow may jump between two samples, which a measured volume shows.
-    blur = 0.0 if breaths.volume is not None else 0.25 * float(np.median(breaths.dt))
-    return LungFit(fitted, covariance(table, fitted), table, segments, blur)
+    blur, jump = 0.0, 0.0
+    if breaths.volume is None and breaths.flow is not None:
+        steps = np.abs(np.diff(np.where(breaths.valid, breaths.flow, np.nan), axis=1))
+        known = np.isfinite(steps).any(axis=1)
+        blur = 0.5 * float(np.median(breaths.dt[breaths.valid]))
+        jump = 0.001 * float(np.median(np.nanmax(steps[known], axis=1)))
+    return LungFit(fitted, covariance(table, fitted), table, segments, blur, jump)
 
 
 def _quadratic_resistance(table: CrossProducts) -> tuple[SelectedTerm, ...]:
@@ -383,7 +422,8 @@ class LungFit:
     covariance: Floats  #: covariance of its coefficients, ``(k, k)``.
     table: CrossProducts  #: cross products of its breaths.
     segments: tuple[Segment, ...]  #: segments of the breaths.
-    blur: float  #: uncertainty of the time over which the flow is integrated, s.
+    blur: float  #: most by which the time of a jump of the flow is off, s.
+    jump: float  #: largest step of the flow from one sample to the next, median of breaths, L/s.
 
     def resistance(self, flow: float) -> Estimate:
         """Inspiratory resistance at a flow, L/s, and at half of the tidal volume, cmH2O/(L/s)."""
@@ -409,7 +449,10 @@ class LungFit:
         elastance = self._derived(
             lambda x: (x("elastance") + x("nonlinear_compliance") * tidal) * _leak_factor(x), ""
         )
-        low, high = (max(end, 1e-3) for end in elastance.ci95)
+        half_width = 0.5 * (elastance.ci95[1] - elastance.ci95[0])
+        jumps = elastance.value * self.blur * self.jump / tidal
+        reach = float(np.hypot(half_width, jumps))
+        low, high = (max(elastance.value + side * reach, 1e-3) for side in (-1.0, 1.0))
         return Estimate(1000.0 / elastance.value, "mL/cmH2O", (1000.0 / high, 1000.0 / low))
 
     def offset(self) -> Estimate:

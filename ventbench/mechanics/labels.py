@@ -16,8 +16,8 @@ from ventbench.task.lungs import RECORDED_LUNGS, Lung
 if TYPE_CHECKING:
     from ventbench.system_id import Fit
 
-#: Factors by which R and C may differ from the label beyond their intervals: calibration errors of
-#: lung and sensors.
+#: Factors by which R and C may differ from the label beyond their intervals in 95 % of cases:
+#: calibration errors of lung and sensors.
 TOLERANCE_R, TOLERANCE_C = 1.3, 1.2
 
 #: Resistance of tubes and filters between pressure sensor and lung, by which R may be larger,
@@ -30,6 +30,9 @@ INFORMATIVE = 2.5
 
 #: Flow at which a parabolic resistor has its nominal resistance, L/s.
 REFERENCE_FLOW = 1.0
+
+#: Normal quantile of 97.5 %, and quantile of 99 % of chi square of two degrees of freedom.
+_Z95, _CHI2 = 1.96, 9.21
 
 #: Factor by which the gain of the valve may be wrong where flow is not measured.
 GAIN = 1.2
@@ -70,7 +73,11 @@ Resistance = Callable[[float], Estimate]
 
 
 def fits(resistance: Resistance, compliance: Estimate, setting: Lung, scale: float = 1.0) -> bool:
-    """Whether a setting is within tolerance of the intervals of R and C.
+    """Whether R and C are as near to a setting as independent errors put them in 99 % of cases.
+
+    The logarithms of R and C are off by the tolerances of lung and sensors, by what their intervals
+    say, and both together by the gain of the valve, each of which is a 95 % interval. Tubes may add
+    any part of their resistance. That all are off at their ends at once is no longer chance.
 
     Args:
         resistance: resistance of the lung as a function of flow.
@@ -78,13 +85,38 @@ def fits(resistance: Resistance, compliance: Estimate, setting: Lung, scale: flo
         setting: lung setting to compare with.
         scale: common factor by which R and 1/C may be wrong.
     """
+    (r, of_R), (c, of_C) = _off_R(resistance, setting), _off_C(compliance, setting)
+    common = (math.log(scale) / _Z95) ** 2
+    first, second = of_R + common, of_C + common
+    if math.isinf(first) or math.isinf(second):  # one says nothing
+        return min(c**2 / second if math.isinf(first) else r**2 / first, math.inf) <= _CHI2
+    determinant = first * second - common**2
+    return (second * r**2 - 2.0 * common * r * c + first * c**2) / determinant <= _CHI2
+
+
+def _off_R(resistance: Resistance, setting: Lung) -> tuple[float, float]:
+    """Logarithm of R, less the likeliest part of the tubes, over a setting's; and its variance."""
     low, high = resistance(REFERENCE_FLOW).ci95
-    ends = (low - APPARATUS) / TOLERANCE_R, high * TOLERANCE_R
-    from_R = [_log(end / setting.R) for end in ends]
+    at = _middle(low, high)
+    low, high, at = (x - min(max(at - setting.R, 0.0), APPARATUS) for x in (low, high, at))
+    return _log(at / setting.R), _variance(low, high, TOLERANCE_R)
+
+
+def _off_C(compliance: Estimate, setting: Lung) -> tuple[float, float]:
+    """Logarithm of the elastance over a setting's, and its variance."""
     low, high = compliance.ci95
-    from_C = [_log(setting.C / end) for end in (high * TOLERANCE_C, low / TOLERANCE_C)]
-    reach = math.log(scale)
-    return max(from_R[0], from_C[0], -reach) <= min(from_R[1], from_C[1], reach) + 1e-12
+    return _log(setting.C / _middle(low, high)), _variance(low, high, TOLERANCE_C)
+
+
+def _middle(low: float, high: float) -> float:
+    """Middle of an interval of a factor; its upper end where the lower one is no factor."""
+    return math.sqrt(low * high) if low > 0.0 else high
+
+
+def _variance(low: float, high: float, tolerance: float) -> float:
+    if not low > 0.0 or not math.isfinite(high):
+        return math.inf
+    return (math.log(tolerance) / _Z95) ** 2 + (0.5 * math.log(high / low) / _Z95) ** 2
 
 
 def matching_settings(
@@ -115,7 +147,18 @@ def match_label(
     """
     at = resistance(REFERENCE_FLOW)
     same = fits(resistance, compliance, label, scale)
-    known = _is_informative(at.ci95, APPARATUS) and _is_informative(compliance.ci95)
+    r, c = (at.ci95, APPARATUS), (compliance.ci95, 0.0)
+    known = all(_is_informative(*each) for each in (r, c))
+    # A fit that cannot tell one of them is not trusted with the other, but a wide interval that
+    # the label lies beyond contradicts it.
+    beyond = [
+        off**2 > _CHI2 * (variance + (math.log(scale) / _Z95) ** 2)
+        for (off, variance), each in (
+            (_off_R(resistance, label), r),
+            (_off_C(compliance, label), c),
+        )
+        if not _is_informative(*each)
+    ]
     near = [setting.id for setting in matching_settings(resistance, compliance, scale)]
     if same and known:  # what holds comes first, whatever is nearer
         near.sort(key=lambda setting: setting != label.id)
@@ -128,7 +171,7 @@ def match_label(
         same and known,
         source,
         tuple(near),
-        informative=known or not same,
+        informative=known or any(beyond),
     )
 
 
@@ -158,7 +201,7 @@ def label_texts(match: LungMatch) -> tuple[str, str]:
 
 
 def tolerance_text() -> str:
-    """How far R and C may be from a label that holds, in words."""
+    """How far each of R and C may be from a label that holds, in words."""
     return (
         f"R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, "
         f"C by a factor of {TOLERANCE_C:g}"

@@ -20,6 +20,7 @@ from itertools import product
 import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
+from ventbench.base.linear import inverse, solve
 from ventbench.mechanics.segments import Segment
 
 #: Autocorrelations between neighbouring smoothed samples.
@@ -244,11 +245,11 @@ def fit(table: CrossProducts, which: Bools, columns: Sequence[int]) -> Regressio
         sigma = np.sqrt(square / max(freedom - len(columns), 1.0))
         return np.maximum(sigma, _LEAST_SIGMA), square
 
-    x = np.linalg.solve(left, right[..., None])[..., 0]
+    x = solve(left, right[..., None])[..., 0]
     precision = _zero_precision(x[:, _ELASTANCE])
     left = left.copy()
     left[:, _FLOW_ZERO, _FLOW_ZERO] += sigma_of(x)[0] ** 2 * precision
-    x = np.linalg.solve(left, right[..., None])[..., 0]
+    x = solve(left, right[..., None])[..., 0]
     sigma, square = sigma_of(x)
     value = constants - freedom * np.log(sigma) - 0.5 * square / sigma**2
     value -= 0.5 * precision * x[:, _FLOW_ZERO] ** 2
@@ -261,15 +262,38 @@ def log_likelihood(table: CrossProducts, fitted: RegressionFit) -> Floats:
 
     Offsets and the scatter of drifts are integrated out.
     """
-    pick = [*fitted.columns, -1]
-    products = table.products[:, fitted.grid][:, pick][:, :, pick]
-    towards = np.append(fitted.coefficients, -1.0)
-    square = np.einsum("i,bij,j->b", towards, products, towards)
+    square = _squares(table, fitted)
     return (
         table.constant[:, fitted.grid]
         - table.freedom * np.log(fitted.sigma)
         - 0.5 * square / fitted.sigma**2
     )
+
+
+#: Residual of a breath over the median one, as a ratio of variances, beyond which it counts less.
+_BOUND = 6.0
+
+
+def bounded(table: CrossProducts) -> CrossProducts:
+    """Bound the influence of breaths that no model of the others explains."""
+    if len(table) < 4:
+        return table
+    columns = (*range(len(BASE)), *columns_of("turbulent_resistance"))
+    fitted = fit(table, np.ones(len(table), bool), columns)
+    square = _squares(table, fitted) / np.maximum(table.freedom, 1.0)
+    weight = np.minimum(1.0, _BOUND * np.median(square) / np.maximum(square, 1e-12))
+    if (weight == 1.0).all():
+        return table
+    products = table.products * weight[:, None, None, None]
+    return CrossProducts(products, table.freedom * weight, table.constant * weight[:, None])
+
+
+def _squares(table: CrossProducts, fitted: RegressionFit) -> Floats:
+    """Sum of the squared innovations of each breath, cmH2O2, ``(b,)``."""
+    pick = [*fitted.columns, -1]
+    products = table.products[:, fitted.grid][:, pick][:, :, pick]
+    towards = np.append(fitted.coefficients, -1.0)
+    return np.einsum("i,bij,j->b", towards, products, towards)
 
 
 def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
@@ -283,7 +307,7 @@ def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
     curvature = products[:, columns][:, :, columns]
     total = _regularised(curvature.sum(axis=0))
     total[_FLOW_ZERO, _FLOW_ZERO] += fitted.sigma**2 * fitted.zero_precision
-    bread = np.asarray(np.linalg.inv(total), np.float64)
+    bread = inverse(total)
     model = bread * fitted.sigma**2
     count = len(table)
     if count < 3:
@@ -300,7 +324,7 @@ def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> flo
     others = [c for c in fitted.columns if c != column]
     total = table.products[:, 0].sum(axis=0)
     cross = total[others, column]
-    explained = cross @ np.linalg.solve(_regularised(total[np.ix_(others, others)]), cross)
+    explained = cross @ solve(_regularised(total[np.ix_(others, others)]), cross)
     square = total[column, column] - explained
     x = fitted.coefficients[fitted.columns.index(column)]
     return float(abs(x) * np.sqrt(max(square, 0.0) / table.freedom.sum()))

@@ -2,7 +2,9 @@
 
 The same window smooths all signals, which preserves the linear relations between them: the
 derivative of a smoothed volume is the smoothed flow, whatever the window. Missing samples and
-readings that are clipped at an end of the sensor's range are left out.
+readings that are clipped at an end of the sensor's range are left out. A flow that is missing for a
+moment is interpolated for the volume that it adds, if that is known well enough; else a breath is
+split there, and each part has an offset of its own.
 """
 
 from __future__ import annotations
@@ -29,6 +31,10 @@ FEWEST_SAMPLES = 12
 #: Samples at which flow is known in half a window, about: a lag is exact for a signal that is
 #: linear between them.
 _PER_HALF_WINDOW = 4
+
+#: Longest gap of the flow that is bridged, s, and most of the breath's volume that it may make
+#: uncertain.
+_BRIDGED, _UNCERTAIN = 0.12, 0.003
 
 #: Number of successive samples at the highest or lowest reading that count as clipped.
 _CLIPPED_RUN = 3
@@ -82,6 +88,8 @@ def segments(breaths: Breaths) -> tuple[Segment, ...]:
         parts = [(0, end)]
         if volume is None:
             assert flow is not None
+            flow[i, :end], bridged = _bridged(breaths.time[i, :end], flow[i, :end])
+            pressure[i, :end][bridged] = np.nan
             parts = runs(np.isfinite(flow[i, :end]))
         for start, stop in parts:
             part = slice(start, stop)
@@ -94,6 +102,23 @@ def segments(breaths: Breaths) -> tuple[Segment, ...]:
             if signals is not None:
                 smoothed.append(Segment(i, start == 0, *signals))
     return tuple(smoothed)
+
+
+def _bridged(time: Floats, flow: Floats) -> tuple[Floats, Bools]:
+    """Flow, L/s, with short gaps interpolated, and where, ``(m,)`` each."""
+    known = np.isfinite(flow)
+    bridged = np.zeros(len(flow), bool)
+    at = np.flatnonzero(known)
+    if known.all() or len(at) < 2:
+        return flow, bridged
+    volume = np.ptp(integrate(time[at], flow[at]))
+    for k in np.flatnonzero(np.diff(at) > 1):
+        before, after = at[k], at[k + 1]
+        gap, change = time[after] - time[before], abs(flow[after] - flow[before])
+        if gap <= _BRIDGED and 0.5 * gap * change <= _UNCERTAIN * volume:
+            bridged[before + 1 : after] = True
+    filled = np.interp(time, time[at], flow[at])
+    return np.where(known | bridged, np.where(known, flow, filled), np.nan), bridged
 
 
 def clipped_share(breaths: Breaths) -> float:
@@ -143,7 +168,7 @@ def _compared(fine: NDArray[np.intp], known: Bools, half: int, step: int) -> tup
     """
     complete = np.zeros(len(known), bool)
     for start, stop in runs(known):
-        complete[start + half : stop - half] = True
+        complete[start + half : max(stop - half, 0)] = True
     whole = complete[fine]
     # A run ends where a window is incomplete, and where the next centre is further away.
     ends = np.flatnonzero(np.diff(fine) > step) + 1

@@ -14,7 +14,10 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.base.linear import solve
+from ventbench.recordings.bad_samples import MEASURED
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.headers import UNITS
 
 SLOW = 0.5
 """Median sampling interval, s, above which times are not in seconds."""
@@ -34,12 +37,25 @@ _OPPOSITE = -0.25
 #: Share of a breath that is its end, and of its range of pressure above which it ends at its peak.
 _END, _PEAK = 0.1, 0.6
 
+#: Correlation of volume and integrated flow from which they are of one lung, and ratio from which
+#: they contradict each other: leaks and drifts of a sensor make less.
+_OF_ONE_LUNG, _CONTRADICTS = 0.9, 1.4
+
+#: A clock jumps over rows with a step of so many usual ones.
+_JUMP = 2.5
+
+#: Least inspiratory rows that tell whose commands pressures follow, and ratio of the variances.
+_NUMBERED, _FOLLOWS = 200, 0.6
+
 #: Saturation: fewest readings and share of them at the level, times as many as at the next level,
 #: and largest step from it as a share of the range (a square wave leaves its top by a larger one).
 _READINGS, _SHARE, _TIMES, _STEP = 10, 0.004, 3.0, 0.15
 
 #: Breaths that a diagnosis and a simulator of one's own need at least.
 _DIAGNOSIS, _TRAINING = 4, 10
+
+#: Samples that are looked at together, about.
+_TOGETHER = 1 << 17
 
 #: Agreement of R and C with an exchanged label, as a ratio, and largest agreement with the label.
 _EXCHANGED, _HELD = 1.35, 1.6
@@ -111,7 +127,9 @@ def breath_figures(
         "u_in_inside": mean(u_in, inside),
         "u_in_outside": mean(u_in, ~inside),
         "u_in": np.maximum.reduceat(u_in, starts),
+        "missing": _missing(time, starts, breath),
     }
+    out |= _commands_of(time, pressure, np.where(inside, u_in, np.nan), starts, breath)
     for name in ("pressure", "flow"):
         if name in samples:
             for side, sign in (("high", 1.0), ("low", -1.0)):
@@ -119,8 +137,46 @@ def breath_figures(
                     out[f"{name}_{side}{key}"] = values
             out[f"{name}_count"] = np.add.reduceat(np.isfinite(samples[name]) * 1.0, starts)
     if "flow" in samples:
-        out |= _regression(time, pressure, samples["flow"], starts, breath)
+        out |= _regression(time, pressure, samples["flow"], samples.get("volume"), starts, breath)
     return out
+
+
+def _missing(time: Floats, starts: Ints, breath: Ints) -> Floats:
+    """Rows that the clock of each breath jumps over."""
+    steps = np.where(np.diff(breath, prepend=-1) == 0, np.diff(time, prepend=np.nan), np.nan)
+    known = steps[np.isfinite(steps)]
+    if len(known) == 0:
+        return np.zeros(len(starts))
+    usual = float(np.median(known))
+    jumps = np.where(steps > _JUMP * usual, np.round(steps / max(usual, 1e-9)) - 1.0, 0.0)
+    return np.add.reduceat(jumps, starts)
+
+
+#: Breaths whose commands may stand beside a pressure: its own, the one before, the one after.
+_SHIFTS = (0, -1, 1)
+
+
+def _commands_of(
+    time: Floats, pressure: Floats, u_in: Floats, starts: Ints, breath: Ints
+) -> dict[str, Floats]:
+    """Cross products of p = a u + b V + c over inspirations, with the commands of three breaths."""
+    within = np.arange(len(time)) - starts[breath]
+    lengths = np.diff(starts, append=len(time))
+    dt = np.where(within > 0, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0)
+    volume = np.cumsum(np.nan_to_num(u_in) * dt)
+    volume -= volume[starts][breath]
+    sums = {}
+    for shift in _SHIFTS:
+        other = np.clip(breath + shift, 0, len(starts) - 1)
+        at = np.minimum(starts[other] + within, len(time) - 1)
+        good = (other == breath + shift) & (within < lengths[other])
+        good &= np.isfinite(u_in[at]) & np.isfinite(pressure) & np.isfinite(u_in)
+        columns = (u_in[at], volume[at], np.ones(len(time)), pressure)
+        columns = [np.where(good, x, 0.0) for x in columns]
+        for i, a in enumerate(columns):
+            for j, b in enumerate(columns[i:], i):
+                sums[f"shift{shift}:{i}{j}"] = np.add.reduceat(a * b, starts)
+    return sums
 
 
 def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
@@ -147,10 +203,14 @@ def _regression(
     time: Floats,
     pressure: Floats,
     flow: Floats,
+    measured: Floats | None,
     starts: Ints,
     breath: Ints,
 ) -> dict[str, Floats]:
-    """Correlation of pressure and flow, and the cross products of p = R Q + V / C + p0."""
+    """Correlation of pressure and flow, and the cross products of p = R Q + V / C + p0.
+
+    With a measured volume also how many times the integrated flow it is, and their correlation.
+    """
     known = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
     q = np.where(known, flow, 0.0)
     same = np.diff(breath, prepend=-1) == 0
@@ -163,6 +223,16 @@ def _regression(
         for a, b in ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p", "pp")
     }
     n = np.maximum(sums["11"], 1.0)
+    if measured is not None:
+        both = known & np.isfinite(measured)
+        count = np.maximum(np.add.reduceat(both * 1.0, starts), 1.0)
+        v, w = (np.where(both, x, 0.0) for x in (volume, measured))
+        v, w = (
+            np.where(both, x - (np.add.reduceat(x, starts) / count)[breath], 0.0) for x in (v, w)
+        )
+        vv, vw, ww = (np.add.reduceat(a * b, starts) for a, b in ((v, v), (v, w), (w, w)))
+        sums["volume_ratio"] = _ratio(vw, vv)
+        sums["volume_correlation"] = _ratio(vw, np.sqrt(vv * ww))
     covariance = sums["qp"] / n - sums["q1"] * sums["1p"] / n**2
     variances = (sums["qq"] / n - (sums["q1"] / n) ** 2) * (sums["pp"] / n - (sums["1p"] / n) ** 2)
     sums["correlation"] = _ratio(covariance, np.sqrt(np.maximum(variances, 0.0)))
@@ -228,6 +298,13 @@ def findings(
                 float(np.nanmedian(figures["correlation"])),
             )
         )
+    found += _volumes(figures)
+    found += _numbering(figures, R, C)
+    if missing := int(figures["missing"].sum()):
+        some = int((figures["missing"] > 0).sum())
+        what = f"the clock jumps over {missing} rows in {some} of {len(spans)} breaths"
+        advice = "What was commanded meanwhile is unknown: leave such breaths out, or record again."
+        found.append(Finding("time_step", what, advice, value=missing))
     inverted = _agree((figures["inside"] - figures["outside"])[moves], 0.0)
     if inverted and not any(f.column == "flow" for f in found):
         what = "pressure is higher while u_out is 1 than while it is 0, so 0 and 1 are exchanged"
@@ -256,7 +333,7 @@ def few_breaths(count: int) -> str | None:
     """What fewer breaths than everything needs can still be used for; None if they are enough."""
     if not 0 < count < _TRAINING:
         return None
-    use = "`ventbench open-loop` and, with flow, `ventbench mechanics`"
+    use = "`ventbench data open-loop` and, with flow, `ventbench mechanics`"
     need = f"`train simulator` needs {_TRAINING}"
     if count >= _DIAGNOSIS:
         use = f"`ventbench diagnose`, {use}"
@@ -282,6 +359,64 @@ def _times(interval: Floats) -> list[Finding]:
     advice = f"Rates are 20 to 1000 Hz: pass --time-unit {unit} (or --rate) to "
     level = "refused" if median > SLOW else "suspicious"
     return [Finding("time_step", what, f"{advice}`ventbench data import`.", level, median)]
+
+
+def _volumes(figures: Mapping[str, Floats]) -> list[Finding]:
+    """Volume against the integral of flow: by a unit, or by any other factor."""
+    ratio = figures.get("volume_ratio", np.zeros(0))
+    ratio = ratio[figures.get("volume_correlation", ratio) > _OF_ONE_LUNG]
+    if len(ratio) < 0.5 * len(figures["inspiration"]) or len(ratio) == 0:
+        return []
+    factor = float(np.median(ratio))
+    apart = max(factor, 1.0 / factor)
+    if apart < _CONTRADICTS:
+        return []
+    units = [
+        f"--{role}-unit {unit}"
+        for role, sense in (("flow", 1.0), ("volume", -1.0))
+        for unit, size in UNITS[role].items()
+        if size != 1 and abs(np.log(factor * float(size) ** -sense)) < np.log(1.1)
+    ]
+    share = {2: "half", 3: "a third", 4: "a quarter"}.get(round(apart), f"1/{apart:.3g}")
+    times = {2: "twice", 3: "three times"}.get(round(apart), f"{apart:.3g} times")
+    if abs(apart / round(apart) - 1.0) > 0.05:
+        share, times = f"1/{apart:.3g}", f"{apart:.3g} times"
+    what = (
+        f"flow and volume contradict each other: they differ by a factor of {apart:.1f} (volume is "
+        f"{share if factor < 1.0 else times}{' of' if factor < 1.0 else ''} the integrated flow)"
+    )
+    advice = "Say which is wrong: --map NAME=unused leaves it out, "
+    advice += f"{' or '.join(units) or 'a unit such as --flow-unit L/min'} corrects it."
+    return [Finding("volume", what, advice, "refused", factor)]
+
+
+def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding]:
+    """Pressures that follow the commands of the breath before, or after, by far better."""
+    left = dict.fromkeys(_SHIFTS, 0.0)
+    rows = dict.fromkeys(_SHIFTS, 0.0)
+    for label in np.unique(np.stack([R, C]), axis=1).T:
+        own = (label[0] == R) & (label[1] == C)
+        for shift in _SHIFTS:
+            A = np.zeros((4, 4))
+            for i in range(4):
+                for j in range(i, 4):
+                    A[i, j] = A[j, i] = figures[f"shift{shift}:{i}{j}"][own].sum()
+            solved = np.linalg.lstsq(A[:3, :3], A[:3, 3], rcond=1e-9)[0]
+            left[shift] += max(float(A[3, 3] - A[:3, 3] @ solved), 0.0)
+            rows[shift] += A[2, 2]
+    if min(rows.values()) < _NUMBERED:
+        return []
+    variance = {shift: left[shift] / rows[shift] for shift in _SHIFTS}
+    best = min(variance, key=lambda shift: variance[shift])
+    if best == 0 or variance[best] > _FOLLOWS * variance[0] or variance[0] < _MOVES**2:
+        return []
+    which = "before" if best < 0 else "after"
+    what = (
+        f"pressures follow the commands of the breath {which} (to {variance[best] ** 0.5:.2g} "
+        f"cmH2O, those of their own to {variance[0] ** 0.5:.2g}), so their numbers are off by one"
+    )
+    advice = "Put the pressures of each breath beside its own commands."
+    return [Finding("breath_id", what, advice, "refused", float(best))]
 
 
 def _commands(figures: Mapping[str, Floats]) -> list[Finding]:
@@ -338,7 +473,7 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
         )
         if s["qq"] == 0.0 or np.linalg.matrix_rank(A) < 3:
             continue
-        r, e, _ = np.linalg.solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
+        r, e, _ = solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
         if r <= 0.0 or e <= 0.0:
             continue
         fit = np.log([1000.0 * r, 1.0 / e])
@@ -387,9 +522,15 @@ def require_roles(breaths: Breaths) -> None:
 
 
 def _figures_of(breaths: Breaths) -> dict[str, Floats]:
-    names = ("pressure", "u_in", "u_out", "flow")
-    arrays = {name: getattr(breaths, name) for name in names}
-    lengths = breaths.valid.sum(axis=1)
-    flat = {name: a[breaths.valid] for name, a in arrays.items() if a is not None}
-    starts = (np.cumsum(lengths) - lengths).astype(np.int64)
-    return breath_figures(breaths.time[breaths.valid], flat, starts)
+    """Figures of breaths, some at a time since they need many arrays as large as the recording."""
+    parts = []
+    together = max(1, _TOGETHER // breaths.valid.shape[1])
+    for first in range(0, len(breaths), together):
+        some = slice(first, first + together)
+        valid = breaths.valid[some]
+        arrays = {name: getattr(breaths, name) for name in ("u_in", "u_out", *MEASURED)}
+        flat = {name: a[some][valid] for name, a in arrays.items() if a is not None}
+        lengths = valid.sum(axis=1)
+        starts = (np.cumsum(lengths) - lengths).astype(np.int64)
+        parts.append(breath_figures(breaths.time[some][valid], flat, starts))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

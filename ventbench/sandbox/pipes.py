@@ -11,6 +11,7 @@ import functools
 import json
 import os
 import random
+import resource
 import secrets
 import selectors
 import signal
@@ -55,6 +56,23 @@ class SandboxError(InputError):
 MIB, GIB = 1 << 20, 1 << 30
 
 
+@dataclass
+class Budget:
+    """Time that all sessions of an entry share; it is used up as they end.
+
+    Whoever sleeps runs out of the clock's time, whoever computes of the processor's.
+    """
+
+    seconds: float  #: of each.
+    clock: float = 0.0  #: time on the clock that was taken, s.
+    processor: float = 0.0  #: processor time that was taken, s.
+
+    @property
+    def left(self) -> float:
+        """What is left of the scarcer one, s."""
+        return self.seconds - max(self.clock, self.processor)
+
+
 @dataclass(frozen=True)
 class Allowance:
     """Limits of a session; the processor is shared by all its cells, hence patience, not a pace."""
@@ -68,10 +86,12 @@ class Allowance:
     #: all cells time out when a session has taken this long on the clock, so that no entry keeps
     #: others waiting for longer.
     total_s: float = 900.0
+    #: real-time priority (``SCHED_FIFO``) that cells get where the system grants it; None for none.
+    priority: int | None = None
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not value > 0:
+            if value is not None and not value > 0:
                 raise ValueError(f"allowance {name} is {value}, it must be positive")
 
 
@@ -361,6 +381,18 @@ class ZygoteClient:
             said = self._stderr.read()[-2000:].decode(errors="replace").strip()
             self.close()
             raise SandboxError(f"the sandbox's process ended before it was ready: {said}")
+
+    def prefer(self, level: int, longest_s: float) -> None:
+        """Let cells run before ordinary work, where it is granted; the kernel ends those in a loop.
+
+        Args:
+            level: priority of ``SCHED_FIFO``.
+            longest_s: processor time without a pause after which a process is ended, s.
+        """
+        limit = round(1e6 * longest_s)
+        with contextlib.suppress(OSError):
+            resource.prlimit(self._process.pid, resource.RLIMIT_RTTIME, (limit, limit))
+            os.sched_setscheduler(self._process.pid, os.SCHED_FIFO, os.sched_param(level))
 
     def start(self, cell: int, task: Task | None, pipes: Sequence[int]) -> None:
         """Start a cell, which the zygote knows by a random token, with far ends of its two pipes.

@@ -12,8 +12,9 @@ from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
-#: Highest autocorrelation of noise: above it, the model is taken to fit badly.
-MOST_AR = 0.95
+#: Lags of the autocorrelations of noise, and correlations of neighbouring samples that are tried:
+#: above the last, the model is taken to fit badly.
+_LAGS, _CORRELATIONS = 5, np.arange(0.05, 0.96, 0.05)
 
 #: Least standard deviation of the noise of pressure that is believed, cmH2O.
 LEAST_SIGMA = 0.02
@@ -95,14 +96,22 @@ def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | Non
 
 @dataclass(frozen=True)
 class Noise:
-    """First-order autoregressive noise of each channel, Gaussian with exponential tails (Huber)."""
+    """White noise plus a slow discrepancy of each channel, with exponential tails (Huber).
+
+    The discrepancy, what a model misses from sample to sample, is first-order autoregressive. A
+    Kalman filter predicts each sample from those before; its innovations are independent. White
+    noise alone would count a slow error once for each sample. Autoregressive noise alone would
+    count differences of neighbouring samples for all that is sure.
+    """
 
     #: standard deviations of pressure, cmH2O, and of flow, mL/s, one for each channel.
     sigma: tuple[float, ...] = (0.25, 20.0)
-    #: correlations of neighbouring samples, one for each channel, within -1..1.
+    #: correlations of neighbouring samples of the discrepancy, one for each channel, within -1..1.
     ar: tuple[float, ...] = (0.0, 0.0)
     #: whitened size from which the tails are exponential; ``inf`` for a Gaussian.
     tail: float = 3.0
+    #: shares of the variance that are the discrepancy's, one for each channel.
+    slow: tuple[float, ...] = (1.0, 1.0)
 
     def whiten(self, residual: Floats, weight: Floats) -> Floats:
         """Transform residuals to independent ones of unit variance; 0 where ``weight`` is 0.
@@ -111,11 +120,16 @@ class Noise:
             residual: ``(n, ..., c, T)``.
             weight: ``(n, c, T)``.
         """
+        ar, kept, scale = self._filter(weight)
         between = (slice(None),) + (None,) * (residual.ndim - weight.ndim)
-        coupled, scale, weight = (x[between] for x in self._chain(weight))
-        before = np.zeros_like(residual)
-        before[..., 1:] = residual[..., :-1]
-        return weight * (residual - coupled * before) / scale
+        each = np.moveaxis(residual, -1, 0).copy()  # sample first, as the filter runs
+        if np.any(ar):
+            gain = np.moveaxis((ar * kept)[between], -1, 0)
+            expected = np.zeros(each.shape[1:])
+            for k, now in enumerate(each):
+                now -= expected
+                expected = ar[:, 0] * expected + gain[k] * now
+        return weight[between] * np.moveaxis(each, 0, -1) / scale[between]
 
     def loss(self, white: Floats) -> Floats:
         """Negative log density of whitened residuals, without :meth:`log_norm`."""
@@ -136,39 +150,59 @@ class Noise:
     def log_likelihood(self, residual: Floats, weight: Floats) -> Floats:
         """Log-likelihood of the residuals ``(n, c, T)`` of each breath, ``(n,)``."""
         white = self.whiten(residual, weight)
-        _, scale, _ = self._chain(weight)
+        _, _, scale = self._filter(weight)
         terms = -self.loss(white) - weight * (np.log(scale) + self.log_norm())
         return terms.sum(axis=(1, 2))
 
     def log_scale(self, weight: Floats) -> Floats:
         """Logarithm of the product of all scales by which residuals are whitened, ``(n,)``."""
-        _, scale, weight = self._chain(weight)
-        return np.sum(weight * np.log(scale), axis=(1, 2))
+        return np.sum(weight * np.log(self._filter(weight)[2]), axis=(1, 2))
 
-    def _chain(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
-        """Coupling to the sample before, standard deviation of the innovation, and weight."""
+    def _filter(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
+        """Correlation, and gain and standard deviation of each innovation of the Kalman filter.
+
+        Shapes ``(c, 1)`` and twice ``(n, c, T)``.
+        """
         channels = weight.shape[1]
-        ar = np.asarray(self.ar[:channels], float)[None, :, None]
-        sigma = np.asarray(self.sigma[:channels], float)[None, :, None]
-        linked = np.zeros_like(weight)
-        linked[..., 1:] = weight[..., 1:] * weight[..., :-1]
-        return ar * linked, sigma * np.sqrt(1.0 - linked * ar**2), weight
+        sigma, ar, slow = (
+            np.asarray(x[:channels], float)[:, None] for x in (self.sigma, self.ar, self.slow)
+        )
+        gain, spread = np.empty_like(weight), np.empty_like(weight)
+        variance = slow[:, 0] + np.zeros(weight.shape[:-1])  # of the discrepancy, as expected
+        for k in range(weight.shape[-1]):
+            spread[..., k] = variance + 1.0 - slow[:, 0]
+            gain[..., k] = weight[..., k] * variance / spread[..., k]
+            left = variance * (1.0 - gain[..., k])
+            variance = slow[:, 0] + ar[:, 0] ** 2 * (left - slow[:, 0])
+        return ar, gain, sigma * np.sqrt(spread)
 
 
 def robust_noise(residual: Floats, weight: Floats) -> Noise:
     """Estimate the noise from residuals ``(n, c, T)``, robust against outliers.
 
+    A discrepancy of correlation ``a`` and share ``s`` has the autocorrelations ``s a^k`` at lags
+    ``k``, to which both are fitted by least squares.
+
     ``weight`` is 1 where measured, else 0.
     """
-    sigma, ar = [], []
+    sigma, ar, slow = [], [], []
     for channel in range(residual.shape[1]):
         r, w = residual[:, channel], weight[:, channel] > 0
         size = 1.4826 * np.median(np.abs(r[w])) if w.any() else 0.0
-        # Autocorrelation of clipped residuals, so that outliers have a bounded influence.
-        clipped = np.clip(r, -3.0 * size, 3.0 * size)
-        both = w[:, 1:] & w[:, :-1]
-        power = np.sum(clipped[:, 1:][both] ** 2) + np.sum(clipped[:, :-1][both] ** 2)
-        product = np.sum((clipped[:, 1:] * clipped[:, :-1])[both])
+        # Those of the median breath, as some breaths err as a whole.
+        clipped, seen = np.clip(r, -3.0 * size, 3.0 * size) * w, []
+        lags = np.arange(1, min(_LAGS, r.shape[1] - 1) + 1)
+        for lag in lags:
+            both = w[:, lag:] & w[:, :-lag]
+            ahead, behind = clipped[:, lag:] * both, clipped[:, :-lag] * both
+            power = np.sum(ahead**2 + behind**2, axis=1)
+            alike = 2.0 * np.sum(ahead * behind, axis=1)[power > 0] / power[power > 0]
+            seen.append(float(np.median(alike)) if alike.size else 0.0)
+        powers = _CORRELATIONS[:, None] ** lags
+        fitted = powers @ np.array(seen)
+        share = np.clip(fitted / np.sum(powers**2, axis=1), 0.0, 1.0)
+        best = int(np.argmin(np.sum((share[:, None] * powers - seen) ** 2, axis=1)))
         sigma.append(max(float(size), LEAST_SIGMA * (20.0 if channel else 1.0)))
-        ar.append(float(np.clip(2.0 * product / power, -MOST_AR, MOST_AR)) if power > 0 else 0.0)
-    return Noise(tuple(sigma), tuple(ar))
+        ar.append(float(_CORRELATIONS[best]) if share[best] > 0.0 else 0.0)
+        slow.append(float(share[best]))
+    return Noise(tuple(sigma), tuple(ar), slow=tuple(slow))

@@ -9,7 +9,7 @@ gate although it may take over. What reaches the limit is vented by the device a
 
     python benchmarks/hardware_guards.py [--rigs 4] [--entry pid_best ...]
 
-Prints the table of ``hardware_eval/README.md``, and what the population's rigs do, on which the
+Prints both tables, and what the population's rigs do, on which the
 bounds of the fallback rest.
 """
 

@@ -9,7 +9,7 @@ plan, so that a restarted session continues it.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -72,6 +72,10 @@ class PlannedRun:
     perturbation: str = ""  #: what happens to the tube; empty for nothing.
 
 
+#: Kind, entry, PIP, repetition and perturbation of a run.
+_Case = tuple[Kind, str, float, int, str]
+
+
 @dataclass(frozen=True)
 class Plan:
     """A plan of runs."""
@@ -116,58 +120,35 @@ def make_plan(
         pips: cmH2O, of the protocol.
         repeats: repetitions of each cell.
         control_every: see :data:`CONTROL_EVERY`; 0 for no control.
-        perturbations: see :data:`PERTURBATIONS`; each once, at the middle PIP of ``pips``.
+        perturbations: see :data:`PERTURBATIONS`; each once at each PIP.
         seed: of the order.
 
     Raises:
         InputError: if something occurs twice, is unknown, or there is nothing to run.
     """
-    for name, values in (("entry", entries), ("lung", lungs), ("PIP", pips)):
-        if not values:
-            raise InputError(f"the plan has no {name}; give one at least")
-        if len(set(values)) != len(values):
-            raise InputError(f"the plan names one {name} twice: {', '.join(map(str, values))}")
-    for pip in pips:
-        if pip not in protocol.PIPS:
-            raise InputError(f"PIP {pip:g} cmH2O is not one of {_listed(protocol.PIPS)}")
-    for name in perturbations:
-        if name not in PERTURBATIONS:
-            raise InputError(f"perturbation {name!r} is not one of {', '.join(PERTURBATIONS)}")
+    _check(entries, lungs, pips, perturbations)
     if repeats < 1:
         raise InputError(f"{repeats} repetitions: run each cell once at least")
-    if CONTROL in entries:
-        raise InputError(f"no entry can be called {CONTROL}; that is the PID in between")
     # In one order, whatever order they were given in: a log names them in that of mounting.
     named = sorted((scored_lung(lung).id for lung in lungs), key=LUNG_IDS.index)
     order = np.random.default_rng(seed)
     mounted = tuple(named[i] for i in order.permutation(len(named)))
     rising = tuple(sorted(float(pip) for pip in pips))
+    cells = list(itertools.product(entries, rising))
+    cases: list[_Case] = [
+        ("scored", entry, pip, repeat, "")
+        for entry, pip in cells
+        for repeat in range(1, repeats + 1)
+    ]
+    cases.extend(
+        ("perturbed", entry, pip, 1, tube) for entry, pip in cells for tube in perturbations
+    )
     runs: list[PlannedRun] = []
-
-    def add(kind: Kind, entry: str, lung: str, pip: float, repeat: int, tube: str = "") -> None:
-        runs.append(PlannedRun(len(runs), kind, entry, lung, pip, repeat, tube))
-
     for lung in mounted:
-        for entry, pip in itertools.product(entries, rising):
-            add("ramp", entry, lung, pip, 1)
-        scored = [
-            ("scored", entry, pip, repeat, "")
-            for entry, pip, repeat in itertools.product(entries, rising, range(1, repeats + 1))
-        ]
-        middle = rising[len(rising) // 2]
-        scored += [
-            ("perturbed", entry, middle, 1, tube)
-            for entry, tube in itertools.product(entries, perturbations)
-        ]
-        controls = 0
-        for place, index in enumerate(order.permutation(len(scored)).tolist()):
-            if control_every and place % control_every == 0:
-                controls += 1
-                add("control", CONTROL, lung, CONTROL_PIP, controls)
-            kind, entry, pip, repeat, tube = scored[index]
-            add(kind, entry, lung, pip, repeat, tube)  # type: ignore[arg-type]
-        if control_every:
-            add("control", CONTROL, lung, CONTROL_PIP, controls + 1)
+        shuffled = [cases[k] for k in order.permutation(len(cases))]
+        ramps: list[_Case] = [("ramp", entry, pip, 1, "") for entry, pip in cells]
+        for kind, entry, pip, repeat, tube in [*ramps, *_with_controls(shuffled, control_every)]:
+            runs.append(PlannedRun(len(runs), kind, entry, lung, pip, repeat, tube))
     return Plan(
         tuple(entries),
         track,
@@ -179,6 +160,38 @@ def make_plan(
         seed,
         tuple(runs),
     )
+
+
+def _with_controls(cases: Sequence[_Case], every: int) -> Iterator[_Case]:
+    """Cases with a control before each so many of them and after the last; 0 for none."""
+    for place, case in enumerate(cases):
+        if every and place % every == 0:
+            yield "control", CONTROL, CONTROL_PIP, place // every + 1, ""
+        yield case
+    if every:
+        yield "control", CONTROL, CONTROL_PIP, -(-len(cases) // every) + 1, ""
+
+
+def _check(
+    entries: Sequence[str],
+    lungs: Sequence[str],
+    pips: Sequence[float],
+    perturbations: Sequence[str],
+) -> None:
+    """Refuse what is missing, stands twice or is unknown."""
+    for name, values in (("entry", entries), ("lung", lungs), ("PIP", pips)):
+        if not values:
+            raise InputError(f"the plan has no {name}; give one at least")
+        if len(set(values)) != len(values):
+            raise InputError(f"the plan names one {name} twice: {', '.join(map(str, values))}")
+    for pip in pips:
+        if pip not in protocol.PIPS:
+            raise InputError(f"PIP {pip:g} cmH2O is not one of {_listed(protocol.PIPS)}")
+    for name in perturbations:
+        if name not in PERTURBATIONS:
+            raise InputError(f"perturbation {name!r} is not one of {', '.join(PERTURBATIONS)}")
+    if CONTROL in entries:
+        raise InputError(f"no entry can be called {CONTROL}; that is the PID in between")
 
 
 @dataclass(frozen=True)

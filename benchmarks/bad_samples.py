@@ -96,7 +96,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--sound", action="store_true", help="spoil nothing")
     options = parser.parse_args()
-    false, covered = dict.fromkeys(KINDS, 0), {kind: list[bool]() for kind in KINDS}
+    false: dict[str, int] = dict.fromkeys(KINDS, 0)
+    covered: dict[str, list[bool]] = {kind: [] for kind in KINDS}
     for draw in range(options.draws):
         rng = np.random.default_rng([options.seed, draw])
         kind = KINDS[draw % len(KINDS)]

@@ -74,7 +74,6 @@ class Damage:
         if kind == "swapped with the next":
             self.held = frame
             return before
-        content = to_packet(packet)[:-4]
         if kind == "flip one bit":
             frame = self._flipped(frame, 1)
         elif kind == "flip many bits":
@@ -95,20 +94,25 @@ class Damage:
             frame = rng.bytes(int(rng.integers(1, 60))) + frame
         elif kind == "long garbage before":
             frame = rng.bytes(int(rng.integers(200, 800))) + frame
-        elif kind == "another session":
-            frame = encode(Packet(packet.session ^ 0x5A5A, packet.sequence, packet.message))
-        elif kind == "wrong check":
-            frame = to_frame(content + rng.bytes(4))
-        elif kind == "wrong length":
-            longer = content + rng.bytes(int(rng.integers(1, 9)))
-            frame = to_frame(longer + crc32(longer).to_bytes(4, "little"))
-        elif kind == "unknown kind":
-            other = bytes([rng.integers(7, 0x80)]) + content[1:]
-            frame = to_frame(other + crc32(other).to_bytes(4, "little"))
         elif kind == "joined by a lost zero":
             frame = self.older[-2][:-1] + frame[1:] if len(self.older) > 1 else frame
+        elif kind != "none":
+            frame = self._made_up(kind, packet)
         # What was held back comes after the frame that it should have come before.
         return frame + before
+
+    def _made_up(self, kind: str, packet: Packet) -> bytes:
+        """Frame of a packet that no host sends."""
+        rng, content = self.rng, to_packet(packet)[:-4]
+        if kind == "another session":
+            return encode(Packet(packet.session ^ 0x5A5A, packet.sequence, packet.message))
+        if kind == "wrong check":
+            return to_frame(content + rng.bytes(4))
+        if kind == "wrong length":
+            content += rng.bytes(int(rng.integers(1, 9)))
+        elif kind == "unknown kind":
+            content = bytes([rng.integers(7, 0x80)]) + content[1:]
+        return to_frame(content + crc32(content).to_bytes(4, "little"))
 
     def _flipped(self, frame: bytes, bits: int) -> bytes:
         array = np.frombuffer(frame, np.uint8).copy()

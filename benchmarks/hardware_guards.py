@@ -17,21 +17,20 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hardware_selftests import FINE, QUANTUM, STEP, draw, interval
+from hardware_selftests import QUANTUM, Generated, generated, interval
 
 from hardware_eval.bench import fallback, safety
 from hardware_eval.bench.controllers import PIDController
 from hardware_eval.bench.loop import LATE_SHARE
 from hardware_eval.bench.plan import CONTROL_GAINS
-from hardware_eval.emulation.cases import Effect
+from hardware_eval.emulation.cases import Base
 from hardware_eval.emulation.simulated import breath_begun
-from proofs.challenge.stranger.rig import Rig
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import bundled, open_submission
@@ -94,29 +93,25 @@ class Strangers:
     """Lungs of the independent generator, whose labels are those of ``settings``, ``(n,)``."""
 
     def __init__(self, settings: Sequence[str], at: Ints) -> None:
-        mounted = draw(settings, "right", np.random.default_rng(list(SEED)))
-        base, quadratic, dead = jax.tree.map(
-            lambda x: x[at], (vars(mounted.base), mounted.quadratic, mounted.dead)
-        )
-        form: dict[str, Any] = {"quadratic": quadratic}
-        effects = {
-            "turbulent_resistance": Effect("turbulent_resistance", "mild", "quadratic", form)
+        base, effects, dead = generated(settings, "right", np.random.default_rng(list(SEED)))
+
+        def taken(values: dict[str, Any]) -> dict[str, Any]:
+            return {name: np.asarray(value)[at] for name, value in values.items()}
+
+        chosen = {
+            name: replace(effect, parameters=taken(effect.parameters))
+            for name, effect in effects.items()
         }
-        n = len(at)
-        no = np.zeros(n)
-        self._rig = Rig(type(mounted.base)(**base), effects, no, 0.03, no, np.zeros((2, n)))
-        self._rig.start(base["peep"])
-        self._dead, self._before = dead, no
+        self._rig = Generated(Base(**taken(vars(base))), chosen, dead[at])
+        self._before = np.zeros(len(at))
 
     def pressure(self) -> Floats:
         """Airway pressures; see :class:`Lungs`."""
-        return self._rig.shown()
+        return self._rig.pressure()
 
     def step(self, u_in: Floats, u_out: int, begins: bool) -> None:
         """Hold commands; see :class:`Lungs`."""
-        for fine in range(FINE):
-            opened = np.where(fine >= self._dead, u_in, self._before)
-            self._rig.advance(opened, np.full(len(u_in), u_out), 0.0, STEP)
+        self._rig.hold(self._before, u_in, np.full(len(u_in), float(u_out)))
         self._before = u_in
 
 

@@ -165,14 +165,12 @@ def draw(
 ) -> Mounted:
     """Draw a lung of a family about each setting."""
     n = len(settings)
-    begin, gain = (
-        _generated(settings, fault, rng)
-        if family == "generator"
-        else (
-            partial(Plants, _rigs(family, settings, seed), fault == STUCK),
-            np.full(n, VALVE_GAIN),
-        )
-    )
+    if family == "generator":
+        base, effects, dead = generated(settings, fault, rng)
+        begin, gain = partial(Generated, base, effects, dead), np.asarray(base.gain)
+    else:
+        begin = partial(Plants, _rigs(family, settings, seed), fault == STUCK)
+        gain = np.full(n, VALVE_GAIN)
     sensor, flow = np.full(n, SENSORS.get(fault, 1.0)), 1.0 + FLOW_GAIN * rng.standard_normal(n)
     return Mounted(begin, gain, sensor, flow, rng.uniform(0.1, 0.3, n))
 
@@ -200,10 +198,10 @@ def _rigs(family: str, settings: Sequence[str], seed: int) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
 
 
-def _generated(
+def generated(
     settings: Sequence[str], fault: str, rng: np.random.Generator
-) -> tuple[Callable[[], Lungs], Floats]:
-    """Lungs of the generator, whose ranges they have, and the gains of their valves."""
+) -> tuple[Base, dict[str, Effect], Ints]:
+    """Draw what :class:`Generated` takes, in the ranges of the generator."""
     n, lungs = len(settings), [parse_lung(setting) for setting in settings]
     R = np.array([x.R for x in lungs]) * rng.uniform(0.85, 1.15, n)
     C = np.array([x.C for x in lungs]) * rng.uniform(0.93, 1.07, n)
@@ -227,7 +225,7 @@ def _generated(
         "turbulent_resistance": Effect("turbulent_resistance", "mild", "quadratic", quadratic),
         "leak": Effect("leak", "mild", "orifice", conductance),
     }
-    return partial(Generated, Base(**values), effects, rng.integers(0, FINE, n)), gain
+    return Base(**values), effects, rng.integers(0, FINE, n)
 
 
 def driven(

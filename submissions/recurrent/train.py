@@ -153,8 +153,8 @@ def rigs_to_train_on() -> Rigs:
         official.members,
     )
     factor = np.linalg.cholesky(covariance)
-    numbers = (jnp.asarray(x, jnp.float32) for x in (mean, factor))
-    rigs = Rigs(*numbers, recorded, jnp.ones((len(mean), len(protocol.PIPS))))
+    mean, factor = (jnp.asarray(x, jnp.float32) for x in (mean, factor))
+    rigs: Any = Rigs(mean, factor, recorded, jnp.ones((len(mean), len(protocol.PIPS))))
     return rigs.replace(weight=_weights(rigs))
 
 
@@ -218,7 +218,7 @@ def draw(rigs: Rigs, key: Array, times: int = TIMES) -> Runs:
         K2=plants.K2 + sometimes(0.2, 0.0, 10.0),
     )
     wanted = jnp.asarray(protocol.PIPS)[pip]
-    cells = draws.random_scenarios(next(keys), wanted, smooth=True)
+    cells: Any = draws.random_scenarios(next(keys), wanted, smooth=True)
     # Rigs that are drawn anew do not deviate further; half of the others have no gain of a breath.
     steady = recorded & (uniform(0.0, 1.0) < 0.5)
     low = sometimes(0.15, -3.0, 0.0)
@@ -307,7 +307,7 @@ def roll(weights: dict[str, Array], runs: Runs) -> tuple[Array, Array, Array]:
     def breathe(before: tuple[Array, Array], breath: Array) -> Any:
         r_scale, c_scale = runs.scales[:, :, breath]
         own = (cells.r_scale * r_scale, cells.c_scale * c_scale, cells.gain[:, breath])
-        plant = Altered(
+        plant: Any = Altered(
             jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), runs.rigs.vary(*own)),
             **{name: x[:, breath] for name, x in runs.altered.items()},
         )
@@ -356,7 +356,7 @@ def roll(weights: dict[str, Array], runs: Runs) -> tuple[Array, Array, Array]:
         return after, (pressure, missed, hidden)
 
     sizes = (network.COMMANDS, network.READINGS)
-    nothing = tuple(jnp.zeros((n, network.BEFORE, size)) for size in sizes)
+    nothing: Any = tuple(jnp.zeros((n, network.BEFORE, size)) for size in sizes)
     return jax.lax.scan(breathe, nothing, jnp.arange(protocol.BREATHS))[1]
 
 
@@ -421,7 +421,7 @@ def update(state: State, rigs: Rigs, updates: Array, rate: Array) -> tuple[State
 def save(weights: dict[str, Array], path: Path) -> None:
     """Write the weights."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {k: np.asarray(v, np.float32) for k, v in weights.items() if k != "probe"}
+    arrays: Any = {k: np.asarray(v, np.float32) for k, v in weights.items() if k != "probe"}
     files.write_atomically(path, lambda file: np.savez(file, **arrays))
 
 
@@ -463,8 +463,8 @@ def main() -> None:
             print(f"{count + 1} of {args.updates}: {figures}; {time.process_time() - begun:.0f} s")
         if (count + 1) % 200 == 0 or count + 1 == args.updates:
             checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            arrays = {str(k): np.asarray(x) for k, x in enumerate(jax.tree.leaves(state))}
-            files.write_atomically(checkpoint, lambda file, a=arrays: np.savez(file, **a))
+            parts: Any = {str(k): np.asarray(x) for k, x in enumerate(jax.tree.leaves(state))}
+            files.write_atomically(checkpoint, lambda file, a=parts: np.savez(file, **a))
             save(state.average, args.out / "weights.npz")
 
 

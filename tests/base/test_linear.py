@@ -21,7 +21,7 @@ def normal(rank: int, size: int, seed: int) -> np.ndarray:
 def test_a_solution_is_one_where_there_is_any(size, rank, seed):
     matrix = normal(rank, size, seed)
     right = matrix @ np.random.default_rng(seed + 1).standard_normal(size)
-    found = solve(np.round(matrix, 12), right)
+    found = solve(np.asarray(np.round(matrix, 12), float), right)
     assert np.isfinite(found).all()
     if rank >= size:
         np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-4, atol=1e-6)

@@ -54,7 +54,10 @@ def test_breaths_that_commands_predict_are_no_event() -> None:
         peaks, acts = rng.uniform(3.0, 100.0, 40), (rng.permutation(40) < 10).astype(float)
         pressure = peaks[:, None] + np.zeros(30)
         small.append(command_p_value(acts, _commanded(peaks), pressure))
-        assert command_p_value((peaks > 70.0) * 0.9, _commanded(peaks), pressure) < EXCHANGEABLE
+        assert (
+            command_p_value(np.where(peaks > 70.0, 0.9, 0.0), _commanded(peaks), pressure)
+            < EXCHANGEABLE
+        )
     assert np.mean(np.array(small) <= EXCHANGEABLE) <= 0.05
 
 

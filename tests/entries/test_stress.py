@@ -318,7 +318,7 @@ def test_nothing_is_changed_without_a_stressor(runs: Runs, cells: Cells) -> None
         commands = np.asarray(runs.requested)[0].reshape(6, 1, -1)
         varied: Any = environment.vary(plant, scenario, 2)
         assert float(varied.R[0, 0]) != np.asarray(jax.tree.leaves(cells.plants)[0])[0, 0, 0]
-        alone, _ = rollouts.closed_loop(plant, Script(commands), scenario)
+        alone, _ = rollouts.closed_loop(plant, Script(jnp.asarray(commands)), scenario)
     pressure = np.asarray(alone.pressure)
     np.testing.assert_allclose(runs.peak[0], pressure.max(axis=(-2, -1)), rtol=0, atol=1e-9)
     error = run_error(pressure, np.asarray(scenario.pip)[..., None, None])

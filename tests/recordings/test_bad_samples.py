@@ -42,7 +42,9 @@ def recording(columns: dict[str, np.ndarray]):
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("digits", [0, 1, 3, 12])
 def test_sound_signals_are_left_alone(seed, digits):
-    columns = {name: np.round(values, digits) for name, values in signals(seed).items()}
+    columns = {
+        name: np.asarray(np.round(values, digits), float) for name, values in signals(seed).items()
+    }
     assert find_bad_samples(columns) == ()
 
 
@@ -130,6 +132,7 @@ def test_every_door_leaves_the_same_samples_out(tmp_path):
     spoiled = recording(columns)
     write(spoiled, tmp_path / "a.csv")
     read = load(tmp_path / "a.csv")
+    assert read.flow is not None
     np.testing.assert_array_equal(np.isnan(read.flow).ravel().nonzero()[0], np.sort(at))
     assert "10 of 1800 readings of flow (0.56 %) are -1650" in read.notes[0]
     report = check(tmp_path / "a.csv")

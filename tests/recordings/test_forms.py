@@ -227,7 +227,7 @@ def test_a_submission_of_the_competition_is_joined_by_row():
     made = recorded.to_frame()[["id", "pressure"]].sample(frac=1.0, random_state=0)
     from ventbench.recordings.read import simulated_pressures
 
-    table = {name: made[name].to_numpy() for name in made}
+    table = {name: np.asarray(made[name]) for name in made}
     answers = simulated_pressures(table, "submission.csv", recorded)
     np.testing.assert_array_equal(answers[recorded.valid], recorded.pressure[recorded.valid])
     with pytest.raises(InputError, match="rows of the recording"):

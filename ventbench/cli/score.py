@@ -136,13 +136,7 @@ def score(
         track = "robustness"
     if stress is None:
         stress = DRAWS if draws >= 20 else 0
-    jobs = []
-    for entry in opened:
-        entered = entry.manifest.tracks
-        tracks = entered if track == "all" else (track or entered[0],)
-        jobs.extend((entry, each, stress if each == "robustness" else 0) for each in tracks)
-        if stress and not any(job[0] is entry and job[2] for job in jobs):
-            notes().print(f"{entry.manifest.name} is told its lung: no score under missing physics")
+    jobs = [job for entry in opened for job in _jobs(entry, track, stress)]
     work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process)
     scores = of_each_entry("scoring", work, jobs, workers, scheduler)
     results = [result.to_json() for result in scores]
@@ -164,6 +158,15 @@ def score(
             console.print(f"wrote {path}", soft_wrap=True)
     if any(result.failed for result in scores):
         raise typer.Exit(1)
+
+
+def _jobs(entry: Submission, track: Track | None, stress: int) -> list[tuple[Submission, str, int]]:
+    """What :func:`_run` takes, for each track that an entry is scored on."""
+    entered = entry.manifest.tracks
+    tracks = entered if track == "all" else (track or entered[0],)
+    if stress and "robustness" not in tracks:
+        notes().print(f"{entry.manifest.name} is told its lung: no score under missing physics")
+    return [(entry, each, stress if each == "robustness" else 0) for each in tracks]
 
 
 def _run(

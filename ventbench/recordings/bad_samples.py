@@ -119,8 +119,10 @@ def find_bad_samples(
             if (every_nth := signal.slow()) is not None:
                 add("slow", _repeats(values), float(every_nth))
             else:
-                pulses = _pulses(columns["u_in"]) if "u_in" in columns else False
-                add("isolated", signal.isolated(bad) & ~pulses)
+                isolated = signal.isolated(bad)
+                if "u_in" in columns:
+                    isolated &= ~_pulses(columns["u_in"])
+                add("isolated", isolated)
         kept[name] = np.where(bad, np.nan, values)
     held = _held(kept)
     return (*found, *held)

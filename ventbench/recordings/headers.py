@@ -22,7 +22,9 @@ import numpy as np
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 
-_DATA = tomllib.loads(files(__package__).joinpath("headers.toml").read_text("utf-8"))
+_DATA = tomllib.loads(
+    files(__package__ or "ventbench.recordings").joinpath("headers.toml").read_text("utf-8")
+)
 
 #: Factors to the schema's unit, which is the first of each quantity; they are exact.
 UNITS: dict[str, dict[str, Fraction]] = {

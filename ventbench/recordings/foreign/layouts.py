@@ -30,7 +30,9 @@ class Layout:
 LAYOUTS: dict[str, Layout] = {
     name: Layout(**layout)
     for name, layout in tomllib.loads(
-        files(__package__).joinpath("layouts.toml").read_text("utf-8")
+        files(__package__ or "ventbench.recordings.foreign")
+        .joinpath("layouts.toml")
+        .read_text("utf-8")
     ).items()
 }
 

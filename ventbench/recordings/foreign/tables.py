@@ -197,7 +197,9 @@ def _is_value(cell: str, mark: str) -> bool:
     return bool(_NUMBER[mark].fullmatch(cell) or (":" in cell and _CLOCK.fullmatch(cell)))
 
 
-def _table(file: str, data: bytes, above: list[str], separator: str, mark: str, note: str) -> Table:
+def _table(
+    file: str, data: bytes, above: Sequence[str], separator: str, mark: str, note: str
+) -> Table:
     """Lines of cells as columns: header, units, values, and lines that are none."""
     rows = [(k, _cells(line, separator)) for k, line in enumerate(above) if line.strip()]
     begins = _first_numbers([cells for _, cells in rows], mark)
@@ -291,9 +293,9 @@ def _arrow(
     try:
         table, odd = read(body, {})
     except ArrowInvalid:
-        table, odd = None, [""]
+        table, odd = None, []
     stray: list[tuple[int, str]] = []
-    if odd or data.count(b"\n", offset) + 1 != table.num_rows:
+    if table is None or odd or data.count(b"\n", offset) + 1 != table.num_rows:
         kept, numbers = [], []
         for k, line in enumerate(data[offset:].decode().split("\n")):
             if line.count(separator) == usual - 1 and '"' not in line:
@@ -539,7 +541,7 @@ def _by_units(table: Table) -> Table:
     for name in table.columns:
         unit = table.header(name).unit
         role = next((r for r in ("pressure", "flow", "volume") if unit in UNITS[r]), "time")
-        if role not in units:
+        if unit and role not in units:
             roles[name], units[role] = role, unit
     columns = {roles.get(name, name): values for name, values in table.columns.items()}
     told = [x for x in columns.values() if x.dtype.kind == "U" and np.mean(x != "") > 0.5]

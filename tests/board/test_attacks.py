@@ -78,9 +78,9 @@ def withdrawn(board: Path) -> None:
 
 ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
     "all but one record removed": (all_but_one, "is missing: the record of softer"),
-    "an entry moved to the failed ones": (failed, "result.json"),
+    "an entry moved to the failed ones": (failed, "result.sig signs another file"),
     "hashes swapped": (swapped, "result.json, key records"),
-    "seeds invented": (invented_seeds, "result.json"),
+    "seeds invented": (invented_seeds, "result.sig signs another file"),
     "no result": (
         lambda board: (board / "rounds" / ROUND / "result.json").unlink(),
         "result.json is missing",
@@ -93,7 +93,8 @@ ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_an_attack_is_noticed(leaderboard: Path, simulators, attack: str) -> None:
     do, named = ATTACKS[attack]
     do(leaderboard)
-    assert any(named in x for x in verify(leaderboard, lambda: simulators).problems)
+    problems = verify(leaderboard, lambda: simulators).problems
+    assert any(named in x for x in problems), problems
 
 
 def test_a_withdrawal_without_a_key_changes_no_rank(leaderboard: Path) -> None:

@@ -246,7 +246,7 @@ def test_claims_are_computed():
     tau = {"tau": {"value": 0.1, "unit": "s", "ci95": [0.09, 0.11]}}
     lag = {"name": "sensor_lag", "parameters": tau, "alternatives": []}
     good = {
-        "rc": {"cut_percent": 60.0},
+        "rc": {"cut_percent": 70.0},
         "injected": {"wanted": "sensor_lag", "mechanisms": [lag]},
         "frozen": {"mechanisms": []},
     }
@@ -255,7 +255,7 @@ def test_claims_are_computed():
     assert injected.value == "tau 0.1 s [0.09, 0.11]; without injection not named"
     valve = lag | {"name": "valve_lag", "alternatives": ["sensor_lag"]}
     bad = good | {
-        "rc": {"cut_percent": 59.9},
+        "rc": {"cut_percent": 69.9},
         "injected": {"wanted": "sensor_lag", "mechanisms": [valve]},
         "frozen": {"mechanisms": [lag]},
     }
@@ -266,7 +266,7 @@ def test_claims_are_computed():
     assert [claim.met for claim in claims({"rc": {"cut_percent": None}}, {})] == [False]
     for after, met in ((0.7, True), (0.8, False)):
         lungs = {"lung R5C10": {"refit": {"mae": 0.7}, "after": {"mae": after}}, "expiration": {}}
-        _, worse = claims({"rc": {"cut_percent": 60.0, "groups": lungs}}, {})
+        _, worse = claims({"rc": {"cut_percent": 70.0, "groups": lungs}}, {})
         assert (worse.met, "R5C10" in worse.value) == (met, not met)
     assert claims({}, {}) == []
     assert cut(5.0, 2.0) == pytest.approx(60.0)

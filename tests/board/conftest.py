@@ -304,9 +304,14 @@ def attest(folder: Path, lines: str = "", secret: str = KEY) -> None:
 def close(folder: Path) -> None:
     """Write and sign the result of the round: the first record of each entry, or that it failed."""
     path = folder / "rounds" / ROUND / rounds.RESULT
-    own, scored = rounds.load(folder, ROUND), dict[str, str]()
+    own = rounds.load(folder, ROUND)
     if own.frozen is None or own.result is None:
         return
+    scored = {  # a correction comes after the result that it corrects
+        key: sha256
+        for key, sha256 in own.result.records.items()
+        if store.path_of(folder, sha256).exists()
+    }
     for one in store.in_order(map(store.read_record, store.record_paths(folder))):
         if isinstance(one, Record) and one.header.draws.season == ROUND:
             scored.setdefault(f"{one.name} ({one.track})", one.sha256)

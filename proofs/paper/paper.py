@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import ventbench
 from proofs.paper import controller_sections as controllers
 from proofs.paper import simulator_sections as simulators
@@ -21,6 +23,7 @@ from proofs.studies.networks import MEASURED
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
+from ventbench.board import store
 from ventbench.entries.scoring import score
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
@@ -30,6 +33,9 @@ from ventbench.train import pid_search
 
 #: File of stored results.
 STORED = Path(__file__).with_name("stored.json")
+
+#: The published leaderboard of this checkout.
+LEADERBOARD = Path(__file__).parents[2] / "leaderboard"
 
 #: Entry and track by the name that tables have.
 ENTRIES = {
@@ -87,7 +93,7 @@ def reproduce_paper(
         controllers.best_gains(grid),
         controllers.beyond_the_grid(rigs_of(official)),
         controllers.example(official, grid, scored["residual"][1]),
-        controllers.performance(grid, errors["residual"]),
+        controllers.performance(grid, errors["residual"], on_rigs(LEADERBOARD)),
         controllers.robustness(grid, errors["residual"], errors["residual, all lungs"]),
         controllers.regularisation(kept["controllers"]),
         controllers.reinforcement(errors),
@@ -96,6 +102,24 @@ def reproduce_paper(
     )
     about = {"ventbench": ventbench.__version__, "simulators": official.manifest_sha256[:12]}
     return Reproduction(about, sections), kept
+
+
+def on_rigs(leaderboard: Path) -> tuple[str, Floats, Floats] | None:
+    """Errors of the best PIDs and of the residual network on the rigs of the newest round.
+
+    Returns:
+        Its name, and errors of the ranked draws, cmH2O, shape ``(L, P)``; None without one.
+    """
+    kept = store.load(leaderboard)
+    scored = {entry.key: entry for entry in kept.scores}
+    name, track = ENTRIES["residual"]
+    for held in kept.rounds:
+        entry = scored.get((held.name, track, name))
+        if entry is not None:
+            own = entry.headroom
+            ranked = np.flatnonzero(own.ranked) + 1
+            return held.name, own.pid[ranked].mean(axis=0), own.error[ranked].mean(axis=0)
+    return None
 
 
 def load_stored(path: Path | None = None) -> dict[str, Any]:

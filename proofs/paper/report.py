@@ -12,6 +12,18 @@ from ventbench.base.files import json_values
 #: How a claim of the paper came out; ``none`` where a section makes no claim.
 Verdict = Literal["agrees", "in part", "differs", "none"]
 
+
+def below(interval: tuple[float, float], bound: float = 0.0) -> Verdict:
+    """Verdict on the claim that a quantity is below a bound, by its interval of 95 %."""
+    low, high = interval
+    return "agrees" if high <= bound else "differs" if low > bound else "in part"
+
+
+def every(*parts: Verdict) -> Verdict:
+    """Verdict on a claim of several parts: theirs if they are one, else in part."""
+    return parts[0] if len(set(parts)) == 1 else "in part"
+
+
 #: Value of a cell: a text, a number, or None where there is none.
 Cell = str | float | None
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from proofs.__main__ import app
 from proofs.paper import controller_sections, paper, published, simulator_sections
-from proofs.paper.report import Reproduction, Section, Table
+from proofs.paper.report import Reproduction, Section, Table, below, every
 from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.task import protocol
@@ -83,9 +83,20 @@ def test_the_grid_ranks_the_papers_gains():
     row = section.tables[0].rows[0]
     assert row[:3] == ("R5C10", "10, 0.2", 3.0)
     assert row[3:5] == ("2, 0", 1.0)
-    assert section.verdict == "in part"
+    assert section.verdict == "differs"
     error[1:] = 1.02
     assert controller_sections.best_gains(grid_of(error)).verdict == "agrees"
+
+
+@pytest.mark.parametrize(
+    ("interval", "verdict"),
+    [((-2.0, 0.0), "agrees"), ((-1.0, 1.0), "in part"), ((0.1, 2.0), "differs")],
+)
+def test_a_claim_is_judged_by_its_whole_interval(interval, verdict):
+    assert below(interval) == verdict
+    assert below((interval[0] + 5.0, interval[1] + 5.0), 5.0) == verdict
+    assert every(verdict, verdict) == verdict
+    assert every("agrees", "differs") == "in part"
 
 
 def test_a_grid_without_the_papers_gains_is_refused():
@@ -104,6 +115,16 @@ def test_the_residual_network_is_judged_by_lung(residual, verdict):
     assert section.tables[0].rows[0][3] == pytest.approx(100.0 * (residual - 1.0), abs=1e-3)
 
 
+def test_the_residual_network_is_judged_on_the_rigs_of_a_round_too():
+    grid = grid_of(np.linspace(1.0, 2.0, len(GAINS)))
+    ones = np.ones((6, 6))
+    section = controller_sections.performance(grid, 0.9 * ones, ("trial", ones, 1.2 * ones))
+    assert section.verdict == "in part"
+    assert "On the rigs of round trial" in section.finding
+    assert "+20 %" in section.finding
+    assert section.tables[-1].rows[0][1:] == pytest.approx((1.0, 1.2, 20.0))
+
+
 def test_no_claim_agrees_whose_interval_has_a_zero():
     grid = grid_of(np.linspace(1.0, 2.0, len(GAINS)))
     residual = np.repeat([[0.5], [0.9], [0.9], [0.95], [0.99], [0.99]], 6, axis=1)
@@ -119,6 +140,7 @@ def test_one_network_for_all_must_win_by_more():
     own, shared = np.full((6, 6), 0.9), np.full((6, 6), 0.8)
     assert controller_sections.robustness(grid, own, shared).verdict == "agrees"
     assert controller_sections.robustness(grid, shared, own).verdict == "in part"
+    assert controller_sections.robustness(grid, own, 2.0 * shared).verdict == "differs"
 
 
 def test_reinforcement_learning_is_compared_by_the_mean():
@@ -136,6 +158,10 @@ def test_studies_have_their_claims(stored):
     assert "ppo" in {row[0] for row in samples.tables[0].rows}
     assert controller_sections.regularisation(stored["controllers"]).verdict == "differs"
     assert controller_sections.stability(stored["samples"]).verdict == "differs"
+    early = copy.deepcopy(stored["samples"])
+    for row in early["methods"]:
+        row["episodes_to_2_percent"] = 100
+    assert controller_sections.sample_efficiency(early).verdict == "differs"
     unfinished = copy.deepcopy(stored["samples"])
     unfinished["methods"][-1]["episodes_to_best_pid"] = None
     assert "Not all methods" in controller_sections.sample_efficiency(unfinished).finding

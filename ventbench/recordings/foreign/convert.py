@@ -7,6 +7,7 @@ resampled or smoothed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -491,6 +492,7 @@ def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:
                 numbers[k] = float(word)
             except ValueError:
                 shown = [str(x) for x in dict.fromkeys(values.tolist()) if x][:2]
+                shown.sort(key=lambda x: not re.match("open|on|true|yes|high|1", x, re.IGNORECASE))
                 option = ",".join(f"{x}={1 - n}" for n, x in enumerate(shown))
                 raise InputError(
                     f"{table.file}, column {name}: its cells are no numbers, such as {shown[0]!r}; "

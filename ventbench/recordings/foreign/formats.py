@@ -367,15 +367,12 @@ def _of_topics(file: str, topics: dict[str, list[dict[str, Any]]], kind: str) ->
     used = {topic: rows for topic, rows in topics.items() if 2 * len(rows) >= most}
     names = {key for rows in used.values() for key in rows[0]} - {"time"}
     unique = len(used) == 1 or sum(len(rows[0]) - 1 for rows in used.values()) == len(names)
-    rows = sorted(
-        (
-            {"time": row["time"]}
-            | {k if unique else f"{topic}/{k}": x for k, x in row.items() if k != "time"}
-            for topic, rows in used.items()
-            for row in rows
-        ),
-        key=lambda row: row["time"],
-    )
+    at: dict[float, dict[str, Any]] = {}
+    for topic, messages in used.items():
+        for row in messages:
+            own = {k if unique or k == "time" else f"{topic}/{k}": x for k, x in row.items()}
+            at.setdefault(row["time"], {}).update(own)
+    rows = [at[time] for time in sorted(at)]
     columns = dict.fromkeys(key for row in rows for key in row)
     left = [topic for topic in topics if topic not in used]
     table = _of_values(file, {key: [row.get(key) for row in rows] for key in columns}, kind)

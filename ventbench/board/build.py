@@ -12,20 +12,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ventbench.base import files
 from ventbench.base.text import flatten
-from ventbench.board import canonical, frames, pages, ranking, store
+from ventbench.board import canonical, frames, pages, ranking, replay
 from ventbench.board.frames import Line
 from ventbench.board.gate import Evidence
 from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.record import Record
+from ventbench.board.replay import TRACE_BREATH, Load
 from ventbench.board.rounds import Round
-from ventbench.board.schema import ScoreHeader
+from ventbench.board.schema import ScoreContent
 from ventbench.board.store import Store
 from ventbench.task import protocol
-from ventbench.task.lungs import lung as parse_lung
+from ventbench.task.lungs import LUNG_IDS, LUNGS
 
 if TYPE_CHECKING:
     import jinja2
@@ -63,16 +62,17 @@ def content(leaderboard: Store) -> dict[str, bytes]:
     return built
 
 
-def build(folder: Path, out: Path) -> Built:
+def build(folder: Path, out: Path, simulators: Load | None = None) -> Built:
     """Write the site of a leaderboard into a folder: pages, CSV, and the records that they link to.
 
-    Only files that differ are written; pages of an earlier build that are no more are removed.
+    The frozen simulators replay the records, unless others are given. Only files that differ are
+    written; pages of an earlier build that are no more are removed.
 
     Raises:
         InputError: if a record was changed, or jinja2 is not installed.
         OSError: if a file cannot be read or written.
     """
-    leaderboard = store.load(folder)
+    leaderboard = replay.load(folder, simulators)
     built = content(leaderboard)
     named = sorted(filter(canonical.named, canonical.walk(folder)[0]))
     changed = []
@@ -223,17 +223,15 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
             for column in SHOWN
             if column.names[0] not in ("rank", "name", "normalised")
         ],
-        "scaled": pages.heat_map(record.headroom.normalised, record, pages.NORMALISED_LIMITS, 0),
+        "scaled": pages.heat_map(record.figures.normalised, pages.NORMALISED_LIMITS, 0),
         "compared": base.name if base else None,
-        "heat": pages.heat_map(
-            np.concatenate([record.nominal[None], record.drawn]), record, pages.ERROR_LIMITS
-        ),
+        "heat": pages.heat_map(record.figures.error, pages.ERROR_LIMITS),
         "safety": _safety(record),
         "failures": header.failures[:MAX_FAILURES],
-        "frames": [pages.trusted(pages.frame(pip)) for pip in record.pips],
-        "pips": [f"{pip:g}" for pip in record.pips],
-        "lungs": [(x.id, f"{x.R:g}", f"{x.C:g}") for x in map(parse_lung, record.lungs)],
-        "breath": record.breath,
+        "frames": [pages.trusted(pages.frame(pip)) for pip in protocol.PIPS],
+        "pips": [f"{pip:g}" for pip in protocol.PIPS],
+        "lungs": [(x.id, f"{x.R:g}", f"{x.C:g}") for x in LUNGS],
+        "breath": TRACE_BREATH + 1,
         "provenance": _provenance(header),
         "history": _history(row, evidence),
         "protocol": protocol,
@@ -243,19 +241,20 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
 
 def _safety(record: Record) -> list[dict[str, Any]]:
     """A row a lung: highest pressure, longest time above the limit, whether the gate is passed."""
-    highest, steps = record.peak.max(axis=(0, 2)), record.steps_above.max(axis=(0, 2))
+    own = record.figures
+    highest, steps = own.peak.max(axis=(0, 2)), own.steps_above.max(axis=(0, 2))
     return [
         {
             "name": name,
             "peak": pages.figure(float(highest[i]), 1),
             "above": int(steps[i]),
-            "safe": record.header.safe[i],
+            "safe": bool(own.safe[i]),
         }
-        for i, name in enumerate(record.lungs)
+        for i, name in enumerate(LUNG_IDS)
     ]
 
 
-def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
+def _provenance(header: ScoreContent) -> list[tuple[str, list[tuple[str, str]]]]:
     submission = header.submission
     groups = (
         ("Training, as the authors state it", submission.manifest.training),

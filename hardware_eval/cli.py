@@ -6,8 +6,10 @@ without a score, a no-go); 2 bad input or no device.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import secrets
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +21,7 @@ from hardware_eval.commands import (
     Port,
     Yes,
     bench_on,
+    bringup,
     calibrate,
     calibration_of,
     known_by,
@@ -169,7 +172,7 @@ def run(
         print(sheet, flush=True)
         return sheet
 
-    with bench_on(port, yes=yes, control=control) as (line, _, person):
+    with bench_on(port, yes=yes, control=control, kept=out) as (line, _, person):
         calibrated = calibration_of(line, calibration)
         masked = Blind(person, plan)
         done = ev.evaluate(
@@ -203,7 +206,7 @@ def run(
     )
     shown = told(json)
     if not done.complete:
-        print(f"stopped: {plain(reason)}", file=shown)
+        print(f"stopped: {plain(reason)}; {line.client.ending()}", file=shown)
         print(f"what is done is in {done.log}; the same command continues", file=shown)
         raise typer.Exit(1)
     for name, path in done.records.items():
@@ -281,10 +284,11 @@ def conformance(
     from hardware_eval.wire import conformance as judge
 
     shown = told(json)
-    transport, clock = ev.carrier(port)
+    line = ev.connect(port, timeout=1.0)  # how long answers take is a clause of its own
+    transport = line.client.transport
     try:
         clauses = judge.conformance(
-            transport, clock, lambda clause: print(clause, file=shown, flush=True)
+            transport, line.clock, lambda clause: print(clause, file=shown, flush=True)
         )
     finally:
         transport.close()
@@ -383,7 +387,7 @@ def collect(
         raise InputError(
             f"--ease {ease:g} cmH2O: give more than {protocol.PEEP:g} and at most {highest:g}"
         )
-    with bench_on(port, yes=yes) as (line, bench, person):
+    with bench_on(port, yes=yes, kept=out) as (line, bench, person):
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
         with bar("exploring") as exploring:
@@ -402,7 +406,8 @@ def collect(
     to = told(json)
     print(f"{count} whole breaths: {done.recording}", file=to)
     if done.stopped:
-        print(f"stopped: {plain(done.stopped)}; the same command continues", file=to)
+        print(f"stopped: {plain(done.stopped)}; {line.client.ending()}", file=to)
+        print(f"what is done is in {out}; the same command continues", file=to)
         raise typer.Exit(1)
 
 
@@ -473,10 +478,14 @@ def replay(
         raise typer.Exit(1)
 
 
+app.command()(bringup)
 app.command()(trial)
 app.command()(calibrate)
 
 
 def main() -> None:
     """Entry point of the console script."""
-    options.run(app, "ventbench-hardware", stopped="the lung is vented")
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError):  # closed, or replaced
+            stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+    options.run(app, "ventbench-hardware")

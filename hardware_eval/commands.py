@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench
     from hardware_eval.results.evaluate import Line
+    from hardware_eval.wire.client import Client
 
 Port = Annotated[
     str,
@@ -41,27 +42,56 @@ def told(json: Path | None) -> TextIO:
 
 @contextlib.contextmanager
 def bench_on(
-    port: str, *, yes: bool, control: Path | None = None
+    port: str,
+    *,
+    yes: bool,
+    control: Path | None = None,
+    confirmed: bool = True,
+    kept: Path | None = None,
 ) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
     """A bench with a person at it; the line is released at the end.
 
-    Any key is the emergency stop, which ends the command with exit code 1.
+    Real devices must have been brought up before, unless they need not be ``confirmed``. Any key is
+    the emergency stop, which ends the command with exit code 1. However it ends early, the message
+    says whether the lung is vented, and where ``kept`` lies what the same command continues.
     """
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench, EmergencyStop
     from hardware_eval.bench.safety import DEFAULT
     from hardware_eval.results import evaluate as ev
 
-    line = ev.connect(port)
+    line = ev.connect(port, confirmed)
+    client = line.client
+
+    def ending(reason: str) -> str:
+        left = f"; what is done is in {kept}: the same command continues" if kept else ""
+        return f"{reason}; {client.ending()}{left}"
+
     try:
         person = ConsoleOperator(yes=yes, control=control, device=line.device)
-        with person.keys():
-            yield line, Bench(line.client, line.clock, DEFAULT, person), person
+        with _closing(client), person.keys():
+            yield line, Bench(client, line.clock, DEFAULT, person), person
     except EmergencyStop:
-        print("stopped: the operator pressed the emergency stop", file=sys.stderr)
+        print(ending("stopped: the operator pressed the emergency stop"), file=sys.stderr)
         raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        print(ending("interrupted"), file=sys.stderr)
+        raise
+    except BrokenPipeError as error:
+        raise InputError(ending("nobody reads this program's output any more")) from error
+    except OSError as error:
+        raise InputError(ending(f"{error.filename}: {error.strerror}")) from error
+    except InputError as error:
+        raise InputError(ending(str(error))) from error
+
+
+@contextlib.contextmanager
+def _closing(client: Client) -> Iterator[None]:
+    """Vent and release the line; a disk or an output that fails must not keep it from it."""
+    try:
+        yield
     finally:
-        line.client.close()
+        client.close()
 
 
 Calibrated = Annotated[
@@ -115,17 +145,16 @@ def calibrate(
     Example: `ventbench-hardware calibrate span --port /dev/ttyACM0 --reference 0,20,40,20,0`
     """
     from hardware_eval.bench import calibrate as calibration
+    from hardware_eval.bench.dated import device_of
     from ventbench.task.lungs import scored_lung
 
     values = numbers("--reference", reference)
     label = scored_lung(lung).id
     files.claim_folder(out.parent)  # what a person reads off instruments must not be lost
-    with bench_on(port, yes=yes) as (line, bench, person):
-        device = calibration.device_of(line.client)
+    with bench_on(port, yes=yes) as (line, bench, _):
+        device = device_of(line.client)
         kept = calibration.load(out, device, stale=True).parts if out.exists() else {}
-        made = calibration.measure(
-            bench, part, lung=label, reference=values, ask=None if yes else person.number
-        )
+        made = calibration.measure(bench, part, lung=label, reference=values)
     saved = calibration.Calibration(device, {**kept, part: made}).save(out)
     emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
     to = told(json)
@@ -135,6 +164,53 @@ def calibrate(
     print(f"{out}: {', '.join(saved.parts)}; SHA-256 {saved.sha256}", file=to)
 
 
+def bringup(
+    port: Port,
+    operator: Annotated[str, typer.Option(help="Who stands at the machine and confirms.")],
+    only: Annotated[
+        str | None,
+        typer.Option(
+            metavar="STEP",
+            help="Only one step, and keep nothing: room or reference (read the sensor), "
+            "expiratory or inspiratory (click a valve), vent.",
+        ),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Walk through a machine before anything runs on it: sensor, each valve, the vent.
+
+    Exit code 1 if a step was wrong. No real device is armed without it; it is stale after 30 days,
+    and after any change of wiring or calibration.
+
+    Example: `ventbench-hardware bringup --port /dev/ttyACM0 --operator "A. Name"`
+    """
+    from hardware_eval.bench import bringup as steps
+    from hardware_eval.bench import dated
+
+    if only is not None and only not in steps.STEPS:
+        raise InputError(f"--only {only!r}: choose of {', '.join(steps.STEPS)}")
+    to = told(json)
+    with bench_on(port, yes=False, confirmed=False) as (line, bench, _):
+        if line.client.simulated and only is None:
+            emit({"simulated": True}, json)
+            print("a simulated device: no valve moves, so that it needs no bring-up", file=to)
+            return
+        if only is not None:
+            findings = steps.look(bench, only)
+            emit({"findings": [x.as_dict() for x in findings]}, json)
+            print(*findings, sep="\n", file=to)
+            if not all(x.ok for x in findings):
+                raise typer.Exit(1)
+            return
+        done = steps.bring_up(bench, operator=operator)
+    path = steps.place(done.device)
+    digest = dated.save(path, done.as_dict())
+    emit({**done.as_dict(), "file": str(path), "sha256": digest}, json)
+    print(done, f"{path}; SHA-256 {digest}", sep="\n", file=to)
+    if not done.go:
+        raise typer.Exit(1)
+
+
 def calibration_of(line: Line, path: Path | None) -> Calibration | None:
     """The calibration that a command is given.
 
@@ -142,8 +218,9 @@ def calibration_of(line: Line, path: Path | None) -> Calibration | None:
         InputError: if it is stale, was changed, or is of another device than the line's.
     """
     from hardware_eval.bench import calibrate as calibration
+    from hardware_eval.bench.dated import device_of
 
-    return None if path is None else calibration.load(path, calibration.device_of(line.client))
+    return None if path is None else calibration.load(path, device_of(line.client))
 
 
 def known_by(calibration: Calibration | None) -> dict[str, Any]:

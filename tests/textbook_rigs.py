@@ -81,6 +81,11 @@ class TextbookRigs:
 
 
 def _sessions(factor: float) -> OffsetLung:
-    """One lung on its two rigs after the other: the second is stiffer and narrower."""
-    settings = [Lung(x.R * factor * rig, x.C / factor / rig) for x in LUNGS for rig in (1.0, 1.15)]
+    """One lung on its two rigs after the other: the second is stiffer and narrower.
+
+    They have a quarter of the label's resistance: at 20 the bundled PIDs swing, and are unsafe.
+    """
+    settings = [
+        Lung(x.R / 4 * factor * rig, x.C / factor / rig) for x in LUNGS for rig in (1.0, 1.15)
+    ]
     return stack([OffsetLung(single_compartment(setting)) for setting in settings])

@@ -9,16 +9,16 @@ of another one, was changed, or is stale.
 from __future__ import annotations
 
 import datetime
-import hashlib
-import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hardware_eval.bench import dated
+from hardware_eval.bench.bringup import at_open_tube, vented
 from hardware_eval.bench.drive import Commands, Driven, drive
 from hardware_eval.bench.identity import (
     Interval,
@@ -29,18 +29,13 @@ from hardware_eval.bench.identity import (
 )
 from hardware_eval.bench.loop import Bench
 from hardware_eval.bench.selftest import hold, programs
-from hardware_eval.wire.client import Client
-from hardware_eval.wire.messages import Capability, Reading
-from ventbench.base import files
+from hardware_eval.wire.messages import Capability
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 
 FORMAT = "ventbench-calibration-1"
-
-#: Age from which a part is stale, days.
-STALE = 30.0
 
 #: What can be calibrated, and the units of reference and reading.
 PARTS = {
@@ -161,17 +156,6 @@ class Part:
         return f"{'; '.join(parts)}; residual {own.residual:.2g} {y}"
 
 
-def _vented(bench: Bench, readings: int) -> tuple[Floats, Floats]:
-    """Pressures and flows of a vented device, one each control step."""
-    client, clock, taken = bench.client, bench.clock, list[Reading]()
-    client.vent()
-    start = clock.now()
-    for step in range(readings):
-        clock.sleep_until(start + step * protocol.DT)
-        taken.append(client.heartbeat())
-    return np.array([x.pressure for x in taken]), np.array([x.flow for x in taken])
-
-
 def _mean(values: Floats, least: float) -> tuple[float, float]:
     if not np.isfinite(values).all():
         raise InputError("the device gives no reading here; see `ventbench-hardware selftest`")
@@ -189,7 +173,6 @@ def measure(
     *,
     lung: str,
     reference: Sequence[float] = (),
-    ask: Callable[[str], float] | None = None,
     now: datetime.datetime | None = None,
 ) -> Part:
     """Measure one part; a device that moves its valves does so watched, as in a self-test.
@@ -200,7 +183,6 @@ def measure(
         lung: label of the mounted lung, for ``valve`` and ``leak``.
         reference: the reference's values: pressures of ``span``, cmH2O, flows of ``flow``, mL/s,
             openings of ``valve``, %, in the order in which they are set; PEEP by an instrument.
-        ask: asks a person for a number; needed for the valve of a device without a flow sensor.
         now: the time; that of the computer if not given.
 
     Raises:
@@ -225,7 +207,7 @@ def measure(
             else f"set the lung to {lung}, PEEP valve as in use. Does it rest?"
         )
         level = reference[0] if reference else 0.0
-        rows = [_mean(_vented(bench, _READINGS)[0], _PRESSURE_ERROR) for _ in range(_MEANS)]
+        rows = [_mean(vented(bench, _READINGS)[0], _PRESSURE_ERROR) for _ in range(_MEANS)]
         points = [(0.0, value - level, error) for value, error in rows]
     elif kind in ("span", "flow"):
         unit, flow = PARTS[kind][0], kind == "flow"
@@ -237,15 +219,13 @@ def measure(
         for value in reference:
             what = "send" if flow else "apply"
             confirmed(f"{what} {value:g} {unit} {'through' if flow else 'to'} the sensor. Steady?")
-            read = _vented(bench, 2 * _READINGS)[int(flow)]
+            read = vented(bench, 2 * _READINGS)[int(flow)]
             points.append((value, *_mean(read, _FLOW_ERROR if flow else _PRESSURE_ERROR)))
     elif kind == "valve":
         openings = [float(x) for x in reference] or [*OPENINGS, *OPENINGS[::-1]]
         if len(set(openings)) < 2 or min(openings) < 0.0 or max(openings) > protocol.U_MAX:
             raise InputError("valve: give two openings at least, within 0 to 100 %")
         by_hand = not has_flow
-        if by_hand and ask is None:
-            raise InputError("valve: the device measures no flow, and nobody is there to read it")
         confirmed(
             f"set the lung to {lung} and connect it. Is it set?"
             if has_flow
@@ -256,9 +236,9 @@ def measure(
             if has_flow:
                 flows = _puffed(bench, lung, opening, bool(above)).flow[-_COUNT:]
                 points.append((opening, *_mean(flows, _FLOW_ERROR)))
-            elif ask is not None:
+            else:
                 _held_open(bench, lung, opening, bool(above))
-                flow = ask(f"the meter's steady flow at {opening:g} %, mL/s: ")
+                flow = bench.operator.number(f"the meter's steady flow at {opening:g} %, mL/s: ")
                 points.append((opening, flow, max(0.02 * abs(flow), 1.0)))  # as meters state it
     elif kind == "lung":
         confirmed(f"set the lung to {lung} and connect it. Is it set?")
@@ -276,7 +256,7 @@ def measure(
             raise InputError("lung: neither R nor C can be measured here; see the self-test")
     else:
         confirmed(f"set the lung to {lung} and connect it. Is it set?")
-        noise = white_noise(_vented(bench, _READINGS)[0])
+        noise = white_noise(vented(bench, _READINGS)[0])
         ((make, steps, pip),) = programs(lung, noise)[kind]
         still = hold(lung, noise)[0]
         closed = _watched(drive(bench, lung, make(), steps, pip=pip), kind)
@@ -285,7 +265,7 @@ def measure(
         points = [(t - time[0], p, noise) for t, p in zip(time, pressure, strict=True)]
     columns = zip(*points, strict=True)
     xs, ys, errors = (tuple(round(float(x), 6) for x in column) for column in columns)
-    date = (now or datetime.datetime.now(datetime.UTC)).isoformat(timespec="seconds")
+    date = (now or dated.today()).isoformat(timespec="seconds")
     above = (0,) * len(xs) if kind in ("zero", "peep", "leak", "lung") else _above(xs)
     label = lung if kind == "lung" else ""
     return Part(kind, date, xs, ys, errors, above, by_hand, label)
@@ -314,10 +294,7 @@ def _held_open(bench: Bench, lung: str, opening: float, above: bool) -> None:
     """Hold an opening for a person to read, tube and expiratory valve open."""
     steps, larger = round(_HOLD_S / protocol.DT), min(_LARGER * opening, protocol.U_MAX)
     held: Commands = lambda step, pressure: (larger if above and step < 10 else opening, 1)  # noqa: E731
-    # At an open tube there is no pressure, as it should be.
-    low = replace(bench.settings.low_pressure, duration=math.inf)
-    opened = replace(bench, settings=replace(bench.settings, low_pressure=low), rest=0.5)
-    _watched(drive(opened, lung, held, steps, pip=30.0), "valve")
+    _watched(drive(at_open_tube(bench), lung, held, steps, pip=30.0), "valve")
 
 
 @dataclass(frozen=True)
@@ -329,7 +306,8 @@ class Calibration:
     parts: dict[str, Part]  #: by kind.
     sha256: str = ""  #: of the content; identifies the calibration in records.
 
-    def _content(self) -> dict[str, Any]:
+    def save(self, path: Path) -> Calibration:
+        """Write it; returns it with its hash."""
         parts = {}
         for kind, part in self.parts.items():
             line = part.fit
@@ -338,14 +316,7 @@ class Calibration:
             }
             parts[kind] = {**vars(part), "units": PARTS[kind], **found, "residual": line.residual}
         content = {"format": FORMAT, "device": self.device, "parts": parts}
-        return json.loads(json.dumps(files.json_values(content)))
-
-    def save(self, path: Path) -> Calibration:
-        """Write it; returns it with its hash."""
-        content = self._content()
-        digest = _digest(content)
-        files.write_json(path, {**content, "sha256": digest})
-        return replace(self, sha256=digest)
+        return replace(self, sha256=dated.save(path, content))
 
     @property
     def valve(self) -> tuple[float, float, float] | None:
@@ -375,16 +346,6 @@ class Calibration:
         return {"sha256": self.sha256, "dates": {k: x.date for k, x in self.parts.items()}}
 
 
-def _digest(content: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def device_of(client: Client) -> dict[str, str]:
-    """What a device says that it is."""
-    welcome = client.welcome or client.hello()
-    return {"device_id": welcome.device_id.hex(), "calibration": welcome.calibration.hex()}
-
-
 def load(
     path: Path, device: dict[str, str], *, now: datetime.datetime | None = None, stale: bool = False
 ) -> Calibration:
@@ -392,16 +353,15 @@ def load(
 
     Args:
         path: of the file.
-        device: of :func:`device_of`.
+        device: of :func:`hardware_eval.bench.dated.device_of`.
         now: the time; that of the computer if not given.
         stale: take stale parts too, to renew them one by one.
 
     Raises:
         InputError: if it is none, was changed, is of another device, or is stale.
     """
+    content = dated.load(path, FORMAT, device, "ventbench-hardware calibrate PART --port PORT")
     try:
-        content = json.loads(path.read_text("utf-8"))
-        digest = content.pop("sha256")
         parts = {
             kind: Part(
                 kind,
@@ -411,30 +371,15 @@ def load(
                 tuple(x["error"]),
                 tuple(x["above"]),
                 x["by_hand"],
-                x.get("lung", ""),
+                x["lung"],
             )
             for kind, x in content["parts"].items()
         }
-        dates = {kind: datetime.datetime.fromisoformat(x.date) for kind, x in parts.items()}
-        own = content["device"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is no calibration ({error}); make one by `calibrate`") from None
-    if digest != _digest(content) or content.get("format") != FORMAT:
-        raise InputError(f"{path} was changed after it was measured; measure it again")
-    if own != device:
-        raise InputError(
-            f"{path} is of device {own['device_id']} or of other settings of it, not of this "
-            f"{device['device_id']}; calibrate this one"
-        )
-    now = now or datetime.datetime.now(datetime.UTC)
-    for kind, date in dates.items():
-        age = (now - date).total_seconds() / 86400.0
-        if not stale and not -1.0 <= age <= STALE:
-            raise InputError(
-                f"{path}: {kind} is {age:.0f} days old, {STALE:g} are allowed; run "
-                f"`ventbench-hardware calibrate {kind}` again"
-            )
-    return Calibration(own, parts, digest)
+    for kind, part in () if stale else parts.items():
+        dated.check_age(part.date, f"{path}: {kind}", f"ventbench-hardware calibrate {kind}", now)
+    return Calibration(content["device"], parts, content["sha256"])
 
 
 def lost_flow(leak: Part, lung: str) -> Interval:

@@ -40,7 +40,8 @@ REACTION = 0.2
 #: Keys that are read at once, and what stands for a terminal that has gone.
 _KEYS, _GONE = 4096, b"\x04"
 
-_BARS = " ▁▂▃▄▅▆▇█"
+#: Heights of a bar, and those of a terminal that has no blocks.
+_BARS, _PLAIN_BARS = " ▁▂▃▄▅▆▇█", " .:-=+*%#"
 
 
 class ConsoleOperator(Operator):
@@ -83,6 +84,10 @@ class ConsoleOperator(Operator):
         terminal = sys.stdin.fileno()
         before = termios.tcgetattr(terminal)
         tty.setcbreak(terminal, termios.TCSAFLUSH)  # Ctrl-C still interrupts
+        # Ctrl-Z is a key as others, and stops; suspended, the host would just fall silent.
+        own = termios.tcgetattr(terminal)
+        own[6][termios.VSUSP] = b"\0"
+        termios.tcsetattr(terminal, termios.TCSAFLUSH, own)
         self._terminal = terminal
         try:
             yield
@@ -115,9 +120,9 @@ class ConsoleOperator(Operator):
             EmergencyStop: as :meth:`confirm`, or if the terminal has gone.
             InputError: if there is no terminal, or it is no number.
         """
+        if self._terminal is None or self._yes:
+            raise InputError(f"{question}nobody is there to answer (no terminal, or --yes)")
         print(question, end="", flush=True)
-        if self._terminal is None:
-            raise InputError(f"{question}there is no terminal to answer at")
         self._react()
         typed = b""
         while not typed.endswith((b"\n", b"\r")):
@@ -223,13 +228,18 @@ def show_bars(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None
         return
     error = float(np.mean(np.abs(inspired - run.pip)))
     share = (inspired - protocol.PEEP) / (run.pip - protocol.PEEP)
-    heights = np.clip(share * 6.5, 0, len(_BARS) - 1).astype(int)  # the target is at 6.5 of 8
+    bars = _BARS
+    try:
+        bars.encode(getattr(sys.stdout, "encoding", None) or "ascii")
+    except UnicodeEncodeError:
+        bars = _PLAIN_BARS
+    heights = np.clip(share * 6.5, 0, len(bars) - 1).astype(int)  # the target is at 6.5 of 8
     worst = 1e3 * max(breath.late)
     print(
         f"{done + 1:4d}/{total} {run.kind:9s} {run.entry:16.16s} {run.lung:6s} "
         f"PIP {run.pip:2.0f} #{run.repeat:<2d} error {error:6.2f} "
         f"peak {inspired.max():5.1f} late {worst:4.1f} ms "
-        f"|{''.join(_BARS[h] for h in heights)}|",
+        f"|{''.join(bars[h] for h in heights)}|",
         flush=True,
     )
 

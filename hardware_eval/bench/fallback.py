@@ -1,22 +1,26 @@
 """A fallback that takes over when an entry is late or about to leave its envelope, and hands back.
 
 Simplex: the entry commands as long as the safe controller could still rescue the lung after its
-command. Whether it could is a one-sided reachability over every rig within bounds: R, C and the
-valve's gain off by so much, a resistor that is linear or parabolic, a valve one to three steps
-late. The pressure ``j`` steps after a reading ``p`` is at most ::
+command. Whether it could is asked of a set of rigs that span the right ones: R, C and the valve's
+gain off by so much, a resistor that is linear or parabolic, a valve that is quick or slow. On each
+the pressure ``j`` steps after a reading ``p`` is at most ::
 
     p + e + D(g u[j]) - D(g u[0]) + g dt / C (u[1] + ... + u[j])
 
 with the noise ``e``, the commands ``u`` whose flow is seen then, and the resistor's drop ``D``. It
 is monotonic in 1/C and in R, and its largest value over R and g lies at their ends, whichever way
-the flow changes; a slow valve in front of a linear resistor mixes dead times, and stays below the
-largest of their bounds. Every reading of the last steps gives such a bound, as does the volume that
-can be left of the breath before; the least of them holds. After the entry's command the safe
-controller closes the valve. The command is inside the envelope if then no pressure is above the
-device's limit and none above the protocol's for longer than its safety gate allows.
+the flow changes. Every reading of the last steps gives such a bound, as does the volume that can be
+left of the breath before; the least of them holds. After the entry's command the safe controller
+closes the valve. The command is inside the envelope if then on no rig the pressure that remains is
+above the protocol's limit, and on none the pressure, with the readings before, is above it for
+longer than the safety gate allows. Each rig is judged by itself: a late valve shows a peak late and
+a quick one soon, but none shows it twice.
 
-In the first steps of a breath no reading tells the drop of its flow. There, the pressure that
-remains when the flow has ended decides; the rest is left to the checks of host and device.
+A peak that a resistor makes in a step or two passes the gate, and on rigs that are all right it is
+here and there twice as high. No bound of R tells it without refusing commands that do no harm: it
+is left to the device, which vents at 60 cmH2O at once. In the first steps of a breath no reading
+tells the drop of its flow; there, the pressure that remains decides. ``python
+benchmarks/hardware_guards.py`` prints what right rigs do, and how often the fallback is wrong.
 
 The fallback is the paper's PI of the labelled lung, cut to the largest command that is inside.
 """
@@ -34,6 +38,8 @@ from ventbench.base.arrays import Floats
 from ventbench.mechanics.labels import APPARATUS, TOLERANCE_R
 from ventbench.task import protocol
 from ventbench.task.lungs import Lung
+from ventbench.task.metrics import measured
+from ventbench.task.metrics.score import longest_run, safety_limit
 
 
 @dataclass(frozen=True)
@@ -45,11 +51,10 @@ class FallbackSettings:
             a test lung keeps within about half of that.
         apparatus: resistance of tubes and filters, cmH2O/(L/s).
         outlet: largest resistance of the expiratory valve, cmH2O/(L/s).
-        lags: steps from a command to the reading that shows its flow, least and most.
+        delays: shares of a command's flow that the readings 1, 2 and 3 steps later show.
         noise: most by which a reading is too low, cmH2O.
         readings: newest readings that bound the future.
-        highest: pressure that may never be reached, cmH2O.
-        above: steps in a row that the pressure may be above ``PIP + SAFETY_MARGIN``.
+        above: steps in a row that the pressure may be above the safety gate's limit.
         hand_back: answers in a row, in time and inside, after which the entry commands again.
     """
 
@@ -58,12 +63,21 @@ class FallbackSettings:
     gain: float = 1.15
     apparatus: float = APPARATUS
     outlet: float = 10.0
-    lags: tuple[int, int] = (1, 3)
+    delays: tuple[tuple[float, ...], ...] = (
+        (1.0, 0.0, 0.0),
+        (0.5, 0.5, 0.0),
+        (0.0, 1.0, 0.0),
+        (0.0, 0.8, 0.2),
+    )
     noise: float = 1.0
     readings: int = 4
-    highest: float = protocol.SAFETY_PRESSURE
-    above: int = 2
+    above: int = int(protocol.SAFETY_TIME / protocol.DT)
     hand_back: int = 3
+
+    @property
+    def last(self) -> int:
+        """Steps after which a command shows for the last time."""
+        return len(self.delays[0])
 
 
 DEFAULT = FallbackSettings()
@@ -135,7 +149,9 @@ def step(
     error = pip - pressure if known else 0.0
     share = protocol.DT / (protocol.DT + 0.5)
     integral = state.integral + share * (error - state.integral) if known else state.integral
-    outside = answer is not None and not is_inside(settings, state, pip, answer)
+    # Nothing is safer than a valve that is closed.
+    opens = answer is not None and answer > 0.0
+    outside = opens and not is_inside(settings, state, pip, answer or 0.0)
     good = 0 if answer is None or outside else state.good + 1
     active = not good or (state.active and good <= settings.hand_back)
     if active or answer is None:
@@ -162,7 +178,7 @@ def _begun(
     settings: FallbackSettings, state: FallbackState, pressure: float, before: float
 ) -> FallbackState:
     """The state at the first step of an inspiration; ``before`` is the bias flow's command."""
-    residual, late = protocol.PEEP, settings.lags[1]
+    residual, late = protocol.PEEP, settings.last
     if seen := [x for x in state.pressures if math.isfinite(x)]:
         R, C, gain = _most(settings, state.lung)
         filled = seen[-1] + settings.noise + gain * protocol.DT / C * sum(state.commands[-late:])
@@ -187,7 +203,7 @@ def _most(settings: FallbackSettings, lung: Lung) -> tuple[float, float, float]:
 
 
 def reachable(settings: FallbackSettings, state: FallbackState, answer: float) -> Floats:
-    """Highest pressures if the valve takes an answer for a step and is then closed.
+    """Highest pressures on each rig if the valve takes an answer for a step and is then closed.
 
     Args:
         settings: bounds.
@@ -195,49 +211,42 @@ def reachable(settings: FallbackSettings, state: FallbackState, answer: float) -
         answer: command, %.
 
     Returns:
-        Bound of each next step until all flow has ended, cmH2O, shape ``(lags[1] + 1,)``.
+        Bound of each next step until all flow has ended, cmH2O, shape ``(rigs, last + 1)``.
     """
     R_most, C, gain_most = _most(settings, state.lung)
-    first, last = settings.lags
+    last = settings.last
     newest = len(state.pressures) - 1  # this step
     sent = np.array([*state.commands, answer, *[0.0] * (last + 1)])
-    # Of each reading from the inspiration's first on: commands whose flow it may show, by lag.
-    shown = np.stack([sent[last - lag : len(sent) - lag] for lag in range(first, last + 1)])
+    # Command whose flow each reading shows, from the inspiration's first on, by delay.
+    by_lag = [sent[last - lag : len(sent) - lag] for lag in range(1, last + 1)]
+    shown = np.array(settings.delays) @ np.stack(by_lag)
     ahead = newest + np.arange(1, last + 2)
     R = np.array([state.lung.R / settings.R, R_most])[:, None, None, None]
     gain = VALVE_GAIN * np.array([1.0 / settings.gain, settings.gain])
     flows = 1e-3 * gain[:, None, None] * shown  # L/s
-    drops = R * np.stack([flows, flows**2])[:, None]  # linear and parabolic, (2, R, gain, lag, k)
-    drops = drops.reshape(-1, *shown.shape)
+    drops = R * np.stack([flows, flows**2])[:, None]  # linear, parabolic: (2, R, gain, delay, k)
     stored = np.cumsum(shown, axis=1) * gain_most * protocol.DT / C
+    risen = (drops + stored).reshape(-1, len(sent) - last)
     # Since the inspiration began, with what may be left of the breath before.
-    least = state.residual + (drops + stored)[..., ahead].max(axis=(0, 1))
+    least = state.residual + risen[:, ahead]
     for k in range(max(last, newest + 1 - settings.readings), newest + 1):
         if math.isfinite(state.pressures[k]):
-            change = (drops + stored)[..., ahead] - (drops + stored)[..., k : k + 1]
-            bound = state.pressures[k] + settings.noise + change.max(axis=(0, 1))
+            bound = state.pressures[k] + settings.noise + risen[:, ahead] - risen[:, k : k + 1]
             least = np.minimum(least, bound)
     return least
 
 
 def is_inside(settings: FallbackSettings, state: FallbackState, pip: float, answer: float) -> bool:
     """Whether no rig within the bounds comes to harm by a command, if the valve closes after it."""
-    limit = min(protocol.SAFETY_PRESSURE, pip + protocol.SAFETY_MARGIN)
-    highest = reachable(settings, state, answer)
-    if highest[-1] > limit:
+    limit = float(safety_limit(pip))
+    above = reachable(settings, state, answer) > limit
+    if above[:, -1].any():
         return False
-    if len(state.pressures) <= settings.lags[1]:  # no reading tells the resistor's drop yet
+    if len(state.pressures) <= settings.last:  # no reading tells the resistor's drop yet
         return True
-    above = 0
-    for pressure in reversed(state.pressures):
-        if not pressure > limit:
-            break
-        above += 1
-    for pressure in highest.tolist():
-        above = above + 1 if pressure > limit else 0
-        if pressure > settings.highest or above > settings.above:
-            return False
-    return True
+    seen = measured.worst(state.pressures[-settings.above - 1 :]) > limit
+    runs = longest_run(np.hstack([np.tile(seen, (len(above), 1)), above]))
+    return bool(runs.max() <= settings.above)
 
 
 def largest_inside(

@@ -24,14 +24,16 @@ from hardware_eval import realtime
 from hardware_eval.bench import fallback, safety
 from hardware_eval.bench.controllers import ControllerFailedError, LiveController
 from hardware_eval.bench.fallback import FallbackSettings
-from hardware_eval.bench.plan import PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
+from hardware_eval.bench.plan import MEASURED, PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.realtime import Clock
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError, RefusedError
-from hardware_eval.wire.messages import CAUSES, Flag, Reading
+from hardware_eval.wire.messages import CAUSES, Flag, Reading, Reason
 from ventbench.base.arrays import Floats
+from ventbench.base.errors import InputError
 from ventbench.task import protocol, waveform
 from ventbench.task.lungs import lung as parse_lung
+from ventbench.task.metrics import measured
 
 #: When a controller must have answered, s after the step's deadline: what is left of 30 ms is for
 #: the command's way to the device, and for this loop.
@@ -64,6 +66,10 @@ class Operator:
     def confirm(self, question: str) -> bool:
         """Ask; False ends the session."""
         return True
+
+    def number(self, question: str) -> float:
+        """Ask for a number that a person reads or knows; InputError where there is none."""
+        raise InputError(f"{question}nobody is there to answer")
 
     def tell(self, text: str) -> None:
         """Say something."""
@@ -169,16 +175,11 @@ class RunResult:
         """Mean |pressure - PIP| over the scored inspirations, cmH2O; NaN unless complete."""
         if self.status != "complete":
             return math.nan
-        errors = [
-            abs(pressure - target)
-            for k in protocol.SCORED_BREATHS
-            for pressure, target in zip(
-                self.breaths[k].pressure[: protocol.INSPIRATION_STEPS],
-                self.breaths[k].target[: protocol.INSPIRATION_STEPS],
-                strict=True,
-            )
-        ]
-        return float(np.mean(errors))
+        pressure, target = (
+            measured.scored([getattr(breath, name) for breath in self.breaths])
+            for name in ("pressure", "target")
+        )
+        return measured.mean_error(pressure, target)
 
 
 class EmergencyStop(Exception):
@@ -275,7 +276,7 @@ class _Loop:
     def _measured(self) -> RunResult:
         """The end of a run that went through.
 
-        A score needs every pressure of its inspirations, and a controller that answered in time.
+        A score needs the pressures of its inspirations, and a controller that answered in time.
         """
         outside = self._fallback.outside
         if self._late_answers + outside > LATE_SHARE * self._asked:
@@ -286,17 +287,13 @@ class _Loop:
                 f"{1e3 * ANSWER_BY:.0f} ms, the longest "
                 f"{1e3 * self._controller.longest_answer:.0f} ms{left}; {100 * LATE_SHARE:g} % may",
             )
-        if self._run.kind not in ("scored", "control"):
+        if self._run.kind not in MEASURED:
             return self._ended("complete", "")
-        pressures = [
-            pressure
-            for k in protocol.SCORED_BREATHS
-            for pressure in self._breaths[k].pressure[: protocol.INSPIRATION_STEPS]
-        ]
-        missing = sum(math.isnan(pressure) for pressure in pressures)
-        if not missing:
+        pressure = measured.scored([breath.pressure for breath in self._breaths])
+        reason = measured.too_few(pressure)
+        if not reason:
             return self._ended("complete", "")
-        reason = f"{missing} of {len(pressures)} scored steps have no pressure"
+        missing = int(np.isnan(pressure).sum())
         return self._ended("aborted", reason, held_up=missing <= self._unanswered)
 
     def _step(self, start: float, deadline: float, breath: int, step: int) -> RunResult | None:
@@ -313,16 +310,19 @@ class _Loop:
             reading = None
             self._unanswered += 1
         except RefusedError as error:
-            return self._ended("aborted", str(error))
+            return self._refused(error)
         target = float(waveform.target(step, run.pip))
         log.time.append((bench.clock.now() if reading is None else began) - start)
-        log.pressure.append(math.nan if reading is None else reading.pressure)
-        log.flow.append(math.nan if reading is None else reading.flow)
+        # A controller must see each breath begin; what the last command's answer told is at most a
+        # step old, at the end of an expiration.
+        seen = bench.client.reading if reading is None and step == 0 else reading
+        log.pressure.append(math.nan if seen is None else seen.pressure)
+        log.flow.append(math.nan if seen is None else seen.flow)
         log.target.append(target)
         log.late.append(max(began - deadline, 0.0))
         result = self._look(reading, began, log.late[-1])
         if result is None:
-            result = self._act(reading, deadline, step, target)
+            result = self._act(seen, deadline, step, target)
         if result is not None:  # so that every list of the breath has as many values
             log.requested.append(math.nan)
             log.u_in.append(0.0)
@@ -361,10 +361,6 @@ class _Loop:
         requested, budget, cut = math.nan, 0.0, False
         if inspiring:
             previous = _BIAS if step == 0 else self._command[0]
-            if step == 0:
-                # A controller must see each breath begin; what the last command's answer told is
-                # at most a step old.
-                reading = reading or bench.client.reading
             if reading is not None:
                 row = _row(step, reading.pressure, target, run.pip, previous)
                 budget = deadline + ANSWER_BY - bench.clock.now()
@@ -410,7 +406,8 @@ class _Loop:
         flags = getattr(error.refusal, "flags", Flag.NONE)
         if flags & _CAUSES:
             return self._vented_by_device(flags)
-        return self._ended("aborted", str(error))
+        lost = error.refusal.reason is Reason.SESSION  # arming opens it again
+        return self._ended("aborted", str(error), held_up=lost)
 
     def _disturb(self, breath: int, step: int) -> None:
         """Announce and undo the perturbation of a perturbed run."""

@@ -18,10 +18,14 @@ import numpy as np
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS, scored_lung
+from ventbench.task.metrics import measured
 
 #: Kinds of runs: PIP rises step by step before an entry is scored on a lung; scored; the PID
 #: between them; with a leak or a pinched tube at an announced moment; exploring for recordings.
 Kind = Literal["ramp", "scored", "control", "perturbed", "explore"]
+
+#: Those with an error.
+MEASURED = ("scored", "control")
 
 #: Those whose lung is as its label says.
 UNDISTURBED = ("ramp", "scored", "control")
@@ -193,15 +197,16 @@ def progress(plan: Plan, lines: Iterable[Mapping[str, Any]]) -> Progress:
     """How far a plan has come by its log.
 
     A run is done when it is complete, or when a check tripped that blames its controller. A run
-    that was cut off or that the bench spoilt runs again from its first breath, as its controller is
-    gone; its logged breaths stay in the log.
+    that was cut off, that the bench spoilt or of which the log holds too few readings runs again
+    from its first breath, as its controller is gone; its logged breaths stay in the log.
 
     Raises:
         InputError: if the log is of another plan.
     """
-    done: set[int] = set()
+    logged = list(lines)
+    done = {run for run, _ in complete_runs(logged)}
     attempts: dict[int, int] = {}
-    for line in lines:
+    for line in logged:
         if line["type"] == "plan" and line["plan"] != _plain(plan):
             keys = [key for key, value in _plain(plan).items() if line["plan"].get(key) != value]
             raise InputError(
@@ -210,9 +215,25 @@ def progress(plan: Plan, lines: Iterable[Mapping[str, Any]]) -> Progress:
             )
         if line["type"] == "run_begins":
             attempts[line["run"]] = line["attempt"] + 1
-        if line["type"] == "run" and line["status"] in ("complete", "failed"):
+        if line["type"] == "run" and line["status"] == "failed":
             done.add(line["run"])
     return Progress(frozenset(done), attempts)
+
+
+def complete_runs(lines: Iterable[Mapping[str, Any]]) -> set[tuple[int, int]]:
+    """Number and attempt of the runs of a log that are complete, with enough readings to score."""
+    pressures: dict[tuple[int, int], dict[int, list[float | None]]] = {}
+    complete = set()
+    for line in lines:
+        if line["type"] == "breath":
+            run = pressures.setdefault((line["run"], line["attempt"]), {})
+            run[line["breath"]] = line["pressure"]
+        elif line["type"] == "run" and line["status"] == "complete":
+            key = line["run"], line["attempt"]
+            rows = [pressures.get(key, {}).get(k, []) for k in range(protocol.BREATHS)]
+            if line["kind"] not in MEASURED or not measured.too_few(measured.scored(rows)):
+                complete.add(key)
+    return complete
 
 
 def _plain(plan: Plan) -> dict[str, Any]:

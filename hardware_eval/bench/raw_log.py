@@ -7,6 +7,7 @@ one stays where it is; the next session says so in the line that follows, and re
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.loop import BreathLog
-from hardware_eval.bench.plan import PlannedRun
+from hardware_eval.bench.plan import PlannedRun, complete_runs
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, make_breaths
 from ventbench.task.lungs import lung as parse_lung
@@ -66,10 +67,14 @@ class RawLog:
             self.append(_CUT)
 
     def append(self, line: dict[str, Any]) -> None:
-        """Append one line and wait until it is on the disk."""
-        self._file.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        """Append one line and wait until it is on the disk; an OSError names the file."""
+        try:
+            self._file.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            error.filename = str(self.path)
+            raise
 
     def close(self) -> None:
         """Close the file."""
@@ -118,7 +123,7 @@ class LoggedBreath:
     run: PlannedRun  #: what ran.
     attempt: int  #: how often the run had been begun before, from 0.
     breath: int  #: its place in the run, from 0.
-    complete: bool  #: whether its run was finished and no check had tripped.
+    complete: bool  #: whether its run was finished, no check had tripped, and it can be scored.
     log: BreathLog  #: what happened.
 
 
@@ -129,11 +134,7 @@ def breaths(path: Path) -> list[LoggedBreath]:
         InputError: as of :func:`lines`.
     """
     logged = list(lines(path))
-    finished = {
-        (line["run"], line["attempt"])
-        for line in logged
-        if line["type"] == "run" and line["status"] == "complete"
-    }
+    finished = complete_runs(logged)
     return [
         LoggedBreath(
             PlannedRun(
@@ -157,7 +158,8 @@ def recording(path: Path, kinds: Sequence[str]) -> Breaths:
         kinds: kinds of runs that are taken.
 
     Returns:
-        Breaths of equally many samples, those of most breaths: without what a check cut short.
+        Breaths of equally many samples, those of most breaths: without what a check cut short or
+        what begins without a reading; later readings that are missing are blank.
 
     Raises:
         InputError: if there is no such breath.
@@ -165,7 +167,7 @@ def recording(path: Path, kinds: Sequence[str]) -> Breaths:
     taken = [b for b in breaths(path) if b.run.kind in kinds and len(b.log.time) > 1]
     lengths = [len(b.log.time) for b in taken]
     usual = max(set(lengths), key=lengths.count, default=0)
-    taken = [b for b in taken if len(b.log.time) == usual and np.isfinite(b.log.pressure).all()]
+    taken = [b for b in taken if len(b.log.time) == usual and math.isfinite(b.log.pressure[0])]
     if not taken:
         raise InputError(f"{path} holds no whole breath of {', '.join(kinds)}")
     labels = [parse_lung(b.run.lung) for b in taken]
@@ -182,5 +184,5 @@ def recording(path: Path, kinds: Sequence[str]) -> Breaths:
         np.clip(stacked("u_in"), 0.0, 100.0),
         stacked("u_out"),
         stacked("pressure"),
-        flow=flow if np.isfinite(flow).all() else None,
+        flow=flow if np.isfinite(flow[np.isfinite(stacked("pressure"))]).all() else None,
     )

@@ -237,7 +237,9 @@ class SafetyState:
     #: when each condition that holds began to hold, s.
     since: dict[str, float] = field(default_factory=dict)
     trips: tuple[Trip, ...] = ()  #: checks that have tripped, in order; they stay.
-    previous: SafetySample | None = None  #: sample before; None before the first.
+    #: sample before, with the last reading where it had none; None before the first.
+    previous: SafetySample | None = None
+    seen: SafetySample | None = None  #: last sample with a reading; None before the first.
     volume: float = 0.0  #: estimate of the volume above that at PEEP, mL.
     delivered: float = 0.0  #: volume given since this inspiration began, mL.
     start: float = protocol.PEEP  #: pressure when this inspiration began, cmH2O.
@@ -262,7 +264,7 @@ def pressure_limit(settings: SafetySettings, pip: float) -> float:
 
 
 def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> SafetyState:
-    """Look at one sample.
+    """Look at one sample; one without a reading neither ends nor begins what the last one showed.
 
     Args:
         settings: all thresholds.
@@ -272,8 +274,16 @@ def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> 
     Returns:
         The next state; ``trips`` is longer if a check tripped at this sample.
     """
+    number = math.isfinite(sample.pressure) and _PLAUSIBLE[0] <= sample.pressure <= _PLAUSIBLE[1]
+    jump = 0.0
+    if state.seen is not None and math.isfinite(sample.pressure):
+        steps = max((sample.time - state.seen.time) / protocol.DT, 1.0)
+        jump = abs(sample.pressure - state.seen.pressure) / steps
+    seen = sample if number else state.seen
+    last = protocol.PEEP if seen is None else seen.pressure
+    sample = sample._replace(pressure=last)
     state = _estimated(state, sample)
-    values = _values(settings, state, sample)
+    values = _values(settings, state, sample, number, jump)
     since: dict[str, float] = {}
     trips = list(state.trips)
     tripped = {trip.check for trip in trips}
@@ -297,7 +307,7 @@ def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> 
                     check.bench,
                 )
             )
-    return replace(state, since=since, trips=tuple(trips), previous=sample)
+    return replace(state, since=since, trips=tuple(trips), previous=sample, seen=seen)
 
 
 def _estimated(state: SafetyState, sample: SafetySample) -> SafetyState:
@@ -352,6 +362,9 @@ _SHOWS = 8.0
 #: pressure of a closed circuit may settle, s.
 _OPENS_S, _SETTLES_S = 0.6, 0.12
 
+#: Readings that stay equal for longer, s, are of a frozen sensor; of one that moves few are.
+_FROZEN_S = 0.08
+
 #: Volume that no test lung takes, mL.
 _LARGEST_VOLUME = 2500.0
 
@@ -360,19 +373,18 @@ _LEAST_LEFT = 4.0
 
 
 def _values(
-    settings: SafetySettings, state: SafetyState, sample: SafetySample
+    settings: SafetySettings, state: SafetyState, sample: SafetySample, number: bool, jump: float
 ) -> dict[str, tuple[float, bool]]:
-    """Value of each check, and whether its condition holds."""
-    before, pressure, C = state.previous, sample.pressure, state.lung.C
+    """Value of each check, and whether its condition holds.
+
+    ``number``: whether the sample has a reading, else it shows the last one. ``jump``: change of
+    the reading, cmH2O a step.
+    """
+    pressure, C = sample.pressure, state.lung.C
     limit = pressure_limit(settings, sample.pip)
-    number = math.isfinite(pressure) and _PLAUSIBLE[0] <= pressure <= _PLAUSIBLE[1]
     open_for = sample.time - state.switched if sample.u_out else 0.0
     rise = state.delivered / C
     share = (pressure - state.start) / rise if rise > _SHOWS else math.nan
-    jump = 0.0
-    if before is not None and math.isfinite(before.pressure) and math.isfinite(pressure):
-        steps = max((sample.time - before.time) / protocol.DT, 1.0)
-        jump = abs(pressure - before.pressure) / steps
     allowed = settings.over_volume.threshold * (1.0 if math.isfinite(sample.flow) else 2.0)
     largest = min(allowed * C * (limit - protocol.PEEP), _LARGEST_VOLUME)
     still = sample.time - state.unchanged
@@ -381,25 +393,30 @@ def _values(
     apart = abs(sample.applied - sample.u_in)
     left = (pressure - protocol.PEEP) / max(state.switched_pressure - protocol.PEEP, 1.0)
     return {
-        "over_pressure": (pressure - sample.pip, number and pressure > limit),
-        "peak_pressure": (pressure, number and pressure > settings.peak_pressure.threshold),
+        "over_pressure": (pressure - sample.pip, pressure > limit),
+        "peak_pressure": (pressure, pressure > settings.peak_pressure.threshold),
         "over_volume": (
             state.volume / (C * (limit - protocol.PEEP)),
             state.volume > largest and not sample.u_out,
         ),
-        "disconnected": (share, not sample.u_out and share < settings.disconnected.threshold),
+        "disconnected": (
+            share,
+            not sample.u_out
+            and share < settings.disconnected.threshold
+            # A tube that is off shows ambient pressure; any other that does not move is frozen.
+            and not (still > _FROZEN_S and pressure > settings.low_pressure.threshold),
+        ),
         "software_delay": (sample.late, sample.late > settings.software_delay.threshold),
         "missed_deadlines": (sample.late, sample.late > settings.missed_deadlines.threshold),
         "stuck_sensor": (
             state.expected,
-            number
-            and still > 0.0
+            still > 0.0
             and (state.expected > settings.stuck_sensor.threshold or still > _STUCK_AT_REST_S),
         ),
         "implausible_slope": (jump, jump > settings.implausible_slope.threshold),
         "no_reading": (0.0 if number else 1.0, not number and sample.answered),
         "no_answer": (0.0 if sample.answered else 1.0, not sample.answered),
-        "low_pressure": (pressure, number and pressure < settings.low_pressure.threshold),
+        "low_pressure": (pressure, pressure < settings.low_pressure.threshold),
         "expiratory_valve": (
             left,
             open_for > _OPENS_S

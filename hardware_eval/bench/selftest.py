@@ -43,6 +43,27 @@ class Limit:
 
 
 LIMITS: dict[str, Limit] = {
+    "room": Limit(
+        -2.0,
+        2.0,
+        "cmH2O",
+        "A sensor that is open to the room; ten times what the zero of the PVP's part may drift.",
+    ),
+    "reference": Limit(
+        0.93,
+        1.07,
+        "of applied",
+        "A sensor's slope is within 5 % of its data sheet; a water column is read to 2 %.",
+    ),
+    "clicked": Limit(
+        1.0, 1.0, "as ordered", "A person names the valve that clicked, and is not told which."
+    ),
+    "rise": Limit(
+        5.0, 20.0, "cmH2O", "A lung that is filled by 5 % for 3 s at most, towards 10 cmH2O more."
+    ),
+    "vented": Limit(
+        -0.3, 0.35, "of the rise", "What the slowest lung has left after 3 s of a working vent."
+    ),
     "sensor_zero": Limit(
         protocol.PEEP - 1.5,
         protocol.PEEP + 1.5,
@@ -152,6 +173,22 @@ class Finding:
         """What the value must be."""
         return LIMITS[self.name]
 
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return {
+            "name": self.name,
+            "ok": self.ok,
+            "value": _number(self.value),
+            "unit": self.limit.unit,
+            "limits": [self.limit.low, _number(self.limit.high)],
+            "text": self.text,
+            "reason": self.limit.reason,
+        }
+
+    def __str__(self) -> str:
+        limit = f"{self.limit.low:g} to {self.limit.high:g} {self.limit.unit}"
+        return f"  {'ok   ' if self.ok else 'NO-GO'} {self.name:13s} {self.text} ({limit})"
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -197,25 +234,12 @@ class Sheet:
             "R": _number(self.R),
             "C": _number(self.C),
             "errors": {lung: _number(error) for lung, error in self.errors.items()},
-            "findings": [
-                {
-                    "name": x.name,
-                    "ok": x.ok,
-                    "value": _number(x.value),
-                    "unit": x.limit.unit,
-                    "limits": [x.limit.low, _number(x.limit.high)],
-                    "text": x.text,
-                    "reason": x.limit.reason,
-                }
-                for x in self.findings
-            ],
+            "findings": [x.as_dict() for x in self.findings],
         }
 
     def __str__(self) -> str:
         lines = [f"self-test of {self.lung}: {'GO' if self.go else 'NO-GO'}"]
-        for x in self.findings:
-            limit = f"{x.limit.low:g} to {x.limit.high:g} {x.limit.unit}"
-            lines.append(f"  {'ok   ' if x.ok else 'NO-GO'} {x.name:13s} {x.text} ({limit})")
+        lines += map(str, self.findings)
         lines += [f"  left out: {part}" for part in self.skipped]
         return "\n".join(lines)
 
@@ -405,7 +429,8 @@ def judge(
     return Sheet(lung, tuple(findings), errors, R, C, skipped)
 
 
-def _finding(name: str, value: float, text: str) -> Finding:
+def judged(name: str, value: float, text: str) -> Finding:
+    """Hold a value against its limit."""
     limit = LIMITS[name]
     return Finding(name, value, bool(limit.low - 1e-12 <= value <= limit.high + 1e-12), text)
 
@@ -418,8 +443,8 @@ def _at_rest(rest: Driven) -> tuple[list[Finding], float]:
     noise = white_noise(settled)
     mean = float(settled.mean())
     return [
-        _finding("sensor_zero", mean, f"{mean:.2f} cmH2O at rest"),
-        _finding("sensor_noise", noise, f"{noise:.2f} cmH2O of noise"),
+        judged("sensor_zero", mean, f"{mean:.2f} cmH2O at rest"),
+        judged("sensor_noise", noise, f"{noise:.2f} cmH2O of noise"),
     ], noise
 
 
@@ -494,7 +519,7 @@ def _sweep(puffs: Sequence[Driven], noise: float, lung: str) -> list[Finding]:
     opens = rises[-1] - rises[0] > _SIGMAS * error
     text = ", ".join(f"{u:g} % {rise:+.2f}" for u, rise in zip(openings, rises[1:], strict=True))
     share = float(np.mean([*further, opens]))
-    return [_finding("valve_sweep", share, f"{text} cmH2O (SE {error / math.sqrt(2.0):.2f})")]
+    return [judged("valve_sweep", share, f"{text} cmH2O (SE {error / math.sqrt(2.0):.2f})")]
 
 
 def _probe(pip: float, P: float, I: float) -> Commands:  # noqa: E741 - the field's names
@@ -565,9 +590,9 @@ def _lung(
             told += f", {errors[nearest]:.2f} as {nearest}: is the lung set to {nearest}?"
     decided = Finding("lung", ratio, True, told + "; R and C are the label's")
     return [
-        decided if alone else _finding("lung", ratio, told),
-        _finding("resistance", max(R, 0.0) / label.R, f"R {R:.1f}, C {C:.1f} by least squares"),
-        _finding("valve_gain", gain, f"the valve gives {gain:.2f} of 22.8 mL/s per %"),
+        decided if alone else judged("lung", ratio, told),
+        judged("resistance", max(R, 0.0) / label.R, f"R {R:.1f}, C {C:.1f} by least squares"),
+        judged("valve_gain", gain, f"the valve gives {gain:.2f} of 22.8 mL/s per %"),
     ]
 
 
@@ -578,7 +603,7 @@ def _clock(driven: list[Driven], bench: Bench) -> list[Finding]:
     share, worst = float(np.mean(late <= ON_TIME_S)), float(late.max())
     trip, _ = bench.client.round_trips()
     return [
-        _finding("on_time", share, f"{100 * share:.2f} % of {late.size} steps within 2 ms"),
-        _finding("latest_step", worst, f"{1e3 * worst:.1f} ms late at worst"),
-        _finding("round_trip", trip, f"{1e3 * trip:.1f} ms from message to answer"),
+        judged("on_time", share, f"{100 * share:.2f} % of {late.size} steps within 2 ms"),
+        judged("latest_step", worst, f"{1e3 * worst:.1f} ms late at worst"),
+        judged("round_trip", trip, f"{1e3 * trip:.1f} ms from message to answer"),
     ]

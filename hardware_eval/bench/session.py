@@ -11,6 +11,7 @@ from dataclasses import asdict
 from typing import Any
 
 from hardware_eval.bench.controllers import ControllerFailedError, MakeController, control_pid
+from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import (
     REST_S,
     Bench,
@@ -220,7 +221,11 @@ def _run_line(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[s
 
 
 def dry_run(
-    plan: Plan, make_controller: MakeController, settings: SafetySettings, rest: float = REST_S
+    plan: Plan,
+    make_controller: MakeController,
+    settings: SafetySettings,
+    rest: float = REST_S,
+    fallback: FallbackSettings | None = None,
 ) -> tuple[list[str], list[tuple[str, str, float, float]]]:
     """Run every distinct run of a plan once on the frozen simulators, by the code of a bench.
 
@@ -232,6 +237,7 @@ def dry_run(
         make_controller: makes the controller of a run.
         settings: of the safety.
         rest: time at rest before each run, s.
+        fallback: takes over as it will on the bench.
 
     Returns:
         What went wrong, one sentence each, empty if the plan is safe there; and entry, lung, PIP
@@ -253,7 +259,7 @@ def dry_run(
             device, mounted = LoopbackDevice(simulated_lung(run.lung)), run.lung
             client = Client(device, device.clock)
             client.hello()
-            bench = Bench(client, device.clock, settings, Operator(), rest=rest)
+            bench = Bench(client, device.clock, settings, Operator(), (), rest, fallback)
         try:
             controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
         except ControllerFailedError as error:

@@ -55,7 +55,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     where.add_argument(
         "--vent", action="store_true", help="vent once and end (for ExecStopPost of systemd)"
     )
-    parser.add_argument("--pressure-limit", type=float, help="above which to vent, cmH2O")
     given = parser.parse_args(arguments)
     try:
         return _run(given)
@@ -70,15 +69,8 @@ def _run(given: argparse.Namespace) -> int:
     PvpValves(given.config).close()  # vented; what is wrong with them is told here
     if given.vent:
         return 0
-    limit = given.pressure_limit
-    settings = DeviceSettings() if limit is None else DeviceSettings(limit)
     sensor = PvpSensor(given.config)
-    if settings.pressure_limit >= sensor.identity.highest:
-        raise InputError(
-            f"the pressure limit of {settings.pressure_limit:g} cmH2O lies outside the sensor's "
-            f"range, up to {sensor.identity.highest:.4g}: nothing could trip it. Give a smaller "
-            f"--pressure-limit, or the sensor's own highest_pressure in {given.config}"
-        )
+    settings = DeviceSettings(sensor.pressure_limit)
     process, orders = deadman.start(
         f"{PvpValves.__module__}:{PvpValves.__name__}", str(given.config)
     )

@@ -3,27 +3,29 @@
 Nothing of this module has run on a ventilator yet; its tests replace ``pigpio`` and ``smbus2`` by
 stand-ins that check registers and duty cycles. Both are imported only when the hardware is opened.
 
-Pins, addresses and the sensor's conversion are those of the ventilator's own configuration
-(github.com/CohenLabPrinceton/pvp, ``pvp/io/config/devices.ini``): sensor at A0, (V - 2.2 V) / 2 V x
-70.3 cmH2O, which at 2 mV a step is the 0.0703 cmH2O of the public recordings. ADS1015 registers:
-Texas Instruments, SBAS473E, tables 3 to 8.
+No pin, polarity or sensor is assumed: the configuration names a revision of the hardware, of those
+in ``revisions.toml`` or one that it describes itself, and whoever wrote it says how it was read off
+the machine. ADS1015 registers: Texas Instruments, SBAS473E, tables 3 to 8.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib
+import json
 import math
 import statistics
 import tomllib
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_eval.device.program import Identity, Sample
+from hardware_eval.device.program import DeviceSettings, Identity, Sample
 from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
 
@@ -43,32 +45,53 @@ _SATURATED = 0.99
 #: Full duty of pigpio's hardware PWM.
 _FULL_DUTY = 1_000_000
 
+#: GPIOs of a Raspberry Pi that have hardware PWM, those of its header, and those of the I2C bus.
+_PWM_PINS, _PINS, _BUS_PINS = (12, 13, 18, 19), range(2, 28), (2, 3)
+
+
+@dataclass(frozen=True)
+class Revision:
+    """How a machine is wired; the tables ``revisions`` of TOML."""
+
+    source: str  #: where this stands.
+    inspiratory_pin: int  #: GPIO of the proportional valve; one with hardware PWM.
+    expiratory_pin: int  #: GPIO of the on/off valve.
+    pwm_frequency: int  #: Hz.
+    i2c_bus: int  #: bus of the converter.
+    adc_address: int  #: address of the converter.
+    adc_channel: int  #: input of the pressure sensor, 0..3.
+    sensor: str  #: part of the pressure sensor, a table of ``sensors``.
+
+
+@dataclass(frozen=True)
+class SensorPart:
+    """A pressure sensor by its data sheet; the tables ``sensors`` of TOML."""
+
+    source: str  #: where this stands.
+    range: float  #: end of its range, cmH2O.
+    offset_voltage: list[float]  #: least and largest voltage at ambient pressure, V.
+    span_voltage: list[float]  #: least and largest further voltage at the end of the range, V.
+
 
 @dataclass(frozen=True)
 class PvpConfiguration:
-    """Wiring and calibration of one ventilator; every field is a key of its TOML file."""
+    """Wiring and calibration of one ventilator: keys of its TOML file, all of them required."""
 
-    name: str = "PVP"  #: what people call it.
-    device_id: str = "00" * 8  #: its own number, 16 hexadecimal digits.
-    i2c_bus: int = 1  #: bus of the converter.
-    adc_address: int = 0x48  #: address of the converter.
-    adc_channel: int = 0  #: input of the pressure sensor, 0..3.
-    offset_voltage: float = 2.2  #: sensor at ambient pressure, V.
-    cmH2O_per_volt: float = 35.15  #: slope of the sensor.
-    #: largest pressure that the sensor can tell, cmH2O; 20 inH2O are 50.8.
-    highest_pressure: float = 50.8
-    #: GPIO of the proportional valve; one with hardware PWM (12, 13, 18, 19).
-    inspiratory_pin: int = 12
-    pwm_frequency: int = 20_000  #: Hz.
-    expiratory_pin: int = 17  #: GPIO of the on/off valve.
-    #: whether that valve is open without current. The PVP's own is closed without current: with it,
-    #: a device without power does not vent.
-    expiratory_normally_open: bool = False
+    name: str  #: what people call it.
+    device_id: str  #: its own number, 16 hexadecimal digits.
+    revision: str  #: how it is wired: a table of ``revisions``.
+    source: str  #: who saw on the machine that it is so, and when.
+    #: whether the expiratory valve is open without current. The PVP's own is closed without
+    #: current: with it, a device without power does not vent.
+    expiratory_normally_open: bool
     #: GPIO of the monostable's trigger, which moves with every order to the valves; -1 for none.
-    heartbeat_pin: int = -1
+    heartbeat_pin: int
+    offset_voltage: float  #: sensor at ambient pressure, measured, V.
+    cmH2O_per_volt: float  #: slope of the sensor, measured.
+    pressure_limit: float  #: above which the device vents, cmH2O.
     #: CSV of the proportional valve with columns u_in (%, 0 to 100, increasing), opening, closing
     #: (duty cycle, 0..1); beside the TOML file.
-    valve_table: str = "valve.csv"
+    valve_table: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,23 +109,44 @@ class ValveTable:
         return float(np.interp(u_in, self.u_in, self.opening if rising else self.closing))
 
 
-def load_configuration(path: Path) -> tuple[PvpConfiguration, ValveTable, bytes]:
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """One ventilator, as its files describe it; see :func:`load_machine`."""
+
+    configuration: PvpConfiguration
+    wiring: Revision
+    part: SensorPart
+    valve: ValveTable
+    digest: bytes  #: SHA-256 of all of it but the name: who it is to a bring-up.
+
+    def pressure(self, counts: float) -> float:
+        """Pressure of a conversion, cmH2O."""
+        volts = counts * STEP - self.configuration.offset_voltage
+        return volts * self.configuration.cmH2O_per_volt
+
+    @property
+    def highest(self) -> float:
+        """Largest pressure that sensor and converter can tell, cmH2O."""
+        return min(self.part.range, self.pressure(LAST))
+
+
+def load_machine(path: Path) -> Machine:
     """Read a ventilator's configuration.
 
-    Returns:
-        Configuration, valve table, and the SHA-256 of the calibration: of the sensor's conversion
-        and the table.
-
     Raises:
-        InputError: if a file cannot be read, or holds what cannot be.
+        InputError: if a file cannot be read, lacks a key, or holds what cannot be.
     """
     try:
+        known = tomllib.loads(Path(__file__).with_name("revisions.toml").read_text("utf-8"))
         values = tomllib.loads(path.read_text("utf-8"))
-        known = set(PvpConfiguration.__dataclass_fields__)
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"there is no key {unknown[0]!r}; keys: {', '.join(sorted(known))}")
-        configuration = PvpConfiguration(**values)
-        _check(configuration)
+        for kind, tables in known.items():
+            for name, table in values.pop(kind, {}).items():
+                if tables.setdefault(name, table) != table:
+                    raise ValueError(f"{kind}.{name} is known otherwise: give yours another name")
+        configuration = _typed(PvpConfiguration, values, "")
+        wiring = _typed(Revision, *_named(known, "revisions", configuration.revision))
+        part = _typed(SensorPart, *_named(known, "sensors", wiring.sensor))
+        _check(configuration, wiring, part)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path}: {error}") from error
     table_path = path.parent / configuration.valve_table
@@ -115,24 +159,77 @@ def load_configuration(path: Path) -> tuple[PvpConfiguration, ValveTable, bytes]
             f"{table_path}: {error}; it needs a line of names, then u_in,opening,closing with u_in "
             "increasing from 0 to 100 and duty cycles within 0..1"
         ) from error
-    sensor = f"{configuration.offset_voltage!r} {configuration.cmH2O_per_volt!r}\n".encode()
-    digest = hashlib.sha256(sensor + rows.astype("<f8").tobytes()).digest()
-    return configuration, table, digest
+    parts = [dataclasses.asdict(x) for x in (configuration, wiring, part)]
+    del parts[0]["name"]
+    content = json.dumps(parts, sort_keys=True).encode() + rows.astype("<f8").tobytes()
+    machine = Machine(configuration, wiring, part, table, hashlib.sha256(content).digest())
+    if configuration.pressure_limit >= machine.highest:
+        raise InputError(
+            f"{path}: the pressure_limit of {configuration.pressure_limit:g} cmH2O lies outside "
+            f"the range of {wiring.sensor}, up to {machine.highest:.4g}: nothing could trip it"
+        )
+    return machine
 
 
-def _check(configuration: PvpConfiguration) -> None:
-    default = PvpConfiguration()
-    for key, value in asdict(configuration).items():
-        wanted = type(getattr(default, key))
-        if not isinstance(value, (int, float) if wanted is float else wanted):
-            raise ValueError(f"{key} = {value!r} must be a {wanted.__name__}")
+_TableT = TypeVar("_TableT", PvpConfiguration, Revision, SensorPart)
+
+
+def _named(known: Mapping[str, Any], kind: str, name: str) -> tuple[dict[str, Any], str]:
+    if name not in known[kind]:
+        raise ValueError(
+            f"{kind} has no {name!r}, but {', '.join(known[kind])}; describe yours in a table "
+            f'[{kind}."{name}"], as revisions.toml does'
+        )
+    return known[kind][name], f'{kind}."{name}": '
+
+
+def _typed(table: type[_TableT], values: Mapping[str, Any], where: str) -> _TableT:
+    """Make a table of TOML's values; nothing may be missing, unknown or of another type."""
+    kinds = {field.name: str(field.type) for field in dataclasses.fields(table)}
+    if missing := [key for key in kinds if key not in values]:
+        raise ValueError(f"{where}{missing[0]} is missing; nothing about a machine is assumed")
+    if unknown := sorted(set(values) - set(kinds)):
+        raise ValueError(f"{where}there is no key {unknown[0]!r}; keys: {', '.join(kinds)}")
+    kind_of = {"float": (int, float), "list[float]": list, "int": int, "str": str, "bool": bool}
+    for key, kind in kinds.items():
+        value = values[key]
+        if not isinstance(value, kind_of[kind]) or (kind != "bool" and isinstance(value, bool)):
+            raise ValueError(f"{where}{key} = {value!r} must be a {kind}")
+        if kind == "str" and not value.strip():
+            raise ValueError(f"{where}{key} is empty")
+    return table(**values)
+
+
+def _check(configuration: PvpConfiguration, wiring: Revision, part: SensorPart) -> None:
     if len(bytes.fromhex(configuration.device_id)) != 8:
         raise ValueError(f"device_id = {configuration.device_id!r} must have 16 hexadecimal digits")
-    if not 0 <= configuration.adc_channel <= 3:
-        raise ValueError(f"adc_channel = {configuration.adc_channel} is outside 0..3")
-    for key in ("cmH2O_per_volt", "highest_pressure"):
-        if not getattr(configuration, key) > 0.0:
-            raise ValueError(f"{key} = {getattr(configuration, key)} must be positive")
+    DeviceSettings(configuration.pressure_limit)
+    pins = {key: getattr(wiring, key) for key in ("inspiratory_pin", "expiratory_pin")}
+    if configuration.heartbeat_pin >= 0:
+        pins["heartbeat_pin"] = configuration.heartbeat_pin
+    for key, pin in pins.items():
+        same = [x for x, other in pins.items() if other == pin and x != key]
+        if same:
+            raise ValueError(f"{key} and {same[0]} are both GPIO {pin}: one of them is wrong")
+        if pin not in _PINS or pin in _BUS_PINS:
+            raise ValueError(f"{key} = {pin} is no free GPIO of the header (4 to 27)")
+    if wiring.inspiratory_pin not in _PWM_PINS:
+        raise ValueError(
+            f"inspiratory_pin = {wiring.inspiratory_pin} has no hardware PWM; "
+            f"{', '.join(map(str, _PWM_PINS))} have"
+        )
+    if not 0 <= wiring.adc_channel <= 3:
+        raise ValueError(f"adc_channel = {wiring.adc_channel} is outside 0..3")
+    slopes = [part.range / span for span in reversed(part.span_voltage)]
+    for key, (low, high) in {
+        "offset_voltage": part.offset_voltage,
+        "cmH2O_per_volt": slopes,
+    }.items():
+        if not low <= (value := getattr(configuration, key)) <= high:
+            raise ValueError(
+                f"{key} = {value:g} is not of a {wiring.sensor} ({low:.4g} to {high:.4g}: "
+                f"{part.source}): is another sensor in, or was it measured wrongly?"
+            )
 
 
 def _check_table(table: ValveTable) -> None:
@@ -156,12 +253,14 @@ class PvpValves:
         Raises:
             InputError: if the file is wrong, pigpio is missing, or its daemon does not run.
         """
-        self._configuration, self._table, _ = load_configuration(Path(path))
+        machine = load_machine(Path(path))
+        self._configuration, self._wiring = machine.configuration, machine.wiring
+        self._table = machine.valve
         pigpio = _imported("pigpio")
         self._pi: Any = pigpio.pi()
         if not self._pi.connected:
             raise InputError("pigpiod does not run: start it with `sudo pigpiod`")
-        for pin in (self._configuration.expiratory_pin, self._configuration.heartbeat_pin):
+        for pin in (self._wiring.expiratory_pin, self._configuration.heartbeat_pin):
             if pin >= 0:
                 self._pi.set_mode(pin, pigpio.OUTPUT)
         self._set: tuple[float, int] | None = None
@@ -177,12 +276,12 @@ class PvpValves:
         if (u_in, u_out) == self._set:
             return
         energised = u_out == 0 if configuration.expiratory_normally_open else u_out == 1
-        self._pi.write(configuration.expiratory_pin, int(energised))
+        self._pi.write(self._wiring.expiratory_pin, int(energised))
         if u_in != before:
             self._rising = u_in > before
         duty = self._table.duty(u_in, self._rising)
         self._pi.hardware_PWM(
-            configuration.inspiratory_pin, configuration.pwm_frequency, round(duty * _FULL_DUTY)
+            self._wiring.inspiratory_pin, self._wiring.pwm_frequency, round(duty * _FULL_DUTY)
         )
         self._set = u_in, u_out
 
@@ -194,7 +293,12 @@ class PvpValves:
 
 
 class PvpSensor:
-    """The ventilator's pressure sensor; see :class:`~hardware_eval.device.deadman.Sensor`."""
+    """The ventilator's pressure sensor; see :class:`~hardware_eval.device.deadman.Sensor`.
+
+    Attributes:
+        identity: of the device.
+        pressure_limit: of the configuration, cmH2O.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open the converter.
@@ -205,24 +309,24 @@ class PvpSensor:
         Raises:
             InputError: if the file is wrong, smbus2 is missing, or the converter does not answer.
         """
-        self._configuration, _, calibration = load_configuration(path)
+        self._machine = machine = load_machine(path)
+        self._wiring = machine.wiring
         smbus2 = _imported("smbus2")
         try:
-            self._bus: Any = smbus2.SMBus(self._configuration.i2c_bus)
+            self._bus: Any = smbus2.SMBus(self._wiring.i2c_bus)
             self._configure_converter()
         except OSError as error:
             raise InputError(
                 f"the pressure converter does not answer at address "
-                f"0x{self._configuration.adc_address:02x} of I2C bus "
-                f"{self._configuration.i2c_bus}: {error}"
+                f"0x{self._wiring.adc_address:02x} of I2C bus {self._wiring.i2c_bus}: {error}"
             ) from error
-        self._highest = min(self._configuration.highest_pressure, self._pressure(LAST))
+        self.pressure_limit = machine.configuration.pressure_limit
         self.identity = Identity(
-            self._configuration.name,
-            bytes.fromhex(self._configuration.device_id),
-            calibration,
+            machine.configuration.name,
+            bytes.fromhex(machine.configuration.device_id),
+            machine.digest,
             Capability.NONE,
-            highest=self._highest,
+            highest=machine.highest,
             noisy=True,
         )
 
@@ -232,30 +336,25 @@ class PvpSensor:
             counts = statistics.median(self._conversion() for _ in range(_MEDIAN_OF))
         except OSError:
             return Sample(now, math.nan)
-        if counts <= 0:  # no voltage: the wire is off; ambient pressure gives 2.2 V
+        if counts <= 0:  # no voltage: the wire is off; every part gives some at ambient pressure
             return Sample(now, math.nan)
-        pressure = self._pressure(counts)
-        return Sample(now, pressure, saturated=pressure >= _SATURATED * self._highest)
+        pressure = self._machine.pressure(counts)
+        return Sample(now, pressure, saturated=pressure >= _SATURATED * self._machine.highest)
 
     def close(self) -> None:
         """Release the bus."""
         self._bus.close()
 
-    def _pressure(self, counts: float) -> float:
-        """Pressure of a conversion, cmH2O."""
-        volts = counts * STEP - self._configuration.offset_voltage
-        return volts * self._configuration.cmH2O_per_volt
-
     def _configure_converter(self) -> None:
-        channel = self._configuration.adc_channel << 12
+        channel = self._wiring.adc_channel << 12
         word = _SINGLE_ENDED | channel | _RANGE_4V | _FASTEST | _NO_ALERT
         self._bus.write_i2c_block_data(
-            self._configuration.adc_address, _CONFIGURATION, [word >> 8, word & 0xFF]
+            self._wiring.adc_address, _CONFIGURATION, [word >> 8, word & 0xFF]
         )
 
     def _conversion(self) -> int:
         """Counts of one conversion: the upper 12 bits of a signed 16-bit word."""
-        high, low = self._bus.read_i2c_block_data(self._configuration.adc_address, _CONVERSION, 2)
+        high, low = self._bus.read_i2c_block_data(self._wiring.adc_address, _CONVERSION, 2)
         word = high << 8 | low
         return (word - 0x10000 if word & 0x8000 else word) >> 4
 

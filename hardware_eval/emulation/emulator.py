@@ -116,6 +116,10 @@ class LoopbackDevice:
         """Connect again; DisconnectedError if the cable is still out."""
         self._require_cable()
 
+    def raise_lines(self) -> bool:
+        """There are none."""
+        return False
+
     def unplug(self) -> None:
         """Pull the cable; what is on the way is lost."""
         self.plugged = False

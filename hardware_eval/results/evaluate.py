@@ -8,12 +8,12 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from hardware_eval.bench import session
+from hardware_eval.bench import bringup, session
 from hardware_eval.bench.calibrate import Calibration
 from hardware_eval.bench.controllers import (
     ControllerFailedError,
@@ -28,7 +28,7 @@ from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.bench.selftest import Sheet
 from hardware_eval.realtime import Clock, RealClock
 from hardware_eval.results import record as records
-from hardware_eval.wire.client import Client, Link
+from hardware_eval.wire.client import ANSWER_TIMEOUT, Client, Link
 from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
 from ventbench.board import record
@@ -69,6 +69,8 @@ class Line:
     #: the device if it is emulated in this process, else None.
     device: LoopbackDevice | None = None
     port: str = "virtual"  #: what carries the bytes, see :func:`port_kind`.
+    #: the bring-up of a real device, see :mod:`hardware_eval.bench.bringup`; empty for software.
+    bringup: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def real(self) -> bool:
@@ -118,25 +120,29 @@ def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
     return device, device.clock
 
 
-def connect(port: str) -> Line:
-    """Open a port, and a session.
+def connect(port: str, confirmed: bool = True, timeout: float = ANSWER_TIMEOUT) -> Line:
+    """Open a port, and a session; a real device must have been brought up, if it shall be so.
+
+    An answer may take ``timeout``, s.
 
     It is a serial port or socket, in real time; or ``virtual:R20C50``, an emulated lung in this
     process on a virtual clock, where breaths take a fraction of a second.
 
     Raises:
         LinkError: if it cannot be opened, or no device answers.
-        InputError: if there is no such emulated lung.
+        InputError: if there is no such emulated lung, or a real device was not brought up.
     """
     transport, clock = carrier(port)
-    client = Client(transport, clock)
+    kind = port_kind(port)
+    client = Client(transport, clock, timeout, emulated=kind in EMULATED_PORTS)
     try:
         client.hello()
+        found = {} if client.simulated or not confirmed else bringup.load(client)
     except InputError:
         client.close()
         raise
     device = None if isinstance(transport, Link) else transport
-    return Line(client, clock, device, port_kind(port))
+    return Line(client, clock, device, kind, found)
 
 
 def device_about(line: Line) -> dict[str, Any]:
@@ -249,7 +255,7 @@ def evaluate(
         notes: for the record.
         rest: time at rest before each run, s.
         calibration: of the device, for the record.
-        fallback: takes over from entries that are late or leave their envelope; not in the dry run.
+        fallback: takes over from entries that are late or leave their envelope.
 
     Raises:
         InputError: if the log is of another plan, or the dry run finds the plan unsafe.
@@ -261,7 +267,11 @@ def evaluate(
     if dry and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
         problems, simulated = session.dry_run(
-            plan, controllers(submissions, plan.track, runner, real_time=False), settings, rest
+            plan,
+            controllers(submissions, plan.track, runner, real_time=False),
+            settings,
+            rest,
+            fallback,
         )
         if problems:
             raise InputError(
@@ -269,6 +279,8 @@ def evaluate(
                 "sent to the bench; --no-dry-run skips this"
             )
     device = device_about(line)
+    if line.bringup:
+        device["about"]["bringup"] = dict(line.bringup)
     if calibration is not None:
         device["about"]["calibration_file"] = calibration.about()
     about = {

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.loop import ON_TIME_S, BreathLog
-from hardware_eval.bench.plan import CONTROL, UNDISTURBED, Plan, make_plan, progress
+from hardware_eval.bench.plan import CONTROL, UNDISTURBED, Plan, complete_runs, make_plan, progress
 from hardware_eval.bench.raw_log import LOG, LoggedBreath, breaths, lines, recording
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -32,7 +32,7 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.task.metrics.score import passes_safety_gate
+from ventbench.task.metrics import measured
 
 #: Longest reason of a stopped run in a record, characters.
 _REASON = 1000
@@ -211,7 +211,7 @@ def _tables(
     errors, pressures, commands = [], [], []
     stops, safe, peaks = [], [], []
     for lung in lungs:
-        peak, passed = 0.0, True
+        peak, passed = -math.inf, True
         for tables in (errors, pressures, commands):
             tables.append([[] for _ in plan.pips])
         for place, pip in enumerate(plan.pips):
@@ -224,17 +224,18 @@ def _tables(
                     for tables in (errors, pressures, commands):
                         tables[-1][place].append(None)
                     continue
-                rows = [run[k] for k in protocol.SCORED_BREATHS]
-                inspired = np.stack([row.pressure[: protocol.INSPIRATION_STEPS] for row in rows])
-                u_in = np.stack([row.u_in[: protocol.INSPIRATION_STEPS] for row in rows])
-                milli = np.round(1000.0 * inspired).astype(int)
-                errors[-1][place].append(float(np.mean(np.abs(milli / 1000.0 - pip))))
-                pressures[-1][place].append(milli.tolist())
+                inspired = measured.scored([breath.pressure for breath in run])
+                u_in = measured.scored([breath.u_in for breath in run])
+                milli = np.round(1000.0 * inspired)
+                errors[-1][place].append(measured.mean_error(milli / 1000.0, pip))
+                pressures[-1][place].append(
+                    [[None if math.isnan(x) else int(x) for x in row] for row in milli]
+                )
                 commands[-1][place].append(np.round(10.0 * u_in).astype(int).tolist())
-                peak = max(peak, max(float(np.max(row.pressure)) for row in run))
-                passed &= bool(np.all(passes_safety_gate(inspired, pip, protocol.DT)))
+                peak = max(peak, *(measured.highest(breath.pressure) for breath in run))
+                passed &= all(measured.is_safe(x.pressure, pip, protocol.DT) for x in run)
         safe.append(passed)
-        peaks.append(round(peak, 3))
+        peaks.append(round(peak, 3) if math.isfinite(peak) else 0.0)
     return {
         "errors": errors,
         "trace": {"pressure_milli_cmH2O": pressures, "u_in_tenths_percent": commands},
@@ -260,9 +261,11 @@ def _control(log: Path) -> dict[str, Any]:
     cmH2O; beside it stands its standard error.
     """
     by_lung: dict[str, list[float]] = {}
-    for line in lines(log):
-        complete = line["type"] == "run" and line["status"] == "complete"
-        if complete and line["entry"] == CONTROL:
+    logged = list(lines(log))
+    complete = complete_runs(logged)
+    for line in logged:
+        control = line["type"] == "run" and line["entry"] == CONTROL
+        if control and (line["run"], line["attempt"]) in complete:
             by_lung.setdefault(line["lung"], []).append(line["error"])
     figures: dict[str, Any] = {}
     for lung, errors in by_lung.items():

@@ -27,6 +27,7 @@ import numpy as np
 from scipy import stats
 
 from hardware_eval.bench.identity import Interval, interval
+from hardware_eval.bench.plan import complete_runs
 from hardware_eval.bench.raw_log import LOG, lines
 from hardware_eval.results.record import plan_of
 from ventbench.base import files
@@ -232,10 +233,13 @@ def _tables(logs: Sequence[Path]) -> tuple[dict[str, Floats], dict[str, Floats],
             raise InputError(
                 f"{log} is of another trial than {logs[0]}: entries, PIPs, repeats or track differ"
             )
+        complete = complete_runs(logged)
         ended = {
             (x["entry"], x["lung"], x["pip"], x["repeat"]): x.get("error")
             for x in logged
-            if x["type"] == "run" and x["kind"] == "scored" and x["status"] != "aborted"
+            if x["type"] == "run"
+            and x["kind"] == "scored"
+            and (x["status"] == "failed" or (x["run"], x["attempt"]) in complete)
         }
         predicted: dict[tuple[str, str, float], float] = {}
         for line in logged:

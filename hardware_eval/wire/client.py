@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import secrets
 import threading
 import time
@@ -28,6 +29,7 @@ from hardware_eval.realtime import Clock, RealClock, take_priority
 from hardware_eval.wire.messages import (
     PROTOCOL_VERSION,
     Arm,
+    Capability,
     Command,
     Counters,
     Event,
@@ -36,9 +38,11 @@ from hardware_eval.wire.messages import (
     Hello,
     HostMessage,
     Message,
+    Mode,
     Packet,
     ParserState,
     Reading,
+    Reason,
     Refusal,
     Statistics,
     Vent,
@@ -65,9 +69,14 @@ _PAUSE, _FACTOR, _LONGEST_PAUSE = 0.1, 1.5, 2.0
 #: Time that an answer may take, s: most of a control step of 30 ms.
 ANSWER_TIMEOUT = 0.020
 
-#: Attempts at hello, arm and vent, which may be repeated safely, and time for each, s: a device
-#: may be busy starting.
-ATTEMPTS, PATIENCE = 5, 0.2
+#: Time for each attempt at hello, arm and vent, which may be repeated safely, s, and attempts: of
+#: arm and vent, and of hello, as a board that restarts when its port opens takes up to 3 s.
+PATIENCE, ATTEMPTS, HELLOS = 0.2, 5, 15
+
+#: What two clocks may part by in a second, s; crystals do 0.0001. Oldest that a sample may be when
+#: the device answers with it, s: then its program has vented. Parting at once from which it is a
+#: jump, s.
+_DRIFT, _SAMPLE_AGE, _JUMP = 0.002, 0.06, 0.2
 
 #: Round trips that :meth:`Client.round_trips` summarises.
 _REMEMBERED = 10_000
@@ -95,6 +104,14 @@ class DisconnectedError(LinkError):
     """The port went away while it was open; the device vents by itself."""
 
 
+class ClockError(LinkError):
+    """The device's clock and that of this computer part; its readings are of no known time."""
+
+
+class DeviceChangedError(InputError):
+    """Another device answers, or the same one with another calibration."""
+
+
 class NoAnswerError(LinkError):
     """The device did not answer in time."""
 
@@ -110,6 +127,10 @@ class RefusedError(LinkError):
         """Keep the device's answer."""
         super().__init__(message)
         self.refusal = refusal
+
+
+class UnconfirmedError(InputError):
+    """A real device may not be armed: nobody has confirmed what its valves and its sensor do."""
 
 
 class Transport(Protocol):
@@ -129,6 +150,10 @@ class Transport(Protocol):
 
     def reopen(self) -> None:
         """Connect again after a loss."""
+        ...
+
+    def raise_lines(self) -> bool:
+        """Assert the control lines (DTR, RTS); False if there are none."""
         ...
 
 
@@ -252,11 +277,20 @@ class Link:
             time.sleep(pause)
             pause = min(pause * _FACTOR, _LONGEST_PAUSE)
 
+    def raise_lines(self) -> bool:
+        """Assert DTR and RTS: boards with USB of their own send nothing without them."""
+        try:
+            self._port.dtr = self._port.rts = True
+        except (OSError, serial.SerialException):
+            return False
+        return isinstance(self._port, serial.Serial)
+
     def _open(self) -> serial.Serial:
         try:
             port = serial.serial_for_url(self.url, BAUD_RATE, do_not_open=True)
             if isinstance(port, serial.Serial):
                 port.exclusive = True  # a second program would steal bytes
+                port.dtr = port.rts = False  # asserted, they restart common boards
             port.write_timeout = WRITE_TIMEOUT
             port.timeout = READ_SLICE  # fixed: pyserial configures the port anew at each change
             port.open()
@@ -294,6 +328,46 @@ class Link:
         )
 
 
+class ClockWatch:
+    """Compares the clocks of device and host, however late the host is.
+
+    A sample was taken between its question, less what a sample may be old, and its answer: that
+    bounds the clocks' offset. All bounds since the session began must agree, but for the drift of
+    crystals.
+    """
+
+    def __init__(self) -> None:
+        """Begin with a session."""
+        self._low, self._high = -math.inf, math.inf
+        self._seen, self._first = -math.inf, (math.nan, math.nan)
+        self._still = self._first
+
+    def see(self, device: float, asked: float, answered: float) -> str:
+        """Look at a reading's device time and the host's times, s; returns what is wrong."""
+        elapsed = answered - self._seen if math.isfinite(self._seen) else 0.0
+        if math.isnan(self._first[0]):
+            self._first = device, asked
+        if device != self._still[0]:
+            self._still = device, asked
+        self._low -= _DRIFT * elapsed
+        self._high += _DRIFT * elapsed
+        low, high = asked - _SAMPLE_AGE - device, answered - device
+        apart = max(low - self._high, self._low - high)
+        self._low, self._high = max(self._low, low), min(self._high, high)
+        self._seen = answered
+        if apart <= 0.0:
+            return ""
+        if asked - self._still[1] > _SAMPLE_AGE:
+            for_s = asked - self._still[1]
+            return f"the device's clock, or its sensor, has stood still for {for_s:.2g} s"
+        if apart > _JUMP:
+            return f"the device's clock jumped by {apart:.2g} s against this computer's"
+        passed = asked - self._first[1]
+        rate, error = (device - self._first[0]) / passed - 1.0, 2.0 * _SAMPLE_AGE / passed
+        speed = "fast" if rate > 0.0 else "slow"
+        return f"the device's clock is {100 * abs(rate):.1f} (+-{100 * error:.1f}) % too {speed}"
+
+
 class Client:
     """A session with one device.
 
@@ -302,28 +376,41 @@ class Client:
     and RefusedError if the session is not open or the device refuses for another cause.
 
     Attributes:
+        transport: what carries the bytes.
         welcome: what the device told at the last :meth:`hello`; None before.
         reading: the newest reading; None before the first.
         counts: messages ``sent``, ``answered`` in time, ``unanswered`` and ``refused``; answers to
             none that waited (``unexpected``), such as late ones; ``sessions``, ``disconnections``;
             and bytes that were no message, by the name of their :class:`Fault`.
+        vented: whether the last answer was of a device that has vented.
+        brought_up: device and calibration, as ``(device_id, calibration)``, that a person has
+            confirmed (:mod:`hardware_eval.bench.bringup`); without it no real device is armed.
     """
 
     def __init__(
-        self, transport: Transport, clock: Clock | None = None, timeout: float = ANSWER_TIMEOUT
+        self,
+        transport: Transport,
+        clock: Clock | None = None,
+        timeout: float = ANSWER_TIMEOUT,
+        emulated: bool = True,
     ) -> None:
         """Talk through a :class:`Link` or a loopback device.
 
-        The latter needs its own clock. An answer may take ``timeout``, s.
+        The latter needs its own clock. An answer may take ``timeout``, s. Only at a port where
+        software may be (``emulated``) a device is believed that says it is simulated.
         """
+        self.brought_up: tuple[bytes, bytes] | None = None
+        self._emulated = emulated
         self.welcome: Welcome | None = None
         self.reading: Reading | None = None
-        self._transport, self._clock, self._timeout = transport, clock or RealClock(), timeout
+        self.transport, self._clock, self._timeout = transport, clock or RealClock(), timeout
         self._parser = ParserState()
         self._session, self._sequence = 0, 0
         self.counts: Counter[str] = Counter()
         self._round_trips: deque[float] = deque(maxlen=_REMEMBERED)
         self._pressure_limit: float | None = None
+        self._watch = ClockWatch()
+        self.vented = False
 
     def hello(self, pressure_limit: float | None = None) -> Welcome:
         """Open a new session; the device vents. It refuses another protocol version.
@@ -331,21 +418,60 @@ class Client:
         Args:
             pressure_limit: pressure above which the device shall vent, cmH2O, if it is below the
                 device's own limit.
+
+        Raises:
+            DeviceChangedError: if it is not the device of the session before.
         """
+        before = self.welcome
         self._session, self._sequence = secrets.randbits(32), 0
-        self._pressure_limit = pressure_limit
+        self._pressure_limit, self._watch = pressure_limit, ClockWatch()
         self.counts["sessions"] += 1
         hello = Hello(PROTOCOL_VERSION, pressure_limit)
-        self.welcome = self._persist(hello, Welcome)
-        self.heartbeat()
+        try:
+            self.welcome = self._persist(hello, Welcome, HELLOS)
+        except NoAnswerError:
+            if not self.transport.raise_lines():
+                raise
+            self.welcome = self._persist(hello, Welcome, HELLOS)
+        now = self.welcome.device_id, self.welcome.calibration
+        if before is not None and now != (before.device_id, before.calibration):
+            raise DeviceChangedError(
+                f"the device is {self.welcome.name} {now[0].hex()} with calibration "
+                f"{now[1].hex()[:8]}; the session began with {before.name} "
+                f"{before.device_id.hex()}, {before.calibration.hex()[:8]}: begin a new one"
+            )
+        self._persist(Heartbeat(), Reading)
         return self.welcome
+
+    @property
+    def simulated(self) -> bool:
+        """Whether no valve moves, so that nobody need have confirmed what moves."""
+        says = self.welcome is not None and bool(self.welcome.capabilities & Capability.SIMULATED)
+        return says and self._emulated
 
     def arm(self) -> Reading:
         """Begin a run: clear the causes of venting; commands must follow within 80 ms.
 
-        The device refuses while a cause of venting lasts.
+        The device refuses while a cause of venting lasts. A session that was lost, to another host
+        or by a restart of the device, is opened again.
+
+        Raises:
+            UnconfirmedError: if the device is real, and was not brought up as it is now.
         """
-        return self._persist(Arm(), Reading)
+        now = self.welcome and (self.welcome.device_id, self.welcome.calibration)
+        if not self.simulated and (now is None or now != self.brought_up):
+            raise UnconfirmedError(
+                "nobody has confirmed what the valves and the sensor of this device do, as it is "
+                "configured now: run `ventbench-hardware bringup --port PORT`; nothing was armed"
+            )
+        try:
+            return self._persist(Arm(), Reading)
+        except RefusedError as error:
+            if error.refusal.reason is not Reason.SESSION:
+                raise
+            self.counts["reopened"] += 1  # another host, or a restart of the device, ended it
+            self.hello(self._pressure_limit)
+            return self._persist(Arm(), Reading)
 
     def command(self, u_in: float, u_out: int, timeout: float | None = None) -> Reading:
         """Set the valves, and return what the device applied, as it was when the command arrived.
@@ -387,38 +513,49 @@ class Client:
         Raises:
             LinkError: if the port does not come back.
         """
-        self._transport.reopen()
+        self.transport.reopen()
         self._parser = ParserState()
         return self.hello(self._pressure_limit)
 
     def close(self) -> None:
         """Vent if the device still listens, and release the port."""
         try:
-            with contextlib.suppress(NoAnswerError, RefusedError, DisconnectedError):
-                self._ask(Vent(), Reading, self._timeout)  # else the watchdog vents
+            with contextlib.suppress(LinkError):
+                self.vent()  # else the watchdog vents
         finally:
-            self._transport.close()
+            self.transport.close()
+
+    def ending(self) -> str:
+        """Whether the lung is vented, as far as is known, in words."""
+        if self.vented:
+            return "the lung is vented: the device said so"
+        return (
+            "whether the lung is vented is not known, as the device does not answer: its watchdog "
+            "vents after 0.1 s; look at the lung"
+        )
 
     def round_trips(self) -> tuple[float, float]:
         """Median and longest time from message to answer of the last ten thousand, s, or NaN."""
         trips = np.asarray(self._round_trips if self._round_trips else [np.nan])
         return float(np.median(trips)), float(np.max(trips))
 
-    def _persist(self, message: HostMessage, answer: type[AnswerT]) -> AnswerT:
-        for attempt in range(ATTEMPTS):
+    def _persist(
+        self, message: HostMessage, answer: type[AnswerT], attempts: int = ATTEMPTS
+    ) -> AnswerT:
+        for attempt in range(attempts):
             try:
                 return self._ask(message, answer, PATIENCE)
             except NoAnswerError:
-                if attempt == ATTEMPTS - 1:
+                if attempt == attempts - 1:
                     raise
         raise AssertionError("unreachable")
 
     def _ask(self, message: HostMessage, answer: type[AnswerT], timeout: float) -> AnswerT:
         self._sequence += 1
         frame = encode(Packet(self._session, self._sequence, message))
-        begun = self._clock.now()
+        begun, self.vented = self._clock.now(), False
         try:
-            self._transport.write(frame)
+            self.transport.write(frame)
             self.counts["sent"] += 1
             answered = self._wait(begun + timeout)
         except DisconnectedError:
@@ -432,12 +569,19 @@ class Client:
                 "does its program run?"
             )
         self.counts["answered"] += 1
-        self._round_trips.append(self._clock.now() - begun)
+        now = self._clock.now()
+        self._round_trips.append(now - begun)
         if isinstance(answered, Reading):
-            self.reading = answered
+            self.reading, self.vented = answered, answered.mode is not Mode.RUNNING
+            if wrong := self._watch.see(answered.time, begun, now):
+                self._watch = ClockWatch()
+                raise ClockError(f"{wrong}; no reading of it can be placed in time")
         if isinstance(answered, Refusal):
             self.counts["refused"] += 1
+            self.vented = answered.mode is not Mode.RUNNING
             causes = f" (vented by {answered.flags.name})" if answered.flags else ""
+            if answered.reason is Reason.SESSION:
+                causes += "; another host, or a restart of the device, ended the session"
             raise RefusedError(
                 f"the device refused {name}: {answered.reason.name}, mode {answered.mode.name}"
                 f"{causes}",
@@ -455,7 +599,7 @@ class Client:
             left = deadline - self._clock.now()
             if left <= 0.0:
                 return None
-            self._parser, events = feed_bytes(self._parser, self._transport.read(left))
+            self._parser, events = feed_bytes(self._parser, self.transport.read(left))
             answers = [message for event in events if (message := self._expected(event))]
             if answers:
                 return answers[-1]

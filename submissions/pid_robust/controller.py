@@ -2,7 +2,7 @@
 
 TIME_CONSTANT = 0.5  # s, of both averages
 
-GAINS = (10.0, 2.0, 9.0)  # P, I, D, %/cmH2O
+GAINS = (4.0, 8.0, 9.0)  # P, I, D, %/cmH2O
 
 
 class Controller:

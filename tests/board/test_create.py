@@ -73,8 +73,8 @@ def test_replay_agrees_with_the_scorer(drafts, scores) -> None:
 
 def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: TextbookRigs) -> None:
     from ventbench.entries.cells import as_float64
-    from ventbench.entries.scoring import replay
     from ventbench.plants.stacking import take
+    from ventbench.task.rollouts import Script, closed_loop
 
     pressures = []
     with compilation.float64():
@@ -83,7 +83,9 @@ def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: Tex
             plants = jax.tree.map(lambda leaf: leaf[:, None], plants)
             cells, _, _ = draw_tables.with_nominal(None, [0] * 6, protocol.PIPS)
             cells = jax.tree.map(lambda leaf: leaf[:, 0], cells)
-            inspired, _ = replay(plants, cells, scores["pid_best"].requested[:, 0])
+            commands = scores["pid_best"].requested[:, 0].reshape(6, 6, -1)
+            run = jax.vmap(lambda plant, cell, u: closed_loop(plant, Script(u), cell)[0])
+            inspired = run(plants, cells, commands)
             pressures.append(np.asarray(inspired.pressure)[:, :, protocol.SCORED_BREATHS, :])
     expected = np.std(pressures, axis=0, ddof=1).mean(axis=(-2, -1))
     item = opened(drafts["pid_best"])

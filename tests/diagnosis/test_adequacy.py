@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.identification import without_saturated
+from ventbench.diagnosis.experiment import below, saturation
 from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
 from ventbench.diagnosis.validation import Adequacy, check_residuals, order_p_value, passes_fdr
 from ventbench.recordings import join
@@ -115,14 +115,13 @@ def test_saturated_readings_are_left_out():
     recorded = made.breaths(n=BREATHS)
     top = float(np.quantile(recorded.pressure, 0.95))
     clipped = dataclasses.replace(recorded, pressure=np.minimum(recorded.pressure, top))
-    kept, saturated = without_saturated(clipped)
+    saturated = saturation(clipped)
     assert saturated == pytest.approx((top, 0.05), rel=0.01)
+    kept = below(clipped, top)
     np.testing.assert_array_equal(np.isnan(kept.pressure), recorded.pressure >= top)
     step = np.round(recorded.pressure / 0.07) * 0.07
     for whole in (recorded, dataclasses.replace(recorded, pressure=step)):
-        same, nothing = without_saturated(whole)
-        assert nothing is None
-        assert same is whole
+        assert saturation(whole) is None
 
 
 def test_a_sensor_that_saturates_on_one_lung_does_so_on_all():
@@ -133,6 +132,5 @@ def test_a_sensor_that_saturates_on_one_lung_does_so_on_all():
     clipped = dataclasses.replace(both, pressure=np.minimum(both.pressure, top))
     seldom = np.count_nonzero(other.pressure >= top)
     assert 0 < seldom < 0.01 * other.pressure.size
-    assert without_saturated(clipped[20:])[1] is None
-    kept, _ = without_saturated(clipped)
-    np.testing.assert_array_equal(np.isnan(kept.pressure), both.pressure >= top)
+    assert saturation(clipped[20:]) is None
+    assert saturation(clipped) == pytest.approx((top, np.mean(both.pressure >= top)))

@@ -15,8 +15,8 @@ from ventbench.base import compilation
 from ventbench.diagnosis import corrected as module
 from ventbench.diagnosis.corrected import choose, compare_open_loop, correct, fit_open_loop
 from ventbench.diagnosis.evaluator import make_evaluator
+from ventbench.diagnosis.experiment import Judge, prepare, split
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.identification import split
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics import paths, physics
 from ventbench.plants.catalog import load_simulators
@@ -74,13 +74,13 @@ def test_whatever_the_candidates_no_lung_gets_worse(refit, after, seed):
         + np.where(R == 5.0, size[0], size[1])[:, None] * rng.standard_normal(both.pressure.shape)
         for stage, size in sizes.items()
     }
-    uses = split(both)
-    stages = choose(both, uses, pressures)
+    judge = Judge(both, split(both).judging)
+    stages = choose(both, judge, pressures)
     final = {"before": pressures["before"]} | {
         stage: module._by_lung(both, pressures, chosen)
         for stage, chosen in zip(("refit", "after"), stages, strict=True)
     }
-    line = compare_open_loop(both, uses.judging, final, 0.2)
+    line = compare_open_loop(both, judge, final, 0.2)
     everything = {"before": line.before, "refit": line.refit, "after": line.after}
     for group in (everything, line.groups["lung R5C50"], line.groups["lung R20C50"]):
         for kind in ("rmse", "mae"):
@@ -97,7 +97,7 @@ def test_only_breaths_that_were_set_aside_choose(breaths):
     for where, wanted in ((uses.judging, "before"), (~uses.judging, "after")):
         after = before + np.where(where[:, None], -9.0, 0.5) * error
         pressures = {"before": before, "refit": before, "after": after}
-        assert choose(breaths, uses, pressures)[1][small.LABEL] == (
+        assert choose(breaths, Judge(breaths, uses.judging), pressures)[1][small.LABEL] == (
             "refit" if wanted == "before" else "after"
         )
 
@@ -110,9 +110,7 @@ def test_a_simulator_that_would_err_more_is_left_as_it_is(breaths, fake, worse):
     error = breaths.pressure - before
     after = before - error if worse else before + 0.9 * error
     found, had = something(after, other), something(before, own)
-    one = correct(
-        breaths, make_data(breaths), split(breaths), before, found, had, load_simulators(given)
-    )
+    one = correct(prepare(breaths, load_simulators(given)), found, had)
     assert one.unchanged is worse
     assert one.helps is not worse
     np.testing.assert_allclose(one.pressures["after"], before if worse else after)
@@ -137,15 +135,8 @@ def test_any_simulator_is_corrected_for_the_least_error(breaths, fake, monkeypat
     identified.evaluator.settings = DEFAULT
     identified.pressures = lambda fitted, data, first: least if fitted == "again" else reported
     monkeypatch.setattr(module, "_least_error_model", lambda *_: "again")
-    correction = correct(
-        breaths,
-        make_data(breaths),
-        split(breaths),
-        before,
-        identified,
-        something(before, own),
-        load_simulators(given),
-    )
+    experiment = prepare(breaths, load_simulators(given))
+    correction = correct(experiment, identified, something(before, own))
     again = share < DEFAULT.correction.drift_ratio
     np.testing.assert_allclose(correction.pressures["after"], least if again else reported)
     plant: Any = correction.plants[small.LABEL]
@@ -154,15 +145,7 @@ def test_any_simulator_is_corrected_for_the_least_error(breaths, fake, monkeypat
 
     # A simulator that is left as it is has no note on a correction.
     reported, least = before - 2.0 * error, before - error
-    correction = correct(
-        breaths,
-        make_data(breaths),
-        split(breaths),
-        before,
-        identified,
-        something(before, own),
-        load_simulators(given),
-    )
+    correction = correct(experiment, identified, something(before, own))
     assert correction.unchanged
     assert correction.notes == ()
 
@@ -174,13 +157,7 @@ def test_a_correction_that_helps_its_own_breaths_alone_is_not_chosen(breaths, fa
     error = breaths.pressure - before
     after = before + np.where(uses.judging[:, None], -9.0, 0.5) * error
     one = correct(
-        breaths,
-        make_data(breaths),
-        uses,
-        before,
-        something(after, given),
-        something(before, given),
-        load_simulators(given),
+        prepare(breaths, load_simulators(given)), something(after, given), something(before, given)
     )
     assert not one.unchanged
     assert not one.helps
@@ -196,9 +173,7 @@ def test_a_function_has_corrected_pressures_but_no_plants(breaths, fake):
     before = simulators.pressures(breaths)
     after = before + 0.9 * (breaths.pressure - before)
     found, had = something(after, plants()), something(before, plants())
-    correction = correct(
-        breaths, make_data(breaths), split(breaths), before, found, had, simulators
-    )
+    correction = correct(prepare(breaths, simulators), found, had)
     assert correction.plants == {}
     np.testing.assert_allclose(correction.pressures["after"], after)
     assert f"no plant stands behind {simulators.name} that" in correction.notes[0]

@@ -7,8 +7,9 @@ import pytest
 from scipy import stats
 
 from ventbench.diagnosis.evidence import Posterior, _integrated_out, evidence
-from ventbench.diagnosis.in_time import _affected
+from ventbench.diagnosis.in_time import EXCHANGEABLE, _affected, command_p_value
 from ventbench.diagnosis.linearised import Term, gaussian
+from ventbench.system_id.data import Data
 
 
 def test_evidence_of_coefficients_is_that_of_the_marginal_density() -> None:
@@ -30,11 +31,31 @@ def test_an_event_is_found_in_the_breaths_that_it_affects() -> None:
         size = np.isin(np.arange(12), acts) * rng.uniform(0.7, 1.3, 12)
         G = 40.0 * (np.eye(12) - 0.8 / 12)  # their mean is hardly known
         b = G @ size + rng.standard_normal(12)
-        at, sizes = _affected(G, b, 1.0, 1.0)
+        at, likely = _affected(G, b, 1.0, 1.0)
         assert at.tolist() == acts
-        assert np.all(sizes > 0.2)
+        assert np.array_equal(np.flatnonzero(likely > 0.5), acts)
     at, _ = _affected(G, rng.standard_normal(12), 1.0, 1.0)
     assert not len(at)
+
+
+def _commanded(peaks: np.ndarray) -> Data:
+    """Breaths of one second with constant openings, %."""
+    n, zeros = len(peaks), np.zeros((len(peaks), 30))
+    lung = np.full(n, 20.0)
+    measured = np.zeros((n, 1, 30))
+    u_in = zeros + peaks[:, None]
+    return Data(u_in, zeros, zeros + 0.033, measured, measured + 1.0, lung, lung, np.arange(n) / n)
+
+
+def test_breaths_that_commands_predict_are_no_event() -> None:
+    """Chance predicts as much in one of a hundred sessions; a threshold on the command always."""
+    rng, small = np.random.default_rng(6), []
+    for _ in range(100):
+        peaks, acts = rng.uniform(3.0, 100.0, 40), (rng.permutation(40) < 10).astype(float)
+        pressure = peaks[:, None] + np.zeros(30)
+        small.append(command_p_value(acts, _commanded(peaks), pressure))
+        assert command_p_value((peaks > 70.0) * 0.9, _commanded(peaks), pressure) < EXCHANGEABLE
+    assert np.mean(np.array(small) <= EXCHANGEABLE) <= 0.05
 
 
 def test_what_acts_in_time_is_integrated_out_once_for_all_sets() -> None:

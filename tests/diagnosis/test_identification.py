@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import identification
-from ventbench.diagnosis.identification import held_out, split, usable
+from ventbench.diagnosis.experiment import held_out, split, usable
 from ventbench.diagnosis.settings import DEFAULT
 
 from . import made

@@ -8,8 +8,8 @@ import json
 import numpy as np
 import pytest
 
+from ventbench.diagnosis.experiment import never_fitted
 from ventbench.diagnosis.findings import OpenLoopError
-from ventbench.diagnosis.identification import never_fitted
 from ventbench.mechanics.labels import Estimate
 from ventbench.plants.catalog import load_simulators
 from ventbench.simulation import read_controls

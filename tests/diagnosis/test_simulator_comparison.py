@@ -13,8 +13,9 @@ from ventbench.base import compilation
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.evaluator import fit_with_noise
+from ventbench.diagnosis.experiment import held_out
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.identification import IdentifiedModel, held_out, identify
+from ventbench.diagnosis.identification import IdentifiedModel, identify
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.diagnosis.simulator_comparison import (
     describe_otherwise,

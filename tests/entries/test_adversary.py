@@ -31,11 +31,11 @@ SEVERITY = 0.3
 def test_a_held_valve_is_unsafe_at_the_supply_that_algebra_says(
     make, tmp_path, monkeypatch
 ) -> None:
-    """A held flow Q gives PEEP + Q (R + t / C); the gate needs four samples, from t = 0.9 s on."""
+    """A held flow Q gives PEEP + Q (R + t / C); the gate needs four samples, from t = 0.93 s on."""
     monkeypatch.setattr(
         "ventbench.entries.adversary.ROUNDS", 2
     )  # one coordinate has no combinations
-    flow = (LIMIT - 5.0) / (R / 1e3 + 30 * 0.03 / C)
+    flow = (LIMIT - 5.0) / (R / 1e3 + 31 * 0.03 / C)
     u_in = flow / stressor("supply_high").strong ** SEVERITY / VALVE_GAIN
     entry = make(act=f"return {u_in!r}")
     arguments = ["adversary", str(entry), "--lung", "R20C50", "--lung", "R5C50", "--plant"]
@@ -51,7 +51,7 @@ def test_a_held_valve_is_unsafe_at_the_supply_that_algebra_says(
     assert unsafe["physics"] == {"supply_high": f"gain x {1.5 ** unsafe['severity']:.3g}"}
     assert unsafe["alone"]["supply_high"] == pytest.approx(SEVERITY, abs=0.02)
     # On the other lung the same flow, half as much again, ends below the limit.
-    highest = 5.0 + 1.5 * u_in * VALVE_GAIN * (5.0 / 1e3 + 0.9 / C)
+    highest = 5.0 + 1.5 * u_in * VALVE_GAIN * (5.0 / 1e3 + 0.93 / C)
     assert safe["severity"] is None
     assert safe["excess"] == pytest.approx(highest - LIMIT, abs=0.1)
     text = (tmp_path / "out" / "adversary.txt").read_text()
@@ -107,7 +107,8 @@ def test_physics_that_cannot_be_is_left_out(monkeypatch) -> None:
         broken = np.flatnonzero(gain[:, 0, 0] / gain[:, 0, 1] > 1.5**0.95)
         if broken.size:
             raise PlantError(int(broken[0]))
-        return ProtocolRun(pressure, zero, zero, None, {(6,): Failure("act", "x")}, np.ones(1))
+        failed, none = {(6,): Failure("act", "x")}, zero[..., :0]
+        return ProtocolRun(pressure, zero, zero, none, None, failed, np.ones(1))
 
     monkeypatch.setattr("ventbench.entries.adversary.step_through", run)
     excess = bench._batch(points, pip).ravel()

@@ -80,7 +80,7 @@ def test_robust_pid(plants):
         )
         with compilation.float64():
             cells = environment.nominal_scenario(np.array(protocol.PIPS))
-        expected = pure_errors(plants, cells, [(10.0, 2.0, 9.0)] * 6)
+        expected = pure_errors(plants, cells, [(4.0, 8.0, 9.0)] * 6)
         np.testing.assert_allclose(found.nominal, expected, rtol=0, atol=1e-9)
 
 

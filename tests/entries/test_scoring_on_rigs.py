@@ -23,7 +23,7 @@ from ..valve import Stepped
 PIPS = (10.0, 35.0)
 
 #: Gains of the submission, %/cmH2O.
-PID_ROBUST = (10.0, 2.0, 9.0)
+PID_ROBUST = (4.0, 8.0, 9.0)
 
 
 @pytest.fixture(scope="module")

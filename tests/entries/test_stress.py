@@ -162,7 +162,7 @@ def _made(cells: Cells, pressure: np.ndarray) -> Runs:
     pressure = pressure[:, :, :, None]
     pip = np.asarray(cells.scenario.pip)[..., None, None]
     zero = np.zeros_like(pressure)
-    run = ProtocolRun(pip + pressure, zero, zero, zero + 1.0, {}, np.ones(1))
+    run = ProtocolRun(pip + pressure, zero, zero, zero[..., :0], zero + 1.0, {}, np.ones(1))
     cells = dataclasses.replace(cells, conditions=cells.conditions[: len(pressure)])
     return runs_of(run, cells, submission_of(Controller), [])
 

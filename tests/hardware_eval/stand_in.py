@@ -21,7 +21,7 @@ class Bench:
     saturated: bool = False
     lapsed: bool = False
     identity: Identity = field(
-        default_factory=lambda: Identity("bench", b"12345678", bytes(32), Capability.NONE)
+        default_factory=lambda: Identity("bench", b"12345678", bytes(32), Capability.SIMULATED)
     )
     random: Random = field(default_factory=lambda: Random(0))
     valves: list[tuple[float, float, int]] = field(default_factory=list)

@@ -17,10 +17,12 @@ from typer.testing import CliRunner
 from hardware_eval import cli
 from hardware_eval.bench.controllers import ControllerFailedError, SubmissionController
 from hardware_eval.bench.raw_log import breaths
+from hardware_eval.device.program import Identity
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
+from hardware_eval.wire.messages import Capability
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 from ventbench.board import record
@@ -31,7 +33,7 @@ MANUAL = Path(cli.__file__).parent / "README.md"
 
 @pytest.fixture
 def on_line(line: Line, monkeypatch: pytest.MonkeyPatch) -> Line:
-    monkeypatch.setattr(evaluate, "connect", lambda port: line)
+    monkeypatch.setattr(evaluate, "connect", lambda port, confirmed=True: line)
     return line
 
 
@@ -177,7 +179,8 @@ def test_the_port_and_not_the_device_decides_what_is_emulated(tmp_path: Path) ->
     assert {port: evaluate.port_kind(port) for port in kinds} == kinds
     for descriptor in (master, slave):
         os.close(descriptor)
-    device = LoopbackDevice(Bench())  # says that it is hardware
+    hardware = Identity("bench", b"12345678", bytes(32), Capability.NONE)
+    device = LoopbackDevice(Bench(identity=hardware))
     client = Client(device, device.clock)
     for kind, emulated in (("serial", False), ("pseudo-terminal", True), ("virtual", True)):
         about = evaluate.device_about(Line(client, device.clock, port=kind))

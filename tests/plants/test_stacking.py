@@ -94,9 +94,11 @@ def late(lung_id: str, **base: float):
         return physics(lung(lung_id), {"valve_delay": {"delay": 1.0 / 24.0}}, **base)
 
 
-def test_physics_with_other_mechanisms_are_stacked_and_stay_themselves() -> None:
+@pytest.mark.parametrize("base", [{}, {"PEEP": 3.0}], ids=["at rest", "own PEEP"])
+def test_physics_with_other_mechanisms_are_stacked_and_stay_themselves(base) -> None:
+    """One without a PEEP of its own takes the pressure that it starts from, beside one with it."""
     with compilation.float64():
-        leaking = physics(lung("R5C10"), {"leak": {"conductance": 8.0}})
+        leaking = physics(lung("R5C10"), {"leak": {"conductance": 8.0}}, **base)
         both = stack_heterogeneous([late("R20C50"), leaking])
         u_in = np.array([[30.0, 20.0, 0.0, 10.0, 0.0, 0.0]])
         u_out, dt = np.array([[0.0, 0.0, 0.0, 0.0, 1.0, 1.0]]), np.full((1, 6), 0.03)
@@ -111,5 +113,3 @@ def test_physics_with_other_mechanisms_are_stacked_and_stay_themselves() -> None
 def test_plants_that_cannot_be_stacked() -> None:
     with pytest.raises(InputError, match="make a file for each lung"):
         stack_heterogeneous([late("R20C50"), single_compartment(lung("R5C10"))])
-    with pytest.raises(InputError, match="PEEP of their own"):
-        stack_heterogeneous([late("R20C50"), late("R5C10", PEEP=5.0)])

@@ -16,7 +16,7 @@ from ventbench.base.errors import InputError
 from ventbench.cli.data import app
 from ventbench.recordings import check, load, write
 from ventbench.recordings.foreign import import_recording, import_runs
-from ventbench.recordings.foreign.layouts import UNITS, conversion
+from ventbench.recordings.headers import UNITS, conversion
 
 RATE, PERIOD = 50.0, 3.0
 
@@ -168,11 +168,14 @@ def test_breaths_from_pressure_alone_and_from_a_rate(tmp_path):
     made = waveforms()
     path = tmp_path / "p.txt"
     path.write_text("\n".join(f"{p:.3f}\t1" for p in made["pressure"]))
-    imported = import_recording(path, columns={"1": "pressure"}, rate=RATE, lung="R20C50")
+    with pytest.raises(InputError, match=r"--map 2=flow; or, if none of them is, --map 2=unused"):
+        import_recording(path, columns={"1": "pressure"}, rate=RATE, lung="R20C50")
+    columns = {"1": "pressure", "2": "unused"}
+    imported = import_recording(path, columns=columns, rate=RATE, lung="R20C50")
     assert len(imported.breaths) == 4
     assert "where pressure rises" in " ".join(imported.understood)
     with pytest.raises(InputError, match="--rate 50"):
-        import_recording(path, columns={"1": "pressure"}, lung="R20C50")
+        import_recording(path, columns=columns, lung="R20C50")
 
 
 @pytest.mark.parametrize(

@@ -285,7 +285,7 @@ def test_absolute_pressure(tmp_path):
 
 def test_bad_breaths_are_named(tmp_path):
     made = lung()
-    made["pressure"][700] = 300.0
+    made["pressure"][700:740] = np.arange(300.0, 340.0)
     path = table(tmp_path / "a.csv", NAMES, plain(made))
     with pytest.raises(InputError, match=r"line 702 \(300\).*\n.*--skip-bad-breaths"):
         import_recording(path, lung=LABEL)

@@ -28,7 +28,7 @@ class Figures:
     attainable: Floats  #: least error of any commands in the cell, cmH2O.
     pid: Floats  #: error of the lung's best PID in the cell, cmH2O.
     peak: Floats  #: highest pressure of the run, cmH2O; not NaN.
-    steps_above: Ints  #: longest time of the run above the safety limit, steps.
+    steps_above: Ints  #: samples above the safety limit in a breath, the most of the run.
     safe: Bools  #: whether all runs of a lung pass the safety gate, ``(L,)``.
     #: disagreement of the ensemble along the nominal runs, cmH2O, ``(L, P)``; NaN where one failed.
     spread: Floats

@@ -23,7 +23,7 @@ from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
 from ventbench.board.figures import Figures
 from ventbench.task import protocol
-from ventbench.task.metrics.score import passes_safety_gate
+from ventbench.task.metrics import measured
 
 #: What the key ``track`` says of every such record.
 TRACK = "hardware"
@@ -38,6 +38,7 @@ _HALF_WAY = 0.5
 MAX_REPEATS = 100
 
 _Run = list[list[schema.SmallInt]] | None
+_MeasuredRun = list[list[schema.SmallInt | None]] | None
 
 #: End of a record's file name, after its SHA-256.
 SUFFIX = canonical.RECORD_SUFFIX
@@ -113,10 +114,10 @@ class Stop(schema.Table, frozen=True):
 class HardwareTrace(schema.Table, frozen=True):
     """Scored inspirations of every run, ``(L, P, K)``; null for a stopped run.
 
-    Each run is ``(scored breaths, INSPIRATION_STEPS)``.
+    Each run is ``(scored breaths, INSPIRATION_STEPS)``, with null where there is no reading.
     """
 
-    pressure_milli_cmH2O: list[list[list[_Run]]]
+    pressure_milli_cmH2O: list[list[list[_MeasuredRun]]]
     u_in_tenths_percent: list[list[list[_Run]]]
 
 
@@ -285,15 +286,17 @@ def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecor
             if run is None:
                 missing.add((lung, pip, k + 1))
                 continue
-            pressure = np.array(run) / 1000.0
-            given = float(np.mean(np.abs(pressure - pip)))
+            pressure = np.array(run, float) / 1000.0
+            if why := measured.too_few(pressure):
+                raise InputError(f"{label}, key trace: {where}: {why}")
+            given = measured.mean_error(pressure, pip)
             if abs(given - recorded) > _ROUNDED:
                 raise InputError(
                     f"{label}, key errors: {where} says {recorded:.4f} cmH2O, its pressures give "
                     f"{given:.4f}"
                 )
-            highest = max(highest, float(pressure.max()))
-            safe &= bool(np.all(passes_safety_gate(pressure, pip, protocol.DT)))
+            highest = max(highest, measured.highest(pressure))
+            safe &= bool(np.all(measured.is_safe(pressure, pip, protocol.DT)))
             first = float(np.abs(pressure[:, 0] - protocol.PEEP).max())
             if first > _HALF_WAY * (pip - protocol.PEEP):
                 raise InputError(

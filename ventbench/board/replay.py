@@ -44,7 +44,7 @@ from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.task.metrics.score import controllable_error, longest_run, safety_limit
+from ventbench.task.metrics.score import controllable_error, safety_limit
 
 #: The breath whose nominal inspirations pages show.
 TRACE_BREATH = max(protocol.SCORED_BREATHS)
@@ -79,21 +79,22 @@ Kept = dict[Any, Any]
 
 @jax.jit
 def _breath(plants: Plant, scenario: Scenario, commands: Array, breath: Array) -> Any:
-    """Inspirations of one breath, steps last, for commands ``(L, ..., S)``; cells ``(L, ...)``."""
+    """Both phases of one breath, steps last, for commands ``(L, ..., S)``; cells ``(L, ...)``."""
 
     def run(plant: Plant, cells: Scenario, commands: Array) -> Any:
         varied = environment.vary(plant, cells, breath)
         inputs = jnp.moveaxis(commands, -1, 0)
-        _, _, inspired = rollouts.inspiration(
+        loop, _, inspired = rollouts.inspiration(
             varied, cells, rollouts.commanded, breath=breath, inputs=inputs
         )
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), inspired)
+        phases = inspired, rollouts.expiration(varied, cells, loop)[1]
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), phases)
 
     return jax.vmap(run)(plants, scenario, commands)
 
 
-def _inspirations(plants: Sequence[Plant], scenario: Scenario, commands: Floats) -> Any:
-    """Inspirations of all breaths, with the plants of each, for commands ``(L, ..., B, S)``."""
+def _breaths(plants: Sequence[Plant], scenario: Scenario, commands: Floats) -> Any:
+    """Inspirations and expirations of all breaths, with the plants of each, for commands ``(L, ..., B, S)``."""
     breaths = [
         jax.tree.map(np.asarray, _breath(plant, scenario, jnp.asarray(commands[..., k, :]), k))
         for k, plant in enumerate(plants)
@@ -108,7 +109,7 @@ def run_of(cells: Cells, commands: Floats) -> ProtocolRun:
     with compilation.float64():
         if conditions == 1:
             plants = [as_float64(cells.plants, lungs)] * protocol.BREATHS
-            found = _inspirations(plants, cells.scenario, commands[0])
+            found = _breaths(plants, cells.scenario, commands[0])
             parts = [jax.tree.map(lambda x: x[None], found)]
         else:
             for draw in range(len(cells.draw)):
@@ -117,12 +118,20 @@ def run_of(cells: Cells, commands: Floats) -> ProtocolRun:
                     jax.tree.map(lambda x, k=k: x[:, k], plants) for k in range(protocol.BREATHS)
                 ]
                 own = commands[:, :, draw, 0].reshape(conditions * lungs, *commands.shape[4:])
-                found = _inspirations(each, scenario, own)
+                found = _breaths(each, scenario, own)
                 parts.append(
                     jax.tree.map(lambda x: x.reshape(conditions, lungs, 1, 1, *x.shape[1:]), found)
                 )
-    whole = jax.tree.map(lambda *x: np.concatenate(x, axis=2), *parts)
-    return ProtocolRun(whole.pressure, whole.requested, whole.u_in, whole.volume, {}, np.zeros(0))
+    inspired, expired = jax.tree.map(lambda *x: np.concatenate(x, axis=2), *parts)
+    return ProtocolRun(
+        inspired.pressure,
+        inspired.requested,
+        inspired.u_in,
+        expired.pressure,
+        inspired.volume,
+        {},
+        np.zeros(0),
+    )
 
 
 def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
@@ -144,7 +153,7 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
         by_member = []
         for k in range(members):
             plants = [jax.tree.map(lambda x, k=k: x[k], wide)] * protocol.BREATHS
-            by_member.append(_inspirations(plants, nominal, requested[:, None]).pressure[:, 0])
+            by_member.append(_breaths(plants, nominal, requested[:, None])[0].pressure[:, 0])
     deviation = np.std(by_member, axis=0, ddof=1)
     return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
 
@@ -206,7 +215,7 @@ def figures_of(
     size = what.cells.pips.shape
     failed = np.isnan(runs.error[0]).reshape(size)
     pip = np.asarray(what.cells.scenario.pip)[..., None, None]
-    above = longest_run(run.pressure[0] > safety_limit(pip)).max(axis=-1)
+    above = np.sum(run.breaths[0] > safety_limit(pip), axis=-1).max(axis=-1)
 
     def by_draw(values: Any) -> Any:
         return np.moveaxis(np.asarray(values).reshape(size), 1, 0)

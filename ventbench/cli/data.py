@@ -12,6 +12,7 @@ from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     Clip,
     JsonFile,
+    Missing,
     Pad,
     PlantName,
     bar,
@@ -78,19 +79,22 @@ def check(
     file: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet in the public schema.")],
     clip: Clip = False,
     pad: Pad = False,
+    missing: Missing = None,
     json: JsonFile = None,
 ) -> None:
     """Report every problem of a recording, with line, column and value.
 
     Also whether columns are what they are called: signs, units, valves, labels, sensors that
-    saturate. Ends with 0 if all is well, 1 if something is suspicious, 2 if it cannot be used.
+    saturate, and samples that are no readings: marks of missing values, isolated and held ones,
+    which every command leaves out. Ends with 0 if all is well, 1 if something is suspicious, 2 if
+    it cannot be used.
 
     Example: `ventbench data check lab.csv`
     """
     from ventbench import recordings
 
     with bar(f"reading {file}") as reading:
-        report = recordings.check(file, clip=clip, pad=pad, progress=reading)
+        report = recordings.check(file, clip=clip, pad=pad, missing=missing or (), progress=reading)
     emit(report.to_dict(), json)
     for line in report.lines():
         typer.echo(line, err=str(json) == "-")
@@ -103,7 +107,11 @@ def check(
 @app.command("import")
 def import_(
     file: Annotated[
-        Path, typer.Argument(help="CSV with any separator, .xlsx, Parquet, or MATLAB .mat (-v7).")
+        Path,
+        typer.Argument(
+            help="Text with any separator, JSON, .xlsx, Parquet, MATLAB .mat (-v7), EDF, WFDB, "
+            "MCAP, or a bag of ROS."
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -116,13 +124,16 @@ def import_(
         typer.Option(
             "--map",
             metavar="NAME=ROLE",
-            help="What a column is: time, pressure, flow, volume, u_in, u_out, R, C, breath, "
-            "group, target or unused. May be repeated; usual names need none.",
+            help="What a column is: time, pressure, flow, flow_in, flow_out, volume, u_in, u_out, "
+            "R, C, breath, group, target or unused. May be repeated; headers that are understood "
+            "need none.",
         ),
     ] = None,
     layout: Annotated[
         str | None,
-        typer.Option(help="kaggle, respiraworks, pvp or servo; recognised if not given."),
+        typer.Option(
+            help="kaggle, respiraworks, pvp, servo, mvm or session; recognised if not given."
+        ),
     ] = None,
     lung: Annotated[
         str | None, typer.Option(metavar="R20C50", help="Label where no columns hold R and C.")
@@ -154,6 +165,13 @@ def import_(
     select: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="Only rows with this value; may be repeated."),
+    ] = None,
+    missing: Missing = None,
+    map_values: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WORD=NUMBER,...", help="What words in cells stand for: open=1,closed=0."
+        ),
     ] = None,
     skip_bad_breaths: Annotated[
         bool, typer.Option("--skip-bad-breaths", help="Leave out bad breaths, and name them.")
@@ -189,8 +207,10 @@ def import_(
             rate=rate,
             split_breaths=split_breaths,
             invert=invert or (),
-            offsets=_offsets(offset),
+            offsets=_numbers(offset, "--offset"),
             select=_pairs(select, "--select"),
+            missing=missing or (),
+            words=_numbers(map_values.split(",") if map_values else None, "--map-values"),
             skip_bad_breaths=skip_bad_breaths,
             separator=separator,
             decimal=decimal,
@@ -226,13 +246,13 @@ def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
     return pairs
 
 
-def _offsets(given: list[str] | None) -> dict[str, float]:
-    """Numbers of ``ROLE=VALUE``."""
-    pairs = _pairs(given, "--offset")
+def _numbers(given: list[str] | None, option: str) -> dict[str, float]:
+    """Numbers of ``NAME=VALUE``."""
+    pairs = _pairs(given, option)
     try:
         return {role: float(value) for role, value in pairs.items()}
     except ValueError as error:
-        raise InputError(f"--offset: a number is wanted ({error})") from None
+        raise InputError(f"{option}: a number is wanted ({error})") from None
 
 
 @app.command()

@@ -12,6 +12,7 @@ from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     Clip,
     JsonFile,
+    Missing,
     Pad,
     PlantName,
     bar,
@@ -37,6 +38,7 @@ def mechanics(
     ],
     clip: Clip = False,
     pad: Pad = False,
+    missing: Missing = None,
     json: JsonFile = None,
 ) -> None:
     """Identify lungs from pressure with flow or volume, and check their labels.
@@ -47,7 +49,7 @@ def mechanics(
 
     Example: `ventbench mechanics lab.csv`
     """
-    named = _of_runs(recordings) or _of_session(recordings, clip=clip, pad=pad)
+    named = _of_runs(recordings) or _of_session(recordings, clip=clip, pad=pad, missing=missing)
     console = told([{"name": name} | _lung(lung) for name, lung in named.items()], json)
     console.print(_table(named))
     for name, lung in named.items():
@@ -82,7 +84,9 @@ def _of_runs(path: Path) -> dict[str, Mechanics]:
     return {f"{name}: {lung.label}": lung for name, lung in found.items()}
 
 
-def _of_session(path: Path, *, clip: bool, pad: bool) -> dict[str, Mechanics]:
+def _of_session(
+    path: Path, *, clip: bool, pad: bool, missing: list[float] | None
+) -> dict[str, Mechanics]:
     """Lungs of a file by label; of a folder by file and label."""
     from ventbench.mechanics import share_faults
     from ventbench.recordings.read import session_files
@@ -91,15 +95,17 @@ def _of_session(path: Path, *, clip: bool, pad: bool) -> dict[str, Mechanics]:
     found = {
         f"{file.stem}: {lung.label}" if len(paths) > 1 else lung.label: lung
         for file in paths
-        for lung in _identify(file, clip=clip, pad=pad)
+        for lung in _identify(file, clip=clip, pad=pad, missing=missing)
     }
     return dict(zip(found, share_faults(list(found.values())), strict=True))
 
 
-def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
+def _identify(
+    path: Path, *, clip: bool, pad: bool, missing: list[float] | None
+) -> tuple[Mechanics, ...]:
     from ventbench.mechanics import identify
 
-    breaths = read_recording(path, clip=clip, pad=pad)
+    breaths = read_recording(path, clip=clip, pad=pad, missing=missing)
     if breaths.flow is None and breaths.volume is None:
         raise InputError(
             f"{path}: there is neither a column flow (mL/s) nor volume (mL); record one of them, "
@@ -184,6 +190,7 @@ def diagnose(
     ] = False,
     clip: Clip = False,
     pad: Pad = False,
+    missing: Missing = None,
     json: JsonFile = None,
 ) -> None:
     """Find the physics that a simulator lacks when it differs from a recording.
@@ -203,7 +210,7 @@ def diagnose(
     if drive not in ("auto", "valve", "flow"):
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
     require("jinja2", "rerun")
-    breaths = read_recording(recordings, clip=clip, pad=pad)
+    breaths = read_recording(recordings, clip=clip, pad=pad, missing=missing)
     diagnosis = _diagnose(breaths, plant, lung, patient, drive)
     written = diagnosis.save(out)
     console = told(diagnosis.as_dict(), json)

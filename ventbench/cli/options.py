@@ -109,6 +109,14 @@ JsonFile = Annotated[
 Clip = Annotated[
     bool, typer.Option("--clip", help="Clip u_in to 0..100 % instead of refusing the file.")
 ]
+Missing = Annotated[
+    list[float] | None,
+    typer.Option(
+        metavar="VALUE",
+        help="A value of pressure, flow or volume that stands for a missing one, such as -99; may "
+        "be repeated. Marks that come again and again are found without it.",
+    ),
+]
 Pad = Annotated[bool, typer.Option("--pad", help="Accept breaths of unequal length.")]
 InProcess = Annotated[
     bool,
@@ -271,12 +279,14 @@ def _progress(*columns: ProgressColumn) -> Progress:
     )
 
 
-def read_recording(path: Path, *, clip: bool, pad: bool) -> Breaths:
+def read_recording(
+    path: Path, *, clip: bool, pad: bool, missing: Sequence[float] | None = None
+) -> Breaths:
     """Read a recording with a bar; its notes go to stderr."""
     from ventbench import recordings
 
     with bar(f"reading {path}") as reading:
-        breaths = recordings.load(path, clip=clip, pad=pad, progress=reading)
+        breaths = recordings.load(path, clip=clip, pad=pad, missing=missing or (), progress=reading)
     for note in breaths.notes:
         notes().print(f"note: {note}")
     return breaths

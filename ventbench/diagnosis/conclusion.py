@@ -41,7 +41,7 @@ Progress: TypeAlias = Callable[[str], None]
 _NEAR, _LISTED = 0.05, 2
 
 #: Least posterior probability of an effect of some breaths that is looked for.
-_LOOKED_FOR = 0.1
+_LOOKED_FOR = 0.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,14 +19,14 @@ import numpy as np
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.experiment import Experiment, Judge, Split, open_loop_error
 from ventbench.diagnosis.findings import OpenLoopComparison, OpenLoopError, Stage
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
-from ventbench.diagnosis.identification import IdentifiedModel, Split
+from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.residual_analysis import EDGE_SIZE
 from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.plants.corrected import Corrected
-from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Data
 from ventbench.system_id.problem import parameter_of, parameter_values
@@ -72,29 +72,23 @@ class Correction:
 
 
 def correct(
-    breaths: Breaths,
-    data: Data,
-    split: Split,
-    before: Floats,
+    experiment: Experiment,
     recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None,
-    simulators: Simulators,
 ) -> Correction:
     """Correct a simulator by the difference of the models of the recording and of itself.
 
     A simulator that is not the base model stays as it is if the correction raises its mean error on
     the breaths of the fits. Likelihoods of coloured noise excuse slow errors, which a learned
-    simulator may not make; the mean error does not. The judging breaths choose among the rest.
+    simulator may not make; the mean error does not. The judge chooses among the rest.
 
     Args:
-        breaths: n recorded ones.
-        data: the same as fits see them.
-        split: their uses.
-        before: pressures of the simulator, cmH2O, ``(n, T)``.
+        experiment: n breaths, and what is diagnosed.
         recording_model: identified from the recording.
         simulator_model: identified from the simulator's response; None for the base model.
-        simulators: what was diagnosed.
     """
+    breaths, data, split = experiment.breaths, experiment.data, experiment.uses
+    before, simulators = experiment.before, experiment.simulators
     if simulator_model is None:
         pressures, plants, notes = _base_model(breaths, data, split, before, recording_model)
     else:
@@ -109,7 +103,7 @@ def correct(
     unchanged = simulator_model is not None and bool(errors[1] >= errors[0])
     if unchanged:
         pressures, notes = dict.fromkeys(pressures, before), []  # notes on the correction
-    refitted, chosen = choose(breaths, split, pressures)
+    refitted, chosen = choose(breaths, experiment.judge, pressures)
     if unchanged:
         given_everywhere: dict[str, Stage] = dict.fromkeys(chosen, "before")
         refitted = chosen = given_everywhere
@@ -125,8 +119,11 @@ def correct(
             "diagnosis."
         )
         return Correction(final, errors, {}, chosen, unchanged, (*notes, note))
+    # Plants of one kind can be run together: the base model is the library's physics here.
     given = {
-        name: simulators.plant_of_breath(breaths, int(index[0]))
+        name: simulators.plant(name)
+        if simulators.is_base_physics
+        else simulators.plant_of_breath(breaths, int(index[0]))
         for name, index in breaths.by_lung_index.items()
     }
     result: Plants = {}
@@ -146,13 +143,13 @@ _NOTE_ON_DRIFT = (
 
 
 def choose(
-    breaths: Breaths, split: Split, pressures: dict[str, Floats]
+    breaths: Breaths, judge: Judge, pressures: dict[str, Floats]
 ) -> tuple[dict[str, Stage], dict[str, Stage]]:
     """Choose the refitted and the corrected simulator of each lung, by its judging breaths.
 
     Args:
         breaths: n recorded breaths.
-        split: their uses; a lung without judging breaths follows those of all lungs together.
+        judge: has the readings; a lung without judging breaths follows those of all lungs together.
         pressures: pressures of the candidates ``before``, ``refit`` and ``after``, cmH2O, ``(n,
             T)`` each.
 
@@ -161,24 +158,25 @@ def choose(
         worse, and the one that stands for the corrected simulator, both by label.
     """
     # What reports measure: inspirations, from the second sample on.
-    judged = breaths.inspiratory & (breaths.time > 0) & split.judging[:, None]
+    judged = breaths.inspiratory & (breaths.time > 0)
     refitted: dict[str, Stage] = {}
     corrected: dict[str, Stage] = {}
-    for name in breaths.by_lung_index:
-        mask = judged & (breaths.lung_ids == name)[:, None]
-        mask = mask if mask.any() else judged
+    for name, index in breaths.by_lung_index.items():
+        mask = judged
+        if judge.judging[index].any():
+            mask = judged & (breaths.lung_ids == name)[:, None]
         best: Stage = "before"
-        if _is_no_worse(breaths, pressures["refit"], pressures[best], mask):
+        if _is_no_worse(judge, pressures["refit"], pressures[best], mask):
             best = "refit"
         refitted[name] = corrected[name] = best
-        if _is_no_worse(breaths, pressures["after"], pressures[best], mask):
+        if _is_no_worse(judge, pressures["after"], pressures[best], mask):
             corrected[name] = "after"
     return refitted, corrected
 
 
-def _is_no_worse(breaths: Breaths, trial: Floats, current: Floats, mask: Bools) -> bool:
+def _is_no_worse(judge: Judge, trial: Floats, current: Floats, mask: Bools) -> bool:
     """Whether neither error rises; a simulator whose pressures are unknown never wins."""
-    new, old = (open_loop_error(breaths.pressure, p, mask) for p in (trial, current))
+    new, old = (judge.error(pressure, mask) for pressure in (trial, current))
     if not np.isfinite(old.rmse):
         return bool(np.isfinite(new.rmse))
     return bool(new.rmse <= old.rmse and new.mae <= old.mae)
@@ -352,17 +350,9 @@ def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, 
     return start
 
 
-def open_loop_error(recorded: Floats, simulated: Floats, mask: Bools) -> OpenLoopError:
-    """Error over the samples of a mask, all ``(n, T)``; NaN if there is none."""
-    error = (simulated - recorded)[mask & np.isfinite(recorded) & np.isfinite(simulated)]
-    if error.size == 0:
-        return OpenLoopError(float("nan"), float("nan"))
-    return OpenLoopError(float(np.mean(np.abs(error))), float(np.sqrt(np.mean(error**2))))
-
-
 def compare_open_loop(
     breaths: Breaths,
-    held_out: Bools,
+    judge: Judge,
     pressures: dict[str, Floats],
     noise_floor: float,
     scatter_error: Floats | None = None,
@@ -372,7 +362,7 @@ def compare_open_loop(
 
     Args:
         breaths: n recorded breaths of T samples.
-        held_out: breaths that no fit has seen, ``(n,)``.
+        judge: has the readings of the breaths that no fit has seen.
         pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
             T)``.
         noise_floor: standard deviation of the noise, cmH2O.
@@ -381,32 +371,27 @@ def compare_open_loop(
         sensor: that of :func:`sensor_noise`.
     """
     # The first sample is where every simulation starts.
-    inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
+    inspiration = breaths.inspiratory & (breaths.time > 0) & judge.judging[:, None]
 
     def by_stage(mask: Bools) -> dict[str, OpenLoopError]:
-        return {
-            stage: open_loop_error(breaths.pressure, simulated, mask)
-            for stage, simulated in pressures.items()
-        }
+        return {stage: judge.error(simulated, mask) for stage, simulated in pressures.items()}
 
     whole = by_stage(inspiration)
     parts = {
         f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
         "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
-        "expiration": (breaths.u_out == 1) & breaths.valid & held_out[:, None],
+        "expiration": (breaths.u_out == 1) & breaths.valid & judge.judging[:, None],
     }
     lungs = breaths.by_lung_index
     for name in lungs if len(lungs) > 1 else ():
         parts[f"lung {name}"] = inspiration & (breaths.lung_ids == name)[:, None]
-    ids = tuple(int(i) for i in breaths.breath_id[held_out])
     groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
     scatter = 0.0
     if scatter_error is not None:
         scatter = float(np.sqrt(np.mean(scatter_error[inspiration] ** 2)))
-    error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
-    usual = _usual_error(error)
+    usual = _usual_error(*judge.by_breath(pressures["after"], inspiration))
     return OpenLoopComparison(
-        ids,
+        judge.ids,
         whole["before"],
         whole["refit"],
         whole["after"],
@@ -418,9 +403,8 @@ def compare_open_loop(
     )
 
 
-def _usual_error(error: Floats) -> float:
-    """Root mean square of errors ``(n, T)`` without the breaths that err most."""
-    squares, counts = np.nansum(error**2, axis=1), np.isfinite(error).sum(axis=1)
+def _usual_error(squares: Floats, counts: Floats) -> float:
+    """Root mean square of errors without the breaths that err most, ``(k,)`` each."""
     order = np.argsort(squares / np.maximum(counts, 1))
     kept = order[: len(order) - math.ceil(_SET_ASIDE * len(order))] if len(order) > 2 else order
     total = counts[kept].sum()

@@ -24,6 +24,7 @@ from ventbench.diagnosis.corrected import (
     sensor_noise,
 )
 from ventbench.diagnosis.evidence import IN_TIME, told_posterior
+from ventbench.diagnosis.experiment import Experiment, Split, prepare
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import (
     BreathRequest,
@@ -32,18 +33,9 @@ from ventbench.diagnosis.findings import (
     Traces,
     Verdict,
 )
-from ventbench.diagnosis.hypothesis import varies_by_breath
-from ventbench.diagnosis.identification import (
-    IdentifiedModel,
-    Split,
-    identify,
-    never_fitted,
-    place_of_change,
-    split,
-    usable,
-    without_saturated,
-)
-from ventbench.diagnosis.intermittent import Intermittent, find
+from ventbench.diagnosis.hypothesis import FittedModel, varies_by_breath
+from ventbench.diagnosis.identification import IdentifiedModel, identify, place_of_change
+from ventbench.diagnosis.intermittent import find
 from ventbench.diagnosis.residual_analysis import flow_and_volume, locate
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
@@ -60,10 +52,9 @@ from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.decimation import decimate, is_fast
 from ventbench.recordings.read import load
 from ventbench.recordings.roles import require_roles
-from ventbench.system_id import Data, Fit, Noise, make_data
+from ventbench.system_id import Data, Fit, Noise
 from ventbench.task.lungs import lung as parse_lung
 
 if TYPE_CHECKING:
@@ -82,11 +73,6 @@ _STARTED, _IDENTIFIED, _STEP = 0.02, 0.9, 0.3
 
 #: Most effects that act in some breaths.
 _MOST_INTERMITTENT = 2
-
-_NOTE_ON_FLOW = (
-    "No valve command: the recorded flow drives the model, so nothing is said of the valves, R_ex "
-    "and PEEP, and an offset of the flow sensor looks like a leak."
-)
 
 
 def diagnose(
@@ -150,142 +136,166 @@ def diagnose(
     simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:
         breaths = _of_lung(breaths, parse_lung(lung).id)
+    tell = progress or (lambda what, share: None)
+    tell("simulating", _STARTED)
     by_flow = drive == "flow" or (drive == "auto" and flow_drive.lacks_commands(breaths))
+    experiment = prepare(breaths, simulators, settings.data, by_flow=by_flow)
+    excluded = () if patient else ("patient_effort",)
+    if by_flow:
+        excluded += (*flow_drive.ventilator_side(), *IN_TIME)
+        settings = flow_drive.without_ventilator(settings)
     told: list[MissingMechanism] = []
     posterior = None  # that of all breaths has all effects
     while True:
-        found = _diagnose(
-            breaths,
-            simulators,
-            patient,
-            by_flow,
-            progress or (lambda what, share: None),
-            settings,
-            look=not by_flow and len(told) < _MOST_INTERMITTENT,
-        )
-        if isinstance(found, Diagnosis):
+        alone = _identify(experiment, excluded, tell, settings)
+        posterior = posterior or alone.conclusion.posterior
+        if by_flow or len(told) == _MOST_INTERMITTENT:
             break
-        told.append(found.missing)
-        posterior = posterior or found.posterior
-        breaths = found.rest_of(breaths)
+        tell("looking for effects of some breaths", _halfway(experiment))
+        left = _without_effect(experiment, alone)
+        if left is None:
+            break
+        experiment, missing = left
+        told.append(missing)
+    found = _conclude(experiment, alone, excluded, tell, settings)
     return replace(
         found,
         verdict="named" if told else found.verdict,
-        posterior=posterior or found.posterior,
+        posterior=told_posterior(posterior),
         mechanisms=(*told, *found.mechanisms),
         simulator=_name(simulator, simulators),
         seconds=time.perf_counter() - began,
     )
 
 
-def _diagnose(
-    breaths: Breaths,
-    simulators: Simulators,
-    patient: bool,
-    by_flow: bool,
+def _halfway(experiment: Experiment) -> float:
+    """Share of a diagnosis that is done when the recording is identified."""
+    return _IDENTIFIED if experiment.simulators.is_base_physics else 0.5 * _IDENTIFIED
+
+
+def _identify(
+    experiment: Experiment,
+    excluded: tuple[str, ...],
     tell: Progress,
     settings: SelectionConfig,
-    *,
-    look: bool,
-) -> Diagnosis | Intermittent:
-    """Diagnose breaths in which all effects act alike; see :func:`diagnose`.
+    low: float = _STARTED,
+    earlier: FittedModel | None = None,
+) -> IdentifiedModel:
+    """Identify the recording alone, from the breaths that do not judge.
 
     Args:
-        breaths: the breaths.
-        simulators: what to diagnose.
-        patient: whether somebody may breathe.
-        by_flow: whether the recorded flow drives the model.
+        experiment: the recording.
+        excluded: mechanisms that cannot act.
         tell: receives the current step.
         settings: every threshold.
-        look: whether to look for an effect of some breaths, which is returned alone.
+        low: share of the diagnosis that is done before.
+        earlier: mechanisms to start from too.
     """
-    notes_on_flow: list[str] = []
-    if by_flow:
-        breaths, notes_on_flow = flow_drive.with_flow(breaths)
-    breaths, saturated = without_saturated(breaths, settings.data)
-    breaths, notes = usable(breaths, settings.data)
-    recorded, uses = breaths, split(breaths, settings.data, never_fitted(breaths, simulators))
-    seen = uses.identifying  # nothing below looks at other breaths until a simulator is chosen
-    held, fitted = uses.testing[seen], uses.fitted[seen]
-    excluded = () if patient else ("patient_effort",)
-    tell("simulating", _STARTED)
-    if by_flow:
-        driven, index = flow_drive.drive_grid(recorded)
-        before = flow_drive.simulate(simulators, recorded, driven, index)
-        data = make_data(driven)
-        u_out = np.take_along_axis(recorded.u_out, index, axis=1)
-        breaths = replace(driven, u_out=u_out)  # phases of the report are those of the recording
-        excluded += (*flow_drive.ventilator_side(), *IN_TIME)
-        settings = flow_drive.without_ventilator(settings)
-        notes += [*notes_on_flow, _NOTE_ON_FLOW]
-    else:
-        before = simulators.pressures(breaths)
-        if is_fast(breaths):
-            rate = 1.0 / float(np.median(breaths.dt[breaths.valid]))
-            grid = decimate(breaths)
-            breaths, before = grid.breaths, grid.of(before)
-            notes.append(_note_on_rate(rate, breaths))
-        data = make_data(breaths)
-    halfway = _IDENTIFIED if simulators.is_base_physics else 0.5 * _IDENTIFIED
-    recording_only_model = identify(
-        data.select(seen), held, excluded, steps_between(tell, _STARTED, halfway), settings, fitted
+    uses = experiment.uses
+    seen = uses.identifying
+    high = 1.0 if earlier is not None else _halfway(experiment)
+    return identify(
+        experiment.seen,
+        uses.testing[seen],
+        excluded,
+        steps_between(tell, low, high),
+        settings,
+        uses.fitted[seen],
+        earlier,
     )
-    if look:
-        tell("looking for effects of some breaths", halfway)
-        some = find(recording_only_model, data, recorded.breath_id)
-        if some is not None and some.leaves_enough(recorded, simulators, settings):
-            return some
-    recording_model, simulator_model = recording_only_model, None
+
+
+def _without_effect(
+    experiment: Experiment, model: IdentifiedModel
+) -> tuple[Experiment, MissingMechanism] | None:
+    """The experiment without an effect of some breaths, and that effect; None if there is none."""
+    seen = experiment.uses.identifying
+    some = find(model, experiment.seen, experiment.breaths.breath_id[seen])
+    if some is None:
+        return None
+    affected, u_in = np.zeros(len(seen), bool), None
+    affected[seen] = some.affected
+    if some.u_in is not None:
+        u_in = experiment.reached.copy()
+        u_in[seen] = some.u_in
+    left = experiment.without(affected, u_in)
+    return None if left is None else (left, some.missing)
+
+
+def _compare(
+    experiment: Experiment,
+    recording_model: IdentifiedModel,
+    simulator_model: IdentifiedModel | None,
+) -> _Comparison:
+    """What the recording has and the simulator has not, and the simulator corrected by it."""
+    missing, notes = missing_mechanisms(recording_model, simulator_model)
+    if simulator_model is not None:
+        seen = experiment.uses.identifying
+        steady = refit_at_simulator_parameters(
+            experiment.seen,
+            experiment.uses.testing[seen],
+            experiment.before[seen],
+            recording_model,
+            simulator_model,
+            tuple(missing),
+        )
+        if steady is not None:  # the simulator keeps its mechanisms, shown or not
+            (recording_model, kept), notes = steady, []
+            missing = {name: changed for name, changed in missing.items() if name in kept}
+    correction = correct(experiment, recording_model, simulator_model)
+    return _Comparison(recording_model, missing, notes, correction)
+
+
+def _conclude(
+    experiment: Experiment,
+    alone: IdentifiedModel,
+    excluded: tuple[str, ...],
+    tell: Progress,
+    settings: SelectionConfig,
+) -> Diagnosis:
+    """Compare the recording with the simulator, correct it, and let the judge have its say.
+
+    Args:
+        experiment: breaths in which all effects act alike.
+        alone: identified from the recording alone.
+        excluded: mechanisms that cannot act.
+        tell: receives the current step.
+        settings: every threshold.
+    """
+    breaths, data, uses, judge = (
+        experiment.breaths,
+        experiment.data,
+        experiment.uses,
+        experiment.judge,
+    )
+    simulators, seen = experiment.simulators, experiment.uses.identifying
+    recording_model, simulator_model = alone, None
     if not simulators.is_base_physics:
-        tell("fitting the simulator's response", halfway)
+        tell("fitting the simulator's response", _halfway(experiment))
         recording_model, simulator_model = identify_both(
-            data.select(seen),
-            held,
-            before[seen],
-            recording_only_model,
+            experiment.seen,
+            uses.testing[seen],
+            experiment.before[seen],
+            alone,
             excluded,
-            steps_between(tell, halfway, _IDENTIFIED),
-            fitted,
+            steps_between(tell, _halfway(experiment), _IDENTIFIED),
+            uses.fitted[seen],
         )
     tell("drawing conclusions", _IDENTIFIED)
-
-    def compared(recording_model: IdentifiedModel) -> _Comparison:
-        missing, notes = missing_mechanisms(recording_model, simulator_model)
-        if simulator_model is not None:
-            steady = refit_at_simulator_parameters(
-                data.select(seen),
-                held,
-                before[seen],
-                recording_model,
-                simulator_model,
-                tuple(missing),
-            )
-            if steady is not None:  # the simulator keeps its mechanisms, shown or not
-                (recording_model, kept), notes = steady, []
-                missing = {name: changed for name, changed in missing.items() if name in kept}
-        correction = correct(
-            breaths, data, uses, before, recording_model, simulator_model, simulators
-        )
-        return _Comparison(recording_model, missing, notes, correction)
-
-    comparison = compared(recording_model)
+    comparison = _compare(experiment, recording_model, simulator_model)
     if (
         simulator_model is not None
-        and recording_model is recording_only_model
+        and recording_model is alone
         and describe_otherwise(recording_model, simulator_model)
     ):
         tell("describing the recording by what the simulator has", _IDENTIFIED)
-        in_its_terms = identify(
-            data.select(seen),
-            held,
-            excluded,
-            steps_between(tell, _IDENTIFIED, 1.0),
-            settings,
-            fitted,
-            simulator_model.conclusion.named,
+        in_its_terms = _identify(
+            experiment, excluded, tell, settings, _IDENTIFIED, simulator_model.conclusion.named
         )
         comparison = min(
-            comparison, compared(in_its_terms), key=lambda each: each.error(data, uses.testing)
+            comparison,
+            _compare(experiment, in_its_terms, simulator_model),
+            key=lambda each: each.error(data, uses.testing),
         )
     recording_model, correction = comparison.recording_model, comparison.correction
     missing, notes_on_simulator = comparison.missing, comparison.notes
@@ -294,14 +304,14 @@ def _diagnose(
     own = simulator_model.conclusion.unnamed if simulator_model is not None else None
     if own is not None and term is not None and own.name == term.name:
         notes_on_simulator.append(f"The simulator needs a nonparametric term at {term.name} too.")
-    lungs, notes_on_lungs = _lungs(recorded, recording_only_model.fit)
+    lungs, notes_on_lungs = _lungs(experiment.recorded.select(seen), alone.fit)
     noise, pressures = conclusion.noise, correction.pressures
-    if by_flow and breaths.flow is not None:
+    if experiment.by_flow and breaths.flow is not None:
         flow = breaths.flow
         volume = np.cumsum(data.u_in * data.dt, axis=1) * float(parameter("gain").neutral)
     else:
         flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
-    here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1))
+    here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1) & seen)
     gain, start = recording_model.sensitivities(data)
     adequacy = check_residuals(
         breaths.select(here),
@@ -319,10 +329,10 @@ def _diagnose(
     scatters = simulators.is_base_physics and not any(c.of == "gain" for c in adequacy.changes)
     gain_error = conclusion.gain_sd * np.abs(gain) * scatters
     scatter_error = np.hypot(gain_error, recording_model.effort_spread(data))
-    sensor = sensor_noise(breaths)
+    sensor = sensor_noise(breaths.select(seen))
     open_loop = compare_open_loop(
         breaths,
-        uses.judging,
+        judge,
         pressures,
         noise_floor(float(noise.sigma[0]), sensor),
         scatter_error,
@@ -332,7 +342,7 @@ def _diagnose(
         open_loop = replace(open_loop, usual=open_loop.after.rmse)
     is_input = conclusion.unnamed is not None and conclusion.unnamed.swing is not None
     rejected = (bool(missing) or term is not None) and not _helps(
-        correction, recording_model, open_loop, data.select(uses.judging), by_breath=is_input
+        experiment, correction, recording_model, open_loop, by_breath=is_input
     )
     if rejected:
         missing, notes_on_simulator = {}, [_note_on_unchanged(correction)]
@@ -358,7 +368,7 @@ def _diagnose(
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(
-            _missing_mechanism(name, changed, recording_model, simulator_model, breaths, data, left)
+            _missing_mechanism(name, changed, recording_model, simulator_model, experiment, left)
             for name, changed in missing.items()
         )
         + ((swings,) if swings else ()),
@@ -368,10 +378,10 @@ def _diagnose(
         remaining=adequacy.regions,
         open_loop=open_loop,
         lungs=lungs,
-        request=None if rejected or by_flow else _request(conclusion),
+        request=None if rejected or experiment.by_flow else _request(conclusion),
         traces=Traces(
-            breaths,
-            uses.judging,
+            replace(experiment.whole, u_in=breaths.u_in),
+            judge.judging,
             pressures["before"],
             pressures["refit"],
             pressures["after"],
@@ -381,7 +391,7 @@ def _diagnose(
         split=_ids(breaths, uses),
         chosen=correction.chosen,
         changes=adequacy.changes,
-        saturated=saturated,
+        saturated=experiment.saturated,
         gain_scatter=conclusion.gain_sd,
         posterior=told_posterior(conclusion.posterior),
         detection_limits=limits,
@@ -389,7 +399,7 @@ def _diagnose(
         simulator=simulators.name,
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
         notes=(
-            *notes,
+            *experiment.notes,
             *notes_on_simulator,
             *correction.notes,
             *notes_on_lungs,
@@ -434,21 +444,11 @@ def steps_between(tell: Progress, low: float, high: float) -> Callable[[str], No
     return step
 
 
-def _note_on_rate(rate: float, breaths: Breaths) -> str:
-    """Note on what was kept of a fast recording."""
-    kept = breaths.valid.sum(axis=1)
-    readings = np.isfinite(breaths.pressure).sum(axis=1)
-    return (
-        f"Recorded at {rate:.0f} Hz: {int(np.median(readings))} readings of a breath are used, "
-        f"and {int(np.median(kept))} samples of its commands, whose changes keep their times."
-    )
-
-
 def _helps(
+    experiment: Experiment,
     correction: Correction,
     recording_model: IdentifiedModel,
     open_loop: OpenLoopComparison,
-    judging: Data,
     *,
     by_breath: bool,
 ) -> bool:
@@ -465,18 +465,24 @@ def _helps(
     evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
     if conclusion.base.hypothesis == conclusion.full.hypothesis:
         return by_breath or correction.helps
-    partition = evaluator.partition(judging)
     base = evaluator.fit(conclusion.base.hypothesis, conclusion.full.noise)
-    gained = evaluator.log_likelihood(conclusion.full, partition)
-    return bool(np.sum(gained - evaluator.log_likelihood(base, partition)) > 0.0)
+    first = experiment.breaths.pressure[:, 0]
+    with_it, without = (
+        experiment.judge.log_likelihood(
+            recording_model.pressures(model, experiment.data, first), conclusion.full.noise
+        )
+        for model in (conclusion.full, base)
+    )
+    return with_it > without
 
 
 def _ids(breaths: Breaths, uses: Split) -> dict[str, tuple[int, ...]]:
     """Ids of the breaths by their use."""
     masks = {
-        "training": ~uses.testing & ~uses.judging,
+        "training": ~uses.testing & uses.fitted,
         "testing": uses.testing,
         "judging": uses.judging,
+        "aside": uses.aside,
     }
     return {name: tuple(int(i) for i in breaths.breath_id[mask]) for name, mask in masks.items()}
 
@@ -527,8 +533,7 @@ def _missing_mechanism(
     changed: bool,
     recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None,
-    breaths: Breaths,
-    data: Data,
+    experiment: Experiment,
     left: tuple[float, float],
 ) -> MissingMechanism:
     """A missing mechanism; ``left`` are the error and what is shown to be no noise of it, cmH2O."""
@@ -548,10 +553,11 @@ def _missing_mechanism(
     affected = None
     if changes:
         model, path = recording_model, f"{name}.{changes[0]}"
-        at = place_of_change(model.evaluator, model.fit, data, path)
+        at = place_of_change(model.evaluator, model.fit, experiment.seen, path)
         values[changes[0]] = replace(values[changes[0]], value=at.value, ci95=(at.low, at.high))
-        first = np.searchsorted(data.position, at).clip(max=len(breaths) - 1)
-        now, low, high = (int(i) for i in breaths.breath_id[first])
+        ids = experiment.breaths.breath_id
+        first = np.searchsorted(experiment.data.position, at).clip(max=len(ids) - 1)
+        now, low, high = (int(i) for i in ids[first])
         affected = (now, low, high)
     return MissingMechanism(
         name=name,

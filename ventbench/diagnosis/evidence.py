@@ -18,9 +18,10 @@ import numpy as np
 from scipy import linalg
 
 from ventbench.base.arrays import Floats
+from ventbench.base.linear import cholesky
 from ventbench.diagnosis.evaluator import Evaluator, estimate_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
-from ventbench.diagnosis.in_time import SWINGS, in_time
+from ventbench.diagnosis.in_time import SWINGS, in_time, of_some_breaths
 from ventbench.diagnosis.linearised import (
     CONSTANT,
     EFFORT,
@@ -226,7 +227,7 @@ def _log_posterior(scored: Scored) -> float:
 def _integrated_out(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
     """Log evidence of a term, and what is left of the products beside its coefficients."""
     at, sd = list(term.main), np.array(term.spread)
-    L = np.linalg.cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
+    L = cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
     R = linalg.solve_triangular(L, sd[:, None] * np.column_stack([G[at], b[at]]), lower=True)
     left = R.T @ R
     return evidence(G, b, (term,)), G - left[:-1, :-1], b - left[:-1, -1]
@@ -310,7 +311,7 @@ class _Search:
         noise = self.known(around, chosen.fitted, noise, chosen.terms, loose=True).left
         if len(own) < self.settings.most_terms:
             known = self.known(around, chosen.fitted, noise, chosen.terms)
-            more = enumerate_sets(known, (), 1, self.settings.beam)
+            more = enumerate_sets(known, self.events(known), 1, self.settings.beam)
             for terms in [t for _, t in more if t and not names_of(t) & own][:3]:
                 if names_of(terms) | own not in self.tried:
                     self.attempt(around, noise, (*chosen.terms, *terms), chosen.fitted)
@@ -320,6 +321,12 @@ class _Search:
                 self.attempt(around, noise, rest, chosen.fitted)
             if term.name in basis_terms():
                 self.name(term.name, rest, noise)
+            if term.name in EVENTS and names_of(rest) in self.tried:  # its breaths, beside the rest
+                left = self.tried[names_of(rest)]
+                known = self.known(self.around(left.fitted), left.fitted, noise, rest)
+                for other in self.events(known):
+                    if other.name == term.name:
+                        self.attempt(known.around, noise, (*rest, other), left.fitted)
             for other in self.muscles if term.name == MUSCLES[-1] else ():
                 if names_of((*rest, other)) not in self.tried:
                     self.attempt(around, noise, (*rest, other), self.base)
@@ -339,6 +346,11 @@ class _Search:
         for term in terms[: self.settings.fits - 1]:
             if names_of(rest) | {term.name} not in self.tried:
                 self.attempt(around, noise, (*rest, term), left.fitted)
+
+    def events(self, known: Known) -> list[Term]:
+        """Effects of some breaths beside a fit."""
+        partition = Partition(self.data, self.predictor)
+        return of_some_breaths(known, partition, self.excluded, self.evaluator.settings)
 
     def around(self, fitted: FittedModel) -> Simulated:
         """All candidates, simulated around a fit."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.linear import inverse, solve
 from ventbench.diagnosis.findings import BreathRequest
 from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.fit import Fit
@@ -147,7 +148,7 @@ class Contrast:
             weighted = rows * self.noise.influence(left)[:, None]
             hessian = self.known + np.matmul(weighted, rows.swapaxes(1, 2)).sum(axis=0)
             gradient = np.matmul(weighted, difference[:, :, None])[:, :, 0].sum(axis=0)
-            step = np.linalg.solve(_regular(hessian), gradient)
+            step = solve(_regular(hessian), gradient)
             left = difference - np.einsum("msk,s->mk", rows, step)
         return float(np.sum(self.noise.loss(left)) + 0.5 * step @ self.known @ step), step
 
@@ -173,7 +174,7 @@ def without_own(columns: Floats, own: Floats) -> Floats:
         own: derivatives by the breath's own unknowns, ``(m, o, k)``.
     """
     inner = np.matmul(own, own.swapaxes(1, 2))
-    share = np.linalg.solve(_regular(inner), np.matmul(own, columns.swapaxes(1, 2)))
+    share = solve(_regular(inner), np.matmul(own, columns.swapaxes(1, 2)))
     return columns - np.matmul(share.swapaxes(1, 2), own)
 
 
@@ -188,8 +189,8 @@ def _is_own(problem: Problem, column: int) -> bool:
 
 def _information(hessian: Floats, which: Ints) -> Floats:
     """Information of a Hessian on some unknowns, all others refitted."""
-    covariance = np.asarray(np.linalg.inv(_regular(hessian)), np.float64)
-    return np.asarray(np.linalg.inv(_regular(covariance[np.ix_(which, which)])), np.float64)
+    covariance = inverse(_regular(hessian))
+    return inverse(_regular(covariance[np.ix_(which, which)]))
 
 
 def _regular(matrix: Floats) -> Floats:

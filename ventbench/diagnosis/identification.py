@@ -1,19 +1,13 @@
-"""Identification of a model from breaths: use of the breaths, and a conclusion with its final fit.
-
-Each breath has one use, so that no question is answered by breaths that an earlier one has used up:
-*training* breaths fit hypotheses, *testing* breaths decide which terms are needed, and *judging*
-breaths, which no fit and no test has seen, choose the corrected simulator and measure its error.
-"""
+"""Identification of a model from breaths: a conclusion with its final fit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
-from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name, without_term
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
@@ -23,142 +17,14 @@ from ventbench.diagnosis.hypothesis import (
     all_parameter_paths,
     varies_by_breath,
 )
-from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
+from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.validation import excludes_neutral, is_weak
 from ventbench.physics.catalogue import mechanism, special_cases
-from ventbench.plants.simulators import Simulators
-from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import START, ConfidenceInterval, Fit, likely_places
 from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.problem import make_problem, parameter_of
 from ventbench.task.interfaces import Plant
-
-#: A breath needs more inspiratory samples with a pressure than these.
-_INSPIRATORY = 3
-
-#: Breath ids that a note lists at most.
-_LISTED = 5
-
-
-@dataclass(frozen=True, eq=False)
-class Split:
-    """Use of n breaths; masks ``(n,)``."""
-
-    testing: Bools  #: breaths that decide which terms a model needs.
-    #: breaths that choose the corrected simulator and measure its error. A lung with few breaths
-    #: has none to spare: its testing breaths judge as well.
-    judging: Bools
-
-    @property
-    def identifying(self) -> Bools:
-        """Breaths that the identification may see: training and testing breaths."""
-        return ~self.judging | self.testing
-
-    @property
-    def fitted(self) -> Bools:
-        """Breaths of the final fits: all but the judging ones."""
-        return ~self.judging
-
-
-def held_out(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> Bools:
-    """Every third breath (by default) of each lung, from its second on, bool, ``(n,)``."""
-    chosen = np.zeros(len(breaths), bool)
-    for index in breaths.by_lung_index.values():
-        chosen[np.sort(index)[1 :: settings.held_out_every]] = True
-    return chosen
-
-
-def split(
-    breaths: Breaths, settings: DataSettings = DEFAULT.data, never_fitted: Collection[int] = ()
-) -> Split:
-    """Assign the breaths to their uses.
-
-    Args:
-        breaths: n breaths.
-        settings: how many are held out, and for what.
-        never_fitted: ids of breaths that were held out when the simulator was made; they judge it.
-    """
-    testing, judging = held_out(breaths, settings), np.zeros(len(breaths), bool)
-    earlier = np.isin(breaths.breath_id, list(never_fitted))
-    for index in map(np.sort, breaths.by_lung_index.values()):
-        tests, judges = testing[index], np.zeros(len(index), bool)
-        if earlier[index].any() and not np.all(earlier[index] | tests):
-            judges = earlier[index]
-        elif len(index) >= settings.judging_from:
-            judges[settings.judging_every - 1 :: settings.judging_every] = True
-        else:
-            judges = tests
-        judging[index] = judges
-        if np.any(tests & ~judges):
-            testing[index] = tests & ~judges
-    return Split(testing, judging)
-
-
-def never_fitted(breaths: Breaths, simulators: Simulators) -> tuple[int, ...]:
-    """Ids of the breaths that were held out when a simulator was made of the same recording."""
-    origin = simulators.origin
-    if breaths.sha256 is None or origin.get("recording_sha256") != breaths.sha256:
-        return ()
-    return tuple(int(breath) for breath in origin.get("held_out_breaths", ()))
-
-
-def without_saturated(
-    breaths: Breaths, settings: DataSettings = DEFAULT.data
-) -> tuple[Breaths, tuple[float, float] | None]:
-    """Breaths without the readings at which the pressure sensor saturates, and what these are.
-
-    A saturated reading is censored: it says only that the pressure was at least that. Readings that
-    merely come near a largest one thin out towards it; those that saturate pile up there. A sensor
-    that saturates on one lung of a session does so on all.
-
-    Returns:
-        The breaths, and the reading, cmH2O, with its share of all readings; None if none saturates.
-    """
-    pressure = np.where(breaths.valid, breaths.pressure, np.nan)
-    known = np.isfinite(pressure)
-    top = float(np.max(pressure, initial=-np.inf, where=known))
-
-    def piles_up(own: Floats) -> bool:
-        values, counts = np.unique(own[np.isfinite(own)], return_counts=True)
-        if len(values) < 2 or values[-1] < top:
-            return False
-        return bool(counts[-1] >= max(settings.saturated_share * counts.sum(), 10 * counts[-2]))
-
-    if not any(piles_up(pressure[index]) for index in breaths.by_lung_index.values()):
-        return breaths, None
-    masked = np.where(pressure == top, np.nan, breaths.pressure)
-    return replace(breaths, pressure=masked), (top, float(np.mean(pressure[known] == top)))
-
-
-def usable(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> tuple[Breaths, list[str]]:
-    """Breaths that can be diagnosed, and notes on the others.
-
-    Raises:
-        InputError: if too few are left, or no lung has two.
-    """
-    fewest, pressure = settings.min_breaths, np.isfinite(breaths.pressure)
-    good = pressure[:, 0] & (np.sum(pressure & breaths.inspiratory, axis=1) > _INSPIRATORY)
-    good &= np.any(breaths.u_in > 0, axis=1)
-    notes = []
-    if not good.all():
-        ids = ", ".join(map(str, breaths.breath_id[~good][:_LISTED].tolist()))
-        notes.append(
-            f"{int((~good).sum())} breaths without a first pressure, inspiration or any command "
-            f"were left out (breath_id {ids}...)."
-        )
-    if good.sum() < fewest:
-        raise InputError(
-            f"{int(good.sum())} usable breaths; a diagnosis needs at least {fewest} of a lung with "
-            "pressures and commands"
-        )
-    breaths = breaths.select(good)
-    if not held_out(breaths, settings).any():
-        raise InputError(
-            "no lung has two usable breaths, so that none can be held out; record at least "
-            f"{fewest} of a lung"
-        )
-    return breaths, notes
 
 
 @dataclass(frozen=True, eq=False)

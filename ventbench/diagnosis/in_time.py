@@ -3,6 +3,11 @@
 A breath is affected or not, and the share of affected breaths is uniform: the likeliest set of
 breaths is found by flips. A swing has one frequency and in each breath a size and phase of its own.
 
+Affected breaths are exchangeable given their commands: a breath whose commands ask for much flow is
+no likelier to meet a cough. With the posterior probability ``r_b`` that breath ``b`` is affected,
+``E[r_b | commands] = share`` for every breath, as the mean of a posterior is its prior, however
+much the commands let a breath tell. What commands predict is physics that the model lacks.
+
 Commands may be lost, which leaves the valve at the one before, or come late by ``lag`` samples, and
 then act only if none that was sent after them has arrived. At each sample the valve thus either
 follows or keeps what it has, and readings up to the next sample depend on no later command: a
@@ -25,6 +30,7 @@ from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partitio
 from ventbench.diagnosis.linearised import CONSTANT, EFFORT, OPEN, Known, Term, gaussian
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.events import HALF_SWING
+from ventbench.system_id.data import Data
 from ventbench.system_id.problem import Problem
 
 #: Public names of the places where an input may act.
@@ -48,6 +54,9 @@ SWINGS = {
 #: Shares of the commands that are expected to be lost, or late; samples by which they are late.
 _COMMANDS = {"lost_commands": (0.08, (None,)), "late_commands": (0.18, (2, 3, 4))}
 
+#: Permutations of breaths, and p-value from which commands do not predict which are affected.
+_PERMUTATIONS, EXCHANGEABLE = 2000, 0.01
+
 #: Paths that are kept in each breath, and difference of commands, %, that is none.
 _PATHS, _SAME = 6, 0.3
 
@@ -58,7 +67,7 @@ def _share(n: int, k: int) -> float:
 
 
 def _affected(G: Floats, b: Floats, sd: float, cost: float) -> tuple[Any, Floats]:
-    """Breaths in which an effect acts, by flips that gain, and its sizes there.
+    """Breaths in which an effect acts, by flips that gain, and how likely it acts in each.
 
     Args:
         G: products of a column of each breath, ``(n, n)``.
@@ -68,25 +77,50 @@ def _affected(G: Floats, b: Floats, sd: float, cost: float) -> tuple[Any, Floats
     """
     n = len(b)
 
-    def value(acts: Any) -> tuple[float, Floats]:
+    def value(acts: Any) -> float:
         at = np.flatnonzero(acts)
         if not len(at):
-            return _share(n, 0), np.zeros(0)
+            return _share(n, 0)
         gained, mean, _ = gaussian(G[np.ix_(at, at)], b[at], np.full(len(at), sd))
-        return gained + _share(n, len(at)) - cost * len(at) - 1e3 * float(np.sum(mean < 0.0)), mean
+        return gained + _share(n, len(at)) - cost * len(at) - 1e3 * float(np.sum(mean < 0.0))
 
-    best: tuple[float, Any] = (-np.inf, None)
+    found: list[tuple[float, Any, Floats]] = []
     mean = gaussian(G, b, np.full(n, sd))[1]
     for acts in (np.zeros(n, bool), mean > 0.3 * max(float(mean.max()), 0.0)):
-        reached, moves = value(acts)[0], True
+        reached, moves = value(acts), True
         while moves:
-            flips = [value(acts ^ (np.arange(n) == i))[0] for i in range(n)]
-            moves = max(flips) > reached
+            flips = np.array([value(acts ^ (np.arange(n) == i)) for i in range(n)])
+            moves = bool(flips.max() > reached)
             if moves:
-                acts, reached = acts ^ (np.arange(n) == int(np.argmax(flips))), max(flips)
-        if reached > best[0]:
-            best = reached, acts
-    return np.flatnonzero(best[1]), value(best[1])[1]
+                acts, reached = acts ^ (np.arange(n) == int(np.argmax(flips))), float(flips.max())
+        found.append(
+            (reached, acts, special.expit(np.where(acts, reached - flips, flips - reached)))
+        )
+    _, acts, likely = max(found, key=lambda each: each[0])
+    return np.flatnonzero(acts), likely
+
+
+def command_p_value(affected: Floats, data: Data, pressure: Floats) -> float:
+    """Probability that breaths in random order depend as much on their commands.
+
+    The largest correlation with the ranks of peak opening, volume, highest pressure, R and C.
+
+    Args:
+        affected: posterior probability that each breath is affected, ``(n,)``.
+        data: the breaths.
+        pressure: what a model without the effect predicts, cmH2O, ``(n, T)``.
+    """
+    inspiratory = (data.u_out == 0) * data.u_in
+    volume = np.sum(inspiratory * data.dt, axis=1)
+    series = (inspiratory.max(axis=1), volume, pressure.max(axis=1), data.R, data.C)
+    ranks = np.stack([np.unique(each, return_inverse=True)[1] for each in series])
+    ranks = ranks - ranks.mean(axis=1, keepdims=True)
+    ranks /= np.maximum(np.linalg.norm(ranks, axis=1, keepdims=True), 1e-12)
+    rng = np.random.default_rng(0)
+    drawn = rng.permuted(np.tile(affected, (_PERMUTATIONS, 1)), axis=1)
+    drawn = np.concatenate([affected[None], drawn])
+    largest = np.abs(drawn @ ranks.T).max(axis=1)
+    return float(np.mean(largest >= largest[0] * (1.0 - 1e-9)))
 
 
 def in_time(
@@ -105,8 +139,8 @@ def in_time(
         excluded: effects that cannot act.
         settings: every threshold.
     """
-    terms = _of_some_breaths(known, partition, excluded)
-    values = known.around.values
+    terms = of_some_breaths(known, partition, excluded, settings)
+    values, found = known.around.values, []
     for name, (place, frequencies, harmonics, spreads) in SWINGS.items():
         if name not in excluded:
             by_input = input_responses(partition, values, place)
@@ -114,15 +148,27 @@ def in_time(
                 (np.matmul(_waves(partition, f, harmonics), by_input), float(f), spread)
                 for f, spread in product(frequencies, spreads)
             ]
-            terms.append(_likeliest_swing(known, name, ways))
+            found.append(_likeliest_swing(known, name, ways))
     if "lost_commands" not in excluded:
-        terms += _commands(known, partition, around, settings)
-    return [replace(term, odds=term.odds - settings.search.course_nats) for term in terms]
+        found += _commands(known, partition, around, settings)
+    return [*terms, *(_with_course(term, settings) for term in found)]
 
 
-def _of_some_breaths(known: Known, partition: Partition, excluded: Collection[str]) -> list[Term]:
-    """Events, each with the likeliest course in each breath and the likeliest breaths."""
+def _with_course(term: Term, settings: SelectionConfig) -> Term:
+    """The term, less likely by the courses in time that it was chosen of."""
+    return replace(term, odds=term.odds - settings.search.course_nats)
+
+
+def of_some_breaths(
+    known: Known, partition: Partition, excluded: Collection[str], settings: SelectionConfig
+) -> list[Term]:
+    """Events, each with the likeliest course in each breath and the likeliest breaths.
+
+    Events whose breaths commands predict are left out.
+    """
     n, data, terms = known.n, partition.data, []
+    fitted = known.fitted
+    predicted = (fitted.residual + fitted.problem.data.measured)[:, 0]
     time = np.cumsum(data.dt, axis=1) - data.dt
     sizes = {name: size for name, (_, size) in CONSTANT.items()} | {OPEN: 1.0}
     every = {(name, sizes[name]): known.around.events[name][None] for name in known.around.events}
@@ -140,13 +186,13 @@ def _of_some_breaths(known: Known, partition: Partition, excluded: Collection[st
             gains.append(0.5 * np.maximum(b, 0.0) ** 2 / curvature - 0.5 * np.log(curvature))
         chosen = each[:, np.argmax(gains, axis=0), np.arange(n)]
         cost = float(np.log(each.shape[1]))
-        at = _affected(*known.of_breaths(chosen[0, :, None]), size, cost)[0]
-        if len(at):
+        at, likely = _affected(*known.of_breaths(chosen[0, :, None]), size, cost)
+        if len(at) and command_p_value(likely, data, predicted) > EXCHANGEABLE:
             which = (at[:, None] == np.arange(n))[:, :, None]
             columns = [one for form in chosen for one in np.where(which, form, 0.0)]
             spread = [size * h for h in _HARMONICS[: len(chosen)] for _ in at]
             odds = _share(n, len(at)) - cost * len(at)
-            terms.append(Term(name, spread, odds=odds, latent=columns))
+            terms.append(_with_course(Term(name, spread, odds=odds, latent=columns), settings))
     return terms
 
 

@@ -12,10 +12,11 @@ share are the likeliest on the training breaths. Parameters that breaths share a
 breaths in which the effect does not act, in turn with the question which these are. Commands that
 were lost or late have no grid: each of them was followed or not (:mod:`.in_time`).
 
-The effect is told if it predicts the held-out breaths better than all that was found without it. A
-set of breaths that begins or ends at one breath of the recording is a change of the session and no
-such effect. The breaths that are affected are then set aside, or get the commands that reached the
-valve, and the rest of the diagnosis goes on without the effect.
+The effect acts beside the mechanisms that the search has named. It is told if it predicts the
+held-out breaths better than these alone. A set of breaths that begins or ends at one breath of the
+recording is a change of the session and no such effect; one that commands predict is physics. The
+breaths that are affected are then set aside, or get the commands that reached the valve, and the
+rest of the diagnosis goes on without the effect. Breaths that judge are none of them.
 """
 
 from __future__ import annotations
@@ -29,17 +30,14 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, fit_with_white_noise
-from ventbench.diagnosis.evidence import COMMANDS, told_posterior
+from ventbench.diagnosis.evidence import COMMANDS
 from ventbench.diagnosis.findings import MissingMechanism
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
-from ventbench.diagnosis.identification import IdentifiedModel, held_out
-from ventbench.diagnosis.in_time import Paths, follow
-from ventbench.diagnosis.settings import SelectionConfig
+from ventbench.diagnosis.hypothesis import FittedModel, Partition, linearise
+from ventbench.diagnosis.identification import IdentifiedModel
+from ventbench.diagnosis.in_time import EXCHANGEABLE, Paths, command_p_value, follow
 from ventbench.diagnosis.validation import order_p_value
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism
-from ventbench.plants.simulators import Simulators
-from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Data
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import Problem
@@ -82,31 +80,10 @@ class Intermittent:
     """An effect that acts in some breaths."""
 
     missing: MissingMechanism  #: its finding, with the ids of the breaths that are affected.
-    ids: NDArray[np.int_]  #: ids of the n breaths that were looked at, in order.
-    affected: Bools  #: which of them are, ``(n,)``.
+    affected: Bools  #: which of the n breaths are, ``(n,)``.
     #: commands that reached the valve, %, ``(n, T)``; None if the affected breaths are to be set
     #: aside.
     u_in: Floats | None
-    #: posterior of the search that found it; see :class:`~ventbench.diagnosis.findings.Findings`.
-    posterior: tuple[tuple[tuple[str, ...], float], ...] = ()
-
-    def leaves_enough(
-        self, breaths: Breaths, simulators: Simulators, settings: SelectionConfig
-    ) -> bool:
-        """Whether the diagnosis can go on without the effect."""
-        if self.u_in is not None:  # a table of pressures answers to its own commands alone
-            return self.u_in.shape == breaths.u_in.shape and simulators.kind != "pressures"
-        left = breaths.select(~self.affected)
-        return len(left) >= _LEFT * 2 and bool(held_out(left, settings.data).any())
-
-    def rest_of(self, breaths: Breaths) -> Breaths:
-        """Breaths of the same recording without the effect."""
-        known = np.isin(breaths.breath_id, self.ids)
-        if self.u_in is None:
-            return breaths.select(~np.isin(breaths.breath_id, self.missing.affected))
-        u_in = breaths.u_in.astype(float)
-        u_in[known] = self.u_in
-        return replace(breaths, u_in=u_in)
 
 
 class _Found(NamedTuple):
@@ -138,14 +115,11 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     known, likely = conclusion.named.hypothesis, conclusion.likely_events
     if not likely:
         return None
-    found: list[_Found] = []
-    for hypothesis in dict.fromkeys((known.without(*known.breath_terms), Hypothesis())):
-        own = evaluator if hypothesis.names else replace(evaluator, gain_sd=0.0)
-        alone = fit_with_noise(own, hypothesis)
-        names = [name for name in likely if name not in COMMANDS]
-        found += [each for name in names if (each := _fit(own, alone, name)) is not None]
-        if len(names) < len(likely):
-            found += _fit_commands(own, alone)
+    alone = fit_with_noise(evaluator, known.without(*known.breath_terms))
+    names = [name for name in likely if name not in COMMANDS]
+    found = [each for name in names if (each := _fit(evaluator, alone, name)) is not None]
+    if len(names) < len(likely):
+        found += _fit_commands(evaluator, alone)
     found.sort(key=lambda each: -each.total)
     gained = found[0].held_out - _log_likelihood(model) if found else np.zeros(1)
     if float(gained.sum()) <= _least(evaluator):
@@ -157,6 +131,8 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     affected, u_in, estimates = _everywhere(best, data)
     if affected.sum() < _FEWEST or (u_in is None and _is_change(affected, evaluator, data)):
         return None
+    if u_in is None and _is_commanded(best):
+        return None
     near = np.exp(-_CLOSE)
     missing = MissingMechanism(
         best.name,
@@ -166,7 +142,7 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         float(gained.sum()),
         affected=tuple(int(i) for i in ids[affected]),
     )
-    return Intermittent(missing, ids, affected, u_in, told_posterior(conclusion.posterior))
+    return Intermittent(missing, affected, u_in)
 
 
 def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:
@@ -175,6 +151,22 @@ def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:
         return True
     ranked = affected + 1e-3 * np.random.default_rng(0).uniform(size=len(affected))  # no ties
     return order_p_value(ranked, data.lung, evaluator.settings.residuals) < _ORDERED
+
+
+def _is_commanded(found: _Found) -> bool:
+    """Whether commands predict in which breaths an effect acts."""
+    evaluator = found.evaluator
+    both = evaluator.partition(_joined(evaluator.training.data, evaluator.held_out.data))
+    evidence = _Evidence.of(evaluator, found.fitted, both, found.name)
+    likely = evidence.chances(found.strength, found.share)
+    pressure = evaluator.predict(found.fitted, both)[:, 0]
+    return command_p_value(likely, both.data, pressure) <= EXCHANGEABLE
+
+
+def _joined(one: Data, other: Data) -> Data:
+    """The breaths of both."""
+    pairs = zip(vars(one).items(), vars(other).values(), strict=True)
+    return Data(**{name: np.concatenate([mine, theirs]) for (name, mine), theirs in pairs})
 
 
 def _log_likelihood(model: IdentifiedModel) -> Floats:
@@ -411,6 +403,12 @@ class _Evidence:
             for each in (self.acting()[strength], self.rough)
         )
         return gained, float(np.sum(gained - rough))
+
+    def chances(self, strength: int, share: float) -> Floats:
+        """Posterior probability that the effect acts in each breath, ``(n,)``."""
+        acting = self.acting()[strength]
+        against = np.logaddexp(np.log1p(-share), np.log(share) + self.rough)
+        return 1.0 / (1.0 + np.exp(np.clip(against - np.log(share) - acting, -50.0, 50.0)))
 
     def acts(self, strength: int, share: float) -> Bools:
         """In which breaths it is likelier than not that the effect acts, ``(n,)``."""

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import linalg, special
 
 from ventbench.base.arrays import Floats
+from ventbench.base.linear import cholesky
 from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.physics.catalogue import library, mechanism, strength_path
 from ventbench.physics.mechanism import Parameter
@@ -75,7 +76,7 @@ def gaussian(G: Floats, b: Floats, sd: Floats) -> tuple[float, Floats, Floats]:
         b: ``X' K^-1 y``, ``(k,)``.
         sd: prior standard deviations, ``(k,)``.
     """
-    L = np.linalg.cholesky(np.eye(len(sd)) + sd[:, None] * G * sd)
+    L = cholesky(np.eye(len(sd)) + sd[:, None] * G * sd)
     root = linalg.solve_triangular(L, np.diag(sd), lower=True, check_finite=False)
     q = root @ b
     mean, sds = root.T @ q, np.sqrt(np.sum(root**2, axis=0))
@@ -291,7 +292,7 @@ class Known:
         white = np.moveaxis(self.rows(self.of_each).reshape(self.n, -1, 2), 2, 0)
         blocks = [np.asarray(linalg.block_diag(*x[:, :, None])) for x in white]
         self.Z = np.concatenate([self.rows(shared), *blocks], axis=1)
-        self.factor = linalg.cho_factor(np.eye(self.Z.shape[1]) + self.Z.T @ self.Z, lower=True)
+        self.factor = cholesky(np.eye(self.Z.shape[1]) + self.Z.T @ self.Z), True
         self.mean = linalg.cho_solve(self.factor, self.Z.T @ self.y)
 
     def rows(self, columns: Floats) -> Floats:

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ventbench.base.linear import solve
 from ventbench.diagnosis.hypothesis import FittedModel, Linearisation, linearise
 from ventbench.system_id.data import Floats
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
@@ -250,7 +251,7 @@ class PatientEffortTerm(BreathTerm):
             amplitude: the best, cmH2O, ``(n,)``.
         """
         across, own = curvature[:, -2:, :-2], curvature[:, :-2, :-2]
-        inner = curvature[:, -2:, -2:] - across @ np.linalg.solve(own, across.swapaxes(1, 2))
+        inner = curvature[:, -2:, -2:] - across @ solve(own, across.swapaxes(1, 2))
         norm = np.sqrt(2.0 * np.pi) * AMPLITUDE_SD * _SPAN
         prior = -0.5 * (amplitude / AMPLITUDE_SD) ** 2 - np.log(norm)
         return np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(inner)[1] + prior

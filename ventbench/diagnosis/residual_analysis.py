@@ -416,7 +416,12 @@ def _parts(breaths: Breaths) -> list[Axis]:
     cuts = np.round(np.linspace(0, n, count + 1))
     number = np.repeat(np.arange(n)[:, None], breaths.time.shape[1], axis=1)
     bins = np.where(breaths.valid, np.searchsorted(cuts, number, side="right") - 1, -1)
-    return [Axis("breath number", "1", cuts, bins)] if count > 1 else []
+    # Breaths that are not here keep their numbers.
+    edges = breaths.breath_id[np.maximum(cuts.astype(int) - 1, 0)].astype(float)
+    edges[0] -= 1.0
+    if np.any(np.diff(breaths.breath_id) < 0):  # numbers that begin anew
+        edges = cuts
+    return [Axis("breath number", "1", edges, bins)] if count > 1 else []
 
 
 def _lungs(breaths: Breaths) -> list[Axis]:

@@ -33,6 +33,7 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.executor import parallel_map
+from ventbench.base.linear import solve
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.findings import Change, ErrorRegion, Quantity
 from ventbench.diagnosis.hypothesis import (
@@ -419,7 +420,7 @@ def _amplitudes(error: Floats, usable: Bools, signals: Floats) -> Floats:
     normal = np.einsum("nti,ntj->nij", weighted, weighted) / (scale[:, :, None] * scale[:, None])
     right = np.einsum("nti,nt->ni", weighted, error) / scale
     normal = normal + _RIDGE * np.eye(signals.shape[-1])
-    return np.linalg.solve(normal, right[..., None])[..., 0] / scale
+    return solve(normal, right[..., None])[..., 0] / scale
 
 
 def _step_or_line(values: Floats, groups: Ints) -> tuple[int, Floats, bool]:

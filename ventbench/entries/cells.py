@@ -37,6 +37,7 @@ from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Observation, Plant, PlantT, Task
 from ventbench.task.lungs import Lung
+from ventbench.task.rollouts import expiration
 from ventbench.task.stressors import Condition, conditions, stressor
 
 
@@ -306,7 +307,7 @@ def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
 
 
 #: Series of a :class:`ProtocolRun`.
-_SERIES = ("pressure", "requested", "u_in", "volume")
+_SERIES = ("pressure", "requested", "u_in", "expired", "volume")
 
 
 @dataclass(frozen=True)
@@ -319,10 +320,17 @@ class ProtocolRun:
     pressure: Floats  #: airway pressure at each step, which is scored, cmH2O.
     requested: Floats  #: what the controllers asked for, %; 0 once a cell has failed.
     u_in: Floats  #: what was applied, %.
+    #: airway pressure of the expirations, cmH2O, ``(..., BREATHS, steps)``.
+    expired: Floats
     volume: Floats | None  #: gas in the lung, mL; None where the plants have no such signal.
     failures: Mapping[tuple[int, ...], Failure]  #: what failed, by index of the cell.
     #: time on the clock that an answer took on average, s, each time that some came.
     act_seconds: Floats
+
+    @property
+    def breaths(self) -> Floats:
+        """Airway pressure of whole breaths, cmH2O, ``(..., BREATHS, BREATH_STEPS)``."""
+        return np.concatenate([self.pressure, self.expired], axis=-1)
 
 
 def as_float64(plants: PlantT, count: int) -> PlantT:
@@ -367,6 +375,13 @@ def _inspire(
     """Apply commands to some cells; the others wait."""
     after, applied = _strong(jax.vmap(env.inspire)(plants, scenario, loop, u_in))
     return _where(which, after, loop), applied
+
+
+@jax.jit
+def _expire(plants: Plant, scenario: Scenario, loop: env.LoopState) -> Array:
+    """Pressures of the expirations from the ends of inspirations, cmH2O, steps last."""
+    after = jax.vmap(expiration)(plants, scenario, loop)[1]
+    return jnp.moveaxis(after.pressure, 1, -1)
 
 
 @jax.jit
@@ -427,6 +442,7 @@ def step_through(
     parts = [jax.tree.map(lambda x, k=k: x[:, k], plants) if changing else plants for k in breaths]
     begun = [_begin(part, scenario, k) for k, part in enumerate(parts)]
     loop, seconds = begun[0][1], []
+    ends = [rest for _, rest in begun]
     has_volume = loop.signals.volume is not None
     # Cells go on by themselves: what one takes, no other one waits for.
     given, ready = np.zeros(cells, np.int64), np.arange(cells)
@@ -458,14 +474,23 @@ def step_through(
             given[ready] += 1
             for _ in range(given.min() - rounds):
                 count()
-            for k, (_, rest) in enumerate(begun):
-                fresh = moved & (given % steps == 0) & (given // steps == k)
-                if fresh.any():
-                    loop = _where(fresh.reshape(batch), rest, loop)
+            over = moved & (given % steps == 0)
+            for k in breaths:
+                own = (over & (given // steps == k + 1)).reshape(batch)
+                if own.any():
+                    ends[k] = _where(own, loop, ends[k])
+                    loop = _where(own, begun[k + 1][1], loop) if k + 1 < len(begun) else loop
             ready = ready[given[ready] < total]
         failures = dict(session.failures)
     finally:
         session.close()
+    expired = np.stack(
+        [
+            np.asarray(_expire(varied, scenario, end))
+            for (varied, _), end in zip(begun, ends, strict=True)
+        ],
+        axis=-2,
+    )
     broken = np.flatnonzero(~np.isfinite(pressure).reshape(len(tasks), -1).all(axis=1))
     if broken.size:
         raise PlantError(int(broken[0]))
@@ -475,7 +500,7 @@ def step_through(
         x.reshape(shape) for x in (pressure, requested, applied, volume)
     )
     kept = volume if has_volume else None
-    return ProtocolRun(pressure, requested, applied, kept, by_cell, np.array(seconds))
+    return ProtocolRun(pressure, requested, applied, expired, kept, by_cell, np.array(seconds))
 
 
 def run_cells(

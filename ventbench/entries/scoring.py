@@ -11,19 +11,14 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from ventbench.base import compilation
-from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.entries.cells import (
     Cells,
     ProtocolRun,
     Runner,
-    as_float64,
     protocol_of,
     run_cells,
     runner_of,
@@ -36,10 +31,10 @@ from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure
 from ventbench.plants.catalog import Given
 from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.sandbox.child.cell import SubmissionError
-from ventbench.task import draws, protocol, rollouts
+from ventbench.task import draws, protocol
 from ventbench.task.draws import Draws
-from ventbench.task.environment import Scenario, nominal_scenario
-from ventbench.task.interfaces import Plant, Task
+from ventbench.task.environment import nominal_scenario
+from ventbench.task.interfaces import Task
 from ventbench.task.metrics.score import (
     InspirationSignals,
     controllable_error,
@@ -49,8 +44,8 @@ from ventbench.task.metrics.score import (
     steady_error,
     time_above_alarm,
 )
-from ventbench.task.rollouts import Script
 from ventbench.task.stressors import Condition
+from ventbench.task.waveform import expiratory_command
 from ventbench.trajectories import end_to_end
 
 #: Called with rounds of commands that are done, and all of them.
@@ -174,17 +169,11 @@ def run_protocol(
         if what.stressed is not None:
             stressed = run_cells(what.stressed, runner, submission, tasks, count)
             under_stress = runs_of(stressed, what.stressed, submission, tasks)
-        # The expirations are run for the picture only; no score depends on them.
-        own = as_float64(what.cells.plants, len(names))
-        if rigs.sessions is not None:
-            own = jax.tree.map(lambda leaf: leaf[:, 0, 0], own)
-        nominal = jax.tree.map(lambda x: x[:, 0], what.cells.scenario)
-        replayed = replay(own, nominal, run.requested[0, :, 0])
     scenario = what.cells.scenario
-    joined = [
-        np.concatenate([getattr(part, name) for part in replayed], axis=-1)
-        for name in ("pressure", "u_in")
-    ]
+    inspired = run.u_in[0, :, 0]
+    fixed = expiratory_command(np.arange(protocol.INSPIRATION_STEPS, protocol.BREATH_STEPS))
+    fixed = np.broadcast_to(fixed, (*inspired.shape[:-1], len(fixed)))
+    joined = run.breaths[0, :, 0], np.concatenate([inspired, fixed], axis=-1)
     # The target of every inspiratory step is PIP.
     pip = np.asarray(scenario.pip)
     controllable = controllable_error(run.pressure[0], pip[..., None, None])
@@ -254,22 +243,6 @@ def enter(
     ]
 
 
-def replay(
-    plants: Plant, scenario: Scenario, requested: Floats
-) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
-    """Apply recorded commands again, with the expirations. Call it within ``float64()``.
-
-    Plants and cells as of :func:`~ventbench.entries.cells.step_through`, commands as of
-    :class:`ProtocolRun`; arrays of shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
-    """
-
-    def run(plant: Plant, scenario: Scenario, commands: Array) -> Any:
-        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True)
-
-    commands = jnp.asarray(requested.reshape(*requested.shape[:-2], -1))
-    return jax.vmap(run)(plants, scenario, commands)
-
-
 def runs_of(
     run: ProtocolRun, cells: Cells, submission: Submission | None = None, tasks: Sequence[Task] = ()
 ) -> Runs:
@@ -281,8 +254,8 @@ def runs_of(
         np.broadcast_to(np.asarray(x), cells.pips.shape)
         for x in (cells.scenario.pip, cells.scenario.dt)
     )
-    by_breath = (run.pressure, pip[..., None], dt[..., None])
-    safe = np.all(passes_safety_gate(*by_breath), axis=-1)
+    by_breath = pip[..., None], dt[..., None]
+    safe = np.all(passes_safety_gate(run.breaths, *by_breath), axis=-1)
     plateau = steady_error(run.pressure[..., -1, :], pip)
     error = run_error(run.pressure, pip[..., None, None])
     survived = safe & (plateau <= PLATEAU_TOLERANCE + PLATEAU_SHARE * pip)
@@ -307,7 +280,7 @@ def runs_of(
         error=flat(error),
         safe=flat(safe),
         survived=flat(survived),
-        alarm_s=flat(time_above_alarm(*by_breath).max(axis=-1)),
+        alarm_s=flat(time_above_alarm(run.pressure, *by_breath).max(axis=-1)),
         peak=flat(run.pressure.max(axis=(-2, -1))),
         volume=flat(volume),
         draw=np.repeat(cells.draw, pips),

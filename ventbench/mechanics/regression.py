@@ -20,6 +20,7 @@ from itertools import product
 import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
+from ventbench.base.linear import inverse, solve
 from ventbench.mechanics.segments import Segment
 
 #: Autocorrelations between neighbouring smoothed samples.
@@ -244,11 +245,11 @@ def fit(table: CrossProducts, which: Bools, columns: Sequence[int]) -> Regressio
         sigma = np.sqrt(square / max(freedom - len(columns), 1.0))
         return np.maximum(sigma, _LEAST_SIGMA), square
 
-    x = np.linalg.solve(left, right[..., None])[..., 0]
+    x = solve(left, right[..., None])[..., 0]
     precision = _zero_precision(x[:, _ELASTANCE])
     left = left.copy()
     left[:, _FLOW_ZERO, _FLOW_ZERO] += sigma_of(x)[0] ** 2 * precision
-    x = np.linalg.solve(left, right[..., None])[..., 0]
+    x = solve(left, right[..., None])[..., 0]
     sigma, square = sigma_of(x)
     value = constants - freedom * np.log(sigma) - 0.5 * square / sigma**2
     value -= 0.5 * precision * x[:, _FLOW_ZERO] ** 2
@@ -283,7 +284,7 @@ def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
     curvature = products[:, columns][:, :, columns]
     total = _regularised(curvature.sum(axis=0))
     total[_FLOW_ZERO, _FLOW_ZERO] += fitted.sigma**2 * fitted.zero_precision
-    bread = np.asarray(np.linalg.inv(total), np.float64)
+    bread = inverse(total)
     model = bread * fitted.sigma**2
     count = len(table)
     if count < 3:
@@ -300,7 +301,7 @@ def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> flo
     others = [c for c in fitted.columns if c != column]
     total = table.products[:, 0].sum(axis=0)
     cross = total[others, column]
-    explained = cross @ np.linalg.solve(_regularised(total[np.ix_(others, others)]), cross)
+    explained = cross @ solve(_regularised(total[np.ix_(others, others)]), cross)
     square = total[column, column] - explained
     x = fitted.coefficients[fitted.columns.index(column)]
     return float(abs(x) * np.sqrt(max(square, 0.0) / table.freedom.sum()))

@@ -89,14 +89,16 @@ class Physics:
         """Lung at rest, expiratory valve open; see :class:`~ventbench.task.interfaces.Plant`.
 
         ``pressure`` is what the sensor shows; :meth:`reading_of` gives that of an airway pressure.
-        Without ``peep``, the parameter ``PEEP`` is taken, and without that the pressure.
+        Without ``peep``, the parameter ``PEEP`` is taken, and without that, or where it is NaN, the
+        pressure.
         """
         assembly = self._assembly()
         pressure = jnp.asarray(pressure) * 1.0
         shape = jnp.broadcast_shapes(pressure.shape, *(jnp.shape(v) for v in self.values))
         shown = jnp.broadcast_to(pressure, shape)
         if peep is None:
-            peep = assembly.base["PEEP"] if "PEEP" in self.names else shown
+            own = assembly.base["PEEP"] if "PEEP" in self.names else jnp.nan
+            peep = jnp.where(jnp.isnan(own), shown, own)
         u_in = assembly.base["rest"] + 0.0 * shown
         memory = {
             name: u_in for name, mechanism in assembly.mechanisms.items() if mechanism.has_memory

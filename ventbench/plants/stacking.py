@@ -102,12 +102,11 @@ def _physics_with_equal_parameters(plants: list[Physics]) -> list[Physics]:
     }
     completed = []
     for plant in plants:
-        # One that has no PEEP takes the pressure that it starts from, which no number can say.
-        missing = [name for name in names if name not in plant.names]
-        if "PEEP" in missing:
-            raise InputError("some of the file's plants have a PEEP of their own and some not")
+        missing = {name: plant.get(name) for name in names if name not in plant.names}
+        if "PEEP" in missing:  # it takes the pressure that it starts from
+            missing["PEEP"] = jnp.asarray(jnp.nan)
         with compilation.float64():
-            full = plant.having(**{name: plant.get(name) for name in missing})
+            full = plant.having(**missing)
         values = tuple(np.asarray(value) for value in full.values)
         completed.append(dataclasses.replace(full, values=values, **sizes))
     return completed

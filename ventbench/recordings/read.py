@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,10 +13,11 @@ import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.recordings.bad_samples import UNUSABLE, clean
 from ventbench.recordings.breaths import Breaths, arranged, join
-from ventbench.recordings.roles import breath_figures, few_breaths, findings
+from ventbench.recordings.roles import few_breaths, findings
 from ventbench.recordings.scan import Progress, Scanned, scan
-from ventbench.recordings.schema import OPTIONAL, ProblemLog, RecordingError, RecordingProblem
+from ventbench.recordings.schema import ProblemLog, RecordingError, RecordingProblem
 from ventbench.recordings.sources import Source, locate, open_source
 from ventbench.task.lungs import Lung
 
@@ -248,7 +249,7 @@ class RecordingReport:
 
 def describe(scanned: Scanned) -> dict[str, Any]:
     """Return the fields of a report that describe the content of a file."""
-    lengths, times, samples = scanned.lengths, scanned.times, scanned.samples
+    lengths = scanned.lengths
     pairs, counts = np.unique(np.column_stack([scanned.R, scanned.C]), axis=0, return_counts=True)
     return {
         "rows": int(lengths.sum()),
@@ -259,18 +260,22 @@ def describe(scanned: Scanned) -> dict[str, Any]:
         "time_inferred": {
             int(scanned.breath_id[i]): dt for i, dt in scanned.inferred.items() if dt is not None
         },
-        "time_interpolated": int(times.interpolated.sum()),
-        "time_shifted": int(times.shifted.sum()),
-        "blank_pressures": int(np.isnan(samples["pressure"]).sum()),
-        "optional": tuple(name for name in OPTIONAL if name in samples),
+        "time_interpolated": int(scanned.time_interpolated.sum()),
+        "time_shifted": int(scanned.time_shifted.sum()),
+        "blank_pressures": int(scanned.blank_pressures.sum()),
+        "optional": scanned.optional,
     }
 
 
-def role_problems(file: str, scanned: Scanned) -> dict[str, tuple[RecordingProblem, ...]]:
-    """What the physics of a ventilated lung says about the columns, by its level."""
-    figures = breath_figures(scanned.times.time, scanned.samples, scanned.starts)
-    found = findings(figures, scanned.interval, scanned.R, scanned.C)
-    return {
+#: What to do about samples that were left out.
+_ADVICE = "They count as missing; --missing VALUE names further values that do."
+
+
+def role_problems(source: Source, scanned: Scanned) -> dict[str, tuple[RecordingProblem, ...]]:
+    """What was left out, and what the physics of a lung says about the columns, by its level."""
+    file = source.file
+    found = findings(scanned.figures, scanned.interval, scanned.R, scanned.C)
+    problems = {
         level: tuple(
             RecordingProblem(file, f.what, f.advice, column=f.column, value=f"{f.value:g}")
             for f in found
@@ -278,13 +283,25 @@ def role_problems(file: str, scanned: Scanned) -> dict[str, tuple[RecordingProbl
         )
         for level in ("refused", "suspicious")
     }
+    unusable = {
+        column
+        for column in {each.column for each in scanned.bad}
+        if sum(x.share for x in scanned.bad if x.column == column and x.kind != "slow") > UNUSABLE
+    }
+    for each in scanned.bad:
+        level = "refused" if each.column in unusable else "suspicious"
+        advice = (
+            "That is too much: the recording is unusable." if each.column in unusable else _ADVICE
+        )
+        places = sorted(x for x, _ in locate(source, each.rows[:6].tolist()).values())
+        what = each.what(f"{source.place}s", places)
+        problem = RecordingProblem(file, what, advice, column=each.column)
+        problems[level] = (problem, *problems[level])
+    return problems
 
 
 def _intervals(scanned: Scanned) -> dict[str, float]:
-    with np.errstate(invalid="ignore"):  # infinite values are problems already
-        steps = np.diff(scanned.times.time)
-    steps[scanned.starts[1:] - 1] = np.nan
-    steps = steps[np.isfinite(steps)]
+    steps = scanned.steps[np.isfinite(scanned.steps).all(axis=1)]
     means = scanned.interval[np.isfinite(scanned.interval)]
     if not (len(means) and len(steps)):
         return {}
@@ -344,16 +361,18 @@ def load(
     *,
     clip: bool = False,
     pad: bool = False,
+    missing: Collection[float] = (),
     progress: Progress | None = None,
 ) -> Breaths:
     """Read a recording (CSV, gzipped CSV or Parquet) into memory.
 
     Args:
         path: the file; the folder of a session, whose recordings become one; or a table in memory
-            with the same columns, such as :meth:`~ventbench.Breaths.to_frame` returns. Breaths are
-            returned as they are.
+            with the same columns, such as :meth:`~ventbench.Breaths.to_frame` returns. Of Breaths
+            only samples that are no readings are left out, see :mod:`~.bad_samples`.
         clip: clip u_in to 0..100 %.
         pad: accept breaths of unequal length and pad the short ones (see `Breaths`).
+        missing: values of pressure, flow and volume that stand for a missing one, such as -99.
         progress: called with how much has been read, and of how much.
 
     Returns:
@@ -370,15 +389,15 @@ def load(
         ((24, 80), ['R20C50'])
     """
     if isinstance(path, Breaths):
-        return path
+        return clean(path, missing)
     if isinstance(path, str | os.PathLike) and Path(path).is_dir():
         first, *others = session_files(path)
         if others:
-            return _joined((first, *others), clip=clip, progress=progress)
+            return _joined((first, *others), clip, missing, progress)
         path = first
     source = open_source(path)
     log = ProblemLog(source.file)
-    scanned = scan(source, log, clip=clip, progress=progress)
+    scanned = scan(source, log, clip=clip, missing=missing, progress=progress)
     check_lengths(scanned, log, pad=pad)
     check_inferable(scanned, log)
     log.raise_problems(partial(locate, source), source.place)
@@ -408,11 +427,13 @@ def session_files(path: FilePath) -> tuple[Path, ...]:
     return found
 
 
-def _joined(files: tuple[Path, ...], *, clip: bool, progress: Progress | None) -> Breaths:
+def _joined(
+    files: tuple[Path, ...], clip: bool, missing: Collection[float], progress: Progress | None
+) -> Breaths:
     """The breaths of a session, numbered in the order of its files; short ones are padded."""
     parts, first = [], 1
     for file in files:
-        part = load(file, clip=clip, pad=True, progress=progress)
+        part = load(file, clip=clip, pad=True, missing=missing, progress=progress)
         last = first + len(part) - 1
         notes = (f"Breaths {first} to {last} are those of {file.name}.", *part.notes)
         parts.append(replace(part, breath_id=np.arange(first, last + 1), notes=notes))
@@ -421,7 +442,12 @@ def _joined(files: tuple[Path, ...], *, clip: bool, progress: Progress | None) -
 
 
 def check(
-    path: FilePath, *, clip: bool = False, pad: bool = False, progress: Progress | None = None
+    path: FilePath,
+    *,
+    clip: bool = False,
+    pad: bool = False,
+    missing: Collection[float] = (),
+    progress: Progress | None = None,
 ) -> RecordingReport:
     """Check a recording.
 
@@ -429,6 +455,7 @@ def check(
         path: the file.
         clip: see `load`.
         pad: see `load`.
+        missing: see `load`.
         progress: see `load`.
 
     Returns:
@@ -440,7 +467,7 @@ def check(
     source: Source | None = None
     try:
         source = open_source(path)
-        scanned = scan(source, log, clip=clip, progress=progress)
+        scanned = scan(source, log, clip=clip, missing=missing, keep=False, progress=progress)
         check_lengths(scanned, log, pad=pad)
         check_inferable(scanned, log)
     except RecordingError as error:
@@ -462,7 +489,7 @@ def check(
         advice = "Fill in the pressure in cmH2O: there is nothing to compare a simulator with."
         refused = (RecordingProblem(source.file, what, advice, column="pressure"),)
     else:
-        refused = role_problems(source.file, scanned)["refused"]
+        refused = role_problems(source, scanned)["refused"]
     suspicious = tuple(found for found in report.suspicious if found not in refused)
     return replace(report, problems=refused, problem_count=len(refused), suspicious=suspicious)
 
@@ -470,7 +497,7 @@ def check(
 def _report(source: Source, log: ProblemLog, scanned: Scanned) -> RecordingReport:
     find = partial(locate, source)
     sound = log.counts["problem"] == 0
-    roles = role_problems(source.file, scanned) if sound else {}
+    roles = role_problems(source, scanned) if sound else {}
     warnings = source.warnings + log.listed("warning", find, source.place)
     return RecordingReport(
         source.file,
@@ -487,7 +514,8 @@ def _report(source: Source, log: ProblemLog, scanned: Scanned) -> RecordingRepor
 
 def _assemble(scanned: Scanned, file: str) -> Breaths:
     """Make breaths without problems; blank times are inferred."""
-    time = scanned.times.time.copy()
+    samples = dict(scanned.samples)
+    time = samples.pop("time").copy()
     for i, dt in scanned.inferred.items():
         assert dt is not None  # check_inferable
         start, length = scanned.starts[i], scanned.lengths[i]
@@ -495,11 +523,11 @@ def _assemble(scanned: Scanned, file: str) -> Breaths:
     return arranged(
         scanned.lengths,
         time,
-        scanned.samples,
+        samples,
         breath_id=scanned.breath_id,
         R=scanned.R,
         C=scanned.C,
-        time_inferred=scanned.times.blank,
+        time_inferred=scanned.time_blank,
         source=file,
     )
 

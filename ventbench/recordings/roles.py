@@ -14,7 +14,10 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.base.linear import solve
+from ventbench.recordings.bad_samples import MEASURED
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.headers import UNITS
 
 SLOW = 0.5
 """Median sampling interval, s, above which times are not in seconds."""
@@ -34,12 +37,19 @@ _OPPOSITE = -0.25
 #: Share of a breath that is its end, and of its range of pressure above which it ends at its peak.
 _END, _PEAK = 0.1, 0.6
 
+#: Correlation of volume and integrated flow from which they are of one lung, and ratio from which
+#: they contradict each other: leaks and drifts of a sensor make less.
+_OF_ONE_LUNG, _CONTRADICTS = 0.9, 1.4
+
 #: Saturation: fewest readings and share of them at the level, times as many as at the next level,
 #: and largest step from it as a share of the range (a square wave leaves its top by a larger one).
 _READINGS, _SHARE, _TIMES, _STEP = 10, 0.004, 3.0, 0.15
 
 #: Breaths that a diagnosis and a simulator of one's own need at least.
 _DIAGNOSIS, _TRAINING = 4, 10
+
+#: Samples that are looked at together, about.
+_TOGETHER = 1 << 17
 
 #: Agreement of R and C with an exchanged label, as a ratio, and largest agreement with the label.
 _EXCHANGED, _HELD = 1.35, 1.6
@@ -119,7 +129,7 @@ def breath_figures(
                     out[f"{name}_{side}{key}"] = values
             out[f"{name}_count"] = np.add.reduceat(np.isfinite(samples[name]) * 1.0, starts)
     if "flow" in samples:
-        out |= _regression(time, pressure, samples["flow"], starts, breath)
+        out |= _regression(time, pressure, samples["flow"], samples.get("volume"), starts, breath)
     return out
 
 
@@ -147,10 +157,14 @@ def _regression(
     time: Floats,
     pressure: Floats,
     flow: Floats,
+    measured: Floats | None,
     starts: Ints,
     breath: Ints,
 ) -> dict[str, Floats]:
-    """Correlation of pressure and flow, and the cross products of p = R Q + V / C + p0."""
+    """Correlation of pressure and flow, and the cross products of p = R Q + V / C + p0.
+
+    With a measured volume also how many times the integrated flow it is, and their correlation.
+    """
     known = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
     q = np.where(known, flow, 0.0)
     same = np.diff(breath, prepend=-1) == 0
@@ -163,6 +177,16 @@ def _regression(
         for a, b in ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p", "pp")
     }
     n = np.maximum(sums["11"], 1.0)
+    if measured is not None:
+        both = known & np.isfinite(measured)
+        count = np.maximum(np.add.reduceat(both * 1.0, starts), 1.0)
+        v, w = (np.where(both, x, 0.0) for x in (volume, measured))
+        v, w = (
+            np.where(both, x - (np.add.reduceat(x, starts) / count)[breath], 0.0) for x in (v, w)
+        )
+        vv, vw, ww = (np.add.reduceat(a * b, starts) for a, b in ((v, v), (v, w), (w, w)))
+        sums["volume_ratio"] = _ratio(vw, vv)
+        sums["volume_correlation"] = _ratio(vw, np.sqrt(vv * ww))
     covariance = sums["qp"] / n - sums["q1"] * sums["1p"] / n**2
     variances = (sums["qq"] / n - (sums["q1"] / n) ** 2) * (sums["pp"] / n - (sums["1p"] / n) ** 2)
     sums["correlation"] = _ratio(covariance, np.sqrt(np.maximum(variances, 0.0)))
@@ -228,6 +252,7 @@ def findings(
                 float(np.nanmedian(figures["correlation"])),
             )
         )
+    found += _volumes(figures)
     inverted = _agree((figures["inside"] - figures["outside"])[moves], 0.0)
     if inverted and not any(f.column == "flow" for f in found):
         what = "pressure is higher while u_out is 1 than while it is 0, so 0 and 1 are exchanged"
@@ -284,6 +309,35 @@ def _times(interval: Floats) -> list[Finding]:
     return [Finding("time_step", what, f"{advice}`ventbench data import`.", level, median)]
 
 
+def _volumes(figures: Mapping[str, Floats]) -> list[Finding]:
+    """Volume against the integral of flow: by a unit, or by any other factor."""
+    ratio = figures.get("volume_ratio", np.zeros(0))
+    ratio = ratio[figures.get("volume_correlation", ratio) > _OF_ONE_LUNG]
+    if len(ratio) < 0.5 * len(figures["inspiration"]) or len(ratio) == 0:
+        return []
+    factor = float(np.median(ratio))
+    apart = max(factor, 1.0 / factor)
+    if apart < _CONTRADICTS:
+        return []
+    units = [
+        f"--{role}-unit {unit}"
+        for role, sense in (("flow", 1.0), ("volume", -1.0))
+        for unit, size in UNITS[role].items()
+        if size != 1 and abs(np.log(factor * float(size) ** -sense)) < np.log(1.1)
+    ]
+    share = {2: "half", 3: "a third", 4: "a quarter"}.get(round(apart), f"1/{apart:.3g}")
+    times = {2: "twice", 3: "three times"}.get(round(apart), f"{apart:.3g} times")
+    if abs(apart / round(apart) - 1.0) > 0.05:
+        share, times = f"1/{apart:.3g}", f"{apart:.3g} times"
+    what = (
+        f"flow and volume contradict each other: they differ by a factor of {apart:.1f} (volume is "
+        f"{share if factor < 1.0 else times}{' of' if factor < 1.0 else ''} the integrated flow)"
+    )
+    advice = "Say which is wrong: --map NAME=unused leaves it out, "
+    advice += f"{' or '.join(units) or 'a unit such as --flow-unit L/min'} corrects it."
+    return [Finding("volume", what, advice, "refused", factor)]
+
+
 def _commands(figures: Mapping[str, Floats]) -> list[Finding]:
     largest = float(figures["u_in"].max())
     if 0.0 < largest <= 1.0:
@@ -338,7 +392,7 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
         )
         if s["qq"] == 0.0 or np.linalg.matrix_rank(A) < 3:
             continue
-        r, e, _ = np.linalg.solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
+        r, e, _ = solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
         if r <= 0.0 or e <= 0.0:
             continue
         fit = np.log([1000.0 * r, 1.0 / e])
@@ -387,9 +441,15 @@ def require_roles(breaths: Breaths) -> None:
 
 
 def _figures_of(breaths: Breaths) -> dict[str, Floats]:
-    names = ("pressure", "u_in", "u_out", "flow")
-    arrays = {name: getattr(breaths, name) for name in names}
-    lengths = breaths.valid.sum(axis=1)
-    flat = {name: a[breaths.valid] for name, a in arrays.items() if a is not None}
-    starts = (np.cumsum(lengths) - lengths).astype(np.int64)
-    return breath_figures(breaths.time[breaths.valid], flat, starts)
+    """Figures of breaths, some at a time since they need many arrays as large as the recording."""
+    parts = []
+    together = max(1, _TOGETHER // breaths.valid.shape[1])
+    for first in range(0, len(breaths), together):
+        some = slice(first, first + together)
+        valid = breaths.valid[some]
+        arrays = {name: getattr(breaths, name) for name in ("u_in", "u_out", *MEASURED)}
+        flat = {name: a[some][valid] for name, a in arrays.items() if a is not None}
+        lengths = valid.sum(axis=1)
+        starts = (np.cumsum(lengths) - lengths).astype(np.int64)
+        parts.append(breath_figures(breaths.time[some][valid], flat, starts))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

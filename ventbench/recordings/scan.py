@@ -1,6 +1,7 @@
-"""A file as checked breaths, which `load` and `check` share.
+"""A file as checked breaths, which `load` and `check` share, some 100,000 rows at a time.
 
-Checks of values, breaths and times only add to a `ProblemLog`.
+Samples that are no readings are left out first. Checks of values, breaths and times only add to a
+`ProblemLog`.
 
 Blank times: a few in a breath are interpolated, those of a whole breath are inferred. Inspiration
 lasts 1.0 s, so a breath whose first n samples have u_out = 0 has an interval near 1.0 s / n. The
@@ -13,15 +14,17 @@ ms. If u_out never switches, n says nothing and the median of all breaths is tak
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ventbench.recordings.schema import COLUMNS, Column, ProblemLog, fail
-from ventbench.recordings.sources import Source
+from ventbench.recordings.bad_samples import BadSamples, find_bad_samples, without
+from ventbench.recordings.roles import breath_figures
+from ventbench.recordings.schema import COLUMNS, OPTIONAL, Column, ProblemLog, fail
+from ventbench.recordings.sources import Source, to_numpy
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -39,6 +42,12 @@ class Rows:
     columns: dict[str, np.ndarray]
     #: rows with a blank breath_id, (m,) bool; breath_id then repeats the one before.
     blank_id: np.ndarray
+    first: int = 0  #: row of the file that is the first of these.
+
+    def part(self, start: int, stop: int) -> Rows:
+        """Some of the rows."""
+        columns = {name: values[start:stop] for name, values in self.columns.items()}
+        return Rows(columns, self.blank_id[start:stop], self.first + start)
 
     @cached_property
     def starts(self) -> np.ndarray:
@@ -57,35 +66,50 @@ class Rows:
         return np.repeat(np.arange(len(self.starts)), self.lengths)
 
 
-def rows_of(batches: Iterable[pa.RecordBatch]) -> Rows:
-    """Convert all Arrow batches of a file, of known columns in any numeric type.
+#: Rows that are checked at a time, about: enough to tell a mark of missing from a reading.
+ROWS = 1 << 16
+
+
+def blocks_of(batches: Iterable[pa.RecordBatch]) -> Iterator[Rows]:
+    """Rows of whole breaths, at least :data:`ROWS` at a time unless the file is shorter.
 
     A blank breath_id is that of the row before; at the start of the file, the first one known.
     """
-    parts: dict[str, list[np.ndarray]] = {}
-    blanks = [np.zeros(0, bool)]
+    kept: list[Rows] = []
+    first, waiting = 0, 0
     for batch in batches:
-        for name in batch.schema.names:
-            parts.setdefault(name, []).append(_numpy(batch.column(name), COLUMNS[name].whole))
-        blanks.append(batch.column("breath_id").is_null().to_numpy(zero_copy_only=False))
-    # One column after the other is copied and let go.
-    columns = {name: np.concatenate(parts.pop(name)) for name in list(parts)}
-    blank = np.concatenate(blanks)
+        columns = {x: to_numpy(batch.column(x), COLUMNS[x].whole) for x in batch.schema.names}
+        blank = np.zeros(batch.num_rows, bool)
+        if batch.column("breath_id").null_count:
+            blank = to_numpy(batch.column("breath_id").is_null()) > 0
+        kept.append(Rows(columns, blank, first))
+        first, waiting = first + len(blank), waiting + len(blank)
+        if waiting < 2 * ROWS:
+            continue
+        rows = _joined(kept)
+        starts = rows.starts[(rows.starts >= ROWS) & (rows.starts < waiting)]
+        if len(starts):
+            cut = int(starts[-1])
+            yield rows.part(0, cut)
+            rows, waiting = rows.part(cut, waiting), waiting - cut
+        kept = [rows]
+    if waiting:
+        yield _joined(kept)
+
+
+def _joined(parts: list[Rows]) -> Rows:
+    """Rows that follow one another, with their blank breath_ids filled."""
+    rows = parts[0]
+    if len(parts) > 1:
+        names = parts[0].columns
+        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in names}
+        rows = Rows(columns, np.concatenate([part.blank_id for part in parts]), parts[0].first)
+    blank = rows.blank_id
     if blank.any():
-        before = np.maximum.accumulate(
-            np.where(blank, int(np.argmin(blank)), np.arange(len(blank)))
-        )
-        columns["breath_id"] = columns["breath_id"][before]
-    return Rows(columns, blank)
-
-
-def _numpy(array: pa.Array, whole: bool) -> np.ndarray:
-    import pyarrow as pa
-
-    if whole:
-        return array.fill_null(0).cast(pa.int64()).to_numpy(zero_copy_only=False)
-    array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
-    return array.cast(pa.float64()).to_numpy(zero_copy_only=False)
+        start = 0 if rows.first else int(np.argmin(blank))
+        before = np.maximum.accumulate(np.where(blank, start, np.arange(len(blank))))
+        rows.columns["breath_id"] = rows.columns["breath_id"][before]
+    return rows
 
 
 #: Rows from which a value that is repeated is reported once.
@@ -157,15 +181,19 @@ def _outside(values: np.ndarray, column: Column) -> np.ndarray:
     return low | (values > column.high)
 
 
-def check_ids(rows: Rows, log: ProblemLog) -> None:
-    """Check that the rows of each breath follow one another."""
-    ids = rows.columns["breath_id"][rows.starts]
-    _, first, which = np.unique(ids, return_index=True, return_inverse=True)
-    again = np.flatnonzero(first[which] != np.arange(len(ids)))
+def check_ids(rows: Rows, log: ProblemLog, seen: dict[int, int]) -> None:
+    """Check that the rows of each breath follow one another; ``seen`` are first rows by id."""
+    starts = rows.starts + rows.first
+    ids = rows.columns["breath_id"][rows.starts].tolist()
+    others = np.array(
+        [seen.setdefault(id_, at) for id_, at in zip(ids, starts.tolist(), strict=True)]
+    )
+    again = np.flatnonzero(others != starts)
     what = "breath {value} comes again, it is already at {other}"
     advice = "Keep the rows of a breath together, and give each breath an id of its own."
-    others = rows.starts[first[which[again]]]
-    log.add(rows.starts[again], "breath_id", what, advice, values=ids[again], others=others)
+    values = rows.columns["breath_id"][rows.starts[again]]
+    at = rows.starts[again]
+    log.add(at, "breath_id", what, advice, values=values, others=others[again] - rows.first)
 
 
 def check_lung(rows: Rows, log: ProblemLog) -> None:
@@ -192,13 +220,14 @@ def check_single(rows: Rows, log: ProblemLog) -> None:
     log.add(at, "breath_id", what, advice, values=rows.columns["breath_id"][at])
 
 
-def check_row_ids(rows: Rows, log: ProblemLog) -> None:
-    """Warn where the column id, which is not used otherwise, does not increase."""
+def check_row_ids(rows: Rows, log: ProblemLog, last: int) -> int:
+    """Warn where the column id, which is not used otherwise, does not increase; return the last."""
     ids = rows.columns["id"]
-    at = np.flatnonzero(ids[1:] <= ids[:-1]) + 1
+    at = np.flatnonzero(np.append(rows.first > 0 and ids[0] <= last, ids[1:] <= ids[:-1]))
     what = "id {value} is not greater than the one before"
     advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
     log.add(at, "id", what, advice, values=ids[at], level="warning")
+    return int(ids[-1])
 
 
 _SORT = "Sort the rows of the breath by time_step, and remove rows that are there twice."
@@ -360,9 +389,19 @@ class Scanned:
     lengths: np.ndarray  #: samples, (k,).
     n_inspiratory: np.ndarray  #: leading samples with u_out = 0, (k,).
     interval: np.ndarray  #: mean sampling interval, s, NaN if times are blank, (k,).
-    times: KnownTimes  #: times of the samples, and what was interpolated or shifted.
-    #: u_in %, u_out 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file has them,
-    #: each (m,).
+    time_blank: np.ndarray  #: breaths without times, (k,) bool.
+    time_interpolated: np.ndarray  #: number of single times that are interpolated, (k,).
+    time_shifted: np.ndarray  #: breaths that do not start at 0 in the file, (k,) bool.
+    steps: (
+        np.ndarray
+    )  #: shortest and longest interval between two samples of each breath, s, (k, 2).
+    blank_pressures: np.ndarray  #: samples without pressure, (k,).
+    optional: tuple[str, ...]  #: optional columns of the file.
+    figures: dict[str, np.ndarray]  #: of :func:`~.roles.breath_figures`, (k,) each.
+    bad: tuple[BadSamples, ...]  #: samples that were left out, by rows of the file.
+    #: time, s from each breath's first sample, NaN in all of a breath without times; u_in %, u_out
+    #: 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file has them, each (m,).
+    #: Nothing if only checked.
     samples: dict[str, np.ndarray]
 
     @cached_property
@@ -375,17 +414,24 @@ class Scanned:
         """Interval, s, estimated for each breath without times, by its place; None without one."""
         return {
             i: self.intervals.estimate(int(self.n_inspiratory[i]), int(self.lengths[i]))
-            for i in np.flatnonzero(self.times.blank).tolist()
+            for i in np.flatnonzero(self.time_blank).tolist()
         }
 
 
 def scan(
-    source: Source, log: ProblemLog, *, clip: bool = False, progress: Progress | None = None
+    source: Source,
+    log: ProblemLog,
+    *,
+    clip: bool = False,
+    missing: Collection[float] = (),
+    keep: bool = True,
+    progress: Progress | None = None,
 ) -> Scanned:
     """Read and check a file.
 
     The log receives all problems and warnings except those of the whole file (unequal lengths).
-    After a problem the values must not be used. ``clip`` brings u_in into 0..100 %.
+    After a problem the values must not be used. ``clip`` brings u_in into 0..100 %; ``missing`` are
+    values that stand for a missing one; samples are only kept with ``keep``.
 
     Raises:
         RecordingError: the file cannot be parsed, or has no rows.
@@ -397,31 +443,86 @@ def scan(
             if progress is not None:
                 progress(source.done, source.size)
 
-    rows = rows_of(batches())
-    if not len(rows.blank_id):
+    parts, seen, last = [], dict[int, int](), 0
+    marks = set(missing)
+    for rows in blocks_of(batches()):
+        log.first = rows.first
+        bad = find_bad_samples(rows.columns, marks)
+        marks |= {float(each.values[0]) for each in bad if each.kind == "mark"}
+        rows.columns.update(without(rows.columns, bad))
+        check_ids(rows, log, seen)
+        for check in (check_single, check_lung, check_times):
+            check(rows, log)
+        last = check_row_ids(rows, log, last)
+        columns = check_values(rows, log, clip=clip)
+        with np.errstate(all="ignore"):  # infinite values are problems already
+            parts.append(_scanned(rows, columns, bad, keep))
+    log.first = 0
+    if not parts:
         what = "the file has a header but no rows"
         raise fail(source.file, what, "Write at least one breath.")
-    for check in (check_ids, check_single, check_lung, check_times, check_row_ids):
-        check(rows, log)
-    columns = check_values(rows, log, clip=clip)
-    with np.errstate(all="ignore"):  # infinite values are problems already
-        return _scanned(rows, columns)
+    return parts[0] if len(parts) == 1 else _together(parts)
 
 
-def _scanned(rows: Rows, columns: dict[str, np.ndarray]) -> Scanned:
+def _scanned(
+    rows: Rows, columns: dict[str, np.ndarray], bad: Sequence[BadSamples], keep: bool
+) -> Scanned:
     starts, lengths = rows.starts, rows.lengths
     times = known_times(columns["time_step"], starts, lengths)
-    keep = ("u_in", "pressure", "flow", "volume")
-    samples = {name: columns[name] for name in keep if name in columns}
+    names = ("u_in", "pressure", *OPTIONAL)
+    samples = {name: columns[name] for name in names if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
+    inside = np.diff(times.time, append=np.nan)
+    inside[starts[1:] - 1] = np.nan
+    inside[~np.isfinite(inside)] = np.nan
     return Scanned(
         breath_id=columns["breath_id"][starts],
         R=columns["R"][starts],
         C=columns["C"][starts],
-        starts=starts,
+        starts=starts + rows.first,
         lengths=lengths,
         n_inspiratory=leading_zeros(samples["u_out"], starts, lengths),
         interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
-        times=times,
-        samples=samples,
+        time_blank=times.blank,
+        time_interpolated=times.interpolated,
+        time_shifted=times.shifted,
+        steps=np.stack([x.reduceat(inside, starts) for x in (np.fmin, np.fmax)], axis=1),
+        blank_pressures=np.add.reduceat(np.isnan(samples["pressure"]).astype(int), starts),
+        optional=tuple(name for name in OPTIONAL if name in samples),
+        figures=breath_figures(times.time, samples, starts),
+        bad=tuple(replace(each, rows=each.rows + rows.first) for each in bad),
+        samples={"time": times.time, **samples} if keep else {},
+    )
+
+
+def _together(parts: Sequence[Scanned]) -> Scanned:
+    """Parts of a file as one."""
+
+    def joined(values: Sequence[Any]) -> Any:
+        if isinstance(values[0], np.ndarray):
+            return np.concatenate(values)
+        if isinstance(values[0], dict):
+            return {name: joined([each.pop(name) for each in values]) for name in list(values[0])}
+        return values[0]
+
+    merged: dict[tuple[str, str, float], list[BadSamples]] = {}
+    for each in (each for part in parts for each in part.bad):
+        value = float(each.values[0]) if each.kind == "mark" else 0.0
+        merged.setdefault((each.column, each.kind, value), []).append(each)
+    bad = tuple(
+        BadSamples(
+            column,
+            kind,
+            np.concatenate([x.rows for x in same]),
+            np.concatenate([x.values for x in same]),
+            int(sum(part.lengths.sum() for part in parts)),
+        )
+        for (column, kind, _), same in merged.items()
+    )
+    names = (field.name for field in fields(Scanned))
+    return Scanned(
+        **{
+            name: bad if name == "bad" else joined([getattr(x, name) for x in parts])
+            for name in names
+        }
     )

@@ -108,6 +108,7 @@ class ProblemLog:
     """Problems and warnings of one file by row; keeps the first `SHOWN` of each, and counts all."""
 
     file: str  #: the path as the caller wrote it.
+    first: int = 0  #: row of the file that is row 0 of what is added.
     #: number of problems and of warnings.
     counts: dict[Level, int] = field(default_factory=lambda: {"problem": 0, "warning": 0})
     _kept: dict[Level, list[_Entry]] = field(default_factory=lambda: {"problem": [], "warning": []})
@@ -126,7 +127,7 @@ class ProblemLog:
         """Add a problem, or a warning, for each row.
 
         Args:
-            rows: data rows in the file, 0 for the first, shape (k,); k may be 0.
+            rows: data rows, 0 for `first`, shape (k,); k may be 0.
             column: name of the column, or None.
             what: a phrase; `{value}` stands for the cell and `{other}` for the other row's line.
             advice: a sentence.
@@ -140,8 +141,8 @@ class ProblemLog:
         kept = self._kept[level]
         for i, row in enumerate(rows[:SHOWN]):
             value = None if values is None else _text(values[i])
-            other = None if others is None else int(others[i])
-            kept.append(_Entry(int(row), column, value, what, advice, other))
+            other = None if others is None else int(others[i]) + self.first
+            kept.append(_Entry(int(row) + self.first, column, value, what, advice, other))
         kept.sort(key=lambda entry: entry.row)
         del kept[SHOWN:]
 

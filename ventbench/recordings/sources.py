@@ -12,7 +12,10 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ventbench.base.errors import InputTypeError
 from ventbench.base.files import sha256
@@ -31,7 +34,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-BLOCK = 8 << 20
+BLOCK = 4 << 20
 """Bytes of text read at a time (the parser holds a few of them)."""
 
 BATCH = 1 << 17
@@ -300,6 +303,19 @@ def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[RecordingPr
 def _damaged(file: str, error: Exception) -> RecordingError:
     text = str(error).strip().splitlines()[0].rstrip(".")
     return fail(file, f"the Parquet file cannot be read ({text})", "Write or copy it again.")
+
+
+def to_numpy(array: pa.Array | pa.ChunkedArray, whole: bool = False) -> NDArray[Any]:
+    """Numbers of Arrow as float64, NaN where blank, or int64, 0 there; its own way needs pandas."""
+    import pyarrow as pa
+
+    kind, blank = (pa.int64(), 0) if whole else (pa.float64(), float("nan"))
+    if isinstance(array, pa.ChunkedArray):
+        parts = [to_numpy(chunk, whole) for chunk in array.chunks]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
+    array = array.cast(kind)
+    return np.from_dlpack(array.fill_null(blank) if array.null_count else array)
 
 
 def open_source(path: str | os.PathLike[str] | pd.DataFrame) -> Source:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Floats
+from ventbench.base.linear import inverse, solve
 from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
 from ventbench.system_id.data import Data, Noise, robust_noise
@@ -80,7 +81,7 @@ class Fit:
         """
         hessian, index = self.minimum.hessian, self.problem.unknowns.index
         floor = 1e-9 * np.maximum(np.diag(hessian), 1e-9)
-        bread = np.asarray(np.linalg.inv(hessian + np.diag(floor)), np.float64)
+        bread = inverse(hessian + np.diag(floor))
         own = np.array([len(np.unique(column)) == len(index) for column in index.T])
         common = np.unique(index[:, ~own])
         if len(index) - len(common) < _ENOUGH:
@@ -212,7 +213,7 @@ def _sandwich(
         inner = inner + 1e-9 * np.maximum(inner.max(axis=(1, 2), keepdims=True), 1e-9) * np.eye(
             inner.shape[1]
         )
-        across = np.linalg.solve(inner, curvatures[:, own][:, :, ~own]).swapaxes(1, 2)
+        across = solve(inner, curvatures[:, own][:, :, ~own]).swapaxes(1, 2)
         gradients, curvatures = (
             gradients[:, ~own] - np.matmul(across, gradients[:, own, None])[:, :, 0],
             curvatures[:, ~own][:, :, ~own] - np.matmul(across, curvatures[:, own][:, :, ~own]),
@@ -226,7 +227,7 @@ def _sandwich(
     np.add.at(shares, (rows[:, None, None], place[:, :, None], place[:, None, :]), curvatures)
     forces -= forces.mean(axis=0)
     left = np.eye(len(common)) - _LEVERAGE * np.matmul(shares, bread)
-    spread = np.linalg.solve(left, forces[:, :, None])[:, :, 0] @ bread
+    spread = solve(left, forces[:, :, None])[:, :, 0] @ bread
     return np.asarray(np.sum(spread**2, axis=0) * (1.0 - 1.0 / len(rows)), np.float64)
 
 

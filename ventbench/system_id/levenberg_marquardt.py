@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ventbench.base.arrays import Floats
+from ventbench.base.linear import solve
 
 #: Cost at a point; cost, gradient and Gauss-Newton Hessian at a point.
 Cost = Callable[[Floats], float]
@@ -108,7 +109,7 @@ def _step(
     for _ in range(_PASSES):
         index = np.flatnonzero(free)
         force = gradient[index] + damped[np.ix_(index, np.flatnonzero(~free))] @ step[~free]
-        step[index] = -np.linalg.solve(damped[np.ix_(index, index)], force)
+        step[index] = -solve(damped[np.ix_(index, index)], force)
         beyond = free & ((step < low) | (step > high))
         if not beyond.any():
             break

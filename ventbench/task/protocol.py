@@ -38,8 +38,14 @@ RESOLUTION = 0.001
 #: How many targets ahead of now an observation holds.
 TARGETS_AHEAD = 10
 
-#: Safety gate: pressure above ``min(SAFETY_PRESSURE, PIP + SAFETY_MARGIN)`` cmH2O for longer than
-#: ``SAFETY_TIME`` s fails the entry on that lung.
+#: Safety gate of a breath: at most ``SAFETY_TIME`` s in all above ``min(SAFETY_PRESSURE, PIP +
+#: SAFETY_MARGIN)`` cmH2O, and no sample above ``SAFETY_CAP``; else the entry fails on that lung.
 SAFETY_PRESSURE = 60.0
 SAFETY_MARGIN = 15.0
 SAFETY_TIME = 0.1
+
+#: What a relief valve that opens at ``SAFETY_PRESSURE`` leaves, cmH2O: one that passes 200 mL/s per
+#: cmH2O takes the flow of the fully open inspiratory valve, 2.28 L/s, within about 10 cmH2O.
+#: It is also the highest plateau that the specification of emergency ventilators admits (MHRA,
+#: RMVS001, 2020); their last valve opens at 80, and ISO 80601-2-12 bars 125 even under a fault.
+SAFETY_CAP = 70.0

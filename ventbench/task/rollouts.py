@@ -190,7 +190,7 @@ def closed_loop(
         plant: any plant.
         controller: parameters broadcast against the cells.
         scenario: the cells, batch shape ``(...)``.
-        whole: simulate the expirations too (for pictures; no score depends on them).
+        whole: simulate the expirations too, which the safety gate judges.
 
     Returns:
         The inspirations, and the expirations if asked for.

@@ -13,7 +13,8 @@ import pytest
 from scipy import stats
 
 from hardware_eval.bench import calibrate
-from hardware_eval.bench.calibrate import Calibration, device_of, fit, load, measure
+from hardware_eval.bench.calibrate import Calibration, fit, load, measure
+from hardware_eval.bench.dated import device_of
 from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
@@ -84,11 +85,14 @@ def test_a_meter_is_read_where_the_device_measures_no_flow() -> None:
     device = LoopbackDevice(hal)
     client = Client(device, device.clock)
     client.hello()
-    bench = Bench(client, device.clock, DEFAULT, Operator())
     shown = iter((228.0, 456.0, 240.0))
-    part = measure(
-        bench, "valve", lung=LUNG, reference=(10.0, 20.0, 10.0), ask=lambda question: next(shown)
-    )
+
+    class Reads(Operator):
+        def number(self, question: str) -> float:
+            return next(shown)
+
+    bench = Bench(client, device.clock, DEFAULT, Reads())
+    part = measure(bench, "valve", lung=LUNG, reference=(10.0, 20.0, 10.0))
     assert part.by_hand
     assert part.above == (0, 0, 1)
     assert part.reading == (228.0, 456.0, 240.0)

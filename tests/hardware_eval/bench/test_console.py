@@ -78,6 +78,13 @@ def test_bursts_before_a_question_never_confirm_and_are_stops(keyboard: Keyboard
             assert not person.stop()
 
 
+def test_ctrl_z_is_a_stop_and_does_not_suspend(keyboard: Keyboard) -> None:
+    person = ConsoleOperator(reaction=0.0)
+    with person.keys():
+        keyboard.press("\x1a")
+        assert person.stop()
+
+
 @pytest.mark.parametrize(
     ("keys", "confirms"),
     [("y", True), ("Y", True), ("n", False), ("ny", False), ("yn", False), (" ", False)],

@@ -73,7 +73,7 @@ def test_progress_repeats_what_the_bench_spoilt_and_keeps_what_failed() -> None:
     plan = make_plan(["a"], ["R5C10"], pips=(10.0,), repeats=2)
     begins = [{"type": "run_begins", "run": k, "attempt": 0} for k in range(4)]
     ends = [
-        {"type": "run", "run": k, "attempt": 0, "status": status}
+        {"type": "run", "run": k, "attempt": 0, "status": status, "kind": "ramp"}
         for k, status in enumerate(("complete", "aborted", "failed"))
     ]
     state = progress(plan, [*begins, *ends])

@@ -85,6 +85,32 @@ def test_a_fault_trips_its_check_within_its_time(name: str) -> None:
     assert f"{trip.value:.3g}" in trip.message
 
 
+@pytest.mark.parametrize("lacking", [2, 3, 5])
+@pytest.mark.parametrize("name", sorted(set(FAULTS) - {"no_reading", "no_answer"}))
+@pytest.mark.parametrize("phase", [0, 1])
+def test_missing_readings_hide_no_fault_and_raise_no_alarm(
+    name: str, lacking: int, phase: int
+) -> None:
+    change, within = FAULTS[name]
+    began = 145 if name == "low_pressure" else 110
+
+    def seen(index: int, sample: SafetySample) -> SafetySample:
+        sample = change(index, sample) if index >= began else sample
+        if index % lacking == phase:
+            return sample._replace(pressure=math.nan, answered=False)
+        return sample
+
+    state = looked_at(seen)
+    assert name in [trip.check for trip in state.trips]
+    trip = next(trip for trip in state.trips if trip.check == name)
+    until = 24 * DT if name == "expiratory_valve" else 0.0
+    assert trip.time - began * DT <= until + within + 3 * DT + 1e-9
+    healthy_ones = looked_at(
+        lambda i, s: s._replace(pressure=math.nan, answered=False) if i % lacking == phase else s
+    )
+    assert not healthy_ones.trips
+
+
 def test_a_jump_that_no_valve_can_make_trips() -> None:
     state = looked_at(lambda i, s: s._replace(pressure=105.0) if i == 98 else s)
     assert "implausible_slope" in [trip.check for trip in state.trips]

@@ -13,6 +13,7 @@ import pytest
 
 from hardware_eval.bench import session
 from hardware_eval.bench.controllers import ControllerFailedError, PIDController
+from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, RunResult, run_once
 from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
 from hardware_eval.bench.raw_log import RawLog, breaths, lines
@@ -102,18 +103,32 @@ def silent(device: LoopbackDevice, after: float, steps: float) -> None:
     device.line.faults = (fault,)
 
 
-def test_a_step_without_an_answer_costs_a_scored_run_but_not_the_entry(
-    bench: Bench, device: LoopbackDevice
+@pytest.mark.parametrize("step", [0, 4])
+def test_a_step_without_an_answer_costs_no_run(
+    step: int, bench: Bench, device: LoopbackDevice
 ) -> None:
-    breath = protocol.BREATH_STEPS * protocol.DT
-    for kind, status in (("scored", "aborted"), ("ramp", "complete")):
-        silent(device, breath, 0.9)
-        controller = Scripted()
-        result = run_once(bench, run(kind=kind), controller)
-        assert math.isnan(result.breaths[1].pressure[0])
-        assert (result.status, result.held_up) == (status, status == "aborted")
-        # The controller is told that a breath begins, by the answer to the last command.
-        assert [row[0] for row in controller.rows].count(0.0) == protocol.BREATHS
+    whole = run_once(bench, run(), Scripted())
+    silent(device, (protocol.BREATH_STEPS + step) * protocol.DT, 0.9)
+    controller = Scripted()
+    result = run_once(bench, run(), controller)
+    # The controller is told that a breath begins, by the answer to the last command.
+    assert [row[0] for row in controller.rows].count(0.0) == protocol.BREATHS
+    assert len(controller.rows) == result.asked == 102 - (step > 0)
+    assert math.isnan(result.breaths[1].pressure[step]) == (step > 0)
+    assert (result.status, result.late_answers) == ("complete", 0)
+    assert result.error == pytest.approx(whole.error, abs=0.1)
+
+
+def test_a_run_of_too_few_readings_runs_again(bench: Bench, device: LoopbackDevice) -> None:
+    begins = device.clock.now() - device.start + 2.0 + protocol.DT - 0.002
+    steps = protocol.BREATH_STEPS + np.arange(2, 34, 4)
+    device.line.faults = tuple(
+        Fault(LineFaultKind.SILENT, begins + at * protocol.DT, begins + (at + 0.9) * protocol.DT)
+        for at in steps
+    )
+    result = run_once(bench, run(), Scripted())
+    assert (result.status, result.held_up) == ("aborted", True)
+    assert "8 of 68 scored steps have no pressure, 1 in a row" in result.reason
 
 
 def test_a_silent_line_ends_the_run_and_blames_neither_lung_nor_entry(
@@ -311,6 +326,15 @@ def test_a_dry_run_finds_a_controller_that_is_unsafe(plan: Plan) -> None:
     assert len(problems) == 1
     assert "over pressure" in problems[0]
     assert errors == []
+
+
+def test_the_dry_run_has_the_fallback_of_the_run() -> None:
+    calm = make_plan(["pid"], [LUNG], pips=(10.0,), repeats=5, control_every=0)
+    problems, _ = session.dry_run(
+        calm, lambda run: Scripted(lambda step, u: 100.0), DEFAULT, fallback=FallbackSettings()
+    )
+    assert len(problems) == 1
+    assert "were outside the envelope" in problems[0]
 
 
 def test_a_result_without_scored_breaths_has_no_error() -> None:

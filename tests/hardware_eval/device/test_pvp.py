@@ -22,7 +22,7 @@ import pytest
 from hardware_eval.device import __main__ as board
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
-from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves
+from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves, load_machine
 from hardware_eval.wire.client import Client, Link
 from hardware_eval.wire.messages import PROTOCOL_VERSION, Hello, Mode, Packet, encode
 from tests.hardware_eval.stand_in import Bench
@@ -31,7 +31,25 @@ from ventbench.base.errors import InputError
 CONFIGURATION = """\
 name = "bench 3"
 device_id = "0123456789abcdef"
+revision = "test rig"
+source = "wired for this test"
+expiratory_normally_open = false
+heartbeat_pin = -1
+offset_voltage = 2.2
+cmH2O_per_volt = 35.15
+pressure_limit = 50.0
+valve_table = "valve.csv"
+"""
+RIG = """
+[revisions."test rig"]
+source = "this file"
+inspiratory_pin = 12
+expiratory_pin = 17
+pwm_frequency = 20000
+i2c_bus = 1
+adc_address = 0x48
 adc_channel = 1
+sensor = "1 PSI-D-4V-MINI"
 """
 TABLE = """\
 u_in,opening,closing
@@ -95,7 +113,7 @@ class FakeBus:
 
 @pytest.fixture
 def configuration(tmp_path: Path) -> Path:
-    (tmp_path / "pvp.toml").write_text(CONFIGURATION)
+    (tmp_path / "pvp.toml").write_text(CONFIGURATION + RIG)
     (tmp_path / "valve.csv").write_text(TABLE)
     return tmp_path / "pvp.toml"
 
@@ -119,11 +137,10 @@ def test_the_sensor(configuration: Path, hardware: SimpleNamespace) -> None:
     assert hal.sample(1.5).pressure == pytest.approx(0.0703)  # one step of the recordings
     hardware.bus.counts = [1500, 0, 1501]
     assert hal.sample(2.0).pressure == pytest.approx(400 * 0.0703)  # spikes are cut
-    assert hal.identity.highest == 50.8
-    hardware.bus.counts = [1100 + int(0.98 * 50.8 / 0.0703)]
+    highest = hal.identity.highest  # the converter ends before the sensor, of 70.3 cmH2O
+    assert highest == pytest.approx((2.047 * 2 - 2.2) * 35.15)
+    hardware.bus.counts = [1100 + int(0.98 * highest / 0.0703)]
     assert not hal.sample(2.0).saturated
-    hardware.bus.counts = [1100 + int(50.8 / 0.0703)]
-    assert hal.sample(2.0).saturated
     hardware.bus.counts = [LAST]
     assert hal.sample(2.0).saturated
     for nothing in ([0], [-5]):
@@ -159,7 +176,7 @@ def test_the_valves(configuration: Path, hardware: SimpleNamespace) -> None:
 def test_a_normally_open_valve_is_turned_around(
     configuration: Path, hardware: SimpleNamespace
 ) -> None:
-    configuration.write_text(CONFIGURATION + "expiratory_normally_open = true\n")
+    configuration.write_text((CONFIGURATION + RIG).replace("open = false", "open = true"))
     PvpValves(configuration)
     assert hardware.pi.levels == {17: 0}
 
@@ -167,7 +184,7 @@ def test_a_normally_open_valve_is_turned_around(
 def test_the_heartbeat_pin_moves_with_every_order(
     configuration: Path, hardware: SimpleNamespace
 ) -> None:
-    configuration.write_text(CONFIGURATION + "heartbeat_pin = 27\n")
+    configuration.write_text((CONFIGURATION + RIG).replace("pin = -1", "pin = 27"))
     valves = PvpValves(configuration)
     levels = []
     for _ in range(4):
@@ -192,38 +209,91 @@ def test_systemd_is_told_that_the_program_is_ready_and_awake(
             assert systemd.recv(100) == b"WATCHDOG=1"
 
 
-def test_identity_changes_with_the_calibration_only(
+def test_identity_changes_with_everything_but_the_name(
     configuration: Path, hardware: SimpleNamespace
 ) -> None:
     first = PvpSensor(configuration).identity
     assert (first.name, first.device_id.hex()) == ("bench 3", "0123456789abcdef")
-    configuration.write_text(CONFIGURATION.replace("bench 3", "bench 4"))
-    assert PvpSensor(configuration).identity.calibration == first.calibration
+    changes = [("bench 3", "bench 4"), ("= 17", "= 27"), ("2.2", "2.25"), ("= 12", "= 13")]
+    seen = []
+    for old, new in [*changes, ("open = false", "open = true"), ("20000", "1000")]:
+        configuration.write_text((CONFIGURATION + RIG).replace(old, new))
+        seen.append(PvpSensor(configuration).identity.calibration)
+    assert seen[0] == first.calibration
+    assert len(set(seen)) == len(seen)
     (configuration.parent / "valve.csv").write_text(TABLE.replace("0.90", "0.91"))
-    assert PvpSensor(configuration).identity.calibration != first.calibration
+    assert PvpSensor(configuration).identity.calibration not in seen
+
+
+def test_the_known_machines_are_whole(configuration: Path) -> None:
+    """Each revision of the data and each sensor passes the checks of a configuration."""
+    known = tomllib.loads((Path(board.__file__).parent / "revisions.toml").read_text())
+    for name, wiring in known["revisions"].items():
+        text = CONFIGURATION.replace("test rig", name)
+        configuration.write_text(text)
+        machine = load_machine(configuration)
+        assert (machine.wiring.inspiratory_pin, machine.part.range) == (12, 70.3)
+        assert wiring["sensor"] in known["sensors"]
+
+
+@pytest.mark.parametrize("key", [*CONFIGURATION.split("\n"), *RIG.split("\n")[2:]])
+def test_nothing_about_a_machine_has_a_default(
+    configuration: Path, hardware: SimpleNamespace, key: str
+) -> None:
+    if not key:
+        return
+    configuration.write_text((CONFIGURATION + RIG).replace(key + "\n", ""))
+    with pytest.raises(InputError, match=f"{key.split(' ')[0]} is missing"):
+        PvpValves(configuration)
 
 
 @pytest.mark.parametrize(
-    ("toml", "table", "message"),
+    ("old", "new", "message"),
     [
-        ("colour = 1", TABLE, "no key 'colour'"),
-        ("adc_channel = 7", TABLE, r"outside 0\.\.3"),
-        ('adc_channel = "1"', TABLE, "must be a int"),
-        ('device_id = "01"', TABLE, "16 hexadecimal"),
-        ("highest_pressure = -1.0", TABLE, "must be positive"),
-        ("= 1", TABLE, "pvp.toml"),
-        (CONFIGURATION, "u_in,opening,closing\n0,0,0\n90,1,1\n", "0 to 100"),
-        (CONFIGURATION, "u_in,opening,closing\n0,0,0\n100,1.1,1\n", "leaves"),
-        (CONFIGURATION, "u_in,opening\n0,0\n100,1\n", "closing"),
+        ("= 17", "= 12", r"are both GPIO 12"),
+        ("= 12", "= 17", r"are both GPIO 17"),
+        ("pin = -1", "pin = 17", r"are both GPIO 17"),
+        ("= 12", "= 22", "no hardware PWM"),
+        ("= 17", "= 3", "no free GPIO"),
+        ("_channel = 1", "_channel = 7", r"outside 0\.\.3"),
+        ("_channel = 1", '_channel = "1"', "must be a int"),
+        ("open = false", "open = 0", "must be a bool"),
+        ('"0123456789abcdef"', '"01"', "16 hexadecimal"),
+        ('"wired for this test"', '""', "source is empty"),
+        ('"test rig"\n', '"other rig"\n', "describe yours in a table"),
+        ('[revisions."test rig"]', '[revisions."actuators-rev2"]', "known otherwise"),
+        ("name =", "colour = 1\nname =", "no key 'colour'"),
+        # The sensor that earlier versions assumed: range of one part, slope of another.
+        ("1 PSI-D-4V-MINI", "20 INCH-G-P4V-MINI", "offset_voltage = 2.2 is not of a 20 INCH"),
+        ("35.15", "12.7", "cmH2O_per_volt = 12.7 is not of a 1 PSI"),
+        ("= 50.0", "= 66.6", "nothing could trip it"),
+        ("= 50.0", "= 0.0", "outside"),
+        ("name =", "= 1", "pvp.toml"),
     ],
 )
-def test_wrong_files_say_what_is_wrong(
-    configuration: Path, hardware: SimpleNamespace, toml: str, table: str, message: str
+def test_what_cannot_be_is_refused(
+    configuration: Path, hardware: SimpleNamespace, old: str, new: str, message: str
 ) -> None:
-    configuration.write_text(toml)
-    (configuration.parent / "valve.csv").write_text(table)
+    assert old in CONFIGURATION + RIG
+    configuration.write_text((CONFIGURATION + RIG).replace(old, new))
     with pytest.raises(InputError, match=message):
         PvpSensor(configuration)
+    assert board.main(["--config", str(configuration), "--vent"]) == 2
+    assert not hardware.pi.levels  # no pin was touched
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("u_in,opening,closing\n0,0,0\n90,1,1\n", "0 to 100"),
+        ("u_in,opening,closing\n0,0,0\n100,1.1,1\n", "leaves"),
+        ("u_in,opening\n0,0\n100,1\n", "closing"),
+    ],
+)
+def test_a_wrong_valve_table_is_refused(configuration: Path, table: str, message: str) -> None:
+    (configuration.parent / "valve.csv").write_text(table)
+    with pytest.raises(InputError, match=message):
+        load_machine(configuration)
 
 
 def test_missing_packages_and_hardware_say_what_to_do(
@@ -240,15 +310,6 @@ def test_missing_packages_and_hardware_say_what_to_do(
         PvpValves(configuration)
     assert board.main(["--config", str(configuration), "--vent"]) == 2
     assert "pip install" in capsys.readouterr().err
-
-
-def test_a_limit_outside_the_sensors_range_is_refused(
-    configuration: Path, hardware: SimpleNamespace, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert board.main(["--config", str(configuration), "--port", "x"]) == 2
-    assert "smaller --pressure-limit" in capsys.readouterr().err
-    assert hardware.pi.levels == {17: 1}
-    assert hardware.pi.stopped
 
 
 def test_the_board_vents_once(configuration: Path, hardware: SimpleNamespace) -> None:
@@ -281,7 +342,7 @@ def test_the_board_serves_one_host_after_another() -> None:
             client = Client(Link(url), timeout=600.0)
             assert client.hello().name == "bench"
             assert client.arm().mode is Mode.RUNNING
-            client._transport.close()
+            client.transport.close()
     finally:
         stop.set()
         thread.join()
@@ -335,7 +396,7 @@ def test_the_program_runs_on_the_packages_of_its_own_list_alone(
     )
     master, slave = os.openpty()
     tty.setraw(master)
-    words = ["--config", str(configuration), "--pressure-limit", "50", "--port", os.ttyname(slave)]
+    words = ["--config", str(configuration), "--port", os.ttyname(slave)]
     program = subprocess.Popen(
         [sys.executable, "-m", "hardware_eval.device", *words],
         cwd=root,

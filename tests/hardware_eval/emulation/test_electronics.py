@@ -194,7 +194,7 @@ def test_a_death_in_an_inspiration_vents(
             time.sleep(0.01)
         unvented = dies == "electronics" and bool(normally)
         assert rows()[before][1:] == ["0", "0" if unvented else "1", decides]
-        client._transport.close()
+        client.transport.close()
     finally:
         os.kill(int(ids["device"]), signal.SIGCONT) if emulator.poll() is None else None
         emulator.terminate()

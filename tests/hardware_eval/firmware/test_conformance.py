@@ -60,7 +60,7 @@ def test_the_command_says_what_holds(tmp_path: Path, monkeypatch: pytest.MonkeyP
     out = tmp_path / "verdict.json"
     device = LoopbackDevice(Bench())
     monkeypatch.setattr(evaluate, "carrier", lambda port: (device, device.clock))
-    done = CliRunner().invoke(cli.app, ["conformance", "--port", "p", "--json", str(out)])
+    done = CliRunner().invoke(cli.app, ["conformance", "--port", "virtual:p", "--json", str(out)])
     assert done.exit_code == 0, done.output
     assert f"{len(CLAUSES)} hold, 0 fail, {len(NOT_TRIED)} not tried" in done.output
     verdict = json.loads(out.read_text())
@@ -71,7 +71,7 @@ def test_the_command_says_what_holds(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_line_that_fails_is_the_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
     device = LoopbackDevice(Bench(), latency=0.012)
     monkeypatch.setattr(evaluate, "carrier", lambda port: (device, device.clock))
-    done = CliRunner().invoke(cli.app, ["conformance", "--port", "p"])
+    done = CliRunner().invoke(cli.app, ["conformance", "--port", "virtual:p"])
     assert done.exit_code == 1
     assert re.search(r"FAILS +answers come within 5 ms \(duty 6\): half of the .*", done.output)
 

@@ -22,6 +22,7 @@ from hardware_eval.results.trial import (
     spearman,
 )
 from ventbench.base.errors import InputError
+from ventbench.task import protocol
 
 LUNGS, PIPS, REPEATS = 6, 6, 5
 
@@ -93,17 +94,12 @@ def write(path: Path, seed: int, errors: dict[str, Any]) -> Path:
         for run in plan.runs:
             error = errors[run.entry][plan.pips.index(run.pip)][run.repeat - 1]
             status = "failed" if error is None else "complete"
-            about = {"entry": run.entry, "kind": run.kind, "lung": run.lung, "pip": run.pip}
-            log.append(
-                {
-                    "type": "run",
-                    "run": run.number,
-                    "status": status,
-                    "error": error,
-                    "repeat": run.repeat,
-                    **about,
-                }
-            )
+            about = {"run": run.number, "attempt": 0, "entry": run.entry, "kind": run.kind}
+            about |= {"lung": run.lung, "pip": run.pip, "repeat": run.repeat}
+            for breath in range(protocol.BREATHS):
+                pressure = [run.pip] * protocol.BREATH_STEPS
+                log.append({"type": "breath", **about, "breath": breath, "pressure": pressure})
+            log.append({"type": "run", "status": status, "error": error, **about})
     return path
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -18,22 +19,19 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import Breaths, arranged
-from ventbench.recordings.foreign.formats import read_table
-from ventbench.recordings.foreign.layouts import (
-    LAYOUTS,
-    ROLES,
-    USUAL,
-    Conversion,
-    Layout,
-    conversion,
-    expiratory_valve,
-    find_breaths,
-    in_file_unit,
-    recognise,
-    stem,
+from ventbench.recordings.bad_samples import (
+    MEASURED,
+    BadSamples,
+    find_bad_samples,
+    repeated_rows,
+    without,
 )
+from ventbench.recordings.breaths import Breaths, arranged
+from ventbench.recordings.foreign.cycles import expiratory_valve, find_breaths
+from ventbench.recordings.foreign.formats import read_table
+from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, Layout, recognise
 from ventbench.recordings.foreign.tables import Table
+from ventbench.recordings.headers import Conversion, conversion, in_file_unit, read_header
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung
@@ -45,8 +43,16 @@ _MEASURED = ("time", "pressure", "flow", "volume", "u_in")
 #: is absolute.
 _SMALL_FLOW, _SMALL_VOLUME, _ABSOLUTE = 150.0, 5.0, 500.0
 
-#: Share of the steps of a clock that may be zero.
-_STANDS_STILL = 0.2
+#: Share of the steps of a clock that may be zero, and precision of a rate that it tells.
+_STANDS_STILL, _PRECISE = 0.2, 0.005
+
+#: Numbers at which clocks begin anew, in the unit of the file: counters of 16 to 32 bits, decimal
+#: ones, and minutes, hours, half days and days.
+_WRAPS = (2.0**16, 2.0**24, 2.0**31, 2.0**32, *(10.0**k for k in range(2, 10)), 60.0, 3600.0)
+_WRAPS += (43_200.0, 86_400.0, 3_600_000.0, 86_400_000.0)
+
+#: Share of the rows from which blanks of a column are those of a slower rate, and longest of them.
+_SPARSE, _BRIDGED = 0.05, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +64,7 @@ class Imported:
     columns: Mapping[str, str]  #: role of each column of the file that is used.
     understood: tuple[str, ...]  #: what was understood, a sentence each.
     warnings: tuple[str, ...]  #: what may be wrong, a sentence each.
+    bad: tuple[BadSamples, ...] = ()  #: samples that were left out, in the unit of the file.
 
     @property
     def preview(self) -> str:
@@ -86,6 +93,16 @@ class Imported:
             },
             "understood": list(self.understood),
             "warnings": list(self.warnings),
+            "left_out": [
+                {
+                    "column": each.column,
+                    "kind": each.kind,
+                    "count": len(each.rows),
+                    "share": each.share,
+                    "rows": (each.rows[:1000] + 1).tolist(),
+                }
+                for each in self.bad
+            ],
         }
 
 
@@ -101,6 +118,8 @@ def import_recording(
     invert: Iterable[str] = (),
     offsets: Mapping[str, float] | None = None,
     select: Mapping[str, str] | None = None,
+    missing: Iterable[float] = (),
+    words: Mapping[str, float] | None = None,
     skip_bad_breaths: bool = False,
     separator: str | None = None,
     decimal: str | None = None,
@@ -108,12 +127,14 @@ def import_recording(
     """Read a recording of another laboratory.
 
     Args:
-        path: text with any separator (also gzipped), a spreadsheet, Parquet, MATLAB, EDF, BDF, or
-            the header (.hea) of a WFDB record; or what has been read of one.
+        path: text with any separator (also gzipped), JSON, a spreadsheet, Parquet, MATLAB, EDF,
+            BDF, the header (.hea) of a WFDB record, MCAP, or a bag of ROS; or what has been read of
+            one.
         columns: role of each column, ``{"Paw": "pressure"}``; the roles are ``time``,
-            ``pressure``, ``flow``, ``volume``, ``u_in``, ``u_out``, ``R``, ``C``, ``breath``,
-            ``group`` (a breath ends where it changes), ``target`` (inspiration is where it is
-            high) and ``unused``. Columns of usual names need none.
+            ``pressure``, ``flow`` (or ``flow_in`` and ``flow_out``, one-way flows), ``volume``,
+            ``u_in``, ``u_out``, ``R``, ``C``, ``breath``, ``group`` (a breath ends where it
+            changes), ``target`` (inspiration is where it is high) and ``unused``. Columns whose
+            headers are understood (see :mod:`.headers`) need none.
         units: unit by role where it is not that of the header or of the schema,
             ``{"flow": "L/min"}``.
         layout: name of a known layout, see :data:`~.layouts.LAYOUTS`; recognised if None.
@@ -124,13 +145,15 @@ def import_recording(
         offsets: what is added by role, in the unit of the file, ``{"pressure": -1013.25}``.
         select: values that columns must have, ``{"run": "a", "test": "1"}``; other rows are left
             out.
+        missing: values that stand for a missing one, such as -99.
+        words: numbers that words in cells stand for, ``{"open": 1, "closed": 0}``.
         skip_bad_breaths: leave out breaths that the schema cannot hold, and name them.
         separator: separator of the cells; found out if None.
         decimal: ``"."`` or ``","``; found out if None.
 
     Raises:
-        InputError: if a column is missing, a unit is unknown, there is no breath, or columns are
-            not what they are called.
+        InputError: if a column that is needed is missing or not understood, a unit is unknown,
+            there is no breath, or columns are not what they are called.
 
     Example:
         >>> import ventbench
@@ -142,26 +165,40 @@ def import_recording(
     if not isinstance(table, Table):
         table = read_table(table, separator=separator, decimal=decimal)
     table, selected = _selected(table, dict(select or {}))
+    layout = layout or recognise(table.columns)
     known = _layout(layout, table)
-    roles = _roles(table, dict(columns or {}), known)
-    by_role = {role: name for name, role in roles.items() if role not in ("group",)}
-    if "pressure" not in by_role:
-        raise InputError(
-            f"{table.file}: no column is the pressure; the columns are "
-            f"{', '.join(table.columns)}. Say which with --map NAME=pressure"
-        )
+    roles = _roles(table, dict(columns or {}), known, rate)
+    by_role = {role: name for name, role in roles.items() if role not in ("group", "unused")}
     changes = _conversions(table, by_role, dict(units or {}), known)
     notes, warnings = [*table.notes, *selected], []
     if known is not None:
-        notes.append(f"Layout {known.name}: {known.about}.")
-    added = dict(offsets or {})
-    values = {
-        role: changes[role].apply(_numbers(table, name) + added.pop(role, 0.0))
+        notes.append(f"Layout {layout}: {known.about}.")
+    spoken = (known.words if known is not None else {}) | dict(words or {})
+    raw = {
+        role: _numbers(table, name, spoken)
         for role, name in by_role.items()
-        if role in _MEASURED and not (role == "time" and rate is not None)
+        if role != "breath" and not (role == "time" and rate is not None)
     }
-    if added:
-        raise InputError(f"--offset {next(iter(added))}: no column is {next(iter(added))}")
+    table, raw, said = _once(table, raw)
+    notes += said
+    measured = {role: raw[role] for role in (*MEASURED, "u_in") if role in raw}
+    bad = find_bad_samples(measured, tuple(missing))
+    raw |= without(measured, bad)
+    said = [_of_file(each, table, by_role) for each in bad]
+    warnings += said
+    added = dict(offsets or {})
+    if unknown := set(added) - set(raw):
+        raise InputError(f"--offset {min(unknown)}: no column is {min(unknown)}")
+    if "time" in raw:
+        raw["time"], said = _continued(table, raw["time"])
+        notes += said
+    values = {
+        role: changes[role].apply(x + added[role] if role in added else x)
+        for role, x in raw.items()
+        if role in changes
+    }
+    other = {role: x for role, x in raw.items() if role not in changes}
+    _net_flow(values)
     for role in ("flow", "volume"):
         if role in values and not np.isfinite(values[role]).any():
             notes.append(f"Column {by_role[role]} is blank throughout.")
@@ -171,11 +208,6 @@ def import_recording(
             f"{table.file}, column {by_role['pressure']}: every pressure is blank, so there is "
             "nothing to compare a simulator with"
         )
-    other = {
-        role: _numbers(table, name)
-        for role, name in by_role.items()
-        if role not in _MEASURED and role not in ("group", "breath")
-    }
     _invert(values, other, invert)
     _check_signs(table, by_role, values, changes)
     keys = [
@@ -184,13 +216,16 @@ def import_recording(
         if role == "group" or (role == "breath" and not split_breaths)
     ]
     groups = [_labels(table.columns[n]) for n, role in roles.items() if role == "group"]
-    time, how = _time(table, values.get("time"), rate, keys)
+    time, how = _time(table, by_role, values.get("time"), rate, keys)
     notes.append(how)
+    notes += _bridge(values, time, by_role)
     unused = [name for name in table.columns if roles.get(name, "unused") == "unused"]
     unused += [by_role["time"]] if rate is not None and "time" in by_role else []
     if unused:
         notes.append(f"Columns that are not used: {', '.join(unused)}.")
-    pieces, how = find_breaths(table.file, time, values, other, keys, groups, known)
+    pieces, how = find_breaths(
+        table.file, time, values, other, keys, groups, known.lead if known else 0.0
+    )
     notes.append(how)
     R, C, how = _lung(lung, other, len(table))
     notes.append(how)
@@ -222,11 +257,12 @@ def import_recording(
     few = few_breaths(len(breaths))
     found = check_roles(breaths)
     if found and found[0].level == "refused":
-        raise InputError(f"{table.file}, column {by_role.get(found[0].column)}: {found[0]}")
+        column = by_role.get(found[0].column, found[0].column)
+        raise InputError(f"{table.file}, column {column}: {found[0]}")
     warnings += [str(finding) for finding in found]
     notes += [few] if few is not None else []
     used = {name: role for name, role in roles.items() if role != "unused"}
-    return Imported(breaths, changes, used, tuple(notes), tuple(warnings))
+    return Imported(breaths, changes, used, tuple(notes), tuple(warnings), bad)
 
 
 def import_runs(path: str | Path) -> dict[str, Breaths]:
@@ -242,7 +278,7 @@ def import_runs(path: str | Path) -> dict[str, Breaths]:
     from pyarrow import parquet
 
     try:
-        layout = recognise(tuple(parquet.read_schema(path).names))
+        layout = LAYOUTS.get(recognise(parquet.read_schema(path).names) or "")
     except (pa.ArrowException, OSError):
         return {}
     groups = [name for name, role in layout.columns.items() if role == "group"] if layout else []
@@ -295,7 +331,7 @@ def _same(cell: Any, value: str) -> bool:
 
 def _layout(name: str | None, table: Table) -> Layout | None:
     if name is None:
-        return recognise(tuple(table.columns))
+        return None
     if name not in LAYOUTS:
         raise InputError(f"--layout {name}: choose one of {', '.join(LAYOUTS)}")
     missing = [c for c in LAYOUTS[name].required if c not in table.columns]
@@ -306,28 +342,30 @@ def _layout(name: str | None, table: Table) -> Layout | None:
     return LAYOUTS[name]
 
 
-def _roles(table: Table, given: dict[str, str], layout: Layout | None) -> dict[str, str]:
-    """Role of each column: as given, by the layout, by its usual name; the first of each role."""
-    for name, role in given.items():
-        if role not in ROLES:
-            raise InputError(f"--map {name}={role}: a column may be {', '.join(ROLES)}")
-        if name not in table.columns:
-            close = get_close_matches(name, table.columns, n=1)
-            hint = f" Perhaps {close[0]!r}." if close else ""
-            raise InputError(
-                f"--map {name}={role}: {table.file} has no column {name!r}; it has "
-                f"{', '.join(table.columns)}.{hint}"
-            )
-    roles = dict(given)
-    taken = {role for role in given.values() if role not in ("group", "unused")}
-    known = layout.columns if layout is not None else {}
+def _roles(
+    table: Table, mapped: dict[str, str], layout: Layout | None, rate: float | None
+) -> dict[str, str]:
+    """Role of each column: as mapped, by the layout, by its header; the first of each role."""
+    roles = _mapped(table, mapped)
+    taken = {role for role in roles.values() if role not in ("group", "unused")}
     alike: dict[str, list[str]] = {}
     for name in table.columns:
-        role = known.get(name) or (USUAL.get(stem(name)) if layout is None else None)
-        if name not in roles and role == "group":
+        if name in roles:
+            continue
+        if layout is not None:
+            role = layout.columns.get(name)
+        else:
+            header = table.header(name)
+            role = header.role if header.certain else None
+            role = f"{role}_{header.side}" if role and header.side else role
+        if role in ("group", "unused"):
             roles[name] = role
-        elif name not in roles and role is not None and role not in taken:
+        elif role is not None and role not in taken:
             alike.setdefault(role, []).append(name)
+    one_way = {"flow_in", "flow_out"} & (alike.keys() | taken)
+    if "flow" in alike.keys() | taken or len(one_way) == 1:
+        for role in one_way:
+            alike.pop(role, None)
     for role, names in alike.items():
         _check_alike(table, role, names)
         roles[names[0]] = role
@@ -335,7 +373,64 @@ def _roles(table: Table, given: dict[str, str], layout: Layout | None) -> dict[s
         names = [name for name, own in roles.items() if own == role]
         if len(names) > 1:
             raise InputError(f"columns {' and '.join(names)} are both {role}; map one of them")
+    _check_needed(table, roles, layout, rate)
     return roles
+
+
+def _mapped(table: Table, mapped: dict[str, str]) -> dict[str, str]:
+    """Roles of columns that a user maps, by their names in the table."""
+    headers = {text: name for name, text in table.headers.items()}
+    roles = {}
+    for given, role in mapped.items():
+        name = given if given in table.columns else headers.get(given, read_header(given).name)
+        if role not in ROLES:
+            raise InputError(f"--map {given}={role}: a column may be {', '.join(ROLES)}")
+        if name not in table.columns:
+            close = get_close_matches(given, table.columns, n=1)
+            hint = f" Perhaps {close[0]!r}." if close else ""
+            raise InputError(
+                f"--map {given}={role}: {table.file} has no column {given!r}; it has "
+                f"{', '.join(table.columns)}.{hint}"
+            )
+        roles[name] = role
+    return roles
+
+
+#: Roles one of which a file needs, and what they are in words.
+_NEEDED = {
+    "the pressure": ("pressure",),
+    "the time": ("time",),
+    "the flow, the volume or the command of a valve": ("flow", "flow_in", "volume", "u_in"),
+}
+
+
+def _check_needed(
+    table: Table, roles: Mapping[str, str], layout: Layout | None, rate: float | None
+) -> None:
+    """Ask for a column that is needed and not understood, with the option that says it."""
+    has = set(roles.values())
+    timed = rate or table.rate or any(table.header(name).interval for name in table.columns)
+    for what, wanted in _NEEDED.items():
+        if has & set(wanted) or (wanted == ("time",) and timed):
+            continue
+        headers = {name: table.header(name) for name in table.columns if name not in roles}
+        headers = {n: x for n, x in headers.items() if table.columns[n].dtype.kind in "fiub"}
+        likely = [name for name, header in headers.items() if header.role in wanted]
+        open_ = likely or [name for name, x in headers.items() if not (x.role or x.excluded)]
+        if len(wanted) > 1 and (not open_ or layout is not None):
+            continue
+        columns = f"{table.file}: no column is {what}; the columns are {', '.join(table.columns)}"
+        role = next((headers[n].role for n in likely), None) or wanted[0]
+        option = f"--map {quote((open_ or ['NAME'])[0])}={role}"
+        if wanted == ("time",):
+            raise InputError(
+                f"{columns}. Say which with {option}, or give the sampling rate with --rate 50"
+            )
+        way_out = ""
+        if len(wanted) > 1:
+            others = " ".join(f"--map {quote(name)}=unused" for name in open_)
+            way_out = f"; or, if none of them is, {others}"
+        raise InputError(f"{columns}. Say which with {option}{way_out}")
 
 
 def _check_alike(table: Table, role: str, names: Sequence[str]) -> None:
@@ -363,20 +458,124 @@ def _conversions(
         if role not in _MEASURED:
             raise InputError(f"{role} has no unit; units are for {', '.join(_MEASURED)}")
     known = layout.units if layout is not None else {}
+
+    def unit(role: str, name: str) -> str | None:
+        header = table.header(name).unit if layout is None else None
+        return units.get(role) or known.get(role) or header or table.units.get(name)
+
     return {
-        role: conversion(role, units.get(role) or table.units.get(name) or known.get(role))
+        role: conversion(
+            role.partition("_")[0] if "flow" in role else role,
+            unit(role.partition("_")[0] if "flow" in role else role, name),
+        )
         for role, name in by_role.items()
-        if role in _MEASURED
+        if role in _MEASURED or role in ("flow_in", "flow_out")
     }
 
 
-def _numbers(table: Table, name: str) -> Floats:
+def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:
+    """Numbers of a column, in which words may stand for some."""
     values = table.columns[name]
-    if values.dtype.kind not in "fiub":
-        raise InputError(
-            f"{table.file}, column {name}: its cells are no numbers, such as {str(values[0])!r}"
+    if values.dtype.kind in "fiub":
+        return np.asarray(values, float)
+    spoken = {word.casefold(): number for word, number in words.items()}
+    kinds, which = np.unique(np.char.lower(values.astype(str)), return_inverse=True)
+    numbers = np.full(len(kinds), np.nan)
+    for k, word in enumerate(kinds.tolist()):
+        if word.casefold() in spoken:
+            numbers[k] = spoken[word.casefold()]
+        elif word:
+            try:
+                numbers[k] = float(word)
+            except ValueError:
+                shown = [str(x) for x in dict.fromkeys(values.tolist()) if x][:2]
+                option = ",".join(f"{x}={1 - n}" for n, x in enumerate(shown))
+                raise InputError(
+                    f"{table.file}, column {name}: its cells are no numbers, such as {shown[0]!r}; "
+                    f"say what they stand for, such as --map-values {quote(option)}"
+                ) from None
+    return numbers[which.reshape(-1)]
+
+
+def _once(table: Table, raw: dict[str, Floats]) -> tuple[Table, dict[str, Floats], list[str]]:
+    """Rows, without those that are there twice."""
+    repeats = repeated_rows(raw)
+    if not repeats.any():
+        return table, raw, []
+    count, first = int(repeats.sum()), table.place(int(np.argmax(repeats)))
+    said = f"{count} rows that repeat the row before were left out, the first in {first}."
+    return _rows(table, ~repeats), {k: x[~repeats] for k, x in raw.items()}, [said]
+
+
+def _of_file(bad: BadSamples, table: Table, by_role: Mapping[str, str]) -> str:
+    """What was left out, by the name and the lines of the file."""
+    at = bad.rows[:6].tolist()
+    first = [int(row) + 1 if table.lines is None else int(table.lines[row]) for row in at]
+    what = bad.what("rows" if table.lines is None else "lines", first)
+    return what.replace(f"of {bad.column} ", f"of {by_role[bad.column]} ", 1) + "."
+
+
+def _net_flow(values: dict[str, Floats]) -> None:
+    """Replace two one-way flows by their difference."""
+    if "flow_in" in values:
+        out = values.pop("flow_out")
+        outward = 1.0 if np.nanmean(out) >= 0.0 else -1.0
+        values["flow"] = values.pop("flow_in") - outward * out
+
+
+def _continued(table: Table, time: Floats) -> tuple[Floats, list[str]]:
+    """Times, in the unit of the file, continued over the wraps of a counter; and where it jumps."""
+    at = np.flatnonzero(np.isfinite(time))
+    steps = np.diff(time[at])
+    back = np.flatnonzero(steps < 0)
+    if len(back) == 0 or not (steps > 0).any():
+        return time, []
+    usual, time, wraps, resets = float(np.median(steps[steps > 0])), time.copy(), [], []
+    for k in back.tolist():
+        size = next((w for w in _WRAPS if 0.0 < steps[k] + w <= 2.5 * usual), None)
+        place = table.place(int(at[k + 1]))
+        if size is None:
+            resets.append(place)
+        else:
+            wraps.append(f"{place} (at {size:.10g})")
+            time[at[k + 1] :] += size
+    said = []
+    if wraps:
+        said.append(f"The clock wraps in {_few(wraps)}; it was continued.")
+    if resets and len(resets) <= max(3, len(time) // 1000):
+        said.append(f"The clock begins anew in {_few(resets)}; no breath goes on over that.")
+    return time, said
+
+
+def _few(items: Sequence[str]) -> str:
+    more = f" and {len(items) - 3} more places" if len(items) > 3 else ""
+    return ", ".join(items[:3]) + more
+
+
+def _bridge(values: dict[str, Floats], time: Floats, by_role: Mapping[str, str]) -> list[str]:
+    """Interpolate the blanks of columns that come at a slower rate than the rows."""
+    said = []
+    for role in (role for role in (*MEASURED, "u_in") if role in values):
+        known = np.isfinite(values[role])
+        if known.mean() > 1.0 - _SPARSE or known.sum() < 2:
+            continue
+        at = np.flatnonzero(known)
+        every = float(np.median(np.diff(at)))
+        if every < 2:
+            continue
+        bridged = np.interp(np.arange(len(known)), at, values[role][at])
+        if role == "u_in":  # a command stays until the next
+            bridged = values[role][at][np.searchsorted(at, np.arange(len(known)), side="right") - 1]
+        before = np.searchsorted(at, np.arange(len(known)), side="right") - 1
+        after = np.minimum(before + 1, len(at) - 1)
+        near = (before >= 0) & (at[after] - at[np.maximum(before, 0)] <= 2.0 * every)
+        near &= ~(time[at[after]] - time[at[np.maximum(before, 0)]] > _BRIDGED)
+        values[role] = np.where(known | ~near, values[role], bridged)
+        said.append(
+            f"{by_role.get(role, role)} is known in one of {every:g} rows; between, it was "
+            + ("held." if role == "u_in" else "interpolated.")
         )
-    return np.asarray(values, float)
+    return said
 
 
 def _labels(values: NDArray[Any]) -> Ints:
@@ -385,20 +584,21 @@ def _labels(values: NDArray[Any]) -> Ints:
 
 
 def _time(
-    table: Table, time: Floats | None, rate: float | None, keys: list[Ints]
+    table: Table,
+    by_role: Mapping[str, str],
+    time: Floats | None,
+    rate: float | None,
+    keys: list[Ints],
 ) -> tuple[Floats, str]:
     """Time of each row, s; NaN where the file leaves it blank."""
+    if rate is not None and rate <= 0:
+        raise InputError(f"--rate {rate:g}: a positive rate in Hz is needed")
     if rate is not None:
-        if rate <= 0:
-            raise InputError(f"--rate {rate:g}: a positive rate in Hz is needed")
         return np.arange(len(table)) / rate, f"Sampling rate {rate:g} Hz, as given."
     if time is None:
-        if table.rate is None:
-            raise InputError(
-                f"{table.file}: no column is the time; say which with --map NAME=time, or give "
-                "the sampling rate with --rate 50"
-            )
-        return np.arange(len(table)) / table.rate, f"Sampling rate {table.rate:g} Hz, of the file."
+        stated = next(filter(None, (table.header(n).interval for n in by_role.values())), None)
+        rate = table.rate or 1.0 / (stated or np.nan)
+        return np.arange(len(table)) / rate, f"Sampling rate {rate:g} Hz, of the file."
     steps = np.diff(time)
     inside = np.isfinite(steps)
     for key in keys:
@@ -407,15 +607,17 @@ def _time(
         return time, "Times are blank in part."
     onwards = steps[inside & (steps > 0)]
     if len(onwards) == 0:
-        raise InputError(f"{table.file}: the time does not increase")
+        raise InputError(f"{table.file}: the time does not increase; give --rate in its place")
     median = float(np.median(onwards))
     if (steps[inside] == 0).mean() > _STANDS_STILL:
-        rows_per_step = float(np.median(np.diff(np.flatnonzero(steps > 0))))
-        guess = rows_per_step / median
+        forward = inside & (steps >= 0) & (steps <= 5.0 * median)
+        rows, seconds = int(forward.sum()), float(steps[forward].sum())
+        advice = "the sampling rate with --rate, which such a clock does not tell"
+        if median / seconds < _PRECISE:
+            advice = f"the sampling rate, such as --rate {_plain(rows / seconds, median / seconds)}"
         raise InputError(
             f"{table.file}: the clock has steps of {1e3 * median:.4g} ms for "
-            f"{rows_per_step:.3g} rows each; give the sampling rate, such as "
-            f"--rate {guess:.4g}"
+            f"{rows * median / seconds:.3g} rows each; give {advice}"
         )
     if median > SLOW:
         raise InputError(
@@ -423,6 +625,12 @@ def _time(
             "1000 Hz; give --time-unit ms, or the sampling rate with --rate 100"
         )
     return time, f"Sampling interval {1e3 * median:.4g} ms (median), {1 / median:.4g} Hz."
+
+
+def _plain(rate: float, precision: float) -> str:
+    """The roundest number within the precision of a rate."""
+    digits = next(d for d in range(1, 12) if abs(float(f"{rate:.{d}g}") / rate - 1.0) < precision)
+    return f"{float(f'{rate:.{digits}g}'):g}"
 
 
 def _lung(given: str | None, other: Mapping[str, Floats], count: int) -> tuple[Floats, Floats, str]:

@@ -1,14 +1,17 @@
 """Tables of numbers from files of every kind: recognised by their first bytes, read by a library.
 
-Parquet (pyarrow), MATLAB (scipy), EDF and BDF (pyedflib), and WFDB (wfdb). Nothing is resampled.
+Parquet (pyarrow), JSON, MATLAB (scipy), EDF and BDF (pyedflib), WFDB (wfdb), MCAP (mcap) and bags
+of ROS (rosbags). Nothing is resampled.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError, require
-from ventbench.recordings.foreign.layouts import USUAL, spelled, stem, unit_of
-from ventbench.recordings.foreign.tables import RATES, Table, read_spreadsheet, read_text
+from ventbench.recordings.foreign.tables import (
+    RATES,
+    Table,
+    decoded,
+    named,
+    read_spreadsheet,
+    read_text,
+)
+from ventbench.recordings.headers import read_header
 
 
 def read_table(
@@ -33,12 +43,16 @@ def read_table(
     """
     file, path = str(path), Path(path)
     if not path.is_file():
+        if (path / "metadata.yaml").is_file():
+            return _rosbag(file)
         what = "is a folder" if path.is_dir() else "does not exist"
         raise InputError(f"{file} {what}; name a CSV, Parquet or .mat file")
     with open(path, "rb") as stream:
         first = stream.read(128)
     if not first:
         raise InputError(f"{file} is empty")
+    if first.startswith(b"\x1f\x8b"):
+        first = decoded(file)[0][:128]
     if first.startswith(b"PAR1"):
         return _parquet(file)
     if first.startswith(b"MATLAB 5.0"):
@@ -52,6 +66,14 @@ def read_table(
         return _edf(file)
     if path.suffix == ".hea":
         return _wfdb(file)
+    if first.startswith(b"\x89MCAP"):
+        return _mcap(file)
+    if first.startswith((b"#ROSBAG", b"SQLite format 3")):
+        return _rosbag(file)
+    if first.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"["):
+        content = _json(file)
+        if content is not None:
+            return content
     if first.startswith(b"PK\x03\x04"):
         return read_spreadsheet(file)
     return read_text(file, separator, decimal)
@@ -65,9 +87,9 @@ def _parquet(file: str) -> Table:
         frame = parquet.read_table(file).to_pandas()
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{file} cannot be read ({str(error).splitlines()[0]})") from None
-    columns, units = {}, {}
-    for header in frame.columns:
-        name, unit = unit_of(str(header))
+    names = named([str(header) for header in frame.columns])
+    columns = {}
+    for name, header in zip(names, frame.columns, strict=True):
         values = frame[header]
         kind = values.dtype.kind
         if kind == "M":
@@ -76,11 +98,9 @@ def _parquet(file: str) -> Table:
             columns[name] = values.to_numpy(float)
         else:
             columns[name] = values.astype(str).to_numpy(str)
-        if unit:
-            units[name] = unit
     if not columns or len(frame) == 0:
         raise InputError(f"{file} holds no rows")
-    return Table(file, columns, units, None, None, ("Parquet.",))
+    return Table(file, columns, notes=("Parquet.",), headers=names)
 
 
 def _matlab(file: str) -> Table:
@@ -123,8 +143,7 @@ def _variables(file: str, content: dict[str, Any]) -> Table:
         notes.append(f"Columns of other lengths were left out ({', '.join(others[:5])}).")
     named = {re.sub(r"[^a-z]", "", n.rpartition(".")[2].lower()): v for n, v in scalars.items()}
     rate = next((named[name] for name in RATES if named.get(name, 0.0) > 0.0), None)
-    units = {name: unit for name in columns if (unit := unit_of(name)[1])}
-    return Table(file, columns, units, None, rate, tuple(notes))
+    return Table(file, columns, rate=rate, notes=tuple(notes))
 
 
 def _flatten(
@@ -163,7 +182,7 @@ def _channels(
 ) -> Table:
     """The channels that share the pressure's rate, or else the commonest."""
     rate = next(
-        (r for name, r in zip(names, rates, strict=True) if USUAL.get(stem(name)) == "pressure"),
+        (r for name, r in zip(names, rates, strict=True) if read_header(name).role == "pressure"),
         Counter(rates).most_common(1)[0][0] if rates else 0.0,
     )
     columns: dict[str, NDArray[Any]] = {}
@@ -175,7 +194,7 @@ def _channels(
             name += "_"
         columns[name] = np.asarray(signal, float)
         if unit and unit != "NU":  # WFDB's "no units"
-            spelt[name] = spelled(unit)
+            spelt[name] = unit
     if not columns or not len(next(iter(columns.values()))):
         raise InputError(f"{file} holds no signal; name the file of the waveforms")
     notes = [f"{kind} with {len(columns)} signals at {rate:g} Hz."]
@@ -220,3 +239,148 @@ def _wfdb(file: str) -> Table:
     return _channels(
         file, "WFDB", record.sig_name or (), record.units or (), rates, record.e_p_signal or ()
     )
+
+
+def _json(file: str) -> Table | None:
+    """Rows of a JSON document, or of a line each; None if the text is no JSON."""
+    text = decoded(file)[0]
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError:
+        try:
+            content = [json.loads(line) for line in text.splitlines() if line.strip()]
+        except json.JSONDecodeError:
+            return None
+    if (columns := _rows_within(content)) is None:
+        raise InputError(
+            f"{file} is JSON without a table: a list of records, lists of equal length by name, or "
+            "rows beside a list of their names are wanted"
+        )
+    return _of_values(file, columns, "JSON")
+
+
+def _rows_within(content: Any) -> dict[str, Sequence[Any]] | None:
+    """The longest table in a document: records, named lists, or rows beside their names."""
+    found: list[dict[str, Sequence[Any]]] = []
+    if isinstance(content, list) and len(content) > 1 and all(isinstance(x, dict) for x in content):
+        records = [_flat(record) for record in content]
+        names = dict.fromkeys(name for record in records[:1000] for name in record)
+        found.append({name: [record.get(name) for record in records] for name in names})
+    elif isinstance(content, dict):
+        lists = {name: x for name, x in content.items() if isinstance(x, list) and len(x) > 1}
+        plain = {k: x for k, x in lists.items() if not isinstance(x[0], dict | list)}
+        for rows in (x for x in lists.values() if isinstance(x[0], list)):
+            names = next((x for x in plain.values() if len(x) == len(rows[0])), None)
+            if names is not None and all(len(row) == len(names) for row in rows):
+                columns = zip(*rows, strict=True)
+                found.append(dict(zip(map(str, names), columns, strict=True)))
+        longest = max(map(len, plain.values()), default=0)
+        found.append({name: x for name, x in plain.items() if len(x) == longest})
+        found += filter(None, map(_rows_within, content.values()))
+    return max(
+        (x for x in found if len(x) > 1), key=lambda x: len(next(iter(x.values()))), default=None
+    )
+
+
+def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A record without records in it: their names are joined by points."""
+    flat: dict[str, Any] = {}
+    for name, value in record.items():
+        flat |= (
+            _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+        )
+    return flat
+
+
+def _of_values(file: str, columns: dict[str, Sequence[Any]], kind: str) -> Table:
+    """Columns of any values: numbers where they are, words elsewhere."""
+    names = named(list(columns))
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, header in names.items():
+        values = ["" if value is None else value for value in columns[header]]
+        try:
+            arrays[name] = np.array([np.nan if value == "" else value for value in values], float)
+        except (TypeError, ValueError):
+            arrays[name] = np.array(list(map(str, values)))
+    note = f"{kind} with {len(arrays)} columns of {len(next(iter(arrays.values())))} rows."
+    return Table(file, arrays, notes=(note,), headers=names)
+
+
+def _mcap(file: str) -> Table:
+    """Messages in JSON of the topic with most of them; their times are those of the log."""
+    require("mcap", extra="mcap", what="MCAP files")
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    topics: dict[str, list[dict[str, Any]]] = {}
+    try:
+        with open(file, "rb") as stream:
+            for _, channel, message in make_reader(stream).iter_messages():
+                if channel.message_encoding != "json":
+                    return _rosbag(file)
+                record = {"time": 1e-9 * message.log_time} | _flat(json.loads(message.data))
+                topics.setdefault(channel.topic, []).append(record)
+    except (McapError, OSError, ValueError) as error:
+        raise InputError(f"{file} cannot be read as MCAP ({error})") from None
+    return _of_topics(file, topics, "MCAP")
+
+
+def _rosbag(file: str) -> Table:
+    """Messages of the topic with most of them; the times are those at which they were recorded."""
+    require("rosbags", extra="ros", what="bags of ROS")
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
+
+    topics: dict[str, list[dict[str, Any]]] = {}
+    path = Path(file)
+    store = get_typestore(Stores.LATEST)
+    try:
+        with AnyReader(
+            [path if path.is_dir() or path.suffix == ".bag" else path.parent],
+            default_typestore=store,
+        ) as bag:
+            for connection, at, data in bag.messages():
+                message = bag.deserialize(data, connection.msgtype)
+                record = {"time": 1e-9 * at} | _flat(_fields(message))
+                topics.setdefault(connection.topic, []).append(record)
+    except (AnyReaderError, OSError) as error:
+        raise InputError(f"{file} cannot be read as a bag of ROS ({error})") from None
+    return _of_topics(file, topics, "ROS bag")
+
+
+def _fields(message: Any) -> dict[str, Any]:
+    """Numbers and words of a message, and of those within it but their headers."""
+    values: dict[str, Any] = {}
+    for name, value in vars(message).items():
+        if hasattr(value, "__dict__") and not isinstance(value, np.ndarray):
+            values |= {} if name == "header" else {name: _fields(value)}
+        elif isinstance(value, bool | int | float | str) and not name.startswith("__"):
+            values[name] = value
+    return values
+
+
+def _of_topics(file: str, topics: dict[str, list[dict[str, Any]]], kind: str) -> Table:
+    """The topics of the most messages as one table: a row a time, the last value of each."""
+    if not topics:
+        raise InputError(f"{file} holds no messages")
+    most = max(map(len, topics.values()))
+    used = {topic: rows for topic, rows in topics.items() if 2 * len(rows) >= most}
+    names = {key for rows in used.values() for key in rows[0]} - {"time"}
+    unique = len(used) == 1 or sum(len(rows[0]) - 1 for rows in used.values()) == len(names)
+    rows = sorted(
+        (
+            {"time": row["time"]}
+            | {k if unique else f"{topic}/{k}": x for k, x in row.items() if k != "time"}
+            for topic, rows in used.items()
+            for row in rows
+        ),
+        key=lambda row: row["time"],
+    )
+    columns = dict.fromkeys(key for row in rows for key in row)
+    left = [topic for topic in topics if topic not in used]
+    table = _of_values(file, {key: [row.get(key) for row in rows] for key in columns}, kind)
+    notes = [
+        *table.notes,
+        *([f"Topics of fewer messages were left out ({', '.join(left)})."] if left else []),
+    ]
+    return replace(table, notes=tuple(notes))

@@ -1,8 +1,9 @@
 """Tables of numbers from text of any dialect and from spreadsheets.
 
-Text is split once, by the separator and the decimal mark that make most cells numbers. The first
-three lines of numbers in a row begin the data; names and units stand above them. What stands
-between rows and is none, such as an alarm, is left out and named.
+The first lines tell the separator and the decimal mark that make most cells numbers; the first
+three lines of numbers in a row begin the data, and names and units stand above them. pyarrow reads
+the rest. Only lines of another length, and columns in which a cell is no number, are looked at one
+by one. What stands between rows and is none, such as an alarm, is left out and named.
 """
 
 from __future__ import annotations
@@ -11,18 +12,20 @@ import csv
 import gzip
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Floats, Ints
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError, require
-from ventbench.recordings.foreign.layouts import UNITS, is_unit, spelled, unit_of
+from ventbench.recordings.headers import UNITS, Header, is_unit, read_header
+from ventbench.recordings.sources import to_numpy
 
-#: Lines that decide on separator, decimal mark and header, and of those, the ones that are split.
+#: Lines that decide on separator, decimal mark and header.
 _LOOKED_AT = 400
 
 #: Separators, the likelier first.
@@ -46,16 +49,21 @@ _CLOCK = re.compile(
     r"(?:Z|[+-]\d{2}:?\d{2})?"
 )
 
-#: Names of a sampling rate, Hz, and of an interval, above a table or beside it.
+#: Names of a sampling rate, Hz, and of an interval, s, above a table or beside it.
 RATES = ("fs", "rate", "samplingrate", "samplerate", "freq", "frequency", "samplingfrequency")
+_INTERVALS = ("interval", "samplinginterval", "sampleinterval", "dt", "deltax")
+
+#: First cells of lines that hold names, and units, of the columns right of them.
+_TITLES, _UNIT_TITLES = (
+    ("channeltitle", "channels", "titles", "names"),
+    ("unitname", "units", "unit"),
+)
 
 #: Share of the lines that may be no rows before a file is refused, and number of lines anyway.
 _STRAY, _STRAY_LINES = 0.01, 20
 
 #: First lines of what a Servo ventilator exports beside recordings.
 _NO_WAVEFORMS = {"[TRE]": "trends", "[RECRUITMENT]": "a manoeuvre", "[LOG]": "events"}
-
-_Row: TypeAlias = tuple[int, list[str]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,18 +74,35 @@ class Table:
     #: values by name, float64 with NaN for blank, ``(m,)``; text only where no cell is a number.
     #: Times of day are seconds.
     columns: dict[str, NDArray[Any]]
-    units: dict[str, str] = field(default_factory=dict)  #: units that headers state, by name.
+    units: dict[str, str] = field(default_factory=dict)  #: units beside the names, by name.
     lines: Ints | None = None  #: line of each row in a text file, ``(m,)``, else None.
     rate: float | None = None  #: sampling rate that stands beside the columns, Hz, or None.
     notes: tuple[str, ...] = ()  #: what was understood, a sentence each.
+    headers: dict[str, str] = field(default_factory=dict)  #: headers as written, by name.
 
     def __len__(self) -> int:
         """Number of rows."""
         return len(next(iter(self.columns.values())))
 
+    def header(self, name: str) -> Header:
+        """What the header of a column says, with the unit beside it."""
+        text, unit = self.headers.get(name, name), self.units.get(name)
+        return read_header(f"{text} [{unit}]" if unit and is_unit(unit) else text)
+
     def place(self, row: int) -> str:
         """Where a row stands in the file, in words."""
         return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+
+
+def named(headers: Sequence[str]) -> dict[str, str]:
+    """Headers by the names of their columns: without units, and each once."""
+    names: dict[str, str] = {}
+    for k, text in enumerate(headers):
+        name = read_header(text).name or str(k + 1)
+        while name in names:
+            name += "_"
+        names[name] = text
+    return names
 
 
 def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
@@ -86,50 +111,49 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
         raise InputError(
             f"separator {separator!r}, decimal {decimal!r}: give marks such as ; and ,"
         )
-    text, encoding = _decoded(file)
-    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\N{MINUS SIGN}", "-")
-    lines = text.split("\n")
-    if not any(line.strip() for line in lines):
+    data, encoding = decoded(file)
+    if not data:
         raise InputError(f"{file} holds no text")
-    if re.match(r"\s*BS\b", next((x for x in lines if re.match(r"\s*B[SE]\b", x)), "")):
-        return _delimited_breaths(file, lines, encoding)
-    named = re.fullmatch(r"\ufeff?\"?sep=(.)\"?", lines[0].strip("\n"))
-    if named is not None:  # a spreadsheet's own line
-        separator, lines[0] = separator or named[1], ""
-    of_servo = _above_servo_data(file, lines)
-    if of_servo:
-        separator, lines[:of_servo] = separator or "\t", [""] * of_servo
-    looked_at = [line for line in lines[:_LOOKED_AT] if line.strip()]
-    separator, decimal = _dialect(file, looked_at, separator, decimal)
-    rows = [(k + 1, _cells(line, separator)) for k, line in enumerate(lines) if line.strip()]
-    shown = {"\t": "tab", " ": "blanks"}.get(separator, repr(separator))
-    note = f"Text ({encoding}), cells separated by {shown}, decimal {decimal!r}"
-    table = _table(file, rows, decimal, note, packed=separator == " ")
+    above = [line.decode() for line in data[: 1 << 20].split(b"\n", _LOOKED_AT)[:_LOOKED_AT]]
+    if re.match(r"\s*BS\b", next((x for x in above if re.match(r"\s*B[SE]\b", x)), "")):
+        return _delimited_breaths(file, data.decode().split("\n"), encoding)
+    stated = re.fullmatch(r"\"?sep=(.)\"?", above[0])
+    if stated is not None:  # a spreadsheet's own line
+        separator, above[0] = separator or stated[1], ""
+    if of_servo := _above_servo_data(file, above):
+        separator, above[:of_servo] = separator or "\t", [""] * of_servo
+    separator, decimal = _dialect(file, [x for x in above if x.strip()], separator, decimal)
+    table = _table(file, data, above, separator, decimal, f"Text ({encoding}), cells ")
     return _by_units(table) if of_servo else table
 
 
-def _decoded(file: str) -> tuple[str, str]:
+def decoded(file: str) -> tuple[bytes, str]:
+    """The text in UTF-8 with LF at the ends of lines, and the encoding of the file."""
     data = Path(file).read_bytes()
     if data.startswith(b"\x1f\x8b"):
         try:
             data = gzip.decompress(data)
         except (OSError, EOFError) as error:
             raise InputError(f"{file} cannot be unpacked ({error})") from None
-    zeros = data[:4096].count(0)
+    zeros, encoding = data[:4096].count(0), "UTF-8"
     if data.startswith((b"\xff\xfe", b"\xfe\xff")) or zeros > 0.3 * len(data[:4096]):
         wide = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le"
         try:
-            return data.decode(wide), "UTF-16"
-        except UnicodeDecodeError:
+            data, encoding = data.decode(wide).encode(), "UTF-16"
+        except UnicodeError:
             raise InputError(
                 f"{file} begins like UTF-16 text and is none; export it as CSV"
             ) from None
-    if zeros:
+    elif zeros:
         raise InputError(f"{file} is no text, Parquet or MATLAB file; export it as CSV")
-    try:
-        return data.decode("utf-8-sig"), "UTF-8"
-    except UnicodeDecodeError:
-        return data.decode("latin-1"), "Latin-1"
+    if not data.isascii():
+        try:
+            data = data.decode("utf-8-sig").replace("\N{MINUS SIGN}", "-").encode()
+        except UnicodeDecodeError:
+            data, encoding = data.decode("latin-1").encode(), "Latin-1"
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return data.rstrip(b" \n\0"), encoding
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -176,51 +200,129 @@ def _is_value(cell: str, mark: str) -> bool:
     return bool(_NUMBER[mark].fullmatch(cell) or (":" in cell and _CLOCK.fullmatch(cell)))
 
 
-def _table(file: str, rows: list[_Row], mark: str, note: str, packed: bool = False) -> Table:
-    """Rows of cells as columns: header, units, values, and lines that are none."""
-    looked_at = rows[:_LOOKED_AT]
+def _table(file: str, data: bytes, above: list[str], separator: str, mark: str, note: str) -> Table:
+    """Lines of cells as columns: header, units, values, and lines that are none."""
+    rows = [(k, _cells(line, separator)) for k, line in enumerate(above) if line.strip()]
+    begins = _first_numbers([cells for _, cells in rows], mark)
+    if begins is None:
+        raise InputError(f"{file}: no line of the first {len(rows)} is one of numbers")
+    widths = Counter(_width(cells) for _, cells in rows[begins:])
+    width = max(w for w, count in widths.items() if count >= 0.05 * sum(widths.values()))
+    texts = [cells for _, cells in rows[:begins]]
+    headers, units, notes = _header(file, texts, width, separator == " ")
+    names = named(headers)
+    first = rows[begins][0]
+    offset = sum(len(line) + 1 for line in data.split(b"\n", first)[:first])
+    cells, numbers, stray = _arrow(data, offset, len(names), separator, mark)
+    if len(stray) > max(_STRAY_LINES, _STRAY * len(numbers)):
+        raise InputError(
+            f"{file}, line {first + 1 + stray[0][0]}: {len(stray)} of {len(numbers) + len(stray)} "
+            f"lines are no rows of at most {len(names)} numbers, such as {stray[0][1][:60]!r}; "
+            "remove them, or give --separator"
+        )
+    columns, units, odd_cells, message = _columns(list(names), units, cells, mark, notes)
+    if message.any():
+        lines = data[offset:].split(b"\n")
+        stray += [(k, lines[k].decode()) for k in numbers[message].tolist()]
+        columns = {name: values[~message] for name, values in columns.items()}
+        numbers = numbers[~message]
+    if odd_cells:
+        notes.append(f"Cells that are no numbers are blank ({'; '.join(odd_cells)}).")
+    for number, line in sorted(stray)[:3]:
+        said = " ".join(_cells(line, separator))[:60]
+        notes.append(f"Line {first + 1 + number} is no row and was left out: {said!r}.")
+    if len(stray) > 3:
+        last = first + 1 + max(number for number, _ in stray)
+        notes.append(f"So were {len(stray) - 3} more lines, the last of them {last}.")
+    shown = {"\t": "tab", " ": "blanks"}.get(separator, repr(separator))
+    numbers = numbers + first + 1
+    notes.insert(
+        0, f"{note}separated by {shown}, decimal {mark!r}, first row in line {numbers[0]}."
+    )
+    return Table(file, columns, units, numbers, _rate(texts, mark), tuple(notes), names)
+
+
+def _first_numbers(rows: list[list[str]], mark: str) -> int | None:
+    """Index of the first of three rows of numbers; None if there is none."""
     good = []
-    for _, cells in looked_at:
+    for cells in rows:
         filled = _filled(cells)
         values = sum(_is_value(cell, mark) for cell in filled)
         good.append(values > len(filled) - values or (values and 2 * values >= len(cells) > 2))
-    runs = [k for k in range(len(good)) if all(good[k : k + 3])]
-    if not runs:
-        raise InputError(f"{file}: no line of the first {len(looked_at)} is one of numbers")
-    start = runs[0]
-    widths = Counter(_width(cells) for _, cells in looked_at[start:])
-    width = max(w for w, count in widths.items() if count >= 0.05 * sum(widths.values()))
-    names, units, notes = _header(file, looked_at[:start], width, packed)
-    width = len(names)
-    kept = [row for row in rows[start:] if _width(row[1]) <= width]
-    stray = [row for row in rows[start:] if _width(row[1]) > width]
-    columns, odd_cells, odd, filled = _columns(names, units, kept, mark, notes)
-    # A line with a word and hardly a number, between lines of numbers, is no row.
-    message = odd & (filled <= 1)
-    if message.any():
-        stray = sorted([*stray, *(kept[k] for k in np.flatnonzero(message))])
-        columns = {name: values[~message] for name, values in columns.items()}
-        odd_cells = {
-            name: cells for name, cells in odd_cells.items() if not message[cells[0]].all()
-        }
-    if len(stray) > max(_STRAY_LINES, _STRAY * len(kept)):
-        raise InputError(
-            f"{file}, line {stray[0][0]}: {len(stray)} of {len(rows) - start} lines are no rows of "
-            f"at most {width} numbers, such as {' '.join(stray[0][1])[:60]!r}; remove them, or "
-            "give --separator"
+    return next((k for k in range(len(good)) if all(good[k : k + 3])), None)
+
+
+def _arrow(
+    data: bytes, offset: int, width: int, separator: str, mark: str
+) -> tuple[Any, Ints, list[tuple[int, str]]]:
+    """Rows as an Arrow table of numbers or text, their lines from 0, and lines that are no rows."""
+    from pyarrow import ArrowInvalid, BufferReader, py_buffer, string, types
+    from pyarrow import csv as arrow
+
+    if separator == " ":
+        data = re.sub(rb"(?m)^[ \t]+|[ \t]+$", b"", data[offset:])
+        data, offset, separator = re.sub(rb"[ \t]+", b"\t", data), 0, "\t"
+    looked_at = data[offset : offset + (1 << 16)].decode(errors="replace").split("\n")[:_LOOKED_AT]
+    count = Counter(len(_cells(line, separator)) for line in looked_at if line.strip())
+    usual = max(width, count.most_common(1)[0][0])
+
+    def read(
+        text: bytes | memoryview, kinds: dict[str, Any], only: list[str] | None = None
+    ) -> tuple[Any, list[str]]:
+        odd: list[str] = []
+        table = arrow.read_csv(
+            BufferReader(py_buffer(text)),
+            arrow.ReadOptions(
+                use_threads=False, column_names=list(map(str, range(usual))), block_size=1 << 22
+            ),
+            arrow.ParseOptions(
+                delimiter=separator, invalid_row_handler=lambda row: odd.append(row.text) or "skip"
+            ),
+            arrow.ConvertOptions(
+                column_types=kinds,
+                include_columns=only,
+                decimal_point=mark,
+                null_values=sorted(
+                    {way for x in _BLANKS for way in (x, x.upper(), x.title(), "NaN")}
+                ),
+                strings_can_be_null=False,
+            ),
         )
-    if odd_cells:
-        said = [
-            f"{name}: {len(at)} cells, such as {cell!r}" for name, (at, cell) in odd_cells.items()
-        ]
-        notes.append(f"Cells that are no numbers are blank ({'; '.join(said)}).")
-    for number, cells in stray[:3]:
-        notes.append(f"Line {number} is no row and was left out: {' '.join(cells)[:60]!r}.")
-    if len(stray) > 3:
-        notes.append(f"So were {len(stray) - 3} more lines, the last of them {stray[-1][0]}.")
-    numbers = np.array([number for number, _ in kept], np.int64)[~message]
-    notes.insert(0, f"{note}, first row in line {numbers[0]}.")
-    return Table(file, columns, units, numbers, _rate(looked_at[:start], mark), tuple(notes))
+        return table, odd
+
+    body: bytes | memoryview = memoryview(data)[offset:]
+    try:
+        table, odd = read(body, {})
+    except ArrowInvalid:
+        table, odd = None, [""]
+    stray: list[tuple[int, str]] = []
+    if odd or data.count(b"\n", offset) + 1 != table.num_rows:
+        kept, numbers = [], []
+        for k, line in enumerate(data[offset:].decode().split("\n")):
+            if line.count(separator) == usual - 1 and '"' not in line:
+                kept.append(line)
+            elif not line.strip():
+                continue
+            elif _width(cells := _cells(line, separator)) > width:
+                stray.append((k, line))
+                continue
+            else:
+                quoted = ('"' + cell.replace('"', '""') + '"' for cell in cells[:usual])
+                kept.append(separator.join([*quoted, *[""] * (usual - len(cells))]))
+            numbers.append(k)
+        body, lines = "\n".join(kept).encode(), np.array(numbers, np.int64)
+        if not kept:
+            return None, lines, stray
+        table = read(body, {})[0]
+    else:
+        lines = np.arange(table.num_rows)
+    numeric = (types.is_integer, types.is_floating, types.is_null)
+    words = [x.name for x in table.schema if not any(is_kind(x.type) for is_kind in numeric)]
+    if words:
+        text = read(body, dict.fromkeys(words, string()), words)[0]
+        for name in words:
+            table = table.set_column(table.schema.get_field_index(name), name, text.column(name))
+    return table.select(list(map(str, range(width)))), lines, stray
 
 
 def _width(cells: list[str]) -> int:
@@ -229,19 +331,28 @@ def _width(cells: list[str]) -> int:
 
 
 def _header(
-    file: str, above: list[_Row], width: int, packed: bool
-) -> tuple[list[str], dict[str, str], list[str]]:
-    """Names and units from the lines above the numbers."""
+    file: str, above: list[list[str]], width: int, packed: bool
+) -> tuple[list[str], list[str], list[str]]:
+    """Headers, units that stand below them, and notes, from the lines above the numbers."""
     texts = [
-        [cell.strip("'\"").lstrip("#%").strip() for cell in cells[: _width(cells)]]
-        for _, cells in above
+        [
+            re.sub(r"^(['\"])(.*)\1$", r"\2", cell).lstrip("#%").strip()
+            for cell in cells[: _width(cells)]
+        ]
+        for cells in above
     ]
+    keyed = {re.sub(r"[^a-z]", "", cells[0].lower()): cells[1:] for cells in texts if cells}
+    titles = next((keyed[key] for key in _TITLES if key in keyed), [])
+    if titles and width - 1 <= len(titles) <= width:
+        units = next((keyed[key] for key in _UNIT_TITLES if key in keyed), [])
+        first = ["time"] * (width - len(titles))
+        return [*first, *titles], [""] * len(first) + units, ["Names stand in a line of titles."]
     while texts and (sum(map(bool, texts[-1])) < min(2, width) or _mostly_numbers(texts[-1])):
         texts.pop()
     if not texts:
-        return [str(k + 1) for k in range(width)], {}, ["There is no header; columns are 1, 2, ..."]
+        return [str(k + 1) for k in range(width)], [], ["There is no header; columns are 1, 2, ..."]
     units_row: list[str] = []
-    known = sum(is_unit(cell) for cell in texts[-1])
+    known = sum(map(is_unit, texts[-1]))
     if len(texts) > 1 and known and 2 * known >= sum(map(bool, texts[-1])):
         units_row = texts.pop()
     # The names are the last line of as many cells as columns; an alarm may stand below them.
@@ -254,20 +365,8 @@ def _header(
     if width == len(cells) + 1 and not units_row:  # names of R's write.table have no row's own
         cells = ["row", *cells]
     cells = cells + [""] * (width - len(cells))
-    names: list[str] = []
-    units: dict[str, str] = {}
-    for k, cell in enumerate(cells):
-        name, unit = unit_of(cell)
-        name = name or str(k + 1)
-        while name in names:
-            name += "_"
-        names.append(name)
-        if k < len(units_row) and units_row[k]:
-            unit = spelled(units_row[k])
-        if unit:
-            units[name] = unit
     skipped = len(texts) - 1
-    return names, units, [f"{skipped} lines above the header were skipped."] if skipped else []
+    return cells, units_row, [f"{skipped} lines above the header were skipped."] if skipped else []
 
 
 def _mostly_numbers(cells: list[str]) -> bool:
@@ -275,48 +374,66 @@ def _mostly_numbers(cells: list[str]) -> bool:
     return 2 * values >= sum(map(bool, cells))
 
 
-def _rate(above: list[_Row], mark: str) -> float | None:
+def _rate(above: list[list[str]], mark: str) -> float | None:
     """Sampling rate, Hz, that a line above the table states."""
-    for _, cells in above:
+    for cells in above:
         line = re.split(r"[\s,;:=|]+", " ".join(cells).replace(mark, ".").strip(" #%\"'"))
         for k in range(1, len(line)):
             name = re.sub(r"[^a-z]|hz", "", "".join(line[:k]).lower())
-            if name in RATES and re.fullmatch(r"\d+\.?\d*", line[k]) and float(line[k]) > 0:
-                return float(line[k]) * (1000.0 if line[k + 1 : k + 2] == ["kHz"] else 1.0)
+            if not re.fullmatch(r"\d+\.?\d*", line[k]) or float(line[k]) <= 0:
+                continue
+            unit = "".join(line[k + 1 : k + 2]).lower()
+            if name in RATES:
+                return float(line[k]) * (1000.0 if unit == "khz" else 1.0)
+            if name in _INTERVALS and unit in ("s", "ms"):
+                return (1.0 if unit == "s" else 1000.0) / float(line[k])
     return None
 
 
 def _columns(
-    names: list[str], units: dict[str, str], rows: list[_Row], mark: str, notes: list[str]
-) -> tuple[
-    dict[str, NDArray[Any]], dict[str, tuple[NDArray[Any], str]], NDArray[Any], NDArray[Any]
-]:
-    """Values by name; rows with odd cells and one of them by name; rows with any; and values."""
-    import pandas as pd
+    names: list[str], units_row: list[str], cells: Any, mark: str, notes: list[str]
+) -> tuple[dict[str, NDArray[Any]], dict[str, str], list[str], Bools]:
+    """Values and units by name; odd cells in words; rows of a word with hardly a number."""
+    import pyarrow as pa
 
     columns: dict[str, NDArray[Any]] = {}
-    odd_cells: dict[str, tuple[NDArray[Any], str]] = {}
-    any_odd, filled = np.zeros(len(rows), bool), np.zeros(len(rows), int)
+    units = {name: unit for name, unit in zip(names, units_row, strict=False) if unit}
+    odd_cells: list[tuple[str, Bools, Any]] = []
+    any_odd, filled = np.zeros(len(cells), bool), np.zeros(len(cells), int)
     for k, name in enumerate(names):
-        cells = pd.Series([row[k] if k < len(row) else "" for _, row in rows], dtype=str)
-        values, grouped = _values(cells, mark)
-        odd = np.isnan(values) & ~cells.str.lower().isin(_BLANKS).to_numpy()
+        column = cells.column(k)
+        if not pa.types.is_string(column.type):
+            values = to_numpy(column)
+            if not np.isfinite(values).all():
+                values = np.where(np.isfinite(values), values, np.nan)
+            columns[name], filled = values, filled + np.isfinite(values)
+            continue
+        texts = column.to_pandas().str.strip()
+        values, grouped = _values(texts, mark)
+        odd = np.isnan(values) & ~texts.str.lower().isin(_BLANKS).to_numpy()
         if odd.any() and not np.isfinite(values).any():
-            clock = _clock(cells)
+            clock = _clock(texts)
             if clock is None:
-                columns[name] = cells.to_numpy(str)
+                columns[name] = texts.to_numpy(str)
                 continue
             values, units[name] = clock, "s"
-            odd = np.isnan(values) & (cells != "").to_numpy()
-            notes.append(f"{name}: times such as {cells[0]!r} were counted in seconds.")
+            odd = np.isnan(values) & (texts != "").to_numpy()
+            notes.append(f"{name}: times such as {texts[0]!r} were counted in seconds.")
         if grouped:
             notes.append(f"{name}: {grouped} cells have thousands apart.")
-        if odd.any():
-            odd_cells[name] = np.flatnonzero(odd), str(cells[int(np.argmax(odd))])
         any_odd |= odd
         filled += np.isfinite(values)
         columns[name] = values
-    return columns, odd_cells, any_odd, filled
+        if odd.any():
+            odd_cells.append((name, odd, texts))
+    # A line with a word and hardly a number, between lines of numbers, is no row.
+    message = any_odd & (filled <= 1)
+    said = [
+        f"{name}: {odd.sum()} cells, such as {texts[int(np.argmax(odd))]!r}"
+        for name, odd, texts in odd_cells
+        if not message[odd].all()
+    ]
+    return columns, units, said, message
 
 
 def _values(cells: Any, mark: str) -> tuple[Floats, int]:
@@ -422,7 +539,8 @@ def _by_units(table: Table) -> Table:
     inspiration more flows in than out.
     """
     roles, units = {next(iter(table.columns)): "time"}, {"time": "s"}
-    for name, unit in table.units.items():
+    for name in table.columns:
+        unit = table.header(name).unit
         role = next((r for r in ("pressure", "flow", "volume") if unit in UNITS[r]), "time")
         if role not in units:
             roles[name], units[role] = role, unit
@@ -432,23 +550,28 @@ def _by_units(table: Table) -> Table:
         phase = np.array([text[:2].casefold() for text in told[0]])
         inward = [each for each in set(phase) if np.nansum(columns["flow"][phase == each]) > 0]
         columns["expiration"] = 1.0 - np.isin(phase, inward)
-    return replace(table, columns=columns, units=units)
+    return replace(table, columns=columns, units=units, headers={})
 
 
 def read_spreadsheet(file: str) -> Table:
     """Read the first sheet of a spreadsheet."""
     import zipfile
 
-    import pandas as pd
-
     require("openpyxl", extra="excel", what="spreadsheets")
+    from openpyxl import load_workbook
+
     try:
         with zipfile.ZipFile(file) as archive:
             if "xl/workbook.xml" not in archive.namelist():
                 raise InputError(f"{file} is a zip archive; unpack it and name the file in it")
-        frame = pd.read_excel(file, header=None, dtype=object)
+        sheet = load_workbook(file, read_only=True, data_only=True).worksheets[0]
     except zipfile.BadZipFile as error:
         raise InputError(f"{file} cannot be unpacked ({error}); copy it again") from None
-    cells = frame.astype(str).mask(frame.isna(), "").to_numpy(str)
-    rows = [(k + 1, list(row)) for k, row in enumerate(cells.tolist()) if any(row)]
-    return _table(file, rows, ".", "First sheet of a spreadsheet")
+    rows = (
+        ["" if cell is None else " ".join(str(cell).split()) for cell in row]
+        for row in sheet.iter_rows(values_only=True)
+    )
+    text = "\n".join("\t".join(row) for row in rows).rstrip()
+    return _table(
+        file, text.encode(), text.split("\n")[:_LOOKED_AT], "\t", ".", "First sheet, cells "
+    )

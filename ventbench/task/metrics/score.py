@@ -61,20 +61,21 @@ def safety_limit(pip: ArrayLike) -> Floats:
 
 
 def passes_safety_gate(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> Bools:
-    """Whether inspirations pass the protocol's safety gate.
+    """Whether breaths pass the protocol's safety gate.
 
-    The limit is ``min(60, pip + 15)`` cmH2O. A run of n samples above it lasts ``n dt``; longer
-    than 0.1 s (4 samples at 30 ms) fails.
+    No sample may be above 70 cmH2O. The n samples above ``min(60, pip + 15)`` last ``n dt``,
+    whatever is between them; more than 0.1 s in a breath (4 samples at 30 ms) fails.
 
-    Pressure is that at the airway, cmH2O, ``(..., T)``; ``pip``, cmH2O, and the time between
-    samples ``dt``, s, have shape ``(...)`` or broadcast against it. False if a pressure is NaN.
+    Pressure is that at the airway in a breath, or what was measured of it, cmH2O, ``(..., T)``;
+    ``pip``, cmH2O, and the time between samples ``dt``, s, have shape ``(...)`` or broadcast
+    against it. False if a pressure is NaN.
     """
-    pressure, pip = np.asarray(pressure, float), np.asarray(pip, float)[..., None]
+    pressure = np.asarray(pressure, float)
     # "Not below" instead of "above", so that NaN is unsafe.
-    above = longest_run(~(pressure <= safety_limit(pip)))
-    # 1e-9: a run of exactly 0.1 s passes despite rounding.
-    gate = above * np.asarray(dt, float) <= protocol.SAFETY_TIME + 1e-9
-    return gate & ~np.any(np.isnan(pressure), axis=-1)
+    above = np.sum(~(pressure <= safety_limit(_column(pip))), axis=-1)
+    # 1e-9: 0.1 s exactly passes despite rounding.
+    brief = above * np.asarray(dt, float) <= protocol.SAFETY_TIME + 1e-9
+    return brief & np.all(pressure <= protocol.SAFETY_CAP, axis=-1)
 
 
 #: Least distance between the best PID and the best attainable, cmH2O, by which errors are divided:

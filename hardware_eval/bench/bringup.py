@@ -1,0 +1,302 @@
+"""Bring-up: before anything runs on a machine, a person confirms what its parts do.
+
+What a configuration says of pins, polarity and sensor may be of another revision of the hardware.
+So the sensor is read open to the room and at a pressure that a person applies, each valve is
+clicked without saying which, and a vent is watched as it lowers a pressure. Only then a device that
+is not simulated is armed by anything else (:meth:`hardware_eval.wire.client.Client.arm`), and only
+as long as it tells the same number and the same hash of wiring and calibration.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from random import Random, SystemRandom
+from typing import Any
+
+import numpy as np
+
+from hardware_eval.bench import dated
+from hardware_eval.bench.drive import Commands, Driven, drive
+from hardware_eval.bench.identity import white_noise
+from hardware_eval.bench.loop import Bench
+from hardware_eval.bench.selftest import Finding, judged
+from hardware_eval.wire.client import Client
+from ventbench.base import VERSION
+from ventbench.base.arrays import Floats
+from ventbench.base.errors import InputError
+from ventbench.task import protocol
+
+FORMAT, REMEDY = "ventbench-bringup-1", "ventbench-hardware bringup --port PORT"
+
+#: What is looked at, in this order: no valve moves before the sensor is right.
+STEPS = ("room", "reference", "expiratory", "inspiratory", "vent")
+
+#: Pressure above which the device vents meanwhile, cmH2O.
+_LIMIT = 30.0
+
+#: Pressures that a person may apply, cmH2O: enough to tell a slope, and no lung is on.
+_APPLIED = (10.0, 60.0)
+
+#: Readings of which a pressure is the mean.
+_READINGS = 60
+
+#: A click: opening of the inspiratory valve, %, steps between two movements, and movements.
+_CLICK, _PERIOD, _MOVEMENTS = 40.0, 16, 6
+
+#: Lung for the checks of the drive; any label will do where little gas flows.
+_ANY_LUNG = "R20C20"
+
+#: The vent: steps at rest, opening, %, rise after which both valves close, cmH2O, longest filling,
+#: steps closed, and steps vented: in 3 s the slowest lung (R50C50, 2.75 s) loses two thirds.
+_LEAD, _OPENING, _RISE, _FILLING, _CLOSED, _VENTING = 10, 5.0, 10.0, 100, 10, 110
+
+_VALVES = {1.0: "inspiratory", 2.0: "expiratory", 3.0: "both", 0.0: "none"}
+
+
+@dataclass(frozen=True)
+class BringUp:
+    """What a person saw of a device."""
+
+    device: dict[str, str]  #: see :func:`hardware_eval.bench.dated.device_of`.
+    date: str  #: when, UTC, ISO 8601.
+    operator: str  #: who.
+    findings: tuple[Finding, ...]  #: of :data:`STEPS`; fewer where one was wrong.
+
+    @property
+    def go(self) -> bool:
+        """Whether all steps were gone, and each was right."""
+        return len(self.findings) >= len(STEPS) and all(x.ok for x in self.findings)
+
+    def __str__(self) -> str:
+        lines = [f"bring-up by {self.operator}: {'confirmed' if self.go else 'NOT CONFIRMED'}"]
+        return "\n".join([*lines, *map(str, self.findings)])
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return {
+            "format": FORMAT,
+            "device": self.device,
+            "date": self.date,
+            "operator": self.operator,
+            "version": VERSION,
+            "go": self.go,
+            "findings": [x.as_dict() for x in self.findings],
+        }
+
+
+def place(device: dict[str, str]) -> Path:
+    """Where this computer keeps the bring-up of a device."""
+    import typer
+
+    return Path(typer.get_app_dir("ventbench")) / "bringup" / f"{device['device_id']}.json"
+
+
+def load(client: Client, now: datetime.datetime | None = None) -> dict[str, Any]:
+    """The bring-up of a device, with its hash; from here on the client may arm it.
+
+    Raises:
+        InputError: if there is none, or it is stale, was changed, or not confirmed.
+    """
+    device = dated.device_of(client)
+    path = place(device)
+    if not path.exists():
+        raise InputError(
+            f"device {device['device_id']} was never brought up: nobody has confirmed what its "
+            f"valves and its sensor do. Run `{REMEDY}`"
+        )
+    found = dated.load(path, FORMAT, device, REMEDY)
+    dated.check_age(found["date"], "the bring-up of this device", REMEDY, now)
+    if found.get("go") is not True:
+        raise InputError(f"{path}: the bring-up was not confirmed. Run `{REMEDY}`")
+    _allow(client)
+    return found
+
+
+def _allow(client: Client) -> None:
+    assert client.welcome is not None
+    client.brought_up = client.welcome.device_id, client.welcome.calibration
+
+
+def bring_up(
+    bench: Bench,
+    *,
+    operator: str,
+    now: datetime.datetime | None = None,
+    random: Random | None = None,
+) -> BringUp:
+    """Walk a person through all steps; one that is wrong ends it.
+
+    Afterwards the client may arm the device if all was right, and else may not.
+
+    Args:
+        bench: device, clock, safety, person.
+        operator: the person's name.
+        now: the time; that of the computer if not given.
+        random: draws which valve is clicked first.
+
+    Raises:
+        EmergencyStop: if the person pressed the key.
+        InputError: if nobody is there to answer.
+        LinkError: if the device is lost.
+    """
+    client = bench.client
+    client.brought_up = None
+    client.hello(_LIMIT)
+    clicks = list(STEPS[2:4])
+    (random or SystemRandom()).shuffle(clicks)
+    findings: list[Finding] = []
+    for step in (*STEPS[:2], *clicks, STEPS[-1]):
+        findings += look(bench, step)
+        if not all(x.ok for x in findings):
+            break
+    date = (now or dated.today()).isoformat(timespec="seconds")
+    done = BringUp(dated.device_of(client), date, operator, tuple(findings))
+    client.hello()
+    if done.go:
+        _allow(client)
+    return done
+
+
+def look(bench: Bench, step: str) -> list[Finding]:
+    """Take one of :data:`STEPS`; the device is vented before and after, and may not be armed."""
+    if step == "room":
+        return _room(bench)
+    if step == "reference":
+        return _reference(bench)
+    _allow(bench.client)
+    try:
+        return _vent(bench) if step == "vent" else _clicked(bench, step)
+    finally:
+        bench.client.brought_up = None
+
+
+def pressures(bench: Bench, count: int) -> Floats:
+    """Pressures of a vented device, cmH2O, one each control step, ``(count,)``."""
+    return vented(bench, count)[0]
+
+
+def vented(bench: Bench, count: int) -> tuple[Floats, Floats]:
+    """Pressures, cmH2O, and flows, mL/s, of a vented device, one each control step."""
+    client, clock, taken = bench.client, bench.clock, []
+    client.vent()
+    start = clock.now()
+    for step in range(count):
+        clock.sleep_until(start + step * protocol.DT)
+        taken.append(client.heartbeat())
+    return np.array([x.pressure for x in taken]), np.array([x.flow for x in taken])
+
+
+def _asked(bench: Bench, name: str, question: str) -> list[Finding]:
+    """Nothing if a person confirms, else why the step was not taken."""
+    if bench.operator.confirm(question):
+        return []
+    return [Finding(name, math.nan, False, "not confirmed")]
+
+
+def _room(bench: Bench) -> list[Finding]:
+    question = "air supply off, no lung, the sensor's tube open to the room. Is it so?"
+    if refused := _asked(bench, "room", question):
+        return refused
+    read = pressures(bench, _READINGS)
+    if not np.isfinite(read).all():
+        return [Finding("room", math.nan, False, "the sensor gives no pressure")]
+    mean, noise = float(read.mean()), white_noise(read)
+    found = [judged("room", mean, f"{mean:.2f} cmH2O open to the room")]
+    if not np.ptp(read):
+        text = f"{len(read)} readings are equal to the last digit: it is frozen, or not connected"
+        return [*found, Finding("sensor_noise", 0.0, False, text)]
+    return [*found, judged("sensor_noise", noise, f"{noise:.2f} cmH2O of noise")]
+
+
+def _reference(bench: Bench) -> list[Finding]:
+    low, high = _APPLIED
+    applied = bench.operator.number(
+        f"apply a steady pressure of {low:g} to {high:g} cmH2O to the sensor, such as a water "
+        "column; what does the reference show, cmH2O? "
+    )
+    if not low <= applied <= high:
+        text = f"{applied:g} cmH2O tell no slope: apply {low:g} to {high:g}"
+        return [Finding("reference", math.nan, False, text)]
+    shown = float(pressures(bench, _READINGS).mean())
+    text = f"{shown:.2f} cmH2O where the reference shows {applied:g}"
+    found = judged("reference", shown / applied, text)
+    if found.ok:
+        return [found]
+    return [replace(found, text=f"{text}: the slope is another sensor's, or its tube is off")]
+
+
+def at_open_tube(bench: Bench) -> Bench:
+    """A bench whose checks do not miss the pressure, as there is none at an open tube."""
+    low = replace(bench.settings.low_pressure, duration=math.inf)
+    return replace(bench, settings=replace(bench.settings, low_pressure=low), rest=0.5)
+
+
+def _clicks(valve: str) -> Commands:
+    def commands(step: int, pressure: float) -> tuple[float, int]:
+        on = step // _PERIOD % 2
+        return (0.0, 1 - on) if valve == "expiratory" else (_CLICK * on, 1)
+
+    return commands
+
+
+def _clicked(bench: Bench, valve: str) -> list[Finding]:
+    if refused := _asked(bench, "clicked", "air supply off. A valve will click; listen. Ready?"):
+        return refused
+    driven = drive(at_open_tube(bench), _ANY_LUNG, _clicks(valve), _PERIOD * _MOVEMENTS, pip=_LIMIT)
+    if driven.trips:
+        return [Finding("clicked", math.nan, False, f"{valve}: {driven.trips[0]}")]
+    answer = bench.operator.number(
+        "which valve clicked? 1 inspiratory, 2 expiratory, 3 both, 0 none: "
+    )
+    heard = _VALVES.get(answer, "neither")
+    text = f"{valve} ordered, {heard} clicked"
+    if heard != valve:
+        text += ": the pins are not those of this machine"
+    return [judged("clicked", float(heard == valve), text)]
+
+
+def _filled_and_vented() -> Commands:
+    """Fill until the pressure has risen, close both valves, and vent."""
+    before, filled = math.nan, -1
+
+    def commands(step: int, pressure: float) -> tuple[float, int]:
+        nonlocal before, filled
+        if step < _LEAD:
+            before = pressure
+            return 0.0, 1
+        if filled < 0 and step < _LEAD + _FILLING and not pressure > before + _RISE:
+            return _OPENING, 0
+        filled = step if filled < 0 else filled
+        return 0.0, int(step >= filled + _CLOSED)
+
+    return commands
+
+
+def _vent(bench: Bench) -> list[Finding]:
+    question = "connect a test lung with a relief valve, air supply on, low. Ready to fill it?"
+    if refused := _asked(bench, "rise", question):
+        return refused
+    steps = _LEAD + _FILLING + _CLOSED + _VENTING
+    driven: Driven = drive(
+        replace(at_open_tube(bench), rest=1.0), _ANY_LUNG, _filled_and_vented(), steps, pip=_LIMIT
+    )
+    closed = driven.u_out == 0.0
+    if not closed.any():
+        return [Finding("rise", math.nan, False, "; ".join(driven.trips))]
+    before = float(driven.pressure[:_LEAD].mean())
+    peak = float(driven.pressure[closed].max())
+    text = f"the pressure rose by {peak - before:.1f} cmH2O"
+    rise = judged("rise", peak - before, text)
+    if not rise.ok:
+        text += ": the supply is off, the inspiratory valve does not open, or the expiratory one "
+        return [replace(rise, text=text + "is open when it should be closed (polarity?)")]
+    left = (float(driven.pressure[-_LEAD:].mean()) - before) / (peak - before)
+    text = f"{100.0 * left:.0f} % of it was left after {_VENTING * protocol.DT:.1f} s of venting"
+    vent = judged("vented", left, text)
+    if driven.trips or not vent.ok:
+        text = "; ".join((text, *driven.trips)) + ": the vent does not open (pin? polarity?)"
+        vent = replace(vent, ok=False, text=text)
+    return [rise, vent]

@@ -1,0 +1,248 @@
+"""What ends a session's hold of its device, and how it is taken again; and clocks that part."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+import serial
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hardware_eval.bench.console import ConsoleOperator, show_bars
+from hardware_eval.bench.controllers import PIDController
+from hardware_eval.bench.loop import Bench, BreathLog, Operator
+from hardware_eval.bench.plan import PlannedRun, make_plan
+from hardware_eval.bench.raw_log import RawLog, lines
+from hardware_eval.bench.session import run_plan
+from hardware_eval.device.program import DeviceService, DeviceSettings
+from hardware_eval.emulation.emulator import LoopbackDevice
+from hardware_eval.wire.client import (
+    Client,
+    ClockWatch,
+    DeviceChangedError,
+    Link,
+    NoAnswerError,
+    RefusedError,
+)
+from hardware_eval.wire.messages import Mode
+from tests.hardware_eval import stand_in
+
+#: How long common boards take until their program answers, s.
+BOOT = 1.6
+
+
+class Board:
+    """A device that restarts whenever its port opens, or when a test says so."""
+
+    def __init__(self, device: LoopbackDevice, needs_lines: bool = False) -> None:
+        self.device, self.clock = device, device.clock
+        self.mute = needs_lines
+        self.restarts = 0
+        self.restart()
+
+    def restart(self, boot: float = BOOT) -> None:
+        """Begin anew, vented, without a session; bytes of before are lost."""
+        device, self.restarts = self.device, self.restarts + 1
+        device.service = DeviceService(device.service.hal, DeviceSettings(), self.clock.now())
+        device.unplug()
+        device.plug()
+        self.ready = self.clock.now() + boot
+
+    def write(self, data: bytes) -> None:
+        if self.clock.now() >= self.ready and not self.mute:
+            self.device.write(data)
+
+    def read(self, timeout: float) -> bytes:
+        return self.device.read(timeout)
+
+    def reopen(self) -> None:
+        self.restart()
+
+    def raise_lines(self) -> bool:
+        self.mute = False
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_board_that_restarts_when_its_port_opens_passes() -> None:
+    board = Board(LoopbackDevice(stand_in.Bench()))
+    client = Client(board, board.clock)
+    assert client.hello().name == "bench"
+    assert board.clock.now() - board.device.start < 3.0
+    client.reconnect()
+    assert board.restarts == 2
+    assert client.arm().mode is Mode.RUNNING
+
+
+def test_a_board_that_wants_its_lines_gets_them_and_silence_is_an_error() -> None:
+    board = Board(LoopbackDevice(stand_in.Bench()), needs_lines=True)
+    assert Client(board, board.clock).hello().name == "bench"
+    board.ready = math.inf
+    with pytest.raises(NoAnswerError, match="hello"):
+        Client(board, board.clock).hello()
+
+
+def test_a_port_is_opened_with_the_lines_down_that_restart_boards(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[tuple[bool, bool]] = []
+
+    def opened(port: serial.Serial) -> None:
+        seen.append((port.dtr, port.rts))
+        raise FileNotFoundError(2, "no such port")
+
+    monkeypatch.setattr(serial.Serial, "open", opened)
+    with pytest.raises(Exception, match="not there"):
+        Link("/dev/ttyACM7")
+    assert seen == [(False, False)]
+
+
+def test_a_lost_session_is_opened_again_by_arming_and_by_nothing_else() -> None:
+    device = LoopbackDevice(stand_in.Bench())
+    client, other = Client(device, device.clock), Client(device, device.clock)
+    client.hello(40.0)
+    client.arm()
+    other.hello()
+    with pytest.raises(RefusedError, match=r"SESSION.*another host"):
+        client.command(10.0, 0)
+    with pytest.raises(RefusedError, match="SESSION"):
+        client.heartbeat()
+    assert client.arm().mode is Mode.RUNNING
+    assert client.counts["reopened"] == 1
+    assert device.service.state.pressure_limit == 40.0
+    hal: Any = device.service.hal
+    hal.identity = replace(hal.identity, calibration=bytes(31) + b"1")
+    with pytest.raises(DeviceChangedError, match="begin a new one"):
+        client.hello()
+
+
+def test_the_end_says_whether_the_lung_is_vented() -> None:
+    device = LoopbackDevice(stand_in.Bench())
+    client = Client(device, device.clock)
+    client.hello()
+    client.arm()
+    assert "not known" in client.ending()
+    client.close()
+    assert "is vented" in client.ending()
+    device.unplug()
+    client.close()
+    assert "watchdog" in client.ending()
+
+
+def recover(bench: Bench, device: LoopbackDevice, path: Path, seed: int) -> None:
+    """A session of four runs during which the board restarts and another host calls, at random."""
+    draw = Random(seed)
+    board = Board(device)
+    client = Client(board, board.clock)
+    client.hello()
+    other = Client(device, device.clock)
+    steps = 2 * 3 * 34  # some of the four runs, of three inspirations each
+    restarts = {draw.randrange(steps): draw.choice((0.05, 0.3, BOOT)) for _ in range(2)}
+    calls, count = {draw.randrange(steps)}, 0
+
+    class Troubled(PIDController):
+        def act(self, row: np.ndarray, budget: float) -> float | None:
+            nonlocal count
+            count += 1
+            if count in restarts:
+                board.restart(restarts[count])
+            if count in calls:
+                other.hello()
+            return super().act(row, budget)
+
+    plan = make_plan(["a"], ["R5C20"], pips=(10.0,), repeats=3, control_every=0, seed=seed)
+    with RawLog(path) as log:
+        end = run_plan(
+            replace(bench, client=client, clock=board.clock, rest=2.0),
+            plan,
+            lambda run: Troubled((2.0, 5.0, 0.0)),
+            log,
+            about={},
+        )
+    assert end == ""
+    done = {x["run"] for x in lines(path) if x["type"] == "run" and x["status"] == "complete"}
+    assert done == {run.number for run in plan.runs}
+    last = device.actuations[-1]
+    assert (last.u_in, last.u_out) == (0.0, 1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_session_survives_restarts_and_other_hosts(
+    bench: Bench, device: LoopbackDevice, tmp_path: Path, seed: int
+) -> None:
+    recover(bench, device, tmp_path / "raw.jsonl", seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3, 60))
+def test_many_sessions_survive_restarts_and_other_hosts(
+    bench: Bench, device: LoopbackDevice, tmp_path: Path, seed: int
+) -> None:
+    recover(bench, device, tmp_path / "raw.jsonl", seed)
+
+
+class Steps:
+    """Questions to a device whose clock is a function of the host's."""
+
+    def __init__(self, seed: int, period: float = 0.03) -> None:
+        self.draw, self.period, self.watch, self.now = Random(seed), period, ClockWatch(), 0.0
+
+    def until(self, end: float, clock: Any, worst: float = 0.5) -> str:
+        """What is said until then; answers are late by up to ``worst``, s, samples old."""
+        while self.now < end:
+            asked = self.now
+            answered = asked + self.draw.uniform(0.0, self.draw.choice((0.004, worst)))
+            sampled = self.draw.uniform(asked, answered) - self.draw.uniform(0.0, 0.05)
+            if said := self.watch.see(clock(sampled), asked, answered):
+                return said
+            self.now = max(answered, asked + self.period)
+        return ""
+
+
+@given(st.integers(0, 10**6), st.floats(-2e-4, 2e-4), st.floats(-1e6, 1e6))
+def test_a_clock_of_a_crystal_is_never_blamed_however_late_the_host_is(
+    seed: int, drift: float, offset: float
+) -> None:
+    assert Steps(seed).until(30.0, lambda t: offset + (1.0 + drift) * t) == ""
+
+
+@given(st.integers(0, 10**6), st.sampled_from([-0.01, 0.01]))
+def test_a_clock_that_is_one_percent_off_is_named(seed: int, off: float) -> None:
+    said = Steps(seed).until(30.0, lambda t: (1.0 + off) * t, worst=0.02)
+    rate = re.search(r"is ([\d.]+) \(\+-([\d.]+)\) % too (fast|slow)", said)
+    assert rate, said
+    assert abs(float(rate[1]) - 1.0) <= float(rate[2])
+    assert rate[3] == ("fast" if off > 0.0 else "slow")
+
+
+@given(st.integers(0, 10**6), st.floats(0.4, 1e4), st.sampled_from([-1.0, 1.0]))
+def test_a_clock_that_jumps_or_stands_still_is_named(seed: int, by: float, sign: float) -> None:
+    steps = Steps(seed)
+    assert steps.until(3.0, lambda t: t, worst=0.02) == ""
+    said = steps.until(4.0, lambda t: t + (sign * by if t > 3.0 else 0.0), worst=0.02)
+    assert "jumped by" in said
+    assert "stood still" in Steps(seed).until(3.0, lambda t: 7.0, worst=0.02)
+
+
+def test_a_terminal_without_blocks_shows_bars_of_letters(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(raw, "ascii"))
+    breath = BreathLog(pressure=[5.0, 10.0, 20.0], late=[0.0])
+    show_bars(PlannedRun(0, "scored", "a", "R5C20", 20.0, 1), breath, 0, 1)
+    assert raw.getvalue().rstrip().endswith(b"| :*|")
+
+
+def test_a_person_is_not_asked_for_numbers_where_nobody_is() -> None:
+    for person in (Operator(), ConsoleOperator(yes=True)):
+        with pytest.raises(Exception, match="nobody is there"):
+            person.number("the meter, mL/s: ")

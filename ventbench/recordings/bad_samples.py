@@ -1,0 +1,296 @@
+"""Samples that are no readings, as hypotheses against a signal that noise and physics move.
+
+- A *mark* of missing (-99, 99.99, 32767, 0): a value that comes again and again, exactly, with no
+  other value anywhere near it.
+- An *isolated* reading: it lies far outside of what its neighbours on both sides span.
+- A *held* reading: the last one comes again while the noise, which never rests, would have changed
+  it. If all readings are held for the same time, the sensor is slower than the rows.
+
+What is found is listed and left out. A level at which a sensor ends is another matter, since values
+come near it: see :func:`~ventbench.recordings.roles.saturations`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ventbench.base.arrays import Bools, Floats, Ints, runs
+from ventbench.recordings.breaths import Breaths
+
+#: Columns that are measured.
+MEASURED = ("pressure", "flow", "volume")
+
+#: Fewest readings by which the nature of a signal shows, and fewest different ones.
+_READINGS, _DISTINCT = 100, 20
+
+#: A mark comes at least so often, in at most this share of the readings, and no other value is
+#: nearer than this share of the signal's inner range (from its 5th to its 95th percentile).
+_AGAIN, _MOST, _APART = 3, 0.2, 0.1
+
+#: An isolated reading leaves what its neighbours span by so many times that span, so many standard
+#: deviations of the noise, and this share of the inner range.
+_SPANS, _DEVIATIONS, _RANGE = 4.0, 12.0, 0.03
+
+#: Expected number of runs of equal readings by chance below which a run is held.
+_CHANCE = 1e-3
+
+#: Share of equal steps between changes from which a sensor is slower than the rows.
+_REGULAR = 0.8
+
+#: Share of the readings of a column that may be left out before the recording is unusable.
+UNUSABLE = 0.2
+
+#: Places of bad samples that are shown.
+_SHOWN = 5
+
+
+@dataclass(frozen=True, eq=False)
+class BadSamples:
+    """Samples of one column that are left out for one reason."""
+
+    column: str  #: name in the schema.
+    kind: str  #: ``mark``, ``isolated``, ``held`` or ``slow``.
+    rows: Ints  #: rows, ``(k,)``.
+    values: Floats  #: what stands there, in the unit of the file, ``(k,)``.
+    of: int  #: readings of the column in all.
+
+    @property
+    def share(self) -> float:
+        """Share of the readings of the column."""
+        return len(self.rows) / self.of
+
+    def what(self, place: str = "rows", first: Sequence[int] | None = None) -> str:
+        """What was left out, in words; ``first`` are the first places, else rows from 1."""
+        count, listed = len(self.rows), first or [int(row) + 1 for row in self.rows[:_SHOWN]]
+        where = f"{place} {', '.join(map(str, listed[:_SHOWN]))}{', ...' if count > _SHOWN else ''}"
+        if self.kind == "slow":
+            return (
+                f"{self.column} changes in one of {self.values[0]:g} rows only, so it is read more "
+                f"slowly than it is written: the {count} values that only repeat were left out"
+            )
+        why = {
+            "mark": f"are {self.values[0]:g}, which stands for a missing value",
+            "isolated": "are supported by no neighbour (such as "
+            + ", ".join(f"{value:g}" for value in self.values[:3])
+            + ")",
+            "held": "only repeat the one before while the noise rests",
+        }[self.kind]
+        of = f"{count} of {self.of} readings of {self.column} ({100.0 * self.share:.2g} %)"
+        return f"{of} {why}: {where}; they were left out"
+
+
+def find_bad_samples(
+    columns: Mapping[str, Floats], missing: Collection[float] = ()
+) -> tuple[BadSamples, ...]:
+    """Find the samples of a recording that are no readings.
+
+    Args:
+        columns: those of :data:`MEASURED` that there are, and perhaps ``u_in``, in any unit and in
+            the order of time, NaN where blank, ``(m,)`` each.
+        missing: values that stand for a missing one, whatever their neighbours say.
+
+    Returns:
+        What is to be left out, by column.
+    """
+    found: list[BadSamples] = []
+    kept: dict[str, Floats] = {}
+    for name in (name for name in MEASURED if name in columns):
+        values = np.asarray(columns[name], float)
+        every = int(np.isfinite(values).sum())
+        bad = np.zeros(len(values), bool)
+
+        def add(kind: str, where: Bools, value: float | None = None) -> None:
+            rows = np.flatnonzero(where & ~bad)  # noqa: B023
+            if len(rows):
+                bad[rows] = True  # noqa: B023
+                shown = values[rows] if value is None else np.full(len(rows), value)  # noqa: B023
+                found.append(BadSamples(name, kind, rows, shown, every))  # noqa: B023
+
+        for value in missing:
+            add("mark", np.isclose(values, value, rtol=1e-6, atol=0.0))
+        rest = np.where(bad, np.nan, values)
+        if np.isfinite(rest).sum() >= _READINGS:
+            signal = _Signal.of(rest)
+            for value in signal.marks:
+                add("mark", values == value)
+            if (every_nth := signal.slow()) is not None:
+                add("slow", _repeats(values), float(every_nth))
+            else:
+                pulses = _pulses(columns["u_in"]) if "u_in" in columns else False
+                add("isolated", signal.isolated(bad) & ~pulses)
+        kept[name] = np.where(bad, np.nan, values)
+    held = _held(kept)
+    return (*found, *held)
+
+
+def without(columns: Mapping[str, Floats], bad: Iterable[BadSamples]) -> dict[str, Floats]:
+    """The columns with NaN in place of bad samples."""
+    out = dict(columns)
+    for each in bad:
+        values = out[each.column].astype(float)
+        values[each.rows] = np.nan
+        out[each.column] = values
+    return out
+
+
+def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
+    """Breaths without bad samples, which its notes list first; the same object if there is none."""
+    names = [name for name in (*MEASURED, "u_in") if getattr(breaths, name) is not None]
+    columns = {name: getattr(breaths, name)[breaths.valid] for name in names}
+    bad = find_bad_samples(columns, missing)
+    if not bad:
+        return breaths
+    kept, changes = without(columns, bad), {}
+    for name in {each.column for each in bad}:
+        changes[name] = np.full(breaths.valid.shape, np.nan)
+        changes[name][breaths.valid] = kept[name]
+    notes = (*(each.what().capitalize() + "." for each in bad), *breaths.notes)
+    return replace(breaths, notes=notes, **changes)
+
+
+@dataclass(frozen=True)
+class _Signal:
+    """The readings of a column, and what they are like."""
+
+    values: Floats  #: ``(m,)``.
+    span: float  #: inner range.
+    noise: float  #: standard deviation of the noise, of which curvature is part.
+    resolution: float  #: usual step between neighbouring values.
+    marks: tuple[float, ...]  #: values that stand for missing ones.
+
+    @classmethod
+    def of(cls, values: Floats) -> _Signal:
+        known = values[np.isfinite(values)]
+        low, high = np.quantile(known, [0.05, 0.95])
+        kinds, counts = np.unique(known, return_counts=True)
+        gaps = np.diff(kinds, prepend=-np.inf, append=np.inf)
+        apart = np.minimum(gaps[1:], gaps[:-1]) > _APART * max(high - low, 1e-12)
+        often = (counts >= _AGAIN) & (counts <= _MOST * len(known))
+        enough = len(kinds) >= _DISTINCT and high > low
+        marks = tuple(kinds[apart & often].tolist()) if enough else ()
+        good = known[~np.isin(known, marks)] if marks else known
+        bends = np.abs(np.diff(good, 2))
+        noise = float(np.median(bends)) / (0.6745 * np.sqrt(6.0)) if len(bends) else 0.0
+        inner = gaps[1:-1][(kinds[1:] > low) & (kinds[1:] < high)]
+        resolution = float(np.median(inner)) if len(inner) else 0.0
+        return cls(values, float(high - low), noise, resolution, marks)
+
+    def isolated(self, bad: Bools) -> Bools:
+        """Samples far outside of what the three on both sides of them span, but one of them."""
+        out = np.zeros(len(self.values), bool)
+        at = np.flatnonzero(np.isfinite(self.values) & ~bad)
+        if len(at) < _READINGS or self.span <= 0.0:
+            return out
+        own = self.values[at]
+        padded = np.pad(own, 3, mode="edge")  # at an end nothing is isolated
+        limit = _DEVIATIONS * self.noise + max(_RANGE * self.span, 3.0 * self.resolution)
+        moved = np.abs(np.diff(own, prepend=own[0], append=own[-1])) > limit
+        some = np.flatnonzero(moved[1:] | moved[:-1])  # others cannot be far from five of six
+        near = np.sort(padded[some[:, None] + np.array([0, 1, 2, 4, 5, 6])], axis=1)
+        low, high = near[:, 1], near[:, 4]
+        beyond = np.maximum(own[some] - high, low - own[some])
+        far = beyond > limit + _SPANS * (high - low)
+        if far.sum() <= _MOST * len(own):
+            out[at[some[far]]] = True
+        return out
+
+    def slow(self) -> int | None:
+        """Rows from one reading to the next of a sensor that is slower than the rows, or None."""
+        changes = np.flatnonzero(np.diff(self.values[np.isfinite(self.values)]) != 0)
+        lengths = np.diff(changes)
+        if len(lengths) < _READINGS // 2 or (usual := int(np.median(lengths))) < 2:
+            return None
+        same = np.abs(lengths - usual) <= (usual > 2)
+        return usual if same.mean() >= _REGULAR else None
+
+
+def _repeats(values: Floats) -> Bools:
+    """Whether a value is exactly the one before, ``(m,)``."""
+    return np.append(False, values[1:] == values[:-1])
+
+
+def _pulses(u_in: Floats) -> Bools:
+    """Samples just behind a strong move of a command, which a pressure may follow at once."""
+    moves = np.abs(np.diff(np.nan_to_num(u_in), prepend=u_in[:1]))
+    strong = moves > max(5.0, 10.0 * float(np.nanmedian(moves)))
+    return strong | np.append(strong[1:], False) | np.append(False, strong[:-1])
+
+
+def _held(columns: Mapping[str, Floats]) -> list[BadSamples]:
+    """Runs in which all columns, or one of them, repeat while their noise would have moved them."""
+    chances = {name: _chance(values) for name, values in columns.items()}
+    repeats = {name: _repeats(values) for name, values in columns.items()}
+    every = np.logical_and.reduce(list(repeats.values())) if len(repeats) > 1 else None
+    together = np.zeros(len(next(iter(columns.values()), ())), bool)
+    if every is not None:
+        together = _improbable(every, float(np.prod(list(chances.values()))))
+    found = []
+    for name, values in columns.items():
+        ends = (
+            np.isin(values, [np.nanmin(values), np.nanmax(values)])
+            if np.isfinite(values).any()
+            else together
+        )
+        rows = np.flatnonzero(together | (_improbable(repeats[name], chances[name]) & ~ends))
+        if len(rows):
+            of = int(np.isfinite(values).sum())
+            found.append(BadSamples(name, "held", rows, values[rows], of))
+    return found
+
+
+def _improbable(repeats: Bools, chance: float) -> Bools:
+    """Runs of repeats that chance does not make, ``(m,)``."""
+    out = np.zeros(len(repeats), bool)
+    if chance < 1.0:
+        for start, stop in runs(repeats):
+            if stop - start > 1 and len(repeats) * chance ** (stop - start) < _CHANCE:
+                out[start:stop] = True
+    return out
+
+
+def _chance(values: Floats) -> float:
+    """Probability that noise leaves a reading as it was.
+
+    Differences of the fourth order hold hardly anything but noise, and those of the quietest fifth
+    of the signal the least that it has.
+    """
+    known = values[np.isfinite(values)]
+    if len(known) < _READINGS or np.ptp(known) == 0.0:
+        return 1.0
+    kinds = np.unique(known)
+    span = float(np.diff(np.quantile(known, [0.05, 0.95]))[0])
+    step = max(float(np.quantile(np.diff(kinds), 0.05)), 1e-4 * span)
+    fourth = np.abs(np.diff(known, 4))
+    moving = fourth[fourth > 0.0] if (fourth > 0.0).mean() > 0.5 else fourth
+    noise = float(np.quantile(moving, 0.2)) / (0.2533 * np.sqrt(70.0))
+    return min(1.0, step / (3.5 * noise)) if noise > 0.0 else 1.0
+
+
+def repeated_rows(columns: Mapping[str, Floats]) -> Bools:
+    """Rows that are the row before once more, ``(m,)``.
+
+    With a clock, the time is the same too. Without one, a row may also be held while the time goes
+    on: then the signal jumps by two steps behind it, else by one.
+    """
+    repeats = np.logical_and.reduce([_repeats(values) for values in columns.values()])
+    measured = [columns[name] for name in MEASURED if name in columns]
+    if "time" in columns or not repeats.any() or len(measured) < 2:
+        return repeats if "time" in columns else np.zeros(len(repeats), bool)
+    chance = float(np.prod([_chance(values) for values in measured]))
+    if repeats.sum() < 10.0 * (1.0 + len(repeats) * chance):
+        return np.zeros(len(repeats), bool)
+    single = np.flatnonzero(repeats[1:-2] & ~repeats[:-3] & ~repeats[2:-1]) + 1
+    single = single[(single > 2) & (single < len(repeats) - 3)]
+    jumps = slopes = 0.0
+    for values in measured:
+        slope = 0.25 * (
+            values[single - 1] - values[single - 3] + values[single + 3] - values[single + 1]
+        )
+        known = np.isfinite(slope) & np.isfinite(values[single + 1] - values[single])
+        size = max(float(np.nanvar(values)), 1e-12)
+        jumps += float((slope * (values[single + 1] - values[single]))[known].sum()) / size
+        slopes += float((slope**2)[known].sum()) / size
+    return repeats if slopes > 0.0 and jumps < 1.5 * slopes else np.zeros(len(repeats), bool)

@@ -1,0 +1,198 @@
+"""Where breaths begin and end in a continuous recording, and when the expiratory valve is open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.errors import InputError
+
+#: Shortest breath, s, and longest.
+_SHORTEST, _LONGEST = 0.5, 30.0
+
+#: Share of the range of flow or pressure that an inspiration exceeds.
+_ONSET = 0.1
+
+#: A gap in time of more than so many intervals ends a breath.
+_GAP = 5.0
+
+
+def find_breaths(
+    file: str,
+    time: Floats,
+    values: Mapping[str, Floats],
+    other: Mapping[str, Floats],
+    keys: list[Ints],
+    groups: list[Ints],
+    lead: float,
+) -> tuple[list[Ints], str]:
+    """Split a continuous recording where inspirations begin.
+
+    Args:
+        file: names the recording in messages.
+        time: times, s, shape ``(N,)``; NaN where there is none.
+        values: measured columns by role, in the units of the schema, ``(N,)`` each.
+        other: further columns by role, ``(N,)`` each.
+        keys: columns a change of which begins a breath.
+        groups: those of them that only tell recordings apart.
+        lead: time before the number of a breath changes at which its samples begin, s.
+
+    Returns:
+        Rows of each whole breath, and a sentence that says how they were found.
+
+    Raises:
+        InputError: if no whole breath is found.
+    """
+    rows = np.arange(len(time))
+    broken = np.zeros(len(time), bool)
+    broken[0] = True
+    for key in groups:
+        broken[1:] |= np.diff(key) != 0
+    steps = np.diff(time, prepend=time[0])
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    starts = broken.copy()
+    numbered = len(keys) > len(groups)
+    if numbered:
+        for key in keys:
+            starts[1:] |= np.diff(key) != 0
+        if lead and usual:
+            at = np.flatnonzero(starts & ~broken) - round(lead / usual)
+            starts = broken.copy()
+            starts[at[at > 0]] = True
+        how = "by the column that numbers them"
+    else:
+        gaps = (steps < 0) | (steps > _GAP * max(usual, 1e-9))
+        broken[1:] |= gaps[1:]
+        onsets, how = _onsets(file, time, values, other)
+        starts = broken.copy()
+        starts[onsets] = True
+    pieces = np.split(rows, np.flatnonzero(starts)[1:])
+    kept, short, timeless = [], 0, 0
+    for k, piece in enumerate(pieces):
+        at = time[piece][np.isfinite(time[piece])]
+        if len(at) < 2 <= len(piece):
+            timeless += 1
+            continue
+        length = at[-1] - at[0] if len(at) > 1 else 0.0
+        # The first and the last piece of a split recording are no whole breaths.
+        edge = not numbered and (
+            piece[0] not in onsets or k + 1 == len(pieces) or bool(broken[pieces[k + 1][0]])
+        )
+        if edge or not _SHORTEST <= length <= _LONGEST:
+            short += 1
+            continue
+        kept.append(piece)
+    if not kept:
+        raise InputError(
+            f"{file}: no whole breath was found {how}; a breath lasts {_SHORTEST:g} to "
+            f"{_LONGEST:g} s. Check the rate and the units, or map a column that numbers breaths "
+            "with --map NAME=breath"
+        )
+    left = f"; {short} pieces that are no whole breath were left out" if short else ""
+    if timeless:
+        left += f"; {timeless} without times were left out"
+    return kept, f"{len(kept)} breaths, split {how}{left}."
+
+
+def expiratory_valve(
+    values: Mapping[str, Floats], other: Mapping[str, Floats], pieces: list[Ints]
+) -> tuple[NDArray[np.int8], str]:
+    """Return u_out of each row, ``(N,)``, and a sentence that says where it is from.
+
+    Args:
+        values: measured columns by role, in the units of the schema, ``(N,)`` each.
+        other: further columns by role, ``(N,)`` each.
+        pieces: rows of each breath.
+    """
+    if "u_out" in other:
+        return (other["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
+    if "target" in other:
+        u_out = (~_is_high(other["target"])).astype(np.int8)
+        return u_out, "u_out is 1 where the target is low."
+    u_out = np.zeros(len(values["pressure"]), np.int8)
+    if "flow" in values:
+        flow = _bridged(values["flow"])
+        limit = -0.02 * float(np.quantile(np.abs(flow), 0.99))
+        for piece in pieces:
+            out = np.flatnonzero(flow[piece] < limit)
+            inward = np.flatnonzero(flow[piece] > -limit)
+            first = out[out > (inward[0] if len(inward) else -1)]
+            if len(first):
+                u_out[piece[first[0]] : piece[-1] + 1] = 1
+        return u_out, "u_out is 1 from where flow turns outwards."
+    for piece in pieces:
+        p = _bridged(values["pressure"])[piece]
+        peak = int(np.argmax(p))
+        half = 0.5 * (p[peak] + p[-1])
+        below = np.flatnonzero(p[peak:] < half)
+        if len(below):
+            u_out[piece[peak + below[0]] : piece[-1] + 1] = 1
+    return u_out, "u_out is 1 from where pressure has fallen half-way from its peak (a guess)."
+
+
+def _onsets(
+    file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats]
+) -> tuple[Ints, str]:
+    """Rows at which inspirations begin, and what shows them."""
+    if "u_out" in other:
+        shut = other["u_out"] < 0.5
+        return np.flatnonzero(shut[1:] & ~shut[:-1]) + 1, "where the expiratory valve closes"
+    if "target" in other:
+        high = _is_high(other["target"])
+        return np.flatnonzero(high[1:] & ~high[:-1]) + 1, "where the target rises"
+    if "u_in" in values and np.nanmax(values["u_in"]) > 0:
+        on = np.nan_to_num(values["u_in"]) > 0
+        away = _after_pause(on, time)
+        return away, "where the inspiratory valve opens"
+    if "flow" in values and np.isfinite(values["flow"]).any():
+        flow = _bridged(values["flow"])
+        size = float(np.quantile(np.abs(flow), 0.99))
+        return _crossings(flow, _ONSET * size, 0.3 * _ONSET * size), "where flow turns inwards"
+    pressure = _bridged(values["pressure"])
+    low, high = np.quantile(pressure, [0.1, 0.98])
+    if high - low < 1.0:
+        raise InputError(
+            f"{file}: pressure spans {high - low:.2g} cmH2O, in which no breath can be seen"
+        )
+    rise = pressure - low
+    span = high - low
+    return _crossings(rise, 0.3 * span, _ONSET * span), "where pressure rises"
+
+
+def _crossings(signal: Floats, high: float, low: float) -> Ints:
+    """Rows before which a signal was low for the last time before it becomes high."""
+    onsets, last, armed = [], 0, False
+    for k, value in enumerate(signal.tolist()):
+        if value <= low:
+            last, armed = k, True
+        elif value >= high and armed:
+            onsets.append(last)
+            armed = False
+    return np.array(onsets, np.int64)
+
+
+def _after_pause(on: Bools, time: Floats) -> Ints:
+    """Rows at which a valve opens after it was shut for a while."""
+    onsets, shut_since = [], None
+    for k in range(len(on)):
+        if not on[k]:
+            shut_since = k if shut_since is None else shut_since
+        elif shut_since is not None:
+            if time[k] - time[shut_since] >= 0.2:
+                onsets.append(k)
+            shut_since = None
+    return np.array(onsets, np.int64)
+
+
+def _is_high(signal: Floats) -> Bools:
+    """Whether a signal of two levels is at the upper one."""
+    return signal > 0.5 * (np.nanmin(signal) + np.nanmax(signal))
+
+
+def _bridged(values: Floats) -> Floats:
+    """Values with their blanks interpolated, shape ``(N,)``."""
+    known = np.isfinite(values)
+    return np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])

@@ -1,0 +1,253 @@
+"""Headers of columns by a grammar: quantity, place, device, unit, direction.
+
+A header is words and marks; its unit is the longest run of its last ones that spells one. What is
+left is a quantity, with words that change nothing, or one that makes it something else. A device
+stands before a mark such as ``/``. Whatever has another word in it is uncertain: it is asked for,
+never guessed. Words and units are data: ``headers.toml``.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+import unicodedata
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from importlib.resources import files
+from itertools import product
+
+import numpy as np
+
+from ventbench.base.arrays import Floats
+from ventbench.base.errors import InputError
+
+_DATA = tomllib.loads(files(__package__).joinpath("headers.toml").read_text("utf-8"))
+
+#: Factors to the schema's unit, which is the first of each quantity; they are exact.
+UNITS: dict[str, dict[str, Fraction]] = {
+    quantity: {
+        name: Fraction(size) / Fraction(next(iter(sizes.values()))) for name, size in sizes.items()
+    }
+    for quantity, sizes in _DATA["units"].items()
+}
+
+#: Pascal in a centimetre of water (conventional, at 4 degrees Celsius).
+_CMH2O = Fraction(_DATA["units"]["pressure"]["cmH2O"])
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """An exact change of units."""
+
+    unit: str  #: unit in the file.
+    to: str  #: unit of the schema.
+    factor: Fraction  #: one ``unit`` in ``to``; its reciprocal is the exact way back.
+
+    def apply(self, values: Floats) -> Floats:
+        """Convert; one rounding to the nearest number at most for each of two integers."""
+        values = np.asarray(values, float)
+        if self.factor == 1:
+            return values
+        return values * self.factor.numerator / self.factor.denominator
+
+    def __str__(self) -> str:
+        """The change in words, with the way back."""
+        if self.factor == 1:
+            return self.to
+        forth, back = _in_words(self.factor), _in_words(1 / self.factor)
+        return f"{self.unit} -> {self.to}, x {forth} (back: x {back})"
+
+
+def conversion(quantity: str, unit: str | None) -> Conversion:
+    """Return the change from a unit of a quantity in :data:`UNITS` to the schema's (None).
+
+    Raises:
+        InputError: if the quantity has no such unit.
+    """
+    known = UNITS[quantity]
+    to = next(iter(known))
+    name = to if unit is None else _spelled(quantity).get(_key(unit), unit)
+    if name not in known:
+        raise InputError(
+            f"{unit!r} is no unit of {quantity} that is known; choose one of {', '.join(known)}"
+        )
+    return Conversion(name, to, known[name])
+
+
+def in_file_unit(change: Conversion, pascal: float) -> float:
+    """A pressure in the unit of a file."""
+    return pascal / float(change.factor * _CMH2O)
+
+
+def _in_words(factor: Fraction) -> str:
+    if factor.denominator == 1 or factor.numerator == 1 or factor.denominator < 1000:
+        return str(factor)
+    return f"{float(factor):.10g}"
+
+
+@cache
+def _spelled(quantity: str) -> dict[str, str]:
+    """Units of a quantity by every spelling of theirs."""
+    atoms = {unit: {unit, *others.split()} for unit, others in _DATA["spellings"].items()}
+    table: dict[str, str] = {}
+    for unit in UNITS[quantity]:
+        over, _, under = unit.partition("/")
+        ways = atoms.get(unit, {unit})
+        if under:
+            pairs = product(atoms[over], ("", "per", "p"), atoms[under], ("", "1"))
+            ways = (
+                ways
+                | {"".join(parts) for parts in pairs}
+                | {f"{x}p{under[0]}" for x in atoms[over]}
+            )
+        table |= {_key(way): unit for way in ways}
+    return table
+
+
+def _key(text: str) -> str:
+    """A unit without case and marks."""
+    plain = unicodedata.normalize("NFKC", text.strip()).lower()
+    return plain if plain == "%" else re.sub(r"[^\w%]|_", "", plain)
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text spells a unit of some quantity."""
+    return _key(text) != "1" and any(_key(text) in _spelled(quantity) for quantity in UNITS)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a header says."""
+
+    name: str  #: the header without a unit in brackets or behind a comma.
+    role: str | None = None  #: what the column may be, or None.
+    unit: str | None = None  #: its unit, or None.
+    side: str = ""  #: ``in`` or ``out`` of a flow or a valve in one direction.
+    certain: bool = False  #: whether every part of the header was understood.
+    interval: float | None = None  #: s between samples, where the header says it.
+
+    @property
+    def excluded(self) -> bool:
+        """Whether a word makes the column something else than a waveform at the airway."""
+        return any(_KINDS.get(word, ("", ""))[0] == "others" for word in _words(self.name))
+
+
+_KINDS = {
+    word: (kind, name)
+    for kind in ("words", "places", "sides", "others")
+    for name, words in _DATA[kind].items()
+    for word in words.split()
+}
+_LETTERS = {letter: name for name, letter in _DATA["letters"].items()}
+
+#: A derivative as it is printed: V', V with a dot, dV/dt.
+_DOTTED = re.compile(r"(?<![^\W_])(?:d([vq])\s*/\s*dt|([vq])\s*(?:['’‘′`´]|\u0307))", re.I)
+_SAMPLED = re.compile(r"(.*[^\W\d].*?)[\s._-]*\b(\d+(?:\.\d+)?)\s*(ms|hz)", re.I)
+_BRACKETS = re.compile(r"[\[({<]([^\[({<\])}>]*)[\])}>]")
+_PATH = re.compile(r"[/:|.\\]+")
+
+
+@cache
+def read_header(text: str) -> Header:
+    """Read a header.
+
+    Example:
+        >>> read_header("Flow_L_min").role, read_header("Flow_L_min").unit
+        ('flow', 'L/min')
+    """
+    plain = unicodedata.normalize("NFKC", text).strip()
+    plain = _DOTTED.sub(lambda found: f" {(found[1] or found[2]).lower()}dot ", plain).strip()
+    interval = None
+    if (sampled := _SAMPLED.fullmatch(plain)) is not None:
+        number, plain = float(sampled[2]), sampled[1]
+        interval = 1.0 / number if sampled[3].lower() == "hz" else 0.001 * number
+    bracketed = [inside for inside in _BRACKETS.findall(plain) if inside.strip()]
+    name = _BRACKETS.sub(" ", plain).strip(" ,;")
+    units = [inside for inside in bracketed if is_unit(inside)]
+    rest = " ".join([name, *(inside for inside in bracketed if inside not in units)])
+    whole = text.strip()
+    if units:
+        found = next(x for x in _BRACKETS.finditer(text) if is_unit(x[1]))
+        whole = (text[: found.start()] + text[found.end() :]).strip(" _,;") or whole
+        role, side, certain = _meaning(rest, units[0])
+        return _header(whole, role, units[0], side, certain, interval)
+    for at in sorted(
+        {found.start() for found in re.finditer(r"(?<![^\W_])\w|(?<=[a-z])[A-Z]|%", rest)}
+    ):
+        tail, before = rest[at:], rest[:at]
+        alone = not before.strip(" _,;:.-/")
+        if is_unit(tail) and not (alone and (len(tail) < 2 or tail.lower() in _KINDS)):
+            role, side, certain = _meaning(before, tail)
+            if certain:
+                comma = re.search(r"[,;]\s*$|\s$", before) is not None
+                short = before.strip(" ,;") if comma and before.strip(" ,;") in text else whole
+                return _header(short, role, tail, side, certain, interval)
+    role, side, certain = _meaning(rest, None)
+    return _header(whole, role, None, side, certain, interval)
+
+
+def _header(
+    name: str, role: str | None, unit: str | None, side: str, certain: bool, interval: float | None
+) -> Header:
+    tables = [_spelled(q) for q in ([role] if role in UNITS else UNITS)]
+    known = next((t[_key(unit)] for t in tables if unit and _key(unit) in t), unit)
+    return Header(name, role, known, side, certain, interval)
+
+
+def _meaning(text: str, unit: str | None) -> tuple[str | None, str, bool]:
+    """Role, direction, and whether all of a name was understood; it has the unit, or none."""
+    measured = [q for q in UNITS if unit is not None and _key(unit) in _spelled(q)]
+    *devices, last = [_words(part) for part in _PATH.split(text) if part.strip(" _-")] or [[]]
+    # A device may have any name.
+    words = [w for part in devices if all(map(_KINDS.get, part)) for w in part] + last
+    if "".join(words) in _KINDS:
+        words = ["".join(words)]
+    letters = [w for w in words if w in _LETTERS and w not in _KINDS]
+    kinds = [_KINDS.get(w, ("", "")) for w in words if w not in letters and not w.isdigit()]
+    names = {name for kind, name in kinds if kind == "words"}
+    sides = {name for kind, name in kinds if kind == "sides"}
+    certain = len(sides) < 2 and not any(kind in ("", "others") for kind, _ in kinds)
+    if len(letters) == 1 and not names:
+        role = _LETTERS[letters[0]]
+        names = set(measured[:1] or [role])
+        certain &= role not in ("R", "C", "f") or len(words) == 1
+    elif letters:
+        certain = False
+    elif not words:  # a unit alone
+        names = set(measured[:1])
+    side = next(iter(sides)) if len(sides) == 1 else ""
+    if names == {"valve"} and side:
+        names, side = {f"u_{side}"}, ""
+    role = next(iter(names)) if len(names) == 1 else None
+    certain &= not side or role == "flow"
+    certain &= not measured or role in measured
+    if role in (None, "valve", "f") or any(kind == "others" for kind, _ in kinds):
+        return None, "", False
+    return role, side, certain
+
+
+def _words(text: str) -> list[str]:
+    """Words of a name: parted by marks and by capitals, or made of words that are known."""
+    words = []
+    for part in re.findall(r"[^\W_]+", text):
+        if part.lower() in _KINDS or part.lower() in _LETTERS:
+            words.append(part.lower())
+            continue
+        for piece in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[^\WA-Z\d_]+|\d+", part):
+            words += _parted(piece.lower())
+    return words
+
+
+@cache
+def _parted(word: str) -> tuple[str, ...]:
+    """A word as known ones that are written together, such as ``airwaypressure`` and ``paw``."""
+    if word in _KINDS or word in _LETTERS or word.isdigit():
+        return (word,)
+    if word[:1] in _LETTERS and word[1:] in _KINDS:
+        return word[:1], word[1:]
+    for at in range(len(word) - 2, 2, -1):
+        rest = _parted(word[at:])
+        if word[:at] in _KINDS and all(part in _KINDS for part in rest):
+            return word[:at], *rest
+    return (word,)

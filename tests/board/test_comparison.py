@@ -131,3 +131,29 @@ def test_who_follows_an_earlier_entry_is_found():
 def test_entries_without_commands_follow_nobody_but_each_other():
     zero, some = np.zeros((5, 34)), np.ones((5, 34))
     assert comparison.sources([some, zero]) == [None, None]
+
+
+#: Spread between entries of the published stress scores on each lung and draw, cmH2O.
+SPREAD = np.array(
+    [
+        [0.20, 0.05, 0.09, 0.06, 0.07, 0.14],
+        [0.10, 0.19, 0.12, 0.14, 0.10, 0.17],
+        [0.09, 0.11, 0.10, 0.19, 0.16, 0.07],
+        [0.11, 0.22, 0.14, 0.10, 0.17, 0.22],
+        [0.70, 0.71, 1.09, 0.68, 0.86, 0.67],
+        [0.60, 0.24, 1.00, 0.24, 0.42, 0.73],
+    ]
+)
+
+
+@pytest.mark.parametrize(("entries", "boards"), [(7, 300), (15, 150), (30, 60), (60, 20)])
+def test_equal_entries_under_stress_are_not_told_apart(entries, boards):
+    """Rigs differ by a factor of 20 in spread, and two draws share one: at most 5 % of boards."""
+    random = np.random.default_rng(entries)
+    rig = np.tile([0, 1, 2, 3, 1, 5], (6, 1))
+    false = 0
+    for _ in range(boards):
+        of_rig = random.standard_normal((entries, 6, 6))[:, :, rig[0]]
+        values = SPREAD * (0.9 * of_rig + 0.4 * random.standard_normal((entries, 6, 6)))
+        false += comparison.ranks(values, rig, matters=comparison.CMH2O).better.any()
+    assert false <= 0.05 * boards

@@ -12,11 +12,11 @@ import pytest
 from typer.testing import CliRunner
 
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, create, replay, store
+from ventbench.board import canonical, create, frames, replay, store
 from ventbench.board.verify import verify
 from ventbench.cli import app
 
-from .conftest import opened, put
+from .conftest import accept, opened, put
 
 
 def _lowered(made: create.Draft, by: float) -> create.Draft:
@@ -117,3 +117,21 @@ def test_the_terminal_gets_no_commands(leaderboard: Path, drafts, monkeypatch) -
     assert checked.exit_code == 1
     assert "\x1b" not in checked.output
     assert "x.html is no part of a leaderboard" in checked.output
+
+
+def test_a_date_makes_nobody_an_author(leaderboard: Path, draft, simulators) -> None:
+    """The order of freezing does: a copy that says it is older follows the original."""
+
+    def uneasy(requested: np.ndarray) -> None:
+        requested[..., ::2] *= 1.4
+
+    copy = draft("twin", change=uneasy)
+    values = json.loads(copy.content)
+    values["created"] = "2020-01-01T00:00:00Z"
+    put(leaderboard, create.Draft(canonical.canonical(values), copy.commands), simulators)
+    put(leaderboard, draft("honest", change=uneasy), simulators)
+    accept(leaderboard)
+    (track, _) = frames.load_tracks(leaderboard, track="performance")
+    rows = {row.record.name: row for row in track.ranked}
+    assert rows["honest"].entry.source == ""
+    assert rows["twin"].entry.source == "honest"

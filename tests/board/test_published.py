@@ -5,6 +5,7 @@ from __future__ import annotations
 import runpy
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,3 +115,22 @@ def test_only_unseen_draws_of_a_round_count() -> None:
             means = np.delete(row.record.headroom.normalised[1:], seen, 0)
             assert row.normalised is not None
             assert row.normalised.score.value == pytest.approx(means.mean(), abs=1e-9)
+
+
+def test_clusters_of_stress_are_the_rigs_that_ran(monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[np.ndarray] = []
+    ranks = comparison.ranks
+
+    def spied(values: np.ndarray, rig: np.ndarray, *others: Any, **options: Any) -> Any:
+        used.append(rig)
+        return ranks(values, rig, *others, **options)
+
+    monkeypatch.setattr(comparison, "ranks", spied)
+    leaderboard = store.load(FOLDER)
+    track = next(x for x in ranking.board(leaderboard) if x.stress)
+    tables = track.stress[0].tables
+    rigs = track.stress[0].row.record.headroom
+    np.testing.assert_array_equal(
+        tables.rig, rigs.session[:, rigs.ranked][:, : tables.rig.shape[1]]
+    )
+    assert sum(np.array_equal(rig, tables.rig) for rig in used) == 1

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import py_compile
 import re
 import shutil
+import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,7 +28,14 @@ from ventbench.board.verify import verify
 from ventbench.cli import app
 from ventbench.entries import reference as references
 from ventbench.entries.cells import InProcessRunner
-from ventbench.entries.folder import as_submission
+from ventbench.entries.folder import (
+    Submission,
+    as_submission,
+    combined_hash,
+    file_hashes,
+    frozen_copy,
+    open_submission,
+)
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import load_rigs
 from ventbench.task import draws as draw_tables
@@ -64,7 +74,7 @@ def fresh(tmp_path: Path) -> Path:
     return board
 
 
-def freeze(board: Path, *requests: Request, now: datetime = FROZEN) -> rounds.Round:
+def freeze(board: Path, *requests: Any, now: datetime = FROZEN) -> rounds.Round:
     return rounds.freeze(board, "r2", board.parent / "submissions", requests, ABOUT, now=now)
 
 
@@ -210,6 +220,10 @@ def _pid_bounds(own, simulators, pool, folder, **options):
     return references.Reference(about, gains, 0.1 * pid, 0.1 * pid, 0.0 * pid, pid, zero)
 
 
+#: Gains of a controller as weights, which a seed may replace.
+_WEIGHTS = 'numpy.load(os.path.join(os.path.dirname(__file__), "gains.npy"))'
+
+
 def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -> None:
     """Two entries, one of which cannot be run; the second time nothing runs again.
 
@@ -218,14 +232,12 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
     monkeypatch.setattr(official_runs, "bounds_of", _pid_bounds)
     attest(fresh)
     baseline = fresh.parent / "submissions/pid_robust"
-    code = (baseline / "controller.py").read_text()
-    for seed, text in (
-        ("0", code),
-        ("1", code.replace("GAINS = (10.0", "GAINS = (5.0")),
-        ("2", "raise ValueError('no')"),
-    ):
+    code = baseline / "controller.py"
+    code.write_text("import os, numpy\n" + code.read_text().replace("(4.0, 8.0, 9.0)", _WEIGHTS))
+    np.save(baseline / "gains.npy", [4.0, 8.0, 9.0])
+    for seed, gains in (("0", [4.0, 8.0, 9.0]), ("1", [2.0, 8.0, 9.0]), ("2", [1.0])):
         (baseline / "seeds" / seed).mkdir(parents=True)
-        (baseline / "seeds" / seed / "controller.py").write_text(text)
+        np.save(baseline / "seeds" / seed / "gains.npy", gains)
     one = fresh.parent / "submissions/one/controller.py"
     one.write_text("raise ValueError('no')\n" + one.read_text())
     submissions = fresh.parent / "submissions"
@@ -276,7 +288,7 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
         same, other = done.result.seeds[key]
         assert same == pytest.approx(record.ranked_values.mean(), abs=1e-9)
         assert abs(other - same) > 1
-        assert "no" in done.result.failed[f"{key}, seed 2"]
+        assert done.result.failed[f"{key}, seed 2"] == "a cell failed"
     _proposed(fresh, checkout, simulators)
 
 
@@ -306,6 +318,131 @@ def _proposed(scored: Path, leaderboard: Path, simulators) -> None:
     assert git.text("log", "-1", "--format=%s") == "Round r2 is scored"
     with pytest.raises(InputError, match="no name of a round"):
         propose.commit(leaderboard.parent, "../r2", "scored")
+
+
+def _cached(folder: Path) -> Path:
+    """Compiled code of another helper, which Python takes without a look at the source."""
+    helper, cache = folder / "helper.py", folder / "__pycache__"
+    helper.write_text("U_IN = 1.0\n")
+    other = folder.parent / "other.py"
+    other.write_text("U_IN = 99.0\n")
+    compiled = cache / f"helper.{sys.implementation.cache_tag}.pyc"
+    unchecked = py_compile.PycInvalidationMode.UNCHECKED_HASH
+    py_compile.compile(str(other), str(compiled), str(helper), invalidation_mode=unchecked)
+    return compiled
+
+
+@pytest.mark.parametrize("kind", ["cache", "link", "compiled"])
+def test_what_no_hash_covers_is_not_frozen(fresh: Path, kind: str) -> None:
+    entry = fresh.parent / "submissions/one"
+    if kind == "cache":
+        _cached(entry)
+    elif kind == "link":
+        (entry / "weights.npz").symlink_to(fresh.parent / "elsewhere.npz")
+    else:
+        (entry / "helper.pyc").write_bytes(b"\0" * 16)
+    own = freeze(fresh, ask("one", "eve"), ask("two", "eve"))
+    assert own.frozen is not None
+    assert [x.name for x in own.frozen.entries] == ["pid_robust", "two"]
+    assert "is in no hash" in own.frozen.left_out["one"]
+
+
+def test_compiled_code_that_came_after_the_freeze_does_not_run(fresh: Path, tmp_path: Path) -> None:
+    entry = fresh.parent / "submissions/one"
+    (entry / "helper.py").write_text("U_IN = 1.0\n")
+    (entry / "controller.py").write_text(
+        "import helper\nclass Controller:\n"
+        "    def reset(self, task): pass\n    def act(self, observation): return helper.U_IN\n"
+    )
+    own = freeze(fresh, ask("one", "eve"))
+    assert own.frozen is not None
+    sha256 = own.frozen.entries[1].sha256
+    _cached(entry)
+    assert combined_hash(file_hashes(entry)) == sha256, "control: the hash does not see it"
+    rigs = load_rigs("physics")
+
+    def commands(submission: Submission) -> Any:
+        return run_protocol(submission, rigs, pips=(20.0,), runner=InProcessRunner()).requested
+
+    assert np.all(commands(open_submission(str(entry))) == 99.0), "control: Python takes it"
+    assert np.all(commands(frozen_copy(entry, sha256, tmp_path / "copy")) == 1.0)
+
+
+def test_a_bad_request_leaves_itself_out(fresh: Path) -> None:
+    asked = FROZEN.isoformat()
+    given: list[Any] = [
+        {"name": "one", "account": "dependabot[bot]", "asked": asked},
+        {"name": "O\u202ene/..", "account": "eve", "asked": asked},
+        {"name": 3, "asked": asked},
+        "nothing",
+        {"name": "two", "account": "Eve", "asked": asked},
+        {"name": "absent", "account": "eve", "asked": asked},
+    ]
+    path = fresh.parent / "requests.json"
+    path.write_text(json.dumps(given))
+    own = freeze(fresh, *rounds.read_requests(path))
+    assert own.frozen is not None
+    assert [(x.name, x.account) for x in own.frozen.entries] == [("pid_robust", ""), ("two", "eve")]
+    left = own.frozen.left_out
+    assert left.keys() == {"one", "O\ufffdne/..", "3", "without a name", "absent"}
+    assert "there is no folder" in left["absent"]
+
+
+def test_outsiders_return_in_the_next_round_by_the_documented_commands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two rounds from one checkout: outsiders, one that cannot be opened, one over its limit."""
+    inside = tmp_path / "submissions"
+    monkeypatch.setattr(rounds, "bundled", lambda: sorted(x.name for x in inside.iterdir()))
+    board, chain = tmp_path / "leaderboard", tmp_path / "chain.json"
+    chain.write_bytes(msgspec.json.encode(referee.chain(SECRET)))
+    listed: list[Any] = []
+
+    def command(*arguments: str) -> None:
+        ended = CliRunner().invoke(app, ["round", *arguments, "--folder", str(board)])
+        assert ended.exit_code == 0, ended.output
+
+    def merged(name: str, account: str) -> None:
+        entry_folder(tmp_path / "submissions" / name, "pid_robust", name)
+        asked = FROZEN + timedelta(seconds=len(listed))
+        listed.append({"name": name, "account": account, "asked": asked.isoformat()})
+
+    def froze(name: str) -> dict[str, str]:
+        (tmp_path / "requests.json").write_text(json.dumps(listed))
+        where = ("--submissions", f"{tmp_path}/submissions")
+        command("freeze", name, *where, "--requests", f"{tmp_path}/requests.json")
+        made = rounds.load(board, name).frozen
+        assert made is not None
+        accounts = {entry.name: entry.account for entry in made.entries}
+        return accounts | {x: f"left out: {why}" for x, why in made.left_out.items()}
+
+    def opened_at(name: str, closes: str) -> None:
+        command("open", name, "--closes", closes, "--limit", "2", "--rehearsal", str(chain))
+
+    entry_folder(tmp_path / "submissions/pid_robust", "pid_robust", "pid_robust")
+    opened_at("a", "2020-01-01")
+    merged("one", "eve")
+    merged("two", "mallory")
+    merged("lacking", "mallory")
+    (tmp_path / "submissions/lacking/controller.py").unlink()
+    first = froze("a")
+    assert "controller.py is missing" in first.pop("lacking")
+    assert first == {"pid_robust": "", "one": "eve", "two": "mallory"}
+
+    opened_at("b", "2020-02-01")
+    shutil.rmtree(tmp_path / "submissions/lacking")
+    merged("lacking", "mallory")
+    merged("third", "mallory")
+    merged("new", "carol")
+    second = froze("b")
+    assert "mallory has 2 entries already" in second.pop("third")
+    assert second == {
+        "pid_robust": "",
+        "one": "eve",
+        "two": "mallory",
+        "lacking": "mallory",
+        "new": "carol",
+    }
 
 
 def test_code_that_changed_after_the_freeze_is_not_scored(fresh: Path, simulators) -> None:

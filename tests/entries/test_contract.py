@@ -254,12 +254,12 @@ def test_slowness_is_found(check):
 def test_time_limits():
     assert contract.ACTS == 756 * 102
     assert list(contract.time_findings(np.full(9, 1e-3))) == []
-    (note,) = contract.time_findings(np.full(9, 10e-3))
+    (note,) = contract.time_findings(np.full(9, 5e-3))
     assert not note.problem
-    (problem,) = contract.time_findings(np.full(9, 20e-3))
+    (problem,) = contract.time_findings(np.full(9, 10e-3))
     assert problem.problem
     assert problem.what == (
-        "act takes 20 ms of processor time on average, the 77112 calls of a score 771 s on 2 cores"
+        "act takes 10 ms of processor time on average, the 77112 calls of a round 771 s"
     )
 
 

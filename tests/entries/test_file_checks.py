@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import shutil
 import zipfile
 
 import numpy as np
@@ -90,9 +91,20 @@ def test_too_many_seeds(demo):
     for seed in range(MAX_SEEDS + 1):
         assert files(demo) == {}
         (demo / "seeds" / f"{seed}").mkdir(parents=True)
-        (demo / "seeds" / f"{seed}" / "note.txt").write_text("other weights")
-    assert files(demo) == {"seeds": "has 11 folders; at most 10 seeds are scored"}
-    with pytest.raises(SubmissionError, match="more than 10 folders in seeds"):
+        shutil.copy(demo / "weights.npz", demo / "seeds" / f"{seed}")
+    assert files(demo) == {"seeds": "seeds has more than 10 folders"}
+    with pytest.raises(SubmissionError, match="seeds has more than 10 folders"):
+        open_submission(str(demo))
+
+
+@pytest.mark.parametrize("name", ["controller.py", "sub/helper.py", "other.npz", "note.txt"])
+def test_seeds_hold_weights_and_nothing_else(demo, name):
+    path = demo / "seeds" / "0" / name
+    path.parent.mkdir(parents=True)
+    shutil.copy(demo / ("weights.npz" if name.endswith("npz") else "controller.py"), path)
+    expected = f"seeds/0/{name} stands for no weights of the submission"
+    assert expected in files(demo)["seeds"]
+    with pytest.raises(SubmissionError, match=expected):
         open_submission(str(demo))
 
 

@@ -28,12 +28,16 @@ import numpy as np
 from scipy import stats
 
 from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.task.metrics.score import LEAST_HEADROOM
 
 #: Probability that any pair of entries is called wrongly.
 ERROR = 0.05
 
-#: Least difference that matters: points of the normalised score, and cmH2O of the stress score.
-POINTS, CMH2O = 1.0, 0.01
+#: Least difference that matters: points of the normalised score, and cmH2O of the stress score, as
+#: of :data:`~ventbench.task.metrics.score.LEAST_HEADROOM`: what the sensor cannot tell apart. Six
+#: draws are on five rigs of each lung; of equal entries with the spread of the published rigs some
+#: rank is false on 0.5 % of boards or fewer, with 7 to 60 entries (``test_comparison.py``).
+POINTS, CMH2O = 1.0, LEAST_HEADROOM
 
 #: Runs of two entries follow each other if their commands, scaled to fit best, differ by this share
 #: (root mean square), and one entry follows another if this share of its runs does. Independent

@@ -11,8 +11,8 @@ of the stress track. No file of an earlier run is trusted; several processes can
 
 from __future__ import annotations
 
+import itertools
 import math
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -36,14 +36,14 @@ from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
 from ventbench.entries import reference as references
 from ventbench.entries.cells import Runner
 from ventbench.entries.folder import (
-    SEEDS,
-    Submission,
     combined_hash,
     file_hashes,
-    open_submission,
+    frozen_copy,
     seeds,
+    with_seed,
 )
 from ventbench.entries.reference import Reference
+from ventbench.entries.result import Score
 from ventbench.entries.runs import DRAWS
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
@@ -79,10 +79,15 @@ class Outcome:
 
 
 def sandboxed() -> Runner:
-    """The runner of official scores; SandboxError if this machine lacks a layer that they need."""
+    """The runner of official scores of one entry, which has a budget of time for all of its runs.
+
+    Raises:
+        SandboxError: if this machine lacks a layer that they need.
+    """
+    from ventbench.sandbox.pipes import Budget
     from ventbench.sandbox.runner import SandboxRunner
 
-    return SandboxRunner(require_official=True)
+    return SandboxRunner(require_official=True, budget=Budget(protocol.ENTRY_S))
 
 
 def rerun(
@@ -177,19 +182,17 @@ def _run(
     assert isinstance(score, Record)
     simulators, apart = load(), runner()
     try:
-        submission = open_submission(str(code))
-        _check_same(submission, score)
         own = store.load(folder).evidence.rounds.get(score.header.draws.season)
         what = protocol_of(score.header, simulators, own)
-        result = run_protocol(
-            submission,
-            what.rigs,
-            track=score.track,
-            stress=0 if score.header.stress is None else DRAWS,
-            runner=apart,
-            drawn=what.drawn,
-        )
-        _check_same(open_submission(str(code)), score)
+        with TemporaryDirectory() as place:
+            result = run_protocol(
+                frozen_copy(code, score.header.submission.sha256, Path(place)),
+                what.rigs,
+                track=score.track,
+                stress=0 if score.header.stress is None else DRAWS,
+                runner=apart,
+                drawn=what.drawn,
+            )
         runs = [(result.requested, result.failures, score.header.failures)]
         if (stress := score.header.stress) is not None and result.stressed is not None:
             again = result.stressed
@@ -210,12 +213,6 @@ def _run(
         detail, closeness = f"its code cannot be run: {error}", ""
     state = DIFFERENT if detail else REPRODUCED
     return Outcome(score.sha256, score.name, score.track, state, detail or closeness)
-
-
-def _check_same(submission: Submission, score: Record) -> None:
-    """Refuse code that has changed since it was found."""
-    if submission.sha256 != score.header.submission.sha256:
-        raise InputError(f"{submission.label} was changed while it ran")
 
 
 def _closeness(recorded: Floats, again: Floats) -> str:
@@ -319,6 +316,7 @@ def score(
     work: Path,
     *,
     places: Iterable[Path],
+    only: Sequence[str] = (),
     load: Load = frozen.load,
     runner: Callable[[], Runner] = sandboxed,
     secret: str | None = None,
@@ -333,8 +331,10 @@ def score(
         pool: executor of bounds and entries.
         work: folder for what is finished.
         places: folders with the code.
+        only: entries to score alone, in a job of their own: what they give is kept in ``work``, and
+            the same without it closes the round.
         load: gives the simulators; outside of this process, a function of a module.
-        runner: gives the runner; outside of this process, a function of a module.
+        runner: gives the runner of an entry; outside of this process, a function of a module.
         secret: key that signs the records; without one they have no rank.
         starts: of the bounds, see :data:`ventbench.task.attainable.STARTS`.
         progress: called with what is going on, how much of it is done, and of how much.
@@ -359,49 +359,37 @@ def score(
         progress=lambda ready, count: tell("bounds of the draws", ready, count),
     )
     bounds = computed.save(own.folder / BOUNDS)
+    entries = own.frozen.entries if own.frozen else []
     jobs = {
-        f"{entry}-{track}": (
-            leaderboard.resolve(),
-            name,
-            code[entry],
-            track,
-            work.resolve(),
-            load,
-            runner,
-        )
-        for entry, track in runs
-    }
-    jobs |= {
-        f"{entry}-{track}-seed{at}": (*jobs[f"{entry}-{track}"], seed.name)
-        for entry, track in runs
-        for at, seed in enumerate(seeds(code[entry]))
+        entry.name: (leaderboard.resolve(), name, code[entry.name], work.resolve(), load, runner)
+        for entry in entries
+        if not only or entry.name in only
     }
     tell("entries and their seeds", 0, len(jobs))
     made: dict[str, dict[str, Any]] = {}
     for job, scored in kept_results(done, pool, _score_entry, jobs):
         made[job] = scored
         tell("entries and their seeds", len(made), len(jobs))
+    if only:
+        return own
     records: dict[str, str] = {}
     failed: dict[str, str] = {}
     by_seed: dict[str, list[float]] = {}
     for at, (entry, track) in enumerate(runs):
-        scored, key = made[f"{entry}-{track}"], f"{entry} ({track})"
-        if "failed" in scored:
-            failed[key] = scored["failed"][: schema.MAX_TEXT]
-            continue
-        for seed in range(len(seeds(code[entry]))):
-            one = made[f"{entry}-{track}-seed{seed}"]
-            if "failed" in one:
-                failed[f"{key}, seed {seed}"] = one["failed"][: schema.MAX_TEXT]
+        key = f"{entry} ({track})"
+        for run, outcome in made[entry][track].items():
+            if "failed" in outcome:
+                failed[key + run] = outcome["failed"][: schema.MAX_TEXT]
+            elif run:
+                by_seed.setdefault(key, []).append(outcome["score"])
             else:
-                by_seed.setdefault(key, []).append(one["score"])
-        path = Path(scored["record"])
-        kept = leaderboard / canonical.RECORDS / path.name
-        if not kept.exists():
-            store.add(leaderboard, path, simulators)
-        if secret:
-            gate.sign(leaderboard, kept, secret)
-        records[key] = path.stem
+                path = Path(outcome["record"])
+                kept = leaderboard / canonical.RECORDS / path.name
+                if not kept.exists():
+                    store.add(leaderboard, path, simulators)
+                if secret:
+                    gate.sign(leaderboard, kept, secret)
+                records[key] = path.stem
         tell("records", at + 1, len(runs))
     content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))
     files.write_bytes(own.folder / RESULT, content)
@@ -414,46 +402,53 @@ def _score_entry(
     leaderboard: Path,
     name: str,
     code: Path,
-    track: str,
     work: Path,
     load: Load,
     runner: Callable[[], Runner],
-    seed: str = "",
 ) -> dict[str, Any]:
-    """Score one entry on one track, or the same with the files of one of its seeds.
+    """Score an entry on its tracks, and with the weights of each of its seeds, all by one runner.
 
     Returns:
-        The path of its record's draft, the ranked score of a seed, or why it failed.
+        By track and run (empty, or ``", seed N"``) the path of its record's draft, the ranked score
+        of a seed, or why it failed.
     """
     own, simulators = rounds.load(leaderboard, name), load()
     rigs = rigs_of(simulators)
-    drawn = own.draws(rigs)
-    try:
-        submission = open_submission(str(code))
-        if not own.entered(submission.manifest.name, track, submission.sha256 or ""):
-            raise InputError(f"{code} was changed while the round was scored")
-        with TemporaryDirectory() as place:
-            if seed:
-                other = Path(place) / code.name
-                shutil.copytree(code, other, ignore=shutil.ignore_patterns(SEEDS))
-                shutil.copytree(code / SEEDS / seed, other, dirs_exist_ok=True)
-                submission = open_submission(str(other))
-            result = run_protocol(
-                submission,
-                rigs,
-                track=track,
-                drawn=drawn,
-                reference=own.bounds(),
-                stress=DRAWS if track == "robustness" and not seed else 0,
-                runner=runner(),
-            )
-        if seed:
-            assert result.normalised is not None
-            value = float(result.normalised[:, 1:][:, result.ranked].mean())
-            return {"failed": "a cell failed"} if math.isnan(value) else {"score": value}
-        about: Mapping[str, Any] = {"round": name, "frozen": own.frozen_sha256}
-        draft = create.create(result, simulators, source=about)
-        path = draft.save(work / "drafts")
-    except (InputError, FloatingPointError) as error:
-        return {"failed": str(error)}
-    return {"record": str(path)}
+    entry = next(x for x in own.frozen.entries if x.name == code.name) if own.frozen else None
+    assert entry is not None
+    drawn, bounds, apart = own.draws(rigs), own.bounds(), runner()
+    made: dict[str, Any] = {}
+    with TemporaryDirectory() as place:
+        for track, seed in itertools.product(entry.tracks, ["", *(x.name for x in seeds(code))]):
+            run = f", seed {seed}" if seed else ""
+            outcomes = made.setdefault(track, {})
+            try:
+                at = Path(place) / f"{track}{seed}"
+                submission = frozen_copy(code, entry.sha256, at)
+                if seed:
+                    submission = with_seed(submission, seed, at / "seed")
+                result = run_protocol(
+                    submission,
+                    rigs,
+                    track=track,
+                    drawn=drawn,
+                    reference=bounds,
+                    stress=DRAWS if track == "robustness" and not seed else 0,
+                    runner=apart,
+                )
+                if seed:
+                    outcomes[run] = _of_seed(result)
+                    continue
+                about: Mapping[str, Any] = {"round": name, "frozen": own.frozen_sha256}
+                draft = create.create(result, simulators, source=about)
+                outcomes[run] = {"record": str(draft.save(work / "drafts"))}
+            except (InputError, FloatingPointError, OSError) as error:
+                outcomes[run] = {"failed": str(error)}
+    return made
+
+
+def _of_seed(result: Score) -> dict[str, Any]:
+    """Ranked score of a seed."""
+    assert result.normalised is not None
+    value = float(result.normalised[:, 1:][:, result.ranked].mean())
+    return {"failed": "a cell failed"} if math.isnan(value) else {"score": value}

@@ -249,14 +249,21 @@ def _track(
 def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:
     """Name the source of each entry whose commands follow those of an earlier one.
 
-    The earlier one is that whose name came first onto the leaderboard, baselines before all.
+    The earlier one is that whose code was frozen first, in an earlier round or before it in the
+    same, baselines before all. What a record says of its date decides nothing.
     """
+    frozen = [x.frozen for x in leaderboard.evidence.rounds.values() if x.frozen]
     first: dict[str, int] = {}
-    for at, record in enumerate(leaderboard.scores):
-        first.setdefault(record.name, at)
-    order = sorted(
-        entries, key=lambda x: (x.record.name not in BASELINES.values(), first[x.record.name])
-    )
+    for own in sorted(frozen, key=lambda x: x.frozen):
+        for entered in own.entries:
+            first.setdefault(entered.sha256, len(first))
+
+    def place(entry: Entry) -> tuple[bool, int]:
+        record = entry.record
+        code = record.header.submission.sha256
+        return record.name not in BASELINES.values(), first.get(code, len(first))
+
+    order = sorted(entries, key=place)
     found = comparison.sources([_commands(leaderboard, x.record) for x in order])
     return [
         entry if at is None else replace(entry, source=order[at].record.name)

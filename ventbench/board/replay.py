@@ -94,7 +94,7 @@ def _breath(plants: Plant, scenario: Scenario, commands: Array, breath: Array) -
 
 
 def _breaths(plants: Sequence[Plant], scenario: Scenario, commands: Floats) -> Any:
-    """Inspirations and expirations of all breaths, with the plants of each, for commands ``(L, ..., B, S)``."""
+    """Both phases of all breaths, with the plants of each, for commands ``(L, ..., B, S)``."""
     breaths = [
         jax.tree.map(np.asarray, _breath(plant, scenario, jnp.asarray(commands[..., k, :]), k))
         for k, plant in enumerate(plants)

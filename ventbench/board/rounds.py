@@ -28,12 +28,12 @@ import tomli_w
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.base.text import deceptive
+from ventbench.base.text import deceptive, plain
 from ventbench.board import beacon, canonical, schema
 from ventbench.board.beacon import QUICKNET, Chain, Value
 from ventbench.board.canonical import ROUNDS
 from ventbench.entries import reference as references
-from ventbench.entries.folder import Submission, open_submission
+from ventbench.entries.folder import Submission, bundled, open_submission, uncovered
 from ventbench.entries.reference import Reference
 from ventbench.plants import frozen
 from ventbench.plants.rigs import Rigs
@@ -48,6 +48,9 @@ OPENED, PROTOCOL, FROZEN, BEACON, BOUNDS, RESULT = canonical.ROUND_FILES
 DELAY_S, LIMIT = 600, 3
 
 _MAX_BYTES = 5_000_000
+
+#: Characters of a name that is none which are shown.
+_SHOWN = 80
 
 _Name = Annotated[str, schema.matching(canonical.ROUND_NAME)]
 _Account = Annotated[str, schema.matching(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,62}[A-Za-z0-9])?")]
@@ -231,6 +234,15 @@ def load_all(leaderboard: Path) -> tuple[Round, ...]:
     return tuple(sorted(made, key=lambda x: (x.opened.closes, x.name), reverse=True))
 
 
+def project_entries(leaderboard: Path) -> list[str]:
+    """Entries of the project: those of the newest round, or the bundled ones before the first.
+
+    What outsiders have sent since then lies among the bundled submissions too, and is theirs.
+    """
+    made = load_all(leaderboard)
+    return list(made[0].opened.project) if made else bundled()
+
+
 def open_round(
     leaderboard: Path,
     name: str,
@@ -271,14 +283,15 @@ def freeze(
     leaderboard: Path,
     name: str,
     submissions: Path,
-    requests: Sequence[Request],
+    requests: Sequence[Request | Mapping[str, Any]],
     simulators: Mapping[str, Any],
     *,
     now: datetime | None = None,
 ) -> Round:
     """Take the hashes of all entries, one folder each; later changes do not count.
 
-    Requests say who asked for each; entries of the project need none.
+    Requests say who asked for each, as the platform gives them; entries of the project need none. A
+    request that is none, and an entry that cannot be opened, leave themselves out, with the reason.
 
     Raises:
         InputError: if the round is not open or has not closed yet, or nothing can be frozen.
@@ -290,8 +303,9 @@ def freeze(
         raise InputError(f"round {name} closes at {own.opened.closes:%Y-%m-%d %H:%M:%S} UTC")
     before = [r.frozen for r in load_all(leaderboard) if r.frozen]  # the earliest one last
     owners = {x.name: x.account for frozen in before for x in frozen.entries}
+    good, bad = _sorted_out(requests)
     asked: dict[str, Request] = {}
-    for request in sorted(requests, key=lambda x: (x.asked, x.name)):
+    for request in sorted(good, key=lambda x: (x.asked, x.name)):
         asked.setdefault(request.name, request)
     order = [*own.opened.project, *(x for x in asked if x not in own.opened.project)]
     entries: list[dict[str, Any]] = []
@@ -305,7 +319,7 @@ def freeze(
                 raise InputError("the name belongs to another account since an earlier round")
             if account and count.get(account, 0) >= own.opened.limit:
                 raise InputError(f"account {account} has {own.opened.limit} entries already")
-        except InputError as error:
+        except (InputError, OSError) as error:
             left_out[entry] = str(error)[: schema.MAX_TEXT]
             continue
         count[account] = count.get(account, 0) + 1
@@ -313,6 +327,7 @@ def freeze(
         entries.append(
             {"name": entry, "account": account, "sha256": submission.sha256, "tracks": tracks}
         )
+    left_out |= {x: why for x, why in bad.items() if x not in order}
     if not entries:
         raise InputError(f"round {name}: no entry can be frozen; {left_out}")
     written = canonical.canonical(protocol_of(simulators))
@@ -328,10 +343,27 @@ def freeze(
     return load(leaderboard, name)
 
 
+def _sorted_out(
+    requests: Sequence[Request | Mapping[str, Any]],
+) -> tuple[list[Request], dict[str, str]]:
+    """Requests, and by what they call themselves why others are none."""
+    good, bad = [], {}
+    for given in requests:
+        try:
+            good.append(msgspec.convert(given, Request, from_attributes=True))
+        except msgspec.ValidationError as error:
+            said = given.get("name") if isinstance(given, Mapping) else None
+            name = plain(str(said or "without a name"))[:_SHOWN]
+            bad[name] = f"is no request: {error}"[: schema.MAX_TEXT]
+    return good, bad
+
+
 def _named(folder: Path, name: str) -> Submission:
     """Open a submission that must have the name of its folder, and authors who can be read."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder.name}")
+    if strange := uncovered(folder):
+        raise InputError(f"{strange[0]} is in no hash: a cache, a link or compiled code; remove it")
     submission = open_submission(str(folder))
     if submission.manifest.name != name:
         raise InputError(f"submission.toml calls it {submission.manifest.name}")
@@ -392,8 +424,10 @@ def protocol_differences(own: Round, simulators: Mapping[str, Any]) -> list[str]
     return [key for key in sorted({*recorded, *here}) if recorded.get(key) != here.get(key)]
 
 
-def read_requests(path: Path) -> list[Request]:
+def read_requests(path: Path) -> list[Any]:
     """Read who asked for which entry: a JSON list of objects with the keys of :class:`Request`.
+
+    What is in the list is for :func:`freeze` to judge, one by one.
 
     Raises:
         InputError: if it is no such file.
@@ -418,4 +452,4 @@ def _toml(path: Path, kind: type[schema.TableT]) -> schema.TableT:
 
 
 _RESULT = msgspec.json.Decoder(Result)
-_REQUESTS = msgspec.json.Decoder(list[Request])
+_REQUESTS = msgspec.json.Decoder(list[Any])

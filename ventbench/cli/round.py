@@ -43,8 +43,8 @@ def open_(
         list[str] | None,
         typer.Option(
             metavar="ENTRY",
-            help="Entry of the project, which no account asks for; may be repeated. Default: the "
-            "bundled submissions.",
+            help="Entry of the project, which no account asks for; may be repeated. Default: those "
+            "of the round before, or the bundled submissions before the first.",
         ),
     ] = None,
     rehearsal: Annotated[
@@ -63,13 +63,12 @@ def open_(
     Example: `ventbench round open 2027-1 --closes 2027-03-01T12:00`
     """
     from ventbench.board import beacon, rounds
-    from ventbench.entries.folder import bundled
 
     made = rounds.open_round(
         folder,
         name,
         closes.replace(tzinfo=datetime.UTC),
-        project or bundled(),
+        project or rounds.project_entries(folder),
         delay_s=delay,
         limit=limit,
         chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
@@ -141,6 +140,14 @@ def score(
     ] = False,
     workers: Workers = 0,
     scheduler: Scheduler = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ENTRY",
+            help="Score this entry alone, in a job of its own; may be repeated. What it gives is "
+            "kept in --out, and the same command without it closes the round.",
+        ),
+    ] = None,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="What is finished; the same command continues.")
     ] = Path("runs/round"),
@@ -176,6 +183,7 @@ def score(
             pool,
             out / name,
             places=[folder.parent / "submissions", *(source or [])],
+            only=only or (),
             secret=os.environ.get(gate.SECRET) or None,
             progress=tell,
         )

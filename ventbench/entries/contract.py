@@ -16,20 +16,32 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.entries.cells import ControllerSession, Runner
-from ventbench.entries.folder import CONTROLLER, Submission, open_submission, resolve
+from ventbench.entries.folder import (
+    CONTROLLER,
+    SEEDS,
+    Submission,
+    open_submission,
+    resolve,
+    seeds,
+    with_seed,
+)
 from ventbench.entries.manifest import GROUPS, Finding, Group
 from ventbench.entries.review import inspect_folder
+from ventbench.entries.runs import DRAWS
 from ventbench.sandbox.child.cell import ROW, Failure, SubmissionError, printable
 from ventbench.task import draws, protocol
 from ventbench.task.interfaces import Task
 from ventbench.task.lungs import LUNG_IDS, LUNGS
+from ventbench.task.stressors import conditions
 
 #: Yields observations, receives commands in %.
 Script = Generator[list[float], float, None]
@@ -184,12 +196,13 @@ def run_all(
     return Answers(kept, failures, np.array(seconds[_WARM_UP:]))
 
 
-#: Calls of ``act`` in a whole score, on how many processor cores, and the longest that they may
-#: take, s: half of what the sandbox allows, as the scorer's machine may be slower and busy.
+#: Calls of ``act`` in a run of all draws, in one under every condition, and the longest that those
+#: of a round may take, s: half of what an entry has, as the scorer's machine may be slower.
 ACTS = len(LUNGS) * len(protocol.PIPS) * (1 + draws.COUNT) * protocol.BREATHS
 ACTS *= protocol.INSPIRATION_STEPS
-CORES = 2
-LONGEST_S = 450.0
+STRESSED_ACTS = len(conditions()) * len(LUNGS) * DRAWS * protocol.BREATHS
+STRESSED_ACTS *= protocol.INSPIRATION_STEPS
+LONGEST_S = 0.5 * protocol.ENTRY_S
 
 _PLACE = re.compile(r"([\w./-]+\.py) line (\d+) ")
 _ADVICE = {
@@ -352,12 +365,34 @@ def _ran(
     if timed_answers.failures or set(repeats) & set(answers.failures):
         return _report(name, findings, left_out=_TO_RUN[1:], sandbox=sandbox)
     findings += repetition_findings(*(answers.commands[k] for k in repeats))
-    findings += time_findings(timed_answers.act_seconds)
+    findings += _seed_findings(submission, plain_runs, runner, clock)
+    acts = ACTS * len(tracks) * (1 + len(seeds(submission.folder)))
+    acts += STRESSED_ACTS * ("robustness" in tracks)
+    findings += time_findings(timed_answers.act_seconds, acts)
     act_us = (
         1e6 * float(timed_answers.act_seconds.mean()),
         1e6 * float(timed_answers.act_seconds.max()),
     )
     return _report(name, findings, sandbox=sandbox, act_us=act_us)
+
+
+def _seed_findings(
+    submission: Submission,
+    runs: Sequence[ContractRun],
+    runner: Runner,
+    clock: Callable[[ControllerSession], float],
+) -> Iterator[Finding]:
+    """What fails with the weights of a seed, in the first of some runs."""
+    for seed in seeds(submission.folder):
+        with TemporaryDirectory() as place:
+            other = with_seed(submission, seed.name, Path(place))
+            run = runs[0]._replace(script=breaths())
+            try:
+                found = _failure_findings([run], run_all(other, [run], runner, clock))
+            except SubmissionError as error:
+                found = [Finding("run", CONTROLLER, str(error), _IMPORT_ADVICE)]
+        for finding in found:
+            yield replace(finding, what=f"with the weights of {SEEDS}/{seed.name} {finding.what}")
 
 
 def _report(name: str, findings: list[Finding], **others: object) -> CheckReport:
@@ -429,15 +464,15 @@ def _differ(first: Floats, other: Floats) -> str:
     return f"{other[k]:.9g} % instead of {first[k]:.9g} % at step {step + 1} of breath {breath + 1}"
 
 
-def time_findings(act_seconds: Floats) -> Iterator[Finding]:
+def time_findings(act_seconds: Floats, acts: int = ACTS) -> Iterator[Finding]:
     """Findings on how long ``act`` takes, by the processor time of each call, s."""
     mean = float(act_seconds.mean())
-    total = mean * ACTS / CORES
-    score = f"the {ACTS} calls of a score {total:.0f} s on {CORES} cores"
+    total = mean * acts
+    score = f"the {acts} calls of a round {total:.0f} s"
     what = f"act takes {1e3 * mean:.3g} ms of processor time on average, {score}"
     if total > LONGEST_S:
         advice = f"make it {total / LONGEST_S:.1f} times faster: {LONGEST_S:g} s are the limit"
         yield Finding("time", CONTROLLER, what, advice)
-    elif mean > 0.2 * protocol.DT:
+    elif mean > 0.1 * protocol.DT:
         advice = f"at a bench it has {1e3 * protocol.DT:g} ms with everything else"
         yield Finding("time", CONTROLLER, what, advice, problem=False)

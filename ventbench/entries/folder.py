@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+import shutil
 import stat
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -35,7 +36,7 @@ from ventbench.task.interfaces import API_VERSION, Task
 MAX_BYTES = 5_000_000
 MAX_FILES = 1000
 
-#: Folder of a submission with a folder for each seed of its training, and most of them: the files
+#: Folder of a submission with a folder for each seed of its training, and most of them: the weights
 #: of one stand for those of the submission, so that a round tells how much a seed is worth.
 SEEDS, MAX_SEEDS = "seeds", 10
 
@@ -112,8 +113,7 @@ def open_submission(name: str) -> Submission:
             break
     if size > MAX_BYTES:
         problems.append(f"{name}: {size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:g} MB are accepted")
-    if len(seeds(folder)) > MAX_SEEDS:
-        problems.append(f"{name}: more than {MAX_SEEDS} folders in {SEEDS}")
+    problems.extend(f"{name}: {problem}" for problem in _seed_problems(folder))
     problems.extend(
         f"{name}: {required} is missing"
         for required in (CONTROLLER, MANIFEST)
@@ -229,6 +229,59 @@ def file_hashes(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): files.sha256(path) for path in paths}
 
 
+def uncovered(folder: Path) -> list[str]:
+    """What lies in a folder and is not in its hash: links, caches, compiled code, by path."""
+    covered, paths = file_hashes(folder), []
+    for parent, folders, names in walk(folder):
+        links = [name for name in folders if (parent / name).is_symlink()]
+        inside = ((parent / name).relative_to(folder).as_posix() for name in (*links, *names))
+        paths += [path for path in inside if path not in covered or ending(path) in _COMPILED]
+    return sorted(paths)
+
+
+def frozen_copy(folder: Path, sha256: str, place: Path) -> Submission:
+    """Copy what the hash of a submission covers into a new folder, and open the copy.
+
+    Whatever else lies in the folder, or is put there later, is not in the copy.
+
+    Raises:
+        SubmissionError: if the copy has another hash, or cannot be opened.
+    """
+    copy = place / folder.name
+    for name in file_hashes(folder):
+        target = copy / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(folder / name, target, follow_symlinks=False)
+    submission = open_submission(str(copy))
+    if submission.sha256 != sha256:
+        raise SubmissionError(f"{folder} is not what was frozen, {sha256[:12]}")
+    return submission
+
+
+def with_seed(submission: Submission, seed: str, place: Path) -> Submission:
+    """Copy a submission with the weights of one of its seeds in the place of its own."""
+    other = place / submission.folder.name
+    shutil.copytree(submission.folder, other, ignore=shutil.ignore_patterns(SEEDS))
+    shutil.copytree(submission.folder / SEEDS / seed, other, dirs_exist_ok=True)
+    return open_submission(str(other))
+
+
+def _seed_problems(folder: Path) -> list[str]:
+    """Files of seeds that are no weights of the submission, and seeds that are too many."""
+    own, problems = seeds(folder), []
+    if len(own) > MAX_SEEDS:
+        problems.append(f"{SEEDS} has more than {MAX_SEEDS} folders")
+    inside = [path for path in _walk(folder / SEEDS) if (folder / SEEDS).is_dir()]
+    for path in inside:
+        parts = path.relative_to(folder / SEEDS).parts
+        stands_for = folder.joinpath(*parts[1:])
+        weights = ending(path.name) in ARRAYS and stands_for.is_file() and len(parts) > 1
+        if not weights:
+            name = printable(path.relative_to(folder).as_posix())
+            problems.append(f"{name} stands for no weights of the submission: seeds hold no code")
+    return problems
+
+
 def combined_hash(hashes: dict[str, str]) -> str:
     """SHA-256 of the names and contents of a submission's files, by the hash of each.
 
@@ -263,9 +316,8 @@ def check_files(folder: Path) -> list[Finding]:
         else:
             findings.append(_irregular(name, status.st_mode))
     findings += _size(sizes)
-    if len(seeds(folder)) > MAX_SEEDS:
-        what = f"has {len(seeds(folder))} folders; at most {MAX_SEEDS} seeds are scored"
-        findings.append(_problem(SEEDS, what, "leave some out"))
+    advice = "put there only what another seed of the training changes"
+    findings += [_problem(SEEDS, what, advice) for what in _seed_problems(folder)]
     for first, second in collisions(sizes):
         what = f"differs from {first} only in upper and lower case"
         findings.append(_problem(second, what, "rename one of them"))
@@ -384,8 +436,9 @@ _OTHER_KIND = (
     "leave it out: only Python sources, text, pictures (.png, .jpg, .svg) "
     "and weights (.npz, .npy, .safetensors) are accepted"
 )
+_COMPILED = (".pyc", ".pyo", ".pyd", ".so", ".dll", ".dylib", ".a", ".o", ".exe")
 _KIND_ADVICE = {
-    **dict.fromkeys((".pyc", ".pyo", ".pyd", ".so", ".dll", ".dylib", ".a", ".o", ".exe"), _CODE),
+    **dict.fromkeys(_COMPILED, _CODE),
     **dict.fromkeys((".pkl", ".pickle", ".joblib", ".dill", ".pt", ".ckpt", ".h5"), _PICKLE),
     **dict.fromkeys(
         (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".whl", ".egg"), _ARCHIVE

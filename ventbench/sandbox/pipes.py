@@ -55,6 +55,23 @@ class SandboxError(InputError):
 MIB, GIB = 1 << 20, 1 << 30
 
 
+@dataclass
+class Budget:
+    """Time that all sessions of an entry share; it is used up as they end.
+
+    Whoever sleeps runs out of the clock's time, whoever computes of the processor's.
+    """
+
+    seconds: float  #: of each.
+    clock: float = 0.0  #: time on the clock that was taken, s.
+    processor: float = 0.0  #: processor time that was taken, s.
+
+    @property
+    def left(self) -> float:
+        """What is left of the scarcer one, s."""
+        return self.seconds - max(self.clock, self.processor)
+
+
 @dataclass(frozen=True)
 class Allowance:
     """Limits of a session; the processor is shared by all its cells, hence patience, not a pace."""

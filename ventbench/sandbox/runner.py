@@ -17,6 +17,7 @@ import signal
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -30,6 +31,7 @@ from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.pipes import (
     Allowance,
     Asked,
+    Budget,
     Clock,
     Outcome,
     Pipes,
@@ -110,6 +112,7 @@ class SandboxRunner:
         require_official: refuse to run where a layer is missing that official results need.
         allowance: what a submission may use.
         clock: times the cells out; the system's if not given.
+        budget: what all sessions that this runner starts may take together.
 
     Raises:
         SandboxError: if a cell cannot be locked down, or not far enough.
@@ -121,7 +124,9 @@ class SandboxRunner:
         require_official: bool = False,
         allowance: Allowance | None = None,
         clock: Clock | None = None,
+        budget: Budget | None = None,
     ):
+        self._budget = budget
         self._layers = layers() if kernel.LINUX else ()
         check_floor(self._layers)
         self._allowance = allowance or Allowance()
@@ -152,9 +157,17 @@ class SandboxRunner:
 
         Raises:
             SandboxError: if a cell does not show the layers of :attr:`sandbox`.
-            SubmissionError: if the code cannot be imported.
+            SubmissionError: if the code cannot be imported, or the budget is spent.
         """
-        return SandboxSession(submission, tasks, self._layers, self._allowance, self._clock)
+        budget, allowance = self._budget, self._allowance
+        if budget is not None:
+            if budget.left <= 0.0:
+                raise SubmissionError(
+                    f"{submission.label}: took {budget.clock:.0f} s and {budget.processor:.0f} s "
+                    f"of processor time; an entry has {budget.seconds:g} s for all of its runs"
+                )
+            allowance = replace(allowance, total_s=min(allowance.total_s, budget.left))
+        return SandboxSession(submission, tasks, self._layers, allowance, self._clock, budget)
 
 
 #: A silent cell is waited for this many patiences: the machine may be busy with others. But not
@@ -196,13 +209,15 @@ class SandboxSession(Asked):
         layers: tuple[str, ...],
         allowance: Allowance,
         clock: Clock | None = None,
+        budget: Budget | None = None,
     ):
         self.failures: dict[int, Failure] = {}
         self._count, self._live = len(tasks), set(range(len(tasks)))
         self._allowance, self._sequence = allowance, [0] * len(tasks)
         self._asked, self._void = set[int](), set[int]()
         self._clock = clock or Clock()
-        self._deadline = self._clock.now() + allowance.total_s
+        self._begun = self._clock.now()
+        self._deadline = self._begun + allowance.total_s
         with contextlib.ExitStack() as stack:
             stack.enter_context(descriptors_for(2 * len(tasks)))
             hide_process()
@@ -215,9 +230,17 @@ class SandboxSession(Asked):
             stack.callback(self._zygote.close)
             # Ended first: cells then leave by themselves, and the zygote need not kill.
             stack.callback(self._pipes.close_all)
+            if budget is not None:
+                stack.callback(self._charge, budget)
             self._lock_down(tasks, layers)
             self._reset()
             self._stack = stack.pop_all()
+
+    def _charge(self, budget: Budget) -> None:
+        """Take from a budget what this session has had."""
+        budget.clock += self._clock.now() - self._begun
+        with contextlib.suppress(SandboxError, KeyError):  # of cells that were never started
+            budget.processor += self.processor_time()
 
     def _lock_down(self, tasks: Sequence[Task], layers: tuple[str, ...]) -> None:
         # In an order that nobody knows: a process's number says nothing about its cell.
@@ -236,6 +259,8 @@ class SandboxSession(Asked):
             if lacking:
                 raise SandboxError(f"a cell lacks {', '.join(sorted(lacking))}")
         if late:
+            if self._clock.now() >= self._deadline:
+                raise SubmissionError(f"its time was over before {len(late)} cells had started")
             raise SandboxError(f"{len(late)} cells did not start in time")
 
     def _reset(self) -> None:
@@ -339,7 +364,7 @@ class SandboxSession(Asked):
             outcomes = self._pipes.collect(
                 set(late), self._sequence, wire.FAILED, _GRACE_S, deadline
             )
-        limit = f"{self._allowance.total_s:g} s for the whole score"
+        limit = f"the {self._allowance.total_s:.0f} s that were left for its runs"
         if self._clock.now() < self._deadline:
             patience = self._allowance.patience_s
             limit = f"{patience:g} s of processor time, or {_SILENCES * patience:g} s in all"

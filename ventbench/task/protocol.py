@@ -38,6 +38,10 @@ RESOLUTION = 0.001
 #: How many targets ahead of now an observation holds.
 TARGETS_AHEAD = 10
 
+#: What an entry may take of a round, s, on the clock and of processor time: all of its tracks,
+#: seeds and stressed runs together. Whoever sleeps loses alone.
+ENTRY_S = 900.0
+
 #: Safety gate of a breath: at most ``SAFETY_TIME`` s in all above ``min(SAFETY_PRESSURE, PIP +
 #: SAFETY_MARGIN)`` cmH2O, and no sample above ``SAFETY_CAP``; else the entry fails on that lung.
 SAFETY_PRESSURE = 60.0

@@ -12,7 +12,7 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.entries.runs import Runs
-from ventbench.task import draws
+from ventbench.task import draws, protocol
 from ventbench.task.metrics.score import normalised
 
 
@@ -90,9 +90,10 @@ class Figures:
         apart = np.flatnonzero(highest > lowest)
         if not len(apart):
             return ""
-        pip = apart[0]
+        at = apart[0]
+        low, high, pip = f"{lowest[at]:g} %", f"{highest[at]:g} %", protocol.PIPS[at]
         return (
-            f"in the nominal run at PIP number {pip + 1} the first command is {lowest[pip]:g} % on "
-            f"one lung and {highest[pip]:g} % on another, though the first observation is the "
+            f"in the nominal run at PIP {pip:g} the first command is {low} on "
+            f"one lung and {high} on another, though the first observation is the "
             "same: the lung was known"
         )

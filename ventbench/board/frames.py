@@ -153,7 +153,7 @@ COLUMNS = (
     Column(
         _of_three("normalised"),
         _compared("score"),
-        "0 = best attainable, 100 = best PID of the lung; mean over the draws",
+        "0 = best attainable, 100 = best PID of the lung; mean over the draws that rank",
         title="Normalised",
         digits=1,
         terminal=("score", "95 %"),
@@ -161,23 +161,23 @@ COLUMNS = (
     Column(
         _of_three("normalised_to_pid"),
         _compared("to_baseline"),
-        "Difference of the normalised score to the PID of this track",
-        title="To the PID",
+        "Difference of the normalised score to the track's baseline, pid_best or pid_robust",
+        title="To the baseline",
         digits=1,
         sign=True,
     ),
     Column(
         _of_three("normalised_to_above"),
         _compared("to_above"),
-        "Normalised score minus that of the entry one rank above",
-        title="To the rank above",
+        "Normalised score minus that of the entry above it",
+        title="To the entry above",
         digits=1,
         sign=True,
     ),
     Column(
         _of_three("score_cmH2O", "score"),
         lambda x: x.row.error,
-        "The paper's figure: mean |pressure − target| over the draws, cmH₂O",
+        "The paper's figure: mean |pressure − target| over the draws that rank, cmH₂O",
         title="Error",
         terminal=("error",),
     ),
@@ -186,7 +186,11 @@ COLUMNS = (
         lambda x: x.row.nominal,
         "error without noise and deviations on the reference rigs, as in the paper, cmH2O",
     ),
-    Column(("worst_cmH2O",), lambda x: x.row.worst[0], "highest mean of one lung and PIP, cmH2O"),
+    Column(
+        ("worst_cmH2O",),
+        lambda x: x.row.worst[0],
+        "highest mean of one lung and PIP over all draws, cmH2O",
+    ),
     Column(("worst_lung",), lambda x: x.row.worst[1], "lung of the worst cell"),
     Column(("worst_pip",), lambda x: x.row.worst[2], "PIP of the worst cell, cmH₂O"),
     Column(
@@ -302,7 +306,7 @@ def load_cells(folder: Path | str | None = None, *, track: str | None = None) ->
     Columns: ``track``, ``draws``, ``name``, ``lung``, ``pip`` (cmH2O), ``draw`` (0 is the nominal
     run, draws count from 1), ``error_cmH2O`` (mean absolute error over the scored
     inspirations; NaN if the cell failed), ``peak_cmH2O`` (highest pressure) and
-    ``steps_above`` (longest time above the safety limit, control steps).
+    ``steps_above`` (samples above the safety limit in a breath, the most of the run).
     """
     import numpy as np
     import pandas as pd

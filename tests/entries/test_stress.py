@@ -315,7 +315,7 @@ def test_nothing_is_changed_without_a_stressor(runs: Runs, cells: Cells) -> None
             lambda leaf: jnp.asarray(np.asarray(leaf)[:, :, 0], float),
             (cells.plants, cells.scenario),
         )
-        commands = np.asarray(runs.requested)[0].reshape(6, 1, -1)
+        commands = environment.resolved(np.asarray(runs.requested)[0]).reshape(6, 1, -1)
         varied: Any = environment.vary(plant, scenario, 2)
         assert float(varied.R[0, 0]) != np.asarray(jax.tree.leaves(cells.plants)[0])[0, 0, 0]
         alone, _ = rollouts.closed_loop(plant, Script(commands), scenario)

@@ -66,7 +66,7 @@ def add(
     ],
     folder: Folder = FOLDER,
 ) -> None:
-    """Add records whose replay gives the recorded numbers.
+    """Add records that replay: on these simulators, with commands that can be honest.
 
     Example: `ventbench board add runs/record/3f2a....json`
     """
@@ -269,8 +269,7 @@ def _summary(console: Console, report: Report) -> None:
     state = f"{count} problem{'s' if count > 1 else ''}" if count else "no problems"
     reproduced = f", {report.reproduced} reproduced by their code" if report.reproduced else ""
     console.print(
-        f"{state}: {report.records} records, {report.replayed} replayed "
-        f"(largest difference {report.deviation:.1e} cmH2O){reproduced}",
+        f"{state}: {report.records} records, {report.replayed} replayed{reproduced}",
         soft_wrap=True,
     )
 

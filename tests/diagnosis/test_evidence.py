@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from ventbench.diagnosis.evidence import Posterior, _integrated_out, evidence
-from ventbench.diagnosis.in_time import EXCHANGEABLE, _affected, command_p_value
+from ventbench.diagnosis.in_time import EXCHANGEABLE, _affected, command_p_value, phase_p_value
 from ventbench.diagnosis.linearised import Term, gaussian
 from ventbench.system_id.data import Data
 
@@ -56,6 +56,20 @@ def test_breaths_that_commands_predict_are_no_event() -> None:
         small.append(command_p_value(acts, _commanded(peaks), pressure))
         assert command_p_value((peaks > 70.0) * 0.9, _commanded(peaks), pressure) < EXCHANGEABLE
     assert np.mean(np.array(small) <= EXCHANGEABLE) <= 0.05
+
+
+def test_swings_whose_sign_the_breath_predicts_are_none() -> None:
+    rng, chance = np.random.default_rng(7), []
+    for _ in range(50):
+        peaks = rng.uniform(3.0, 100.0, 40)
+        data, pressure = _commanded(peaks), peaks[:, None] + np.zeros(30)
+        phase = rng.uniform(0.0, 2.0 * np.pi, 40)
+        sizes = np.stack([np.sin(phase), np.cos(phase)], axis=1) * np.sqrt(peaks)[:, None]
+        chance.append(phase_p_value(sizes, data, pressure))
+        for same in (np.ones(40), (peaks - 50.0) / 25.0):
+            sizes[:, 0] = same + 0.5 * rng.standard_normal(40)
+            assert phase_p_value(sizes, data, pressure) < EXCHANGEABLE
+    assert np.mean(np.array(chance) <= EXCHANGEABLE) <= 0.06
 
 
 def test_what_acts_in_time_is_integrated_out_once_for_all_sets() -> None:

@@ -21,7 +21,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.linear import cholesky
 from ventbench.diagnosis.evaluator import Evaluator, estimate_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
-from ventbench.diagnosis.in_time import SWINGS, in_time, of_some_breaths
+from ventbench.diagnosis.in_time import SWINGS, in_time, of_some_breaths, swings, with_course
 from ventbench.diagnosis.linearised import (
     CONSTANT,
     EFFORT,
@@ -283,6 +283,8 @@ class _Search:
                 self.attempt(view.around, view.noise, terms, view.base)
         main = min(views, key=lambda view: float(view.noise.log_scale(data.weight).sum()))
         around, noise, self.scatters = main.around, main.noise, main.scatters
+        told = {*self.excluded, *names_of(main.latent)}
+        self.refused = [name for name in SWINGS if name not in told]
         self.muscles = [term for term in main.latent if term.name in (EFFORT, MUSCLES[0])]
         self.tried[frozenset()] = Scored.of(self.known(around, self.base, noise))
         self.near.add(frozenset())
@@ -353,9 +355,16 @@ class _Search:
                 self.attempt(around, noise, (*rest, term), left.fitted)
 
     def events(self, known: Known) -> list[Term]:
-        """Effects of some breaths beside a fit."""
+        """Effects of some breaths beside a fit, and swings that commands predicted before it."""
         partition = Partition(self.data, self.predictor)
-        return of_some_breaths(known, partition, self.excluded, self.evaluator.settings)
+        terms = of_some_breaths(known, partition, self.excluded, self.evaluator.settings)
+        return [
+            *terms,
+            *(
+                with_course(t, self.evaluator.settings)
+                for t in swings(known, partition, self.refused)
+            ),
+        ]
 
     def around(self, fitted: FittedModel) -> Simulated:
         """All candidates, simulated around a fit."""

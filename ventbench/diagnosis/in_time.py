@@ -6,7 +6,9 @@ breaths is found by flips. A swing has one frequency and in each breath a size a
 Affected breaths are exchangeable given their commands: a breath whose commands ask for much flow is
 no likelier to meet a cough. With the posterior probability ``r_b`` that breath ``b`` is affected,
 ``E[r_b | commands] = share`` for every breath, as the mean of a posterior is its prior, however
-much the commands let a breath tell. What commands predict is physics that the model lacks.
+much the commands let a breath tell. What commands predict is physics that the model lacks. A swing
+has a phase of its own in each breath, so that its expected coefficients have the mean zero,
+whatever the commands: one whose sign the breath or its commands predict is no swing.
 
 Commands may be lost, which leaves the valve at the one before, or come late by ``lag`` samples, and
 then act only if none that was sent after them has arrived. At each sample the valve thus either
@@ -100,26 +102,52 @@ def _affected(G: Floats, b: Floats, sd: float, cost: float) -> tuple[Any, Floats
     return np.flatnonzero(acts), likely
 
 
-def command_p_value(affected: Floats, data: Data, pressure: Floats) -> float:
-    """Probability that breaths in random order depend as much on their commands.
+def _commands_of(data: Data, pressure: Floats) -> Floats:
+    """Ranks of what commands ask of each breath, centred, of unit length, ``(k, n)``.
 
-    The largest correlation with the ranks of peak opening, volume, highest pressure, R and C.
-
-    Args:
-        affected: posterior probability that each breath is affected, ``(n,)``.
-        data: the breaths.
-        pressure: what a model without the effect predicts, cmH2O, ``(n, T)``.
+    Peak opening, volume, highest predicted pressure, and the lung's R and C.
     """
     inspiratory = (data.u_out == 0) * data.u_in
     volume = np.sum(inspiratory * data.dt, axis=1)
     series = (inspiratory.max(axis=1), volume, pressure.max(axis=1), data.R, data.C)
     ranks = np.stack([np.unique(each, return_inverse=True)[1] for each in series])
     ranks = ranks - ranks.mean(axis=1, keepdims=True)
-    ranks /= np.maximum(np.linalg.norm(ranks, axis=1, keepdims=True), 1e-12)
+    return ranks / np.maximum(np.linalg.norm(ranks, axis=1, keepdims=True), 1e-12)
+
+
+def command_p_value(affected: Floats, data: Data, pressure: Floats) -> float:
+    """Probability that breaths in random order depend as much on their commands.
+
+    Args:
+        affected: posterior probability that each breath is affected, ``(n,)``.
+        data: the breaths.
+        pressure: what a model without the effect predicts, cmH2O, ``(n, T)``.
+    """
     rng = np.random.default_rng(0)
     drawn = rng.permuted(np.tile(affected, (_PERMUTATIONS, 1)), axis=1)
     drawn = np.concatenate([affected[None], drawn])
-    largest = np.abs(drawn @ ranks.T).max(axis=1)
+    largest = np.abs(drawn @ _commands_of(data, pressure).T).max(axis=1)
+    return float(np.mean(largest >= largest[0] * (1.0 - 1e-9)))
+
+
+def phase_p_value(sizes: Floats, data: Data, pressure: Floats) -> float:
+    """Probability that swings of random phases depend as much on the breath or its commands.
+
+    Args:
+        sizes: expected coefficients of each breath's sines and cosines, ``(n, m)``.
+        data: the breaths.
+        pressure: what a model without the effect predicts, cmH2O, ``(n, T)``.
+    """
+    series = np.concatenate(
+        [np.full((1, len(sizes)), len(sizes) ** -0.5), _commands_of(data, pressure)]
+    )
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PERMUTATIONS + 1, len(sizes)))
+    signs[0] = 1.0
+    norm = np.linalg.norm(sizes, axis=0)
+    drawn = np.einsum(
+        "pn,kn,nm->pkm", signs, series, sizes / np.maximum(norm, 1e-12), optimize=True
+    )
+    largest = np.abs(drawn).max(axis=(1, 2))
     return float(np.mean(largest >= largest[0] * (1.0 - 1e-9)))
 
 
@@ -140,21 +168,34 @@ def in_time(
         settings: every threshold.
     """
     terms = of_some_breaths(known, partition, excluded, settings)
-    values, found = known.around.values, []
-    for name, (place, frequencies, harmonics, spreads) in SWINGS.items():
-        if name not in excluded:
-            by_input = input_responses(partition, values, place)
-            ways = [
-                (np.matmul(_waves(partition, f, harmonics), by_input), float(f), spread)
-                for f, spread in product(frequencies, spreads)
-            ]
-            found.append(_likeliest_swing(known, name, ways))
+    found = swings(known, partition, [name for name in SWINGS if name not in excluded])
     if "lost_commands" not in excluded:
         found += _commands(known, partition, around, settings)
-    return [*terms, *(_with_course(term, settings) for term in found)]
+    return [*terms, *(with_course(term, settings) for term in found)]
 
 
-def _with_course(term: Term, settings: SelectionConfig) -> Term:
+def swings(known: Known, partition: Partition, names: Collection[str]) -> list[Term]:
+    """Swings, each at its likeliest frequency and size, but for those that commands predict."""
+    found = []
+    for name in names:
+        place, frequencies, harmonics, spreads = SWINGS[name]
+        by_input = input_responses(partition, known.around.values, place)
+        ways = [
+            (np.matmul(_waves(partition, f, harmonics), by_input), float(f), spread)
+            for f, spread in product(frequencies, spreads)
+        ]
+        term, sizes = _likeliest_swing(known, name, ways)
+        if phase_p_value(sizes, partition.data, _predicted(known)) > EXCHANGEABLE:
+            found.append(term)
+    return found
+
+
+def _predicted(known: Known) -> Floats:
+    """Pressure without what acts in time, cmH2O, ``(n, T)``."""
+    return (known.fitted.residual + known.fitted.problem.data.measured)[:, 0]
+
+
+def with_course(term: Term, settings: SelectionConfig) -> Term:
     """The term, less likely by the courses in time that it was chosen of."""
     return replace(term, odds=term.odds - settings.search.course_nats)
 
@@ -167,8 +208,7 @@ def of_some_breaths(
     Events whose breaths commands predict are left out.
     """
     n, data, terms = known.n, partition.data, []
-    fitted = known.fitted
-    predicted = (fitted.residual + fitted.problem.data.measured)[:, 0]
+    predicted = _predicted(known)
     time = np.cumsum(data.dt, axis=1) - data.dt
     sizes = {name: size for name, (_, size) in CONSTANT.items()} | {OPEN: 1.0}
     every = {(name, sizes[name]): known.around.events[name][None] for name in known.around.events}
@@ -192,7 +232,7 @@ def of_some_breaths(
             columns = [one for form in chosen for one in np.where(which, form, 0.0)]
             spread = [size * h for h in _HARMONICS[: len(chosen)] for _ in at]
             odds = _share(n, len(at)) - cost * len(at)
-            terms.append(_with_course(Term(name, spread, odds=odds, latent=columns), settings))
+            terms.append(with_course(Term(name, spread, odds=odds, latent=columns), settings))
     return terms
 
 
@@ -227,22 +267,25 @@ def _waves(partition: Partition, frequency: float, harmonics: int) -> Floats:
     return np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
 
 
-def _likeliest_swing(known: Known, name: str, ways: list[tuple[Floats, float, float]]) -> Term:
-    """The frequency and size of the largest evidence."""
-    best, at = -np.inf, ways[0]
+def _likeliest_swing(
+    known: Known, name: str, ways: list[tuple[Floats, float, float]]
+) -> tuple[Term, Floats]:
+    """The frequency and size of the largest evidence, and coefficients of each breath, (n, m)."""
+    best, at, each = -np.inf, ways[0], np.zeros((known.n, 0))
     for way in ways:
         G, b = known.of_breaths(way[0])
         spreads = np.tile(swing_spreads(way[0].shape[1], way[2]), known.n)
-        value = gaussian(G, b, spreads)[0]
+        value, mean, _ = gaussian(G, b, spreads)
         if value > best:
-            best, at = value, way
-    swings, frequency, spread = at
+            best, at, each = value, way, mean.reshape(known.n, -1)
+    columns_at, frequency, spread = at
     which = np.eye(known.n, dtype=bool)[:, :, None]
-    columns = [one for m in range(swings.shape[1]) for one in np.where(which, swings[:, m], 0.0)]
+    sizes = range(columns_at.shape[1])
+    columns = [one for m in sizes for one in np.where(which, columns_at[:, m], 0.0)]
     told = {"frequency": frequency, "spread": spread}
     odds = -float(np.log(len(ways)))
-    spreads = np.repeat(swing_spreads(swings.shape[1], spread), known.n).tolist()
-    return Term(name, spreads, odds=odds, latent=columns, told=told)
+    spreads = np.repeat(swing_spreads(columns_at.shape[1], spread), known.n).tolist()
+    return Term(name, spreads, odds=odds, latent=columns, told=told), each
 
 
 def _commands(

@@ -222,11 +222,12 @@ def test_no_stage_sees_the_readings_of_judging_breaths(monkeypatch):
     np.testing.assert_array_equal(one.traces.breaths.u_in[judging], breaths.u_in[judging])
 
 
-def interval(errors: Floats) -> tuple[float, float]:
-    """95 % of the root mean squares of resampled breaths, of mean squares by breath, ``(k,)``."""
+def chance(squares: Floats, count: int) -> tuple[float, float]:
+    """Errors that 99 % of draws of so many breaths have, of mean squares by breath, ``(k,)``."""
     rng = np.random.default_rng(0)
-    drawn = errors[rng.integers(0, len(errors), (2000, len(errors)))]
-    return tuple(np.sqrt(np.quantile(drawn.mean(axis=1), [0.025, 0.975])))  # type: ignore[return-value]
+    drawn = squares[rng.integers(0, len(squares), (5000, count))]
+    low, high = np.sqrt(np.quantile(drawn.mean(axis=1), [0.005, 0.995]))
+    return float(low), float(high)
 
 
 @pytest.mark.slow
@@ -247,11 +248,10 @@ def test_reported_and_fresh_error_agree(world):
     inside = fresh.inspiratory & (fresh.time > 0)
     error = open_loop_error(fresh.pressure, answer, inside).rmse
     reported = one.open_loop.after.rmse
-    assert len(one.open_loop.held_out_breaths) == BREATHS // 6
-    judging, judged = one.traces.held_out, one.traces.breaths
-    inside = judged.inspiratory & (judged.time > 0)
-    error_there = np.where(inside, one.traces.after - judged.pressure, np.nan)[judging]
-    squares = np.nanmean(error_there**2, axis=1)
-    low, high = interval(squares)
-    print(f"{world}: reported {reported:.2f} [{low:.2f}, {high:.2f}], fresh {error:.2f}")
-    assert 0.8 <= error / reported <= 1.25 or low <= error <= high
+    count = len(one.open_loop.held_out_breaths)
+    assert count == BREATHS // 6
+    squares = np.nanmean(np.where(inside, (answer - fresh.pressure) ** 2, np.nan), axis=1)
+    low, high = chance(squares, count)
+    by_chance = f"{count} of these [{low:.2f}, {high:.2f}]"
+    print(f"{world}: reported {reported:.2f}, fresh {error:.2f}, {by_chance}")
+    assert 0.8 <= error / reported <= 1.25 or low <= reported <= high

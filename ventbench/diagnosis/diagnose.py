@@ -380,6 +380,10 @@ def _conclude(
     term = term if swings is None else None
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
     unnamed = unnamed or adequacy.vetoed
+    if unnamed and adequacy.at_rest < adequacy.noise:
+        # Neighbouring errors differ by more than noise where the simulator errs.
+        noise_at_rest = open_loop.noise_floor * adequacy.at_rest / adequacy.noise
+        open_loop = replace(open_loop, noise_floor=noise_at_rest)
     verdict: Verdict = "named" if missing or swings else "unnamed" if unnamed else "nothing_missing"
     limits: dict[str, float] = {}
     if verdict == "nothing_missing":

@@ -340,6 +340,8 @@ class Excess(NamedTuple):
     """What neighbouring readings of an error share beyond what those of the sensor do."""
 
     noise: float  #: root-mean-square of the noise, cmH2O; NaN if unknown.
+    #: the same where nothing moves, which no error of a simulator can raise; NaN if unknown.
+    at_rest: float
     size: float  #: root-mean-square beyond it where something moves, cmH2O.
     p_value: float  #: probability of as much by chance; 1 if it is not material.
 
@@ -366,7 +368,7 @@ def excess_over_noise(error: Floats, usable: Bools, quiet: Bools) -> Excess:
     """
     rows = [(error[b, own], quiet[b, own]) for b, own in enumerate(usable) if own.sum() > 2]
     if not rows:
-        return Excess(float("nan"), 0.0, 1.0)
+        return Excess(float("nan"), float("nan"), 0.0, 1.0)
     now = np.concatenate([r[2:] for r, _ in rows])
     before = np.concatenate([np.stack([r[1:-1], r[:-2]]) for r, _ in rows], axis=1)
     white = (now - 2.0 * before[0] + before[1]) ** 2 / 6.0
@@ -379,12 +381,15 @@ def excess_over_noise(error: Floats, usable: Bools, quiet: Bools) -> Excess:
         power = before[:, rests] @ before[:, rests].T
         memory = solve(power + 1e-9 * np.eye(2), before[:, rests] @ now[rests])
     expected = (1.0 + shared) * white
-    noise = float(np.sqrt(expected[moves | rests].mean())) if (moves | rests).any() else np.nan
+    noise, at_rest = (
+        float(np.sqrt(expected[which].mean())) if which.any() else float("nan")
+        for which in (moves | rests, rests)
+    )
     if not moves.any():
-        return Excess(noise, 0.0, 1.0)
+        return Excess(noise, at_rest, 0.0, 1.0)
     size = float(np.mean((before[0] ** 2 - expected)[moves]))
     if size <= MIN_EXCESS * noise**2:
-        return Excess(noise, float(np.sqrt(max(size, 0.0))), 1.0)
+        return Excess(noise, at_rest, float(np.sqrt(max(size, 0.0))), 1.0)
     innovation = now - memory @ before
     pairs = moves[1:] & moves[:-1]
     pairs[np.cumsum([len(r) - 2 for r, _ in rows])[:-1] - 1] = False  # of two breaths
@@ -392,7 +397,7 @@ def excess_over_noise(error: Floats, usable: Bools, quiet: Bools) -> Excess:
     products = innovation[1:] * innovation[:-1] * pairs
     by_chance = (signs[:, 1:] * signs[:, :-1]) @ products
     above = np.count_nonzero(by_chance >= products.sum() * (1.0 - 1e-12))
-    return Excess(noise, float(np.sqrt(size)), (1.0 + above) / (1.0 + _FLIPS))
+    return Excess(noise, at_rest, float(np.sqrt(size)), (1.0 + above) / (1.0 + _FLIPS))
 
 
 def amplitudes(error: Floats, usable: Bools, signals: Floats) -> Floats:

@@ -311,6 +311,7 @@ class Adequacy:
     vetoed: bool  #: whether "nothing is missing" would be wrong.
     #: root-mean-square of the noise by neighbouring readings, cmH2O; NaN if unknown.
     noise: float
+    at_rest: float  #: the same where nothing moves.
     #: root-mean-square beyond the noise where something moves, cmH2O; 0 if chance may do it.
     excess: float
 
@@ -394,7 +395,7 @@ def check_residuals(
     vetoed = bool(changes) or bool(significant[len(series) :].any())
     vetoed |= judged is not None and judged.outweighs_noise
     excess = shared.size if significant[len(series) + 1] else 0.0
-    return Adequacy(regions, tuple(changes), vetoed, shared.noise, excess)
+    return Adequacy(regions, tuple(changes), vetoed, shared.noise, shared.at_rest, excess)
 
 
 def order_p_value(

@@ -79,9 +79,9 @@ def withdrawn(board: Path) -> None:
 
 ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
     "all but one record removed": (all_but_one, "is missing: the record of softer"),
-    "an entry moved to the failed ones": (failed, "result.json"),
+    "an entry moved to the failed ones": (failed, "result.sig signs another file"),
     "hashes swapped": (swapped, "result.json, key records"),
-    "seeds invented": (invented_seeds, "result.json"),
+    "seeds invented": (invented_seeds, "result.sig signs another file"),
     "no result": (
         lambda board: (board / "rounds" / ROUND / "result.json").unlink(),
         "result.json is missing",

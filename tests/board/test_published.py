@@ -83,6 +83,8 @@ def test_tables_of_the_docs_are_those_of_the_records(page: str) -> None:
     if page == "docs/stress.md":
         tool = runpy.run_path(str(root / "benchmarks" / "stress.py"))
         scores = [{"name": name, **own.headline()} for name, own in tool["recorded"]().items()]
+        if not scores:
+            pytest.skip("the stressed commands of the last round are not at hand")
         table = tool["table"](scores)
     else:
         tool = runpy.run_path(str(root / "benchmarks" / "board_tables.py"))

@@ -123,7 +123,7 @@ def resolved(u_in: ArrayLike) -> Floats:
     not.
     """
     steps = round(1.0 / protocol.RESOLUTION)
-    return np.rint(np.clip(u_in, 0.0, protocol.U_MAX) * steps) / steps
+    return np.rint(np.clip(u_in, 0.0, protocol.U_MAX) * steps) / steps + 0.0  # no "-0.0"
 
 
 def inspire(

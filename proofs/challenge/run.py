@@ -3,16 +3,20 @@
 A diagnoser is a function of the case's folder that returns the answer. ``module:function`` is the
 caller's own code and runs with his rights. A folder with a manifest, ``diagnoser.toml``, is a
 stranger's: it is copied beside the case, and the process gives up files, network and rights before
-its code is imported, as those of submissions do, where the system can.
+its code is imported, as those of submissions do, where the system can. It has the environment of
+submissions and none of the caller's, says which layers are in force before any of the stranger's
+code is there, on a pipe that is then closed, and answers by one bounded message.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import importlib
 import importlib.util
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -20,7 +24,7 @@ import sys
 import tempfile
 import threading
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +32,13 @@ from typing import Any
 import msgspec
 
 from ventbench.base.errors import InputError
+from ventbench.entries.folder import uncovered
+from ventbench.entries.manifest import NAME, NAME_RULE
+from ventbench.sandbox.child import kernel
+from ventbench.sandbox.child.cell import printable
+from ventbench.sandbox.child.lockdown import FLOOR, CellLimits, Lockdown
+from ventbench.sandbox.reader import ENVIRONMENT as READER
+from ventbench.sandbox.reader import libraries
 
 #: Name of a manifest.
 MANIFEST = "diagnoser.toml"
@@ -35,14 +46,19 @@ MANIFEST = "diagnoser.toml"
 #: Diagnosers of the project, by name: ``module:function`` of each is in this package.
 BUILT_IN = "proofs.diagnosers"
 
-#: Seconds on the clock for each second of processor time, since other processes run too.
-_PATIENCE = 10.0
+#: Seconds on the clock for each second of processor time, since other processes run too, and the
+#: least.
+_PATIENCE, _LEAST_S = 3.0, 60.0
 
-#: Largest answer, bytes, and longest message of a process that failed.
-_LARGEST, _LONGEST = 64_000_000, 300
+#: Largest answer and report, bytes, and longest message of a process that failed.
+_LARGEST, _REPORT, _LONGEST = 64_000_000, 10_000, 300
 
-#: Where the answer is written, so that prints do not mix with it.
-_PIPE = 3
+#: Descriptors of the report and of the answer, so that prints do not mix with them, and the byte
+#: that an answer or the reason for none begins with.
+_STATUS, _PIPE = 3, 4
+_ANSWER, _FAILURE = b"+", b"-"
+
+_SHORT_NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
 
 #: What a stranger finds imported, if his sources speak of it; all else is read from the disk.
 _PRELOADED = ("numpy", "pandas", "scipy.linalg", "scipy.optimize", "jax.numpy")
@@ -132,15 +148,17 @@ def _of_folder(folder: Path) -> Diagnoser:
         manifest = msgspec.convert(tomllib.loads(path.read_text("utf-8")), Manifest)
     except (ValueError, msgspec.ValidationError) as error:
         raise InputError(f"{path}: {error}") from error
-    for link in (inside for inside in folder.rglob("*") if inside.is_symlink()):
-        raise InputError(f"{link} is a link, which would be copied from elsewhere; send the file")
+    for strange in uncovered(folder):
+        raise InputError(f"{folder / strange} is a link, a cache or compiled code; remove it")
+    if not NAME.fullmatch(manifest.name):
+        raise InputError(f"{path}: name {printable(manifest.name)} {NAME_RULE}")
     if manifest.function.count(":") != 1:
         raise InputError(f"{path}: function is {manifest.function!r}; give file:function")
     return _named(manifest.name, manifest.function, folder.resolve())
 
 
 def _named(name: str, function: str, folder: Path | None) -> Diagnoser:
-    if not name.replace("_", "").replace("-", "").isalnum() or len(name) > 60:
+    if not _SHORT_NAME.fullmatch(name):
         raise InputError(f"{name!r}: a name has letters, digits, _ and -, 60 at most")
     return Diagnoser(name, function, folder)
 
@@ -174,27 +192,34 @@ def _preloaded(folder: Path | None) -> list[str]:
 
 
 def _collect(told: dict[str, Any], limits: Limits) -> Outcome:
-    here, there = os.pipe()
     root = str(Path(__file__).resolve().parents[2])
-    environment = {**os.environ, **_ENVIRONMENT, "PYTHONPATH": root}
+    given = READER if told["stranger"] else os.environ
+    environment = {**given, **_ENVIRONMENT, "PYTHONPATH": root}
+    clock_s = max(_LEAST_S, _PATIENCE * limits.seconds)
+    reported, reports = os.pipe()
+    here, there = os.pipe()
+    boot = "from proofs.challenge.run import child; child()"
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
-            [sys.executable, "-c", "from proofs.challenge.run import child; child()", str(there)],
+            [sys.executable, "-P", "-s", "-B", "-c", boot, str(reports), str(there)],
             # A stranger may write no file, and nobody listens to what he prints.
             stdin=subprocess.PIPE,
-            pass_fds=(there,),
+            pass_fds=(reports, there),
             stderr=subprocess.STDOUT,
             stdout=subprocess.DEVNULL if told["stranger"] else errors,
             env=environment,
             start_new_session=True,
         )
+        os.close(reports)
         os.close(there)
-        late = threading.Timer(_PATIENCE * limits.seconds, _end, (process.pid,))
+        late = threading.Timer(clock_s, _end, (process.pid,))
         late.start()
         try:
             assert process.stdin is not None
             with process.stdin as pipe:
                 pipe.write(json.dumps(told).encode())
+            with os.fdopen(reported, "rb") as pipe:
+                report = pipe.read(_REPORT)
             with os.fdopen(here, "rb") as pipe:
                 data = pipe.read(_LARGEST + 1)
             if len(data) > _LARGEST:
@@ -206,19 +231,25 @@ def _collect(told: dict[str, Any], limits: Limits) -> Outcome:
             _end(process.pid)  # and what it has started
         errors.seek(0)
         said = errors.read()[-100_000:].decode(errors="replace").strip()
-    head, _, answer = data.partition(b"\n")
-    told_back = json.loads(head) if head and not code else {"layers": [], "failure": ""}
-    problem = told_back["failure"] or _problem(
-        code, data, usage.ru_utime + usage.ru_stime, said, limits
-    )
+    # Written by our own code alone, before that of a stranger is there.
+    layers = tuple(json.loads(report)) if report else ()
+    seconds = usage.ru_utime + usage.ru_stime
+    kind, answer = data[:1], data[1:]
+    problem = _problem(code, data, seconds, said, limits)
+    if not problem and kind != _ANSWER:
+        text = answer.decode(errors="replace") if kind == _FAILURE else "wrote what is no answer"
+        problem = printable(" ".join(text.split()), _LONGEST)
+    if not problem and told["stranger"] and (lacking := _lacking(layers)):
+        problem = lacking
     peak = usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-    return Outcome(
-        b"" if problem else answer,
-        problem,
-        usage.ru_utime + usage.ru_stime,
-        peak,
-        tuple(told_back["layers"]),
-    )
+    return Outcome(b"" if problem else answer, problem, seconds, peak, layers)
+
+
+def _lacking(layers: Sequence[str]) -> str:
+    """Say which layers a stranger's code would need, of those in force; empty if none."""
+    lacking = [" or ".join(line) for line in FLOOR if not set(line) & set(layers)]
+    missing = " and ".join(lacking)
+    return f"{missing} missing here: a stranger's code does not run" if missing else ""
 
 
 def _end(group: int) -> None:
@@ -232,7 +263,8 @@ def _problem(code: int, data: bytes, seconds: float, said: str, limits: Limits) 
     if code in (-9, -24) and seconds >= limits.seconds - 1.0:
         return f"took more than {limits.seconds:g} s of processor time"
     if code == -9:
-        return f"was ended: more than {_PATIENCE * limits.seconds:g} s on the clock, or no memory"
+        clock_s = max(_LEAST_S, _PATIENCE * limits.seconds)
+        return f"was ended: more than {clock_s:g} s on the clock, or no memory"
     if code:
         last = said.rpartition("\n")[2][:_LONGEST]
         return f"ended by signal {-code}" if code < 0 else f"failed: {last or f'exit code {code}'}"
@@ -242,32 +274,30 @@ def _problem(code: int, data: bytes, seconds: float, said: str, limits: Limits) 
 def child() -> None:
     """Answer in the process of a diagnoser: lock down, import, call, write, end."""
     told = json.loads(sys.stdin.read())
-    os.dup2(int(sys.argv[1]), _PIPE)
+    high = [os.dup(fcntl.fcntl(int(given), fcntl.F_DUPFD, 32)) for given in sys.argv[1:]]
+    for place, descriptor in zip((_STATUS, _PIPE), high, strict=True):
+        os.dup2(descriptor, place)
+    os.closerange(_PIPE + 1, 64)
     for folder in told["path"]:
         if folder not in sys.path:
             sys.path.append(folder)
-    layers, failure, data = [], "", b""
     try:
-        layers = _lock_down(told)
+        with os.fdopen(_STATUS, "wb") as report:
+            report.write(json.dumps(_lock_down(told)).encode())
         module, _, name = told["function"].partition(":")
         if told["stranger"]:
             sys.path.insert(0, f"{told['case']}/diagnoser")
         function: Callable[[Path], Any] = getattr(importlib.import_module(module), name)
         answer = function(Path(told["case"]))
-        data = msgspec.json.encode(answer, enc_hook=_plain)
+        data = _ANSWER + msgspec.json.encode(answer, enc_hook=_plain)
     except Exception as error:
-        failure = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    head = msgspec.json.encode({"layers": layers, "failure": failure[:_LONGEST]})
+        data = _FAILURE + f"{type(error).__name__}: {error}"[:_LONGEST].encode(errors="replace")
     with os.fdopen(_PIPE, "wb") as pipe:
-        pipe.write(head + b"\n" + data)
+        pipe.write(data)
     os._exit(0)  # whatever threads are left
 
 
 def _lock_down(told: dict[str, Any]) -> list[str]:
-    from ventbench.sandbox.child import kernel
-    from ventbench.sandbox.child.lockdown import FLOOR, CellLimits, Lockdown
-    from ventbench.sandbox.reader import libraries
-
     if not told["stranger"]:
         import resource
 
@@ -283,9 +313,8 @@ def _lock_down(told: dict[str, Any]) -> list[str]:
     readable = [told["case"], *libraries(), str(root / "ventbench"), str(root / "data")]
     limits = CellLimits(told["memory"], told["seconds"], threads=True)
     layers = Lockdown(readable, [str(root)]).finish(limits, _PIPE + 1)
-    lacking = [" or ".join(line) for line in FLOOR if not set(line) & set(layers)]
-    if lacking:
-        raise RuntimeError(f"{' and '.join(lacking)} missing here: a stranger's code does not run")
+    if lacking := _lacking(layers):
+        raise RuntimeError(lacking)
     return layers
 
 

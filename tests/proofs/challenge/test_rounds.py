@@ -230,15 +230,50 @@ def test_a_stranger_reads_and_writes_nothing_else(tmp_path, monkeypatch):
         assert "PermissionError" in outcome.problem
         assert "landlock" in outcome.layers
     (mine / "data").symlink_to(kept)
-    with pytest.raises(InputError, match="data is a link"):
+    with pytest.raises(InputError, match="data is a link, a cache or compiled code"):
         find(str(mine))
     (mine / "data").unlink()
-    (mine / "diagnoser.toml").write_text('name = "../up"\nfunction = "spy:diagnose"\n')
-    with pytest.raises(InputError, match="a name has letters"):
-        find(str(mine))
+    for name in ("../up", "v\u0435ntbench", "Mine"):  # one letter of the second is Cyrillic
+        (mine / "diagnoser.toml").write_text(f'name = "{name}"\nfunction = "spy:diagnose"\n')
+        with pytest.raises(InputError, match="must be lower-case letters, digits and underscores"):
+            find(str(mine))
     (mine / "diagnoser.toml").write_text('name = "mine"\n')
     with pytest.raises(InputError, match=r"diagnoser\.toml: .*function"):
         find(str(mine))
+
+
+#: What strangers write where the answer belongs, or try to take, and what comes of it.
+ATTACKS = {
+    "rubbish": ("import os\nos.write(4, b'{]\\xff' * 9)\nos._exit(0)", "wrote what is no answer"),
+    "layers": (
+        "import os\nos.write(3, b'[\"namespaces\"]')",
+        "OSError: [Errno 9] Bad file descriptor",
+    ),
+    "flood": ("import os\nwhile True: os.write(4, b'+' * 1_000_000)", "is longer than"),
+    "text": ("raise ValueError('a\u202eb\x1b[31m' * 90)", "ValueError: a"),
+    "secret": (
+        "import os\nraise ValueError(os.environ.get('VENTBENCH_SIGNING_KEY', 'nothing'))",
+        "ValueError: nothing",
+    ),
+}
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_stranger_deceives_no_judge(tmp_path, monkeypatch, attack):
+    monkeypatch.setenv("VENTBENCH_SIGNING_KEY", "5" * 64)
+    code, expected = ATTACKS[attack]
+    mine, case = tmp_path / "mine", tmp_path / "case"
+    mine.mkdir()
+    case.mkdir()
+    (mine / "diagnoser.toml").write_text('name = "mine"\nfunction = "spy:diagnose"\n')
+    body = "".join(f"    {line}\n" for line in code.splitlines())
+    (mine / "spy.py").write_text(f"def diagnose(folder):\n{body}", "utf-8")
+    outcome = run(find(str(mine)), case, QUICK)
+    assert expected in outcome.problem
+    assert outcome.problem.isprintable()
+    assert outcome.answer == b""
+    assert "seccomp" in outcome.layers
+    assert "namespaces" not in outcome.layers
 
 
 def test_who_is_nobody():

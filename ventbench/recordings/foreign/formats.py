@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError, require
+from ventbench.recordings.foreign import sizes
 from ventbench.recordings.foreign.tables import (
     RATES,
     Table,
@@ -84,6 +86,7 @@ def _parquet(file: str) -> Table:
     from pyarrow import parquet
 
     try:
+        sizes.check_parquet(file)
         frame = parquet.read_table(file).to_pandas()
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{file} cannot be read ({str(error).splitlines()[0]})") from None
@@ -107,8 +110,11 @@ def _matlab(file: str) -> Table:
     from scipy.io import loadmat
 
     try:
+        sizes.check_matlab(file)
         content = loadmat(file, simplify_cells=True)
-    except (ValueError, NotImplementedError, OSError, TypeError) as error:
+    except InputError:
+        raise
+    except (ValueError, NotImplementedError, OSError, TypeError, zlib.error) as error:
         raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
     return _variables(file, content)
 
@@ -208,6 +214,7 @@ def _edf(file: str) -> Table:
     require("pyedflib", extra="formats", what="EDF files")
     from pyedflib import highlevel
 
+    sizes.check_edf(file)
     try:
         signals, headers, _ = highlevel.read_edf(file)
     except (OSError, ValueError) as error:
@@ -227,6 +234,7 @@ def _wfdb(file: str) -> Table:
         import wfdb
 
         try:
+            sizes.check_wfdb(file)
             record = wfdb.rdrecord(file.removesuffix(".hea"), smooth_frames=False)
         except (OSError, ValueError, IndexError) as error:
             raise InputError(

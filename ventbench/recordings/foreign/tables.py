@@ -9,7 +9,6 @@ by one. What stands between rows and is none, such as an alarm, is left out and 
 from __future__ import annotations
 
 import csv
-import gzip
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError, require
+from ventbench.recordings.foreign import sizes
 from ventbench.recordings.headers import UNITS, Header, is_unit, read_header
 from ventbench.recordings.sources import to_numpy
 
@@ -131,10 +131,7 @@ def decoded(file: str) -> tuple[bytes, str]:
     """The text in UTF-8 with LF at the ends of lines, and the encoding of the file."""
     data = Path(file).read_bytes()
     if data.startswith(b"\x1f\x8b"):
-        try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError) as error:
-            raise InputError(f"{file} cannot be unpacked ({error})") from None
+        data = sizes.gunzipped(file)
     zeros, encoding = data[:4096].count(0), "UTF-8"
     if data.startswith((b"\xff\xfe", b"\xfe\xff")) or zeros > 0.3 * len(data[:4096]):
         wide = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le"
@@ -564,14 +561,16 @@ def read_spreadsheet(file: str) -> Table:
         with zipfile.ZipFile(file) as archive:
             if "xl/workbook.xml" not in archive.namelist():
                 raise InputError(f"{file} is a zip archive; unpack it and name the file in it")
+        sizes.check_archive(file)
         sheet = load_workbook(file, read_only=True, data_only=True).worksheets[0]
     except zipfile.BadZipFile as error:
         raise InputError(f"{file} cannot be unpacked ({error}); copy it again") from None
-    rows = (
-        ["" if cell is None else " ".join(str(cell).split()) for cell in row]
-        for row in sheet.iter_rows(values_only=True)
-    )
-    text = "\n".join("\t".join(row) for row in rows).rstrip()
+    rows, cells = [], 0
+    for row in sheet.iter_rows(values_only=True):  # padded to the last row and column
+        sizes.check_cells(file, cells := cells + len(row))
+        texts = ["" if cell is None else " ".join(str(cell).split()) for cell in row]
+        rows.append("\t".join(texts))
+    text = "\n".join(rows).rstrip()
     return _table(
         file, text.encode(), text.split("\n")[:_LOOKED_AT], "\t", ".", "First sheet, cells "
     )

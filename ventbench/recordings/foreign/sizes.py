@@ -1,0 +1,138 @@
+"""What foreign files unpack to, by what they say of themselves, before anything is unpacked.
+
+A header of a hundred bytes can claim 1e14 samples, and ten kilobytes of Parquet, spreadsheet,
+gzip or MATLAB can hold gigabytes of zeros. Each function raises :class:`InputError` where a file
+would take more than :data:`LARGEST` bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import zlib
+from pathlib import Path
+
+from ventbench.base.errors import InputError
+
+#: Most bytes that a table may take in memory: eight columns of 30 million rows, five times the
+#: public set of the People's Ventilator.
+LARGEST = 2_000_000_000
+
+# Of MATLAB files: bytes of an element that say what it is, and numbers of its kinds and classes.
+_HEAD, _COMPRESSED, _NESTED = 512, 15, (1, 2, 3)
+
+#: Bytes of a number, and of a spreadsheet's cell once it is an object.
+_NUMBER, _CELL = 8, 40
+
+
+def refuse(file: str, size: float, what: str) -> None:
+    """Refuse a size, bytes, of what a file holds."""
+    if size > LARGEST:
+        raise InputError(
+            f"{file}: {what} take {size / 1e9:.3g} GB, more than the {LARGEST / 1e9:g} GB that are "
+            "read; export a part of it"
+        )
+
+
+def check_samples(file: str, samples: float) -> None:
+    """Check the number of samples that a header claims, over all signals."""
+    refuse(file, _NUMBER * samples, f"{samples:.3g} samples by its header")
+
+
+def check_parquet(file: str) -> None:
+    """Check the rows and columns, and the pages, that the footer of a Parquet file claims."""
+    from pyarrow import parquet
+
+    about = parquet.read_metadata(file)
+    groups = (about.row_group(k) for k in range(about.num_row_groups))
+    pages = sum(group.total_byte_size for group in groups)
+    values = _NUMBER * about.num_rows * max(about.num_columns, 1)
+    refuse(file, max(pages, values), f"its {about.num_rows} rows")
+
+
+def check_archive(file: str) -> None:
+    """Check what the members of a zip archive, such as a spreadsheet, unpack to."""
+    import zipfile
+
+    with zipfile.ZipFile(file) as archive:
+        refuse(file, sum(member.file_size for member in archive.infolist()), "its unpacked parts")
+
+
+def check_cells(file: str, cells: float) -> None:
+    """Check the number of a spreadsheet's cells."""
+    refuse(file, _CELL * cells, f"{cells:.3g} cells")
+
+
+def check_matlab(file: str) -> None:
+    """Check the shapes of the variables of a MATLAB file of level 5.
+
+    Each is an element of its own, compressed or not, that begins with its size, its class and its
+    shape; no more than these is unpacked. What lies in structures may be packed eight to one.
+    """
+    total = 0
+    with open(file, "rb") as stream:
+        order = ">" if stream.read(128)[126:] == b"MI" else "<"
+        while len(tag := stream.read(8)) == 8:
+            kind, length = struct.unpack(f"{order}2I", tag)
+            following = stream.tell() + length
+            head = stream.read(min(length, _HEAD))
+            if kind == _COMPRESSED:
+                head = zlib.decompressobj().decompress(head, _HEAD)
+            else:
+                head = tag + head
+            if len(head) >= 32:
+                words = struct.unpack_from(f"{order}8I", head)
+                count = min(words[7] // 4, (len(head) - 32) // 4)
+                shape = struct.unpack_from(f"{order}{count}I", head, 32)
+                nested = words[4] & 0xFF in _NESTED
+                total += _NUMBER * (words[1] if nested else math.prod(shape))
+            stream.seek(following)
+    refuse(file, total, "its variables")
+
+
+def check_edf(file: str) -> None:
+    """Check the records that the header of an EDF or BDF file claims against the file's length."""
+    with open(file, "rb") as stream:
+        head = stream.read(256)
+        try:
+            records, signals = int(head[236:244]), int(head[252:256])
+            stream.seek(256 + 216 * signals)
+            counts = [int(stream.read(8)) for _ in range(signals)]
+        except ValueError:
+            raise InputError(f"{file} cannot be read as EDF: its header is damaged") from None
+    width = 3 if head.startswith(b"\xff") else 2
+    samples = max(records, 0) * sum(counts)
+    check_samples(file, samples)
+    if 256 * (1 + signals) + width * samples > os.path.getsize(file):
+        raise InputError(f"{file}: its header claims {samples} samples, which are not in it")
+
+
+def check_wfdb(file: str) -> None:
+    """Check the samples that the header of a WFDB record claims."""
+    import wfdb
+
+    header = wfdb.rdheader(file.removesuffix(".hea"))
+    check_samples(file, (header.sig_len or 0) * (getattr(header, "n_sig", 1) or 1))
+
+
+def gunzipped(file: str) -> bytes:
+    """Unpack a gzipped file, and stop at :data:`LARGEST` bytes.
+
+    Raises:
+        InputError: if it unpacks to more, or cannot be unpacked.
+    """
+    packed, parts, size = Path(file).read_bytes(), [], 0
+    try:
+        while packed:
+            reader = zlib.decompressobj(wbits=31)
+            part = reader.decompress(packed, LARGEST + 1 - size)
+            size += len(part)
+            refuse(file, size, "its unpacked contents")
+            if not reader.eof:
+                raise InputError(f"{file} cannot be unpacked: it ends early; copy it again")
+            parts.append(part)
+            packed = reader.unused_data.lstrip(b"\0")
+    except zlib.error as error:
+        raise InputError(f"{file} cannot be unpacked ({error})") from None
+    return b"".join(parts)

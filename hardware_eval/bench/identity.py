@@ -29,9 +29,9 @@ from ventbench.task.lungs import lung as parse_lung
 RIG_R, RIG_C = 0.2, 0.12
 
 #: Squared distance, in standard deviations of R and C, beyond which a lung is none of a label: one
-#: right lung in a thousand. Twice the logarithm of the odds from which two labels are told apart:
-#: 20 to 1.
-_FAR, _APART = 13.8, 6.0
+#: right lung in a thousand. Twice the logarithm of the odds from which two labels are told apart;
+#: below them the simulators decide.
+_FAR, _APART = 13.8, 2.0
 
 #: Steps from a command to the sample that its flow is in: at once, and two later as in the
 #: recordings.

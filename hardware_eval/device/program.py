@@ -29,7 +29,6 @@ from hardware_eval.wire.messages import (
     DeviceMessage,
     Fault,
     Flag,
-    Heartbeat,
     Hello,
     HostMessage,
     Mode,
@@ -229,83 +228,103 @@ def _received(
     message: HostMessage,
     sample: Sample,
 ) -> tuple[DeviceState, DeviceMessage]:
-    """Do what one message asks."""
+    """Do what one message asks; the checks are in the order of PROTOCOL.md."""
     sequence = packet.sequence
-
-    def refused(state: DeviceState, reason: Reason) -> tuple[DeviceState, DeviceMessage]:
-        return state, Refusal(sequence, reason, state.mode, _flags(state, sample))
-
-    def reading(state: DeviceState) -> tuple[DeviceState, DeviceMessage]:
-        return state, Reading(
-            sequence,
-            sample.time,
-            sample.pressure,
-            sample.flow,
-            state.u_in,
-            state.u_out,
-            state.mode,
-            _flags(state, sample),
-        )
-
     fresh = 0 < sequence - state.sequence <= SEQUENCE_WINDOW
+    ours = packet.session == state.session
+    answer: DeviceMessage | Reason
     if isinstance(message, Vent):  # from whomever, and whenever: it is always safe
-        if packet.session == state.session and fresh:
-            state = replace(state, sequence=sequence)
-        return reading(_vented(state, Flag.HOST_VENTED))
-    if isinstance(message, Hello):
-        if message.version != PROTOCOL_VERSION:
-            return refused(state, Reason.VERSION)
-        if packet.session == state.session and not fresh:
-            return refused(_counted(state, "sequence"), Reason.SEQUENCE)
-        asked = message.pressure_limit
-        limit = settings.pressure_limit if asked is None else min(asked, settings.pressure_limit)
-        state = replace(
-            _vented(state, Flag.NONE),
-            mode=Mode.READY,
-            session=packet.session,
-            sequence=sequence,
-            pressure_limit=limit,
-        )
-        return state, Welcome(
-            PROTOCOL_VERSION,
-            FIRMWARE,
-            identity.capabilities,
-            WATCHDOG,
-            limit,
-            identity.device_id,
-            identity.calibration,
-            identity.name,
-        )
-    if packet.session != state.session:
-        return refused(_counted(state, "session"), Reason.SESSION)
-    if not fresh:
-        return refused(_counted(state, "sequence"), Reason.SEQUENCE)
-    state = replace(state, sequence=sequence)
-    match message:
-        case Heartbeat():
-            return reading(state)
-        case Statistics():
+        state = replace(state, sequence=sequence) if ours and fresh else state
+        state = _vented(state, Flag.HOST_VENTED)
+        answer = _reading(state, sequence, sample)
+    elif isinstance(message, Hello):
+        state, answer = _opened(settings, identity, state, packet, message, fresh or not ours)
+    elif not ours:
+        state, answer = _counted(state, "session"), Reason.SESSION
+    elif not fresh:
+        state, answer = _counted(state, "sequence"), Reason.SEQUENCE
+    else:
+        state = replace(state, sequence=sequence)
+        if isinstance(message, Statistics):
             return state, state.counters
-        case Arm():
-            if state.pressure_limit >= identity.highest:
-                return refused(state, Reason.SENSOR_RANGE)
-            if causes := _dangers(identity, state, sample):
-                return refused(_vented(state, causes), Reason.UNSAFE)
-            armed = replace(
-                state, mode=Mode.RUNNING, fed=state.stepped, u_in=0.0, u_out=1, causes=Flag.NONE
-            )
-            return reading(armed)
-        case Command(u_in, u_out, seen):
-            if u_in > protocol.U_MAX or u_out not in (0, 1):
-                state = _counted(_vented(state, Flag.OUT_OF_RANGE), "out_of_range")
-                return refused(state, Reason.OUT_OF_RANGE)
-            if state.mode is not Mode.RUNNING:
-                return refused(_counted(state, "not_armed"), Reason.NOT_ARMED)
-            age = (state.stepped // 1000 - seen) & 0xFFFFFFFF
-            if age > OLDEST_SEEN * 1000.0:  # also a time ahead of the device's own
-                return refused(_counted(state, "stale"), Reason.STALE)
-            state = replace(_counted(state, "commands"), u_in=u_in, u_out=u_out, fed=state.stepped)
-            return reading(state)
+        state, reason = _obeyed(identity, state, message, sample)
+        answer = reason or _reading(state, sequence, sample)
+    if isinstance(answer, Reason):
+        return state, Refusal(sequence, answer, state.mode, _flags(state, sample))
+    return state, answer
+
+
+def _reading(state: DeviceState, sequence: int, sample: Sample) -> Reading:
+    return Reading(
+        sequence,
+        sample.time,
+        sample.pressure,
+        sample.flow,
+        state.u_in,
+        state.u_out,
+        state.mode,
+        _flags(state, sample),
+    )
+
+
+def _opened(
+    settings: DeviceSettings,
+    identity: Identity,
+    state: DeviceState,
+    packet: Packet,
+    hello: Hello,
+    acceptable: bool,
+) -> tuple[DeviceState, Welcome | Reason]:
+    """Open a session, vented, or say why not."""
+    if hello.version != PROTOCOL_VERSION:
+        return state, Reason.VERSION
+    if not acceptable:
+        return _counted(state, "sequence"), Reason.SEQUENCE
+    asked = hello.pressure_limit
+    limit = settings.pressure_limit if asked is None else min(asked, settings.pressure_limit)
+    state = replace(
+        _vented(state, Flag.NONE),
+        mode=Mode.READY,
+        session=packet.session,
+        sequence=packet.sequence,
+        pressure_limit=limit,
+    )
+    return state, Welcome(
+        PROTOCOL_VERSION,
+        FIRMWARE,
+        identity.capabilities,
+        WATCHDOG,
+        limit,
+        identity.device_id,
+        identity.calibration,
+        identity.name,
+    )
+
+
+def _obeyed(
+    identity: Identity, state: DeviceState, message: HostMessage, sample: Sample
+) -> tuple[DeviceState, Reason | None]:
+    """Arm or command, or say why not; a heartbeat changes nothing."""
+    if isinstance(message, Arm):
+        if state.pressure_limit >= identity.highest:
+            return state, Reason.SENSOR_RANGE
+        if causes := _dangers(identity, state, sample):
+            return _vented(state, causes), Reason.UNSAFE
+        return replace(
+            state, mode=Mode.RUNNING, fed=state.stepped, u_in=0.0, u_out=1, causes=Flag.NONE
+        ), None
+    if not isinstance(message, Command):
+        return state, None
+    if message.u_in > protocol.U_MAX or message.u_out not in (0, 1):
+        return _counted(_vented(state, Flag.OUT_OF_RANGE), "out_of_range"), Reason.OUT_OF_RANGE
+    if state.mode is not Mode.RUNNING:
+        return _counted(state, "not_armed"), Reason.NOT_ARMED
+    age = (state.stepped // 1000 - message.seen) & 0xFFFFFFFF
+    if age > OLDEST_SEEN * 1000.0:  # also a time ahead of the device's own
+        return _counted(state, "stale"), Reason.STALE
+    return replace(
+        _counted(state, "commands"), u_in=message.u_in, u_out=message.u_out, fed=state.stepped
+    ), None
 
 
 def _sampled(state: DeviceState, sample: Sample) -> DeviceState:

@@ -16,6 +16,7 @@ import importlib
 import json
 import math
 import statistics
+import time
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,6 +39,9 @@ STEP, LAST = 0.002, 2047
 
 #: Conversions of which one sample is the median, against spikes; 0.3 ms each.
 _MEDIAN_OF = 3
+
+#: Time until the conversion of an input that was just chosen, s: one ends, and another is whole.
+_SETTLES = 0.001
 
 #: Share of its range at which a sensor is at its end: some clip a little early.
 _SATURATED = 0.99
@@ -74,6 +78,22 @@ class SensorPart:
 
 
 @dataclass(frozen=True)
+class FlowSensor:
+    """A flow sensor on the same converter, the optional table ``flow`` of TOML.
+
+    ``flow = largest sign(x) |x|^exponent`` with ``x = (V - offset_voltage) / span_voltage``, as the
+    ventilator's own driver has it for a D-Lite with a differential pressure sensor.
+    """
+
+    source: str  #: where this stands.
+    adc_channel: int  #: input, 0..3.
+    offset_voltage: float  #: at no flow, V.
+    span_voltage: float  #: V at the largest flow, beyond the offset; below 0 for one turned around.
+    largest: float  #: L/min.
+    exponent: float  #: of the voltage.
+
+
+@dataclass(frozen=True)
 class PvpConfiguration:
     """Wiring and calibration of one ventilator: keys of its TOML file, all of them required."""
 
@@ -90,7 +110,7 @@ class PvpConfiguration:
     cmH2O_per_volt: float  #: slope of the sensor, measured.
     pressure_limit: float  #: above which the device vents, cmH2O.
     #: CSV of the proportional valve with columns u_in (%, 0 to 100, increasing), opening, closing
-    #: (duty cycle, 0..1); beside the TOML file.
+    #: (duty cycle, 0..1); or the ventilator's own ``.npy`` of these three. Beside the TOML file.
     valve_table: str
 
 
@@ -117,6 +137,7 @@ class Machine:
     wiring: Revision
     part: SensorPart
     valve: ValveTable
+    flow: FlowSensor | None  #: None where none is.
     digest: bytes  #: SHA-256 of all of it but the name: who it is to a bring-up.
 
     def pressure(self, counts: float) -> float:
@@ -128,6 +149,13 @@ class Machine:
     def highest(self) -> float:
         """Largest pressure that sensor and converter can tell, cmH2O."""
         return min(self.part.range, self.pressure(LAST))
+
+    def flow_of(self, counts: float) -> float:
+        """Flow of a conversion, mL/s; NaN where nothing measures it."""
+        if self.flow is None:
+            return math.nan
+        x = (counts * STEP - self.flow.offset_voltage) / self.flow.span_voltage
+        return math.copysign(abs(x) ** self.flow.exponent, x) * self.flow.largest * 1000.0 / 60.0
 
 
 def load_machine(path: Path) -> Machine:
@@ -143,15 +171,33 @@ def load_machine(path: Path) -> Machine:
             for name, table in values.pop(kind, {}).items():
                 if tables.setdefault(name, table) != table:
                     raise ValueError(f"{kind}.{name} is known otherwise: give yours another name")
+        measured = values.pop("flow", None)
+        flow = None if measured is None else _typed(FlowSensor, measured, "flow.")
         configuration = _typed(PvpConfiguration, values, "")
         wiring = _typed(Revision, *_named(known, "revisions", configuration.revision))
         part = _typed(SensorPart, *_named(known, "sensors", wiring.sensor))
         _check(configuration, wiring, part)
+        if flow is not None and (
+            flow.adc_channel == wiring.adc_channel
+            or not 0 <= flow.adc_channel <= 3
+            or not flow.span_voltage
+            or min(flow.largest, flow.exponent) <= 0.0
+        ):
+            raise ValueError(
+                "flow: give another adc_channel than the pressure's, of 0..3, a span_voltage other "
+                "than 0, and largest and exponent above 0"
+            )
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path}: {error}") from error
     table_path = path.parent / configuration.valve_table
     try:
-        rows = np.loadtxt(table_path, delimiter=",", skiprows=1, ndmin=2)
+        with table_path.open("rb") as file:
+            stored = file.read(6) == b"\x93NUMPY"
+        rows = (
+            np.asarray(np.load(table_path, allow_pickle=False), float)
+            if stored
+            else np.loadtxt(table_path, delimiter=",", skiprows=1, ndmin=2)
+        )
         table = ValveTable(*(np.ascontiguousarray(column) for column in rows.T))
         _check_table(table)
     except (OSError, ValueError, TypeError) as error:
@@ -159,10 +205,10 @@ def load_machine(path: Path) -> Machine:
             f"{table_path}: {error}; it needs a line of names, then u_in,opening,closing with u_in "
             "increasing from 0 to 100 and duty cycles within 0..1"
         ) from error
-    parts = [dataclasses.asdict(x) for x in (configuration, wiring, part)]
+    parts = [dataclasses.asdict(x) for x in (configuration, wiring, part, flow) if x is not None]
     del parts[0]["name"]
     content = json.dumps(parts, sort_keys=True).encode() + rows.astype("<f8").tobytes()
-    machine = Machine(configuration, wiring, part, table, hashlib.sha256(content).digest())
+    machine = Machine(configuration, wiring, part, table, flow, hashlib.sha256(content).digest())
     if configuration.pressure_limit >= machine.highest:
         raise InputError(
             f"{path}: the pressure_limit of {configuration.pressure_limit:g} cmH2O lies outside "
@@ -171,7 +217,7 @@ def load_machine(path: Path) -> Machine:
     return machine
 
 
-_TableT = TypeVar("_TableT", PvpConfiguration, Revision, SensorPart)
+_TableT = TypeVar("_TableT", PvpConfiguration, Revision, SensorPart, FlowSensor)
 
 
 def _named(known: Mapping[str, Any], kind: str, name: str) -> tuple[dict[str, Any], str]:
@@ -314,7 +360,7 @@ class PvpSensor:
         smbus2 = _imported("smbus2")
         try:
             self._bus: Any = smbus2.SMBus(self._wiring.i2c_bus)
-            self._configure_converter()
+            self._convert(self._wiring.adc_channel)
         except OSError as error:
             raise InputError(
                 f"the pressure converter does not answer at address "
@@ -325,32 +371,42 @@ class PvpSensor:
             machine.configuration.name,
             bytes.fromhex(machine.configuration.device_id),
             machine.digest,
-            Capability.NONE,
+            Capability.NONE if machine.flow is None else Capability.FLOW,
             highest=machine.highest,
             noisy=True,
         )
 
     def sample(self, now: float) -> Sample:
         """Median of three conversions; NaN if the converter does not answer."""
+        flow = math.nan
         try:
-            counts = statistics.median(self._conversion() for _ in range(_MEDIAN_OF))
+            counts = self._median()
+            if self._machine.flow is not None:
+                self._convert(self._machine.flow.adc_channel)
+                flow = self._machine.flow_of(self._median())
+                self._convert(self._wiring.adc_channel)
         except OSError:
             return Sample(now, math.nan)
         if counts <= 0:  # no voltage: the wire is off; every part gives some at ambient pressure
             return Sample(now, math.nan)
         pressure = self._machine.pressure(counts)
-        return Sample(now, pressure, saturated=pressure >= _SATURATED * self._machine.highest)
+        saturated = pressure >= _SATURATED * self._machine.highest
+        return Sample(now, pressure, flow, saturated)
 
     def close(self) -> None:
         """Release the bus."""
         self._bus.close()
 
-    def _configure_converter(self) -> None:
-        channel = self._wiring.adc_channel << 12
-        word = _SINGLE_ENDED | channel | _RANGE_4V | _FASTEST | _NO_ALERT
+    def _convert(self, channel: int) -> None:
+        """Convert an input from here on; the first conversion is awaited."""
+        word = _SINGLE_ENDED | channel << 12 | _RANGE_4V | _FASTEST | _NO_ALERT
         self._bus.write_i2c_block_data(
             self._wiring.adc_address, _CONFIGURATION, [word >> 8, word & 0xFF]
         )
+        time.sleep(_SETTLES)
+
+    def _median(self) -> float:
+        return statistics.median(self._conversion() for _ in range(_MEDIAN_OF))
 
     def _conversion(self) -> int:
         """Counts of one conversion: the upper 12 bits of a signed 16-bit word."""

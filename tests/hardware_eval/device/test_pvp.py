@@ -17,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hardware_eval.device import __main__ as board
@@ -24,7 +25,7 @@ from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves, load_machine
 from hardware_eval.wire.client import Client, Link
-from hardware_eval.wire.messages import PROTOCOL_VERSION, Hello, Mode, Packet, encode
+from hardware_eval.wire.messages import PROTOCOL_VERSION, Capability, Hello, Mode, Packet, encode
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 
@@ -148,6 +149,54 @@ def test_the_sensor(configuration: Path, hardware: SimpleNamespace) -> None:
         assert math.isnan(hal.sample(3.0).pressure)
     hardware.bus.broken = True
     assert math.isnan(hal.sample(4.0).pressure)
+
+
+FLOW = """
+[flow]
+source = "devices.ini, flow_sensor_ex"
+adc_channel = 2
+offset_voltage = 2.25
+span_voltage = 4.0
+largest = 192.6426
+exponent = 0.5228
+"""
+
+
+def test_a_flow_sensor_is_an_option(configuration: Path, hardware: SimpleNamespace) -> None:
+    plain = PvpSensor(configuration)
+    assert plain.identity.capabilities == Capability.NONE
+    assert math.isnan(plain.sample(0.0).flow)
+    configuration.write_text(CONFIGURATION + RIG + FLOW)
+    hal = PvpSensor(configuration)
+    assert hal.identity.capabilities == Capability.FLOW
+    assert hal.identity.calibration != plain.identity.calibration
+    for counts, litres in (
+        (1125, 0.0),
+        (1625, 192.6426 * 0.25**0.5228),
+        (1025, -192.6426 * 0.05**0.5228),
+    ):
+        hardware.bus.counts = [1100] * 3 + [counts] * 3
+        sample = hal.sample(1.0)
+        assert sample.pressure == pytest.approx(0.0)
+        assert sample.flow == pytest.approx(litres * 1000.0 / 60.0)
+    assert hardware.bus.configured[0] >> 4 & 0b111 == 0b101  # the pressure's input is back
+    configuration.write_text(CONFIGURATION + RIG + FLOW.replace("channel = 2", "channel = 1"))
+    with pytest.raises(InputError, match="another adc_channel"):
+        PvpSensor(configuration)
+
+
+def test_the_measured_response_of_the_ventilators_valve_is_read_as_it_is(
+    configuration: Path,
+) -> None:
+    """Its repository keeps setpoints, %, and duty cycles of both directions as numpy does."""
+    rows = np.array([[0.0, 0.0, 0.0], [1.0, 0.38, 0.29], [50.0, 0.69, 0.63], [100.0, 0.96, 0.93]])
+    with (configuration.parent / "SMC_response").open("wb") as file:
+        np.save(file, rows)
+    configuration.write_text((CONFIGURATION + RIG).replace("valve.csv", "SMC_response"))
+    table = load_machine(configuration).valve
+    assert table.duty(50.0, True) == pytest.approx(0.69)
+    assert table.duty(25.5, False) == pytest.approx(0.46)
+    assert table.duty(0.0, True) == 0.0
 
 
 def test_the_valves(configuration: Path, hardware: SimpleNamespace) -> None:

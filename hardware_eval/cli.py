@@ -26,6 +26,7 @@ from hardware_eval.commands import (
     calibrate,
     calibration_of,
     numbers,
+    report,
     told,
     trial,
 )
@@ -480,6 +481,7 @@ def replay(
 
 app.command()(bringup)
 app.command()(trial)
+app.command()(report)
 app.command()(calibrate)
 
 

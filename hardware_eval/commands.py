@@ -120,6 +120,27 @@ def trial(
     print(done, file=told(json))
 
 
+def report(
+    session: Annotated[Path, typer.Argument(help="Folder of a session, finished or not.")],
+    json: JsonFile = None,
+) -> None:
+    """Write a session's page and its acceptance report in the form of ISO 80601-2-12, as HTML.
+
+    Example: `ventbench-hardware report runs/hardware`
+    """
+    from hardware_eval.results import acceptance, page
+
+    written = {"session": str(page.write(session))}
+    to = told(json)
+    try:
+        written["acceptance"] = str(acceptance.write(session))
+    except InputError as error:  # no run is complete yet
+        print(error, file=to)
+    emit(written, json)
+    for path in written.values():
+        print(path, file=to)
+
+
 def calibrate(
     part: Annotated[str, typer.Argument(help="zero, span, valve, peep, flow, leak or lung.")],
     port: Port,

@@ -47,6 +47,8 @@ class Interval:
     high: float = math.nan
 
     def __str__(self) -> str:
+        if math.isnan(self.value):
+            return "–"
         if math.isnan(self.low):
             return f"{self.value:.4g}"
         return f"{self.value:.4g} ({self.low:.4g} to {self.high:.4g})"

@@ -30,6 +30,7 @@ from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.bench.selftest import Sheet
 from hardware_eval.realtime import ENTRY_PRIORITY, Clock, RealClock
+from hardware_eval.results import acceptance, page
 from hardware_eval.results import record as records
 from hardware_eval.wire.client import ANSWER_TIMEOUT, Client, Link
 from hardware_eval.wire.messages import Capability
@@ -362,6 +363,9 @@ def evaluate(
             runs = checked.errors.size
             stopped[name] = f"{len(stops)} of {runs} runs failed, the first: {stops[0].reason}"
             unrun |= {name} if len(stops) == runs else set()
+    with contextlib.suppress(InputError):  # without jinja2, or a complete run
+        page.write(out)
+        acceptance.write(out)
     return Evaluation(not reason, reason, log_path, written, made, stopped, frozenset(unrun))
 
 

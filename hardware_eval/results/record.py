@@ -66,7 +66,7 @@ def timing(log: Path, entry: str | None = None) -> dict[str, float]:
     Returns:
         ``steps``, and those that began after the deadline of the next one (``lost``); the share
         that began within 2 ms of the deadline (``on_time``), and the latest (``worst``, s); answers
-        that came late (``late_answers``), their share of those that were asked for
+        that were asked for (``asked``), that came late (``late_answers``), their share
         (``late_share``), and the longest (``longest_answer``, s); answers that the fallback refused
         (``outside``), its share of the steps (``fallback_share``), and most in a row
         (``longest_fallback``); time from a step's beginning to its command's answer
@@ -92,6 +92,7 @@ def timing(log: Path, entry: str | None = None) -> dict[str, float]:
         "on_time": float(np.mean(delays <= ON_TIME_S)),
         "lost": int(np.sum(delays > protocol.DT)),
         "worst": float(delays.max()),
+        "asked": sums["asked"],
         "late_answers": sums["late_answers"],
         "late_share": sums["late_answers"] / asked,
         "outside": sums["outside"],
@@ -153,7 +154,7 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
             "breaths": sum(line["type"] == "breath" for line in logged),
         },
         "plan": plan.as_dict(),
-        "control": _control(log),
+        "control": control(log),
         "safety": about["safety"],
         "selftest": _skipped(logged, lungs),
         "timing": timing(log, name),
@@ -254,7 +255,7 @@ def _skipped(logged: list[dict[str, Any]], lungs: list[str]) -> dict[str, list[s
     }
 
 
-def _control(log: Path) -> dict[str, Any]:
+def control(log: Path) -> dict[str, Any]:
     """Errors of the PID between the scored runs, by lung, and their drift.
 
     The drift is the slope of a line through them in their order, from the first to the last,
@@ -264,8 +265,8 @@ def _control(log: Path) -> dict[str, Any]:
     logged = list(lines(log))
     complete = complete_runs(logged)
     for line in logged:
-        control = line["type"] == "run" and line["entry"] == CONTROL
-        if control and (line["run"], line["attempt"]) in complete:
+        ran = line["type"] == "run" and line["entry"] == CONTROL
+        if ran and (line["run"], line["attempt"]) in complete:
             by_lung.setdefault(line["lung"], []).append(line["error"])
     figures: dict[str, Any] = {}
     for lung, errors in by_lung.items():

@@ -107,6 +107,8 @@ class EntryTrial:
     """What a trial says of one entry."""
 
     score: Interval  #: mean error, cmH2O, as mounted; NaN if a run failed.
+    scores: dict[str, Interval]  #: the same by mounting.
+    simulated: dict[str, float]  #: mean error in the dry run by mounting, cmH2O; NaN without one.
     #: mean error less that in simulation, cmH2O, mounted anew; NaN without a dry run.
     gap: Interval
     gaps: dict[str, Interval]  #: the same by mounting, cmH2O, as mounted.
@@ -139,7 +141,7 @@ class Trial:
             )
             rows.append(
                 f"  gap to simulation {x.gap} cmH2O mounted anew; SD of repeats "
-                f"{x.repeat_sd:.3f}, of mountings {x.mounting_sd:.3f}"
+                f"{Interval(x.repeat_sd)}, of mountings {Interval(x.mounting_sd)}"
             )
             for mounting, gap in x.gaps.items():
                 succeeded, of = x.successes[mounting]
@@ -189,6 +191,9 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
     """One entry: errors ``(M, P, K)``, NaN where a run failed; in simulation ``(M, P)``."""
     repeats = errors.shape[-1]
     by_mounting = errors.mean(axis=(1, 2)) - simulated.mean(axis=1)
+    predicted = dict(zip(mountings, simulated.mean(axis=1).tolist(), strict=True))
+    means = errors.mean(axis=(1, 2)).tolist()
+    scores = {name: Interval(mean) for name, mean in zip(mountings, means, strict=True)}
     gaps = {name: Interval(float(gap)) for name, gap in zip(mountings, by_mounting, strict=True)}
     score, gap = Interval(float(errors.mean())), Interval(float(by_mounting.mean()))
     within = between = math.nan
@@ -197,6 +202,8 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
         score = interval(*(x[0] for x in as_mounted(flat)))
         mean, error, freedom = as_mounted(errors - simulated[..., None])
         gaps = {name: interval(mean[k], error[k], freedom[k]) for k, name in enumerate(mountings)}
+        own = np.stack(as_mounted(errors), axis=1)
+        scores = {name: interval(*x) for name, x in zip(mountings, own, strict=True)}
         within = float(np.sqrt(errors.var(axis=-1, ddof=1).mean()))
         if len(mountings) > 1:
             excess = by_mounting.var(ddof=1) - (error**2).mean()
@@ -209,6 +216,8 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
     each = errors[0].size
     return EntryTrial(
         score,
+        scores,
+        predicted,
         gap,
         gaps,
         success,

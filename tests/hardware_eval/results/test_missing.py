@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from hardware_eval.bench.loop import Operator
 from hardware_eval.bench.plan import make_plan
 from hardware_eval.bench.raw_log import RECORDING
+from hardware_eval.results import acceptance, page
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results import record as records
 from hardware_eval.results.evaluate import Line
@@ -92,14 +94,19 @@ def test_figures_stay_within_bounds_or_a_word_says_why(
     seed: int,
 ) -> None:
     whole = read(done.log)
+    complete = page.page(page.read(done.log))
     folder = tmp_path_factory.mktemp("lacking")
     log = without(done.log, folder, share, cut, unscored, seed)
+    shown = page.page(page.read(log))
+    assert not re.search(r"\bnan\b", shown, re.IGNORECASE)
+    assert shown.count("<figure>") == complete.count("<figure>") == len(PIPS)
     try:
         left = read(log)
     except InputError as error:
         assert "run the same command again, it continues" in str(error)  # noqa: PT017
         with pytest.raises(InputError, match="continues"):
             analyse([log])
+        assert "runs are left" in shown
         return
     given = np.array(whole.header.trace.pressure_milli_cmH2O, float) / 1000.0
     # A gap of two lies between its neighbours: it is off by three steps of the pressure at most.
@@ -110,6 +117,9 @@ def test_figures_stay_within_bounds_or_a_word_says_why(
     assert left.header.peak_pressure_cmH2O[0] <= whole.header.peak_pressure_cmH2O[0]
     made = records.save(folder, records.hardware_record(log, open_submission("pid_best")))
     assert records.replay(log, record=made).problems == ()
+    told = acceptance.report(page.read(log))
+    assert "This is no certification" in told
+    assert not re.search(r"\bnan\b", told, re.IGNORECASE)
     figures = json.dumps(analyse([log]).as_dict())
     assert "NaN" not in figures
     breaths = records.recorded_breaths(log)

@@ -1,0 +1,261 @@
+"""The page of a session: one HTML file without script or network, from its log alone.
+
+A session that is not finished has a page too, which says what is left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ventbench
+from hardware_eval.bench.identity import Interval
+from hardware_eval.bench.plan import Plan, progress
+from hardware_eval.bench.raw_log import LOG, LoggedBreath, breaths, lines
+from hardware_eval.results import record, trial
+from hardware_eval.results.record import plan_of, timing
+from ventbench import palette
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.base.text import number, page_templates, plain
+from ventbench.pages import panels
+from ventbench.pages.report import frame
+from ventbench.task import protocol, waveform
+from ventbench.task.lungs import LUNG_IDS
+
+#: Files of the pages in a session's folder.
+PAGE, ACCEPTANCE = "session.html", "acceptance.html"
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a log says of a session."""
+
+    path: Path  #: of the log.
+    logged: list[dict[str, Any]]  #: its lines.
+    plan: Plan  #: what was to run.
+    breaths: list[LoggedBreath]  #: all of them.
+
+    @property
+    def lungs(self) -> list[str]:
+        """Lungs of the plan, in the protocol's order."""
+        return [lung for lung in LUNG_IDS if lung in self.plan.lungs]
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """The last session's line: device, operator, notes."""
+        return next(line for line in reversed(self.logged) if line["type"] == "session")
+
+
+def read(folder: Path) -> Session:
+    """Read a session's folder, or its log.
+
+    Raises:
+        InputError: if there is no log, or no session has begun.
+    """
+    path = folder / LOG if folder.is_dir() else folder
+    if not path.is_file():
+        raise InputError(f"{path} is not there: give the folder of a session")
+    logged = list(lines(path))
+    if not any(line["type"] == "session" for line in logged):
+        raise InputError(f"{path} holds no session; a collection has no page")
+    return Session(path, logged, plan_of(logged, str(path)), breaths(path))
+
+
+def style(columns: Sequence[Any]) -> str:
+    """The style of all reports, for panels in some columns."""
+    sheet = page_templates("ventbench.pages").get_template("report.css.j2")
+    given = {"colors": palette.css(), "run_colors": palette.RUNS, "shades": (), "names": ()}
+    return sheet.render(**given, pips=columns)
+
+
+def page(session: Session) -> str:
+    """The page."""
+    plan, about = session.plan, session.about
+    done = progress(plan, session.logged)
+    try:
+        analysed, missing = trial.analyse([session.path]), ()
+    except InputError as error:
+        analysed, missing = None, (str(error),)
+    return (
+        page_templates("hardware_eval.results")
+        .get_template("session.html.j2")
+        .render(
+            style=style(plan.pips),
+            plan=plan,
+            lungs=session.lungs,
+            device=about["device"],
+            operator=plain(about["operator"]),
+            notes=plain(about["notes"]),
+            done=len(plan.runs) - len(done.remaining(plan)),
+            table=[] if analysed is None else _table(session, analysed),
+            agreement={
+                name.capitalize(): shown(value)
+                for name, value in ({} if analysed is None else analysed.agreement).items()
+            },
+            missing=missing if analysed is None else analysed.missing,
+            entries=[_entry(session, name) for name in plan.entries],
+            timing=[_timing(session, name) for name in plan.entries],
+            stopped=_stopped(session),
+            tests=[line for line in session.logged if line["type"] == "selftest" and "go" in line],
+            control=record.control(session.path),
+            skipped=_skipped(session, len(done.remaining(plan))),
+            frame=frame(),
+            shown_breath=panels.BREATH + 1,
+            log=session.path.name,
+            sha256=files.sha256(session.path),
+            priority=about.get("priority"),
+            sessions=sum(line["type"] == "session" for line in session.logged),
+            version=ventbench.__version__,
+        )
+    )
+
+
+def shown(value: Interval, sign: bool = False) -> str:
+    """A figure with its interval; a dash for none."""
+    if math.isnan(value.value):
+        return "–"
+    own, low, high = (number(x, 3, sign) for x in (value.value, value.low, value.high))
+    return own if math.isnan(value.low) else f"{own} ({low} to {high})"
+
+
+def _table(session: Session, analysed: trial.Trial) -> list[dict[str, Any]]:
+    """A row for each entry, and under it one for each lung."""
+    rows = []
+    for name, entry in analysed.entries.items():
+        done, of = (sum(part) for part in zip(*entry.successes.values(), strict=True))
+        whole = {
+            "name": name,
+            "whole": True,
+            "error": shown(entry.score),
+            "simulated": shown(Interval(float(np.mean(list(entry.simulated.values()))))),
+            "gap": shown(entry.gap, sign=True),
+            "done": f"{done} of {of}",
+            "repeats": shown(Interval(entry.repeat_sd)),
+        }
+        rows.append(whole)
+        for lung in session.lungs:
+            gap, (succeeded, every) = entry.gaps[lung], entry.successes[lung]
+            rows.append(
+                {
+                    "name": lung,
+                    "whole": False,
+                    "error": shown(entry.scores[lung]),
+                    "simulated": shown(Interval(entry.simulated[lung])),
+                    "gap": shown(gap, sign=True),
+                    "done": f"{succeeded} of {every}",
+                    "repeats": "",
+                }
+            )
+    return rows
+
+
+def _entry(session: Session, name: str) -> dict[str, Any]:
+    """Panels of an entry: a row for each lung, a column for each PIP, with all repeats."""
+    runs = [x for x in session.breaths if x.run.entry == name and x.run.kind == "scored"]
+    shown = [x for x in runs if x.breath == panels.BREATH and x.complete]
+    grid = []
+    for lung in session.lungs:
+        row = [
+            _panel(pip, [x for x in shown if (x.run.lung, x.run.pip) == (lung, pip)])
+            for pip in session.plan.pips
+        ]
+        grid.append({"lung": lung, "panels": row})
+    return {"name": name, "grid": grid}
+
+
+def _panel(pip: float, repeats: Sequence[LoggedBreath]) -> dict[str, Any]:
+    steps = panels.SHOWN + 1
+    target = np.asarray(waveform.target(np.arange(steps), pip), float)
+    pressures = [np.array(x.log.pressure[:steps]) for x in repeats]
+    low, height = protocol.PEEP, pip - protocol.PEEP
+    known = np.concatenate([*pressures, target])
+    top = min(float(np.nanmax(known)), pip + 0.8 * height) + 0.08 * height
+    bottom = min(float(np.nanmin(known)), low) - 0.08 * height
+
+    def y(pressure: Any) -> Any:
+        clipped = np.clip(pressure, bottom, top)
+        return panels.TOP + (top - clipped) / (top - bottom) * panels.PRESSURE_HEIGHT
+
+    x = panels.time_x(panels.shown_times())
+    inspired = [x.log.pressure[: protocol.INSPIRATION_STEPS] for x in repeats]
+    errors = [float(np.nanmean(np.abs(np.array(each) - pip))) for each in inspired]
+    highest = max((float(np.nanmax(each)) for each in pressures), default=-math.inf)
+
+    def stairs(u_in: Sequence[float]) -> str:
+        held = panels.valve_y(np.repeat(u_in[:steps], 2)[:-1])
+        return panels.path(np.stack([np.repeat(x, 2)[1 : 1 + len(held)], held], axis=-1))
+
+    return {
+        "pip": f"{pip:g}",
+        "repeats": len(repeats),
+        "error": number(float(np.mean(errors))) if errors else "no run",
+        "target": panels.path(np.stack([x, y(target)], axis=-1)),
+        "ticks": [(f"{value:g}", round(float(y(value)), 1)) for value in (low, pip)],
+        "pressures": [panels.path(np.stack([x[: len(p)], y(p)], axis=-1)) for p in pressures],
+        "commands": [stairs(each.log.u_in) for each in repeats],
+        "above": f"{highest:.0f}" if highest > top else "",
+    }
+
+
+def _timing(session: Session, name: str) -> dict[str, Any]:
+    """Late answers and fallbacks of an entry in all of its attempts, and what ran beside it."""
+    runs = [x for x in session.logged if x["type"] == "run" and x["entry"] == name]
+    beside = [x["beside"] for x in runs if x.get("beside")]
+    try:
+        figures: Any = timing(session.path, name)
+    except InputError:  # no breath yet
+        figures = None
+    return {
+        "name": name,
+        "figures": figures,
+        "late": sum(x["late"] for x in beside),
+        "asked": sum(x["asked"] for x in beside),
+        "trips": sum(len(x.get("trips", ())) for x in runs),
+    }
+
+
+def _stopped(session: Session) -> list[dict[str, Any]]:
+    """Attempts that did not complete, alike ones together."""
+    runs = [
+        (x["entry"], x["lung"], f"{x['pip']:g}", x["status"], plain(x["reason"]))
+        for x in session.logged
+        if x["type"] == "run" and x["status"] != "complete"
+    ]
+    keys = ("entry", "lung", "pip", "status", "reason")
+    return [{**dict(zip(keys, run, strict=True)), "count": n} for run, n in Counter(runs).items()]
+
+
+def _skipped(session: Session, left: int) -> list[str]:
+    """What was not done, a sentence each."""
+    told = []
+    if left:
+        told.append(f"{left} of {len(session.plan.runs)} runs are left; `run` continues the plan.")
+    if not any(x.get("simulated") for x in session.logged if x["type"] == "session"):
+        told.append("There was no dry run, so that nothing is known of the simulation.")
+    if not session.plan.control_every:
+        told.append("No control ran, so that a drift of the bench would not show.")
+    told += [
+        f"Self-test of {line['lung']}: {', '.join(line['skipped'])} left out."
+        for line in session.logged
+        if line["type"] == "selftest" and line["skipped"]
+    ]
+    return list(dict.fromkeys(told))
+
+
+def write(folder: Path) -> Path:
+    """Write the page of a session beside its log; returns its path.
+
+    Raises:
+        InputError: if there is no session.
+    """
+    session = read(folder)
+    path = session.path.parent / PAGE
+    files.write_bytes(path, page(session).encode())
+    return path

@@ -439,7 +439,7 @@ class LungFit:
         extrapolated = _EXTRAPOLATION_ERROR * quadratic * max(flow - peak, 0.0)
         jumps = self.blur * self._coefficient("elastance")
         half_width = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
-        reach = float(np.linalg.norm([half_width, jumps, extrapolated]))
+        reach = float(np.hypot(half_width, extrapolated)) + jumps  # the same in every breath
         ends = (estimate.value - reach, estimate.value + reach)
         return Estimate(estimate.value, estimate.unit, ends)
 
@@ -451,7 +451,7 @@ class LungFit:
         )
         half_width = 0.5 * (elastance.ci95[1] - elastance.ci95[0])
         jumps = elastance.value * self.blur * self.jump / tidal
-        reach = float(np.hypot(half_width, jumps))
+        reach = half_width + jumps
         low, high = (max(elastance.value + side * reach, 1e-3) for side in (-1.0, 1.0))
         return Estimate(1000.0 / elastance.value, "mL/cmH2O", (1000.0 / high, 1000.0 / low))
 

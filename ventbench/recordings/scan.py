@@ -519,10 +519,7 @@ def _together(parts: Sequence[Scanned]) -> Scanned:
         )
         for (column, kind, _), same in merged.items()
     )
-    names = (field.name for field in fields(Scanned))
-    return Scanned(
-        **{
-            name: bad if name == "bad" else joined([getattr(x, name) for x in parts])
-            for name in names
-        }
-    )
+    values: dict[str, Any] = {"bad": bad}
+    for name in {field.name for field in fields(Scanned)} - {"bad"}:
+        values[name] = joined([getattr(part, name) for part in parts])
+    return Scanned(**values)

@@ -1,0 +1,142 @@
+"""Samples that are no readings are found, listed and left out; sound signals are left alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from ventbench.mechanics import identify
+from ventbench.recordings import check, load, make_breaths, write
+from ventbench.recordings.bad_samples import clean, find_bad_samples, without
+
+RATE, PERIOD = 50.0, 3.0
+
+
+def signals(seed: int = 0, cycles: int = 12) -> dict[str, np.ndarray]:
+    """Pressure, cmH2O, and flow, mL/s, of R20C50 under pressure control, with noise."""
+    phase = np.tile(np.arange(0.0, PERIOD, 1.0 / RATE), cycles)
+    inside = phase < 1.0
+    rising = 750.0 * np.exp(-phase)
+    flow = np.where(inside, rising, -750.0 * (1.0 - np.exp(-1.0)) * np.exp(-(phase - 1.0)))
+    noise = np.random.default_rng(seed).normal(size=(2, len(phase)))
+    return {
+        "pressure": np.round(np.where(inside, 20.0, 5.0) + 0.1 * noise[0], 3),
+        "flow": np.round(flow + 4.0 * noise[1], 2),
+    }
+
+
+def recording(columns: dict[str, np.ndarray]):
+    shape = (12, round(PERIOD * RATE))
+    time = np.broadcast_to(np.arange(shape[1]) / RATE, shape)
+    u_in = np.where(time < 1.0, 30.0, 0.0)
+    labels = (np.full(12, 20.0), np.full(12, 50.0))
+    split = {name: values.reshape(shape) for name, values in columns.items()}
+    pressure = split.pop("pressure")
+    return make_breaths(np.arange(12), *labels, time, u_in, u_in == 0.0, pressure, **split)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("digits", [0, 1, 3, 12])
+def test_sound_signals_are_left_alone(seed, digits):
+    columns = {name: np.round(values, digits) for name, values in signals(seed).items()}
+    assert find_bad_samples(columns) == ()
+
+
+@pytest.mark.parametrize("name", ["pressure", "flow"])
+@pytest.mark.parametrize("mark", [-9999.0, -1650.0, -1e30, 32767.0])
+def test_marks_are_found_by_themselves(name, mark):
+    columns = signals()
+    at = np.random.default_rng(1).choice(np.arange(3, 1797), 12, replace=False)
+    columns[name] = columns[name].copy()
+    columns[name][at] = mark
+    (found,) = find_bad_samples(columns)
+    assert (found.column, found.kind, found.of) == (name, "mark", 1800)
+    np.testing.assert_array_equal(found.rows, np.sort(at))
+    assert f"12 of 1800 readings of {name} (0.67 %) are {mark:g}, which stands" in found.what()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    at=st.sets(st.integers(5, 1790), min_size=1, max_size=20),
+    size=st.floats(1.0, 50.0),
+    name=st.sampled_from(["pressure", "flow"]),
+)
+def test_isolated_values_far_off_are_found_and_nothing_else(at, size, name):
+    columns = signals()
+    rows = np.array([row for row in sorted(at) if not {row - 1, row - 2, row - 3} & at])
+    rows = rows[np.isin(rows % 150, [*range(4, 46), *range(54, 146)])]  # not where all jumps
+    assume(len(rows))
+    columns[name] = columns[name].copy()
+    columns[name][rows] += size * np.ptp(columns[name]) * np.where(rows % 2, 1.0, -1.0)
+    bad = find_bad_samples(columns)
+    np.testing.assert_array_equal(np.sort(np.concatenate([x.rows for x in bad])), rows)
+    assert find_bad_samples(without(columns, bad)) == ()
+
+
+def test_held_values_are_found_but_not_a_level_of_a_simulation():
+    columns = signals()
+    for start in (100, 700, 1300):
+        for values in columns.values():
+            values[start + 1 : start + 6] = values[start]
+    bad = find_bad_samples(columns)
+    assert {(x.column, x.kind, len(x.rows)) for x in bad} == {
+        ("pressure", "held", 15),
+        ("flow", "held", 15),
+    }
+    phase = np.tile(np.arange(0.0, PERIOD, 1.0 / RATE), 12)
+    level = np.where(phase < 1.0, 5.0 + 15.0 * np.minimum(phase, 0.7), 5.0)
+    assert find_bad_samples({"pressure": level}) == ()
+
+
+def test_a_sensor_slower_than_the_rows_is_named():
+    columns = signals()
+    columns["pressure"] = np.repeat(columns["pressure"][::4], 4)
+    (found,) = find_bad_samples(columns)
+    assert found.kind == "slow"
+    assert "pressure changes in one of 4 rows only" in found.what()
+
+
+def test_clean_is_idempotent_and_leaves_sound_breaths_as_they_are():
+    sound = recording(signals())
+    assert clean(sound) is sound
+    columns = signals()
+    columns["pressure"][[40, 400, 900]] = 99.99
+    cleaned = clean(recording(columns))
+    assert int(np.isnan(cleaned.pressure).sum()) == 3
+    assert "3 of 1800 readings of pressure" in cleaned.notes[0]
+    assert clean(cleaned) is cleaned
+
+
+def test_a_recording_with_too_many_is_unusable(tmp_path):
+    columns = signals()
+    columns["pressure"][np.random.default_rng(0).permutation(1800)[:400]] = -50.0
+    write(
+        recording({**columns, "pressure": np.clip(columns["pressure"], -20.0, None)}),
+        tmp_path / "a.csv",
+    )
+    report = check(tmp_path / "a.csv", missing=[-20.0])
+    assert not report.ok
+    assert "the recording is unusable" in report.problems[0].advice
+
+
+def test_every_door_leaves_the_same_samples_out(tmp_path):
+    columns = signals()
+    at = np.random.default_rng(3).choice(np.arange(3, 1797), 10, replace=False)
+    columns["flow"][at] = -99.0 / 0.06
+    spoiled = recording(columns)
+    write(spoiled, tmp_path / "a.csv")
+    read = load(tmp_path / "a.csv")
+    np.testing.assert_array_equal(np.isnan(read.flow).ravel().nonzero()[0], np.sort(at))
+    assert "10 of 1800 readings of flow (0.56 %) are -1650" in read.notes[0]
+    report = check(tmp_path / "a.csv")
+    assert (report.ok, len(report.suspicious)) == (True, 1)
+    for breaths in (read, spoiled):
+        (lung,) = identify(breaths)
+        assert lung.terms == ()
+        for truth, found in ((20.0, lung.R), (50.0, lung.C)):
+            assert found.ci95[0] < truth < found.ci95[1]
+    assert dataclasses.replace(read, notes=()).pressure.shape == spoiled.pressure.shape

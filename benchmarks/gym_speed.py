@@ -1,16 +1,19 @@
-"""Steps per second through the Gymnasium interface, beside those of the compiled scan alone.
+"""Steps per second through the Gymnasium interface, beside a compiled scan and a numpy loop.
 
-Both run the frozen simulators in float32 on as many cells, in turns, and the best of the rounds
-counts, because other work on the machine slows both. Usage:
+All run rigs in single or double precision on as many cells, in turns, and the best of the rounds
+counts, because other work on the machine slows all. The numpy loop is the rig of the entry
+``identify_plan``, inspirations from rest without observations. Usage:
 
-    python benchmarks/gym_speed.py [--envs 1024] [--rounds 20] [--json FILE]
+    python benchmarks/gym_speed.py [--envs 64 1024 8192] [--rounds 20] [--json FILE]
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import runpy
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -27,6 +30,8 @@ from ventbench.task import protocol
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.rollouts import closed_loop
 
+INSPIRATION = protocol.INSPIRATION_STEPS
+
 
 def episode(many: VentilatorVector, actions: np.ndarray) -> None:
     """One episode of all environments: its reset and all its steps."""
@@ -35,13 +40,19 @@ def episode(many: VentilatorVector, actions: np.ndarray) -> None:
         many.step(actions)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--envs", type=int, default=1024)
-    parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    count = options.envs
+def numpy_loop(count: int) -> Callable[[], object]:
+    """One inspiration of as many rigs of ``identify_plan``."""
+    folder = Path(__file__).parents[1] / "submissions" / "identify_plan"
+    simulate = runpy.run_path(str(folder / "rig.py"))["simulate"]
+    with np.load(folder / "rig.npz") as arrays:
+        rig = {name: arrays[name] for name in arrays.files}
+    lung = np.arange(count) % len(rig["means"])
+    commands = np.random.default_rng(0).uniform(0.0, 50.0, (count, INSPIRATION - 1))
+    return lambda: simulate(rig, rig["means"][lung], protocol.DT, commands, lung)
+
+
+def rates(count: int, rounds: int) -> dict[str, float]:
+    """Steps per second by job and clock."""
     many = VentilatorVector(count)
     many.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1.0, 0.0, (count, 1)).astype(np.float32)
@@ -49,27 +60,45 @@ def main() -> None:
         plant = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), take(frozen.load().plants, 4))
         cells = nominal_scenario(np.resize(protocol.PIPS, count))
         pid = PID(jnp.ones(count), jnp.ones(count))
-        jobs = {
-            "scan": lambda: jax.block_until_ready(closed_loop(plant, pid, cells)),
-            "gymnasium": lambda: episode(many, actions),
+        jobs: dict[str, tuple[Callable[[], object], int]] = {
+            "scan": (lambda: jax.block_until_ready(closed_loop(plant, pid, cells)), STEPS),
+            "gymnasium": (lambda: episode(many, actions), STEPS),
+            "numpy": (numpy_loop(count), INSPIRATION - 1),
         }
         clocks = {"wall": time.perf_counter, "processor": time.process_time}
         best = {(job, clock): np.inf for job in jobs for clock in clocks}
-        for job in jobs.values():
+        for job, _ in jobs.values():
             job()
-        for _ in range(options.rounds):
-            for name, job in jobs.items():
+        for _ in range(rounds):
+            for name, (job, _) in jobs.items():
                 begun = {clock: read() for clock, read in clocks.items()}
                 job()
                 for clock, read in clocks.items():
                     best[name, clock] = min(best[name, clock], read() - begun[clock])
-    rates = {" ".join(key): count * STEPS / seconds for key, seconds in best.items()}
-    print(f"{count} environments, {os.cpu_count()} cores, JAX {jax.__version__}; million steps/s")
-    for clock in clocks:
-        scan, through = rates[f"scan {clock}"] / 1e6, rates[f"gymnasium {clock}"] / 1e6
-        print(f"  by {clock} time: scan {scan:.2f}, Gymnasium {through:.2f} ({through / scan:.2f})")
+    return {" ".join(key): count * jobs[key[0]][1] / seconds for key, seconds in best.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--envs", type=int, nargs="+", default=[64, 1024, 8192])
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    print(f"{os.cpu_count()} cores, JAX {jax.__version__}; million steps/s")
+    found = {}
+    for count in options.envs:
+        found[str(count)] = made = rates(count, options.rounds)
+        for clock in ("wall", "processor"):
+            scan, through, plain = (
+                made[f"{job} {clock}"] / 1e6 for job in ("scan", "gymnasium", "numpy")
+            )
+            print(
+                f"  {count} environments by {clock} time: scan {scan:.2f}, Gymnasium {through:.2f} "
+                f"({through / scan:.2f} of it), numpy {plain:.2f}",
+                flush=True,
+            )
     if options.json:
-        write_json(options.json, rates)
+        write_json(options.json, found)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,9 @@ of :mod:`ventbench.train.rl.environment`. Needs the extra ``ventbench[gym]``.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, ClassVar, Literal
 
 from ventbench.base.errors import InputError, require
@@ -68,49 +69,68 @@ def _pack(trees: Any) -> Array:
     return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(trees)])
 
 
+def _without_noise(episode: environment.Episode) -> tuple[environment.Episode, Array]:
+    """What stays the same in an episode but for its noise, and the noise.
+
+    A step reads one row of the noise: packed with the rest, all of it would be copied.
+    """
+    cell = episode.cell
+    rest = cell.replace(noise=cell.noise[:0])  # type: ignore[attr-defined]
+    return episode.replace(cell=rest), cell.noise  # type: ignore[attr-defined]
+
+
 @partial(jax.jit, static_argnames="vary")
 def _reset(
     seed: Array, lungs: Lungs, lung: Array, pip: Array, *, vary: bool
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[tuple[Array, Array], Array, Array, Array]:
     """Begin E episodes.
 
     Returns:
-        What stays the same in them and what changes, packed; PIPs, cmH2O; observations.
+        What stays the same in them, packed, and their noise; what changes, packed; PIPs, cmH2O;
+        observations.
     """
     keys = jax.random.split(jax.random.key(seed), lung.shape[0])
     reset = partial(environment.reset, lungs=lungs, vary=vary)
     states, seen = jax.vmap(lambda key, lung, pip: reset(key, lung=lung, pip=pip), out_axes=-1)(
         keys, lung, pip
     )
-    return _pack(states.episode), _pack(states.progress), states.episode.cell.pip, seen.T
+    rest, noise = _without_noise(states.episode)
+    return (_pack(rest), noise), _pack(states.progress), states.episode.cell.pip, seen.T
 
 
-@partial(jax.jit, static_argnames="layouts", donate_argnames=("progress", "count"))
-def _step(
-    episodes: Array,
-    progress: Array,
-    count: Array,
-    actions: Array,
-    *,
-    layouts: tuple[_Layout, _Layout],
-) -> tuple[Array, ...]:
-    """Return the next progress and count, observations, rewards, pressures and sums of errors.
+@lru_cache
+def _program(fixed: _Layout, changing: _Layout) -> Callable[..., tuple[Array, Array, Array]]:
+    """Compile the step of packed environments.
 
-    Observations have a row a number, which is quicker to turn outside.
+    It takes what stays the same and the noise, of :func:`_reset`; what changes and the count of
+    steps, which it overwrites; and actions, ``(E, 1)``. It returns the latter two one step later,
+    and one array of what is seen: the rows of the observation, then those of :data:`_FURTHER`.
     """
 
     def advance(
-        episode: environment.Episode, progress: environment.Progress, action: Array
-    ) -> tuple[environment.Progress, Array, Array]:
+        episode: environment.Episode, progress: environment.Progress, count: Array, action: Array
+    ) -> tuple[environment.Progress, Array]:
         state = environment.State(episode, progress, count)
         state, seen, reward, _ = environment.step(state, action)
-        return state.progress, seen, reward
+        after = state.progress
+        further = jnp.stack([reward, after.loop.signals.scored, after.error])
+        return after, jnp.concatenate([seen, further])
 
-    fixed, changing = layouts[0].unpack(episodes), layouts[1].unpack(progress)
-    after, seen, reward = jax.vmap(advance, in_axes=-1, out_axes=-1)(
-        fixed, changing, actions.reshape(-1)
-    )
-    return _pack(after), count + 1, seen, reward, after.loop.signals.scored, after.error
+    def step(
+        constant: tuple[Array, Array], progress: Array, count: Array, actions: Array
+    ) -> tuple[Array, Array, Array]:
+        rest = fixed.unpack(constant[0])
+        episodes = rest.replace(cell=rest.cell.replace(noise=constant[1]))
+        each = (-1, -1, None, -1)
+        states = (episodes, changing.unpack(progress), count, actions.reshape(-1))
+        after, seen = jax.vmap(advance, in_axes=each, out_axes=-1)(*states)
+        return _pack(after), count + 1, seen
+
+    return jax.jit(step, donate_argnums=(1, 2))
+
+
+#: Rows of what a step shows after those of the observation.
+_FURTHER = _REWARD, _PRESSURE, _ERROR = tuple(environment.OBSERVATION + k for k in range(3))
 
 
 class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
@@ -177,7 +197,8 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         self._rigs, self._noise = environment.load_lungs(simulator, rigs=rigs), noise
         with compilation.float32():
             state, _ = jax.eval_shape(environment.reset, jax.random.key(0), self._rigs)
-        self._layouts = _Layout.of(state.episode), _Layout.of(state.progress)
+            rest, _ = jax.eval_shape(_without_noise, state.episode)
+        self._advance = _program(_Layout.of(rest), _Layout.of(state.progress))
         self._count = STEPS + 1
 
     def reset(
@@ -189,7 +210,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         shift = int(self.np_random.integers(len(protocol.PIPS))) * self._turn
         number = np.uint32(self.np_random.integers(2**32))
         with compilation.float32():
-            self._episodes, self._progress, pip, seen = _reset(
+            self._constant, self._progress, pip, seen = _reset(
                 number, self._rigs, self._lung, np.roll(self._pips, shift), vary=self._noise
             )
             self._steps = jnp.zeros((), jnp.int32)
@@ -216,20 +237,22 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
             seen, info = self.reset()
             return seen, np.zeros(self.num_envs, np.float32), nothing, nothing.copy(), info
         values = np.asarray(actions, np.float32)
-        if not np.isfinite(values.sum()):
+        if not math.isfinite(values.sum()):
             at = int(np.argmin(np.isfinite(values.reshape(self.num_envs))))
             raise InputError(f"action {at} is {values[at, 0]}; it must be a number from -1 to 1")
         with compilation.float32():
-            self._progress, self._steps, seen, reward, self.pressure, error = _step(
-                self._episodes, self._progress, self._steps, values, layouts=self._layouts
+            self._progress, self._steps, shown = self._advance(
+                self._constant, self._progress, self._steps, values
             )
         self._count += 1
-        ended, info = ~nothing if self._count == STEPS else nothing.copy(), {}
+        rows = np.asarray(shown)
+        self.pressure = rows[_PRESSURE]
+        ended, info = np.full(self.num_envs, self._count == STEPS), {}
         if self._count == STEPS:
-            info = {"error": np.asarray(error) / environment.SCORED_STEPS, "_error": ended}
-        # Copies, which may be written to, as learners expect; numpy turns them, no further program.
-        turned = np.array(np.asarray(seen).T, order="C")
-        return turned, np.array(reward), ended, nothing, info
+            info = {"error": rows[_ERROR] / environment.SCORED_STEPS, "_error": ended}
+        # Copies, which may be written to, as learners expect.
+        seen = np.array(rows[: environment.OBSERVATION].T, order="C")
+        return seen, rows[_REWARD].copy(), ended, nothing, info
 
 
 class Ventilator(gymnasium.Env[Floats, Floats]):
@@ -289,7 +312,7 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         if self._one._count >= STEPS:
             raise InputError("no episode is under way: call reset() first")
         seen, reward, ended, _, last = self._one.step(np.asarray(action, np.float32).reshape(1, 1))
-        info = {**self._info, "pressure": float(np.asarray(self._one.pressure)[0])}
+        info = {**self._info, "pressure": float(self._one.pressure[0])}
         if ended[0]:
             info["error"] = float(last["error"][0])
         return seen[0], float(reward[0]), bool(ended[0]), False, info

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import runpy
 import shutil
 from collections.abc import Callable, Sequence
@@ -270,7 +271,8 @@ def leaderboard(full: Path, tmp_path: Path) -> Path:
 
 def put(folder: Path, made: create.Draft, simulators: ReplayPlants | None = None) -> Record:
     """Save a draft and add it, accepted as official if it says so."""
-    added = store.add(folder, made.save(folder.parent / "drafts"), simulators)
+    require = None if simulators is None else functools.partial(replay.require_replay, simulators)
+    added = store.add(folder, made.save(folder.parent / "drafts"), require)
     accept(folder)
     assert isinstance(added, Record)
     return added

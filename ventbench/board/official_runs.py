@@ -11,6 +11,7 @@ of the stress track. No file of an earlier run is trusted; several processes can
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -31,7 +32,7 @@ from ventbench.base.resume import WorkFolder, kept_results
 from ventbench.board import canonical, create, gate, rounds, schema, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.record import Record
-from ventbench.board.replay import Load, ReplayPlants, protocol_of
+from ventbench.board.replay import Load, ReplayPlants, protocol_of, require_replay
 from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
 from ventbench.entries import reference as references
 from ventbench.entries.cells import Runner
@@ -386,7 +387,7 @@ def score(
                 path = Path(outcome["record"])
                 kept = leaderboard / canonical.RECORDS / path.name
                 if not kept.exists():
-                    store.add(leaderboard, path, simulators)
+                    store.add(leaderboard, path, functools.partial(require_replay, simulators))
                 if secret:
                     gate.sign(leaderboard, kept, secret)
                 records[key] = path.stem

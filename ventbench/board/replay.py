@@ -396,6 +396,21 @@ def derived_of(
     return kept[key]
 
 
+def require_replay(
+    simulators: ReplayPlants, added: Record, folder: Path, leaderboard: Store
+) -> None:
+    """Replay a record, whose commands are in a folder, before it is added to a leaderboard.
+
+    Raises:
+        InputError: if it was scored on other simulators or draws, or cannot be honest.
+    """
+    own = leaderboard.evidence.rounds.get(added.header.draws.season)
+    figures = derived_of(added, folder, simulators, own, {})
+    if added.track == "robustness" and figures.leak:
+        name = store.path_of(folder, added.sha256).name
+        raise InputError(f"{name}, key commands: {figures.leak}")
+
+
 def once(kept: Kept, key: Any, make: Callable[..., Any], *of: Any) -> Any:
     """Derive something, if it was not derived before."""
     if key not in kept:

@@ -9,10 +9,9 @@ publishes refuses to drop one; see ``ci/publish.py``.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,9 +25,6 @@ from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
 from ventbench.board.rounds import Round
 from ventbench.board.schema import Commands
 from ventbench.task import environment, protocol
-
-if TYPE_CHECKING:
-    from ventbench.board.replay import ReplayPlants
 
 #: Largest file of commands, bytes: those of the stress track, were they noise.
 MAX_COMMANDS_BYTES = 2_000_000
@@ -171,31 +167,17 @@ def find_signed(folder: Path, named: str) -> Path:
     return matches[0]
 
 
-def require_replay(
-    added: Record, folder: Path, simulators: ReplayPlants, known: Sequence[Round]
-) -> None:
-    """Replay a record with its commands in a folder; rounds are those of its leaderboard.
-
-    Raises:
-        InputError: if it was scored on other simulators or draws, or cannot be honest.
-    """
-    from ventbench.board.replay import derived_of
-
-    own = {x.name: x for x in known if x.value is not None}.get(added.header.draws.season)
-    figures = derived_of(added, folder, simulators, own, {})
-    if added.track == "robustness" and figures.leak:
-        raise InputError(f"{path_of(folder, added.sha256).name}, key commands: {figures.leak}")
-
-
 def add(
-    folder: Path, path: Path, simulators: ReplayPlants | None = None
+    folder: Path, path: Path, require: Callable[[Record, Path, Store], object] | None = None
 ) -> Record | HardwareRecord:
     """Add a record, beside which its commands lie, to a leaderboard, which is made if missing.
 
     Args:
         folder: of the leaderboard.
         path: of the record.
-        simulators: to replay it on first; not replayed if not given.
+        require: called with a record of scores, the folder of its commands and the leaderboard
+            before anything is written, such as :func:`ventbench.board.replay.require_replay` on
+            the simulators; raises to refuse.
 
     Raises:
         InputError: if it is not a record, does not replay, or does not fit those that are there.
@@ -214,8 +196,8 @@ def add(
     if isinstance(added, Record):  # a hardware record has measured pressures, and no commands
         for commands in added.commands:
             load_commands(commands, path.parent)
-        if simulators is not None:
-            require_replay(added, path.parent, simulators, store.rounds)
+        if require is not None:
+            require(added, path.parent, store)
         for commands in added.commands:
             content = commands_path(commands, path.parent).read_bytes()
             files.write_bytes(commands_path(commands, folder / RECORDS), content)

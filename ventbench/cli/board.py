@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -71,13 +72,14 @@ def add(
     Example: `ventbench board add runs/record/3f2a....json`
     """
     from ventbench.board import store
+    from ventbench.board.replay import require_replay
     from ventbench.plants import frozen
 
-    done = []
+    require, done = partial(require_replay, frozen.load()), []
     try:
         with bar("replaying records") as replaying:
             for path in paths:
-                done.append(store.add(folder, path, frozen.load()))
+                done.append(store.add(folder, path, require))
                 replaying(len(done), len(paths))
     finally:  # also those before one that is refused
         for added in done:

@@ -15,17 +15,10 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.board import frames, store
 from ventbench.cli import app
-from ventbench.plants import frozen
 
-from ..textbook_rigs import TextbookRigs
 from .conftest import accept
 
 RUN = CliRunner()
-
-
-@pytest.fixture(autouse=True)
-def _textbook(monkeypatch: pytest.MonkeyPatch, simulators: TextbookRigs) -> None:
-    monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
 
 
 def run(*arguments: object, code: int = 0) -> str:
@@ -78,6 +71,8 @@ def test_withdraw(leaderboard: Path) -> None:
     item = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     output = run("withdraw", item.sha256[:12], "--reason", "a bug", "--folder", leaderboard)
     assert item.sha256 in output
+    assert "next: ventbench board sign" in output
+    accept(leaderboard)
     run("build", "--folder", leaderboard, "--out", leaderboard.parent / "site")
     assert "withdrawn: a bug" in (leaderboard.parent / "site" / "index.html").read_text()
     assert "no problems" in run("verify", "--folder", leaderboard)

@@ -39,7 +39,7 @@ def test_from_records_to_a_verified_board(drafts, entered: Path, tmp_path: Path)
         assert f"added {name} (performance)" in added
     accept(folder)
     build = ("build", "--folder", folder, "--out", tmp_path / "site")
-    assert "3 records, 6 pages, 19 files changed" in run(*build)
+    assert "3 records, 6 pages, 21 files changed" in run(*build)
     assert "3 records, 6 pages, 0 files changed" in run(*build)
     output = run("verify", "--folder", folder)
     assert "no problems: 3 records, 3 replayed" in output
@@ -92,7 +92,7 @@ def test_outside_a_checkout_the_last_rounds_board_is_shown(
     found = RUN.invoke(app, ["board", "show"])
     assert "no folder leaderboard here; the board of the last round, which came" in found.stderr
     assert "identify_plan" in found.stdout
-    assert "rehearsal-4: scored" in RUN.invoke(app, ["round", "show"]).stdout
+    assert "rehearsal-5: scored" in RUN.invoke(app, ["round", "show"]).stdout
     assert "there is no such folder; the published leaderboard" in run("verify", code=2)
     (tmp_path / "leaderboard").mkdir()
     assert "leaderboard holds no record" in run("show", code=2)

@@ -368,7 +368,6 @@ def test_stressors_act_as_a_person_expects(runs: Runs) -> None:
     assert np.median(runs.volume_ratio[off]) < 0.7
 
 
-@pytest.mark.xfail(strict=True, reason="the published round kept no commands under stress")
 def test_no_condition_is_more_than_a_tenth_of_level_or_rise() -> None:
     scores = replay.load(Path(__file__).parents[2] / "leaderboard").scores
     found = [score.derived.stressed for score in scores if score.derived is not None]

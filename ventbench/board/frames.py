@@ -83,7 +83,9 @@ def _of_three(name: str, stem: str = "") -> tuple[str, str, str]:
 
 
 def _ranks(line: Line) -> str:
-    return "" if line.row.ranks is None else f"{line.row.ranks[0]} to {line.row.ranks[1]}"
+    """Ranks that it may have, where they are several."""
+    low, high = line.row.ranks or (0, 0)
+    return f"{low} to {high}" if low < high else ""
 
 
 def _family(line: Line) -> str:
@@ -375,8 +377,8 @@ def markdown(tracks: Sequence[Track]) -> str:
     for line in (x for x in shown if x.track.draws == shown[0].track.draws):
         track, status, row = line
         ranks = f"{row.rank}" if status == "ranked" else status
-        if row.ranks and row.ranks[0] != row.ranks[1]:
-            ranks += f" ({_ranks(line)})"
+        if several := _ranks(line):
+            ranks += f" ({several})"
         stress, score = _stress(line), row.normalised and row.normalised.score
         if track.name == "performance":
             told = [f"{row.error.value:.3f}" if row.error else ""]

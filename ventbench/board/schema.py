@@ -29,7 +29,7 @@ from ventbench.task.stressors import VERSION as STRESSORS_VERSION
 from ventbench.task.stressors import conditions
 
 #: What every record says of its form: records of another one are not read.
-FORMAT, PROTOCOL = 2, 2
+FORMAT, PROTOCOL = 2, 3
 
 #: Largest record, bytes.
 MAX_BYTES = 2 * 2**20

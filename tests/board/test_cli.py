@@ -88,6 +88,7 @@ def test_outside_a_checkout_the_last_rounds_board_is_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Which is said; a folder that is here and holds nothing is another thing."""
+    monkeypatch.undo()  # the frozen lungs, not textbook ones in their place
     monkeypatch.chdir(tmp_path)
     found = RUN.invoke(app, ["board", "show"])
     assert "no folder leaderboard here; the board of the last round, which came" in found.stderr

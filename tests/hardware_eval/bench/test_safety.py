@@ -5,16 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hardware_eval.bench import safety
+from hardware_eval.bench.drive import BenchVentilator
+from hardware_eval.bench.loop import Bench
 from hardware_eval.bench.safety import DEFAULT, SafetySample, SafetyState
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import lung
 from ventbench.task.metrics import measured
+from ventbench.task.metrics.score import passes_safety_gate
 
 DT = protocol.DT
 LUNG = lung("R20C20")
@@ -133,6 +137,18 @@ def test_over_pressure_is_the_gate_of_scoring(readings: list[float], inspired: i
         breath = [x.pressure for x in before[2 : k + 1]]
         tripped = "over_pressure" in [trip.check for trip in state.trips]
         assert tripped == (k > 2 and not measured.is_safe(breath, pip, DT))
+
+
+def test_a_valve_that_opens_again_and_again_stays_within_the_gate(bench: Bench) -> None:
+    ventilator, pip = BenchVentilator(bench, "R5C20", 10.0), 10.0
+    shown = [float(ventilator.start(protocol.PEEP)[0])]
+    for _ in range(protocol.INSPIRATION_STEPS):  # as exploring does
+        wanted = protocol.U_MAX if shown[-1] <= pip + protocol.SAFETY_MARGIN else 0.0
+        shown.append(float(ventilator.step(np.array([wanted]), np.zeros(1))[0]))
+    ventilator.vent()
+    assert not ventilator.trips
+    assert passes_safety_gate(shown, pip, DT)
+    assert max(shown) > pip + protocol.SAFETY_MARGIN
 
 
 def test_a_jump_that_no_valve_can_make_trips() -> None:

@@ -199,7 +199,7 @@ def same_commands(recordings: RigRecordings, simulators: frozen.Frozen) -> Float
     breaths = recordings.breaths
     session = simulators.sessions.assign(breaths)
     data = inspirations(breaths, simulators.sessions, recordings.labels)
-    known = np.asarray(data.start_known) > 0
+    known = np.asarray(data.start_measured) > 0
     data = data.replace(start=jnp.where(known, data.start, Noise().unknown_start))  # type: ignore[attr-defined]
     at = (np.zeros_like(session), session)
     plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[at], float), simulators.members)

@@ -26,10 +26,9 @@ from scipy.special import ndtri
 from proofs.paper.published import OPEN_LOOP
 from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats, Ints
-from ventbench.cli.options import recordings_folder
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import Hybrid
-from ventbench.recordings import Breaths
+from ventbench.recordings import Breaths, recordings_dir
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics.open_loop import WIDE_OPEN
 from ventbench.train.rigs.data import (
@@ -343,8 +342,12 @@ def main(recordings: Path | None = None, fits: bool = False, unseen: bool = Fals
     --fits: by fits of other kinds that have not seen the breath.
     --unseen: by fits that have not seen the rig.
     """
+    folder = recordings or recordings_dir()
+    if folder is None:
+        print("no recordings: give --recordings DIR or set VENTBENCH_RECORDINGS")
+        return
     compilation.keep()
-    measured = load_rig_recordings(recordings_folder(recordings), folds=5, seed=0)
+    measured = load_rig_recordings(folder, folds=5, seed=0)
     simulators = frozen.load()
     if not fits and not unseen:
         with compilation.float64():

@@ -9,7 +9,7 @@ from ventbench.entries.reference import PID_GAINS
 from ventbench.plants.rigs import load_rigs
 from ventbench.task.draws import COUNT
 from ventbench.train import pid_search
-from ventbench.train.pid_search import drawn_errors
+from ventbench.train.pid_search import errors_on_draws
 
 
 @pytest.mark.slow
@@ -22,7 +22,7 @@ def test_no_neighbour_of_the_published_gains_and_no_pid_of_the_paper_is_better()
     paper = np.stack(np.meshgrid([2.0, 5.0, 10.0], [1.0, 4.0, 10.0], [0.0, 5.0]), -1).reshape(-1, 3)
     for lung, gains in enumerate(np.array(PID_GAINS)):
         tried = np.concatenate([gains[None], gains * corners, paper])
-        errors = drawn_errors(rigs, drawn, lung, tried).mean(axis=-1)
+        errors = errors_on_draws(rigs, drawn, lung, tried).mean(axis=-1)
         assert errors[0] <= errors.min() + pid_search.AGREEMENT, lung
 
 

@@ -154,7 +154,7 @@ def furnish(folder: Path) -> Path:
     head = ", ".join(f"'{name}'" for name in (*names, "cycle_number"))
     rows = np.stack(logged, axis=1)
     np.savetxt(folder / "waveforms.csv", rows, "%.14g", ",", header=head, comments="")
-    commands = next((ROOT / "leaderboard" / "records").glob("*.actions"))
+    commands = min((ROOT / "leaderboard" / "records").glob("*.actions"))
     (folder / commands.name).write_bytes(commands.read_bytes())
     texts = (path.read_bytes() for path in sorted(commands.parent.glob("*.json")))
     (folder / "RECORD.json").write_bytes(next(x for x in texts if commands.stem.encode() in x))

@@ -165,7 +165,11 @@ def proof_sections(proof: Proof) -> dict[str, str]:
 def _part(name: str, proof: Proof) -> str:
     """Figures of a part of the proof, or why there are none, and its claims."""
     part = proof.parts.get(name)
-    lines = ["```sh", f"python -m proofs rig --recordings DIR --out runs/proof --only {name}", "```"]
+    lines = [
+        "```sh",
+        f"python -m proofs rig --recordings DIR --out runs/proof --only {name}",
+        "```",
+    ]
     if part is None:
         return "\n".join([*lines, "", proof.impossible[name]])
     errors = " | ".join(_error(part["mae"][stage]) for stage in ("before", "refit", "after"))
@@ -175,8 +179,8 @@ def _part(name: str, proof: Proof) -> str:
         named += f"; place: {part['slot']['name']}"
     lines += [
         "",
-        f"Code {part['code'] or 'unknown'}, recording `{proof.sha256[:16]}`; mean absolute error of "
-        "held-out inspirations, cmH2O:",
+        f"Code {part['code'] or 'unknown'}, recording `{proof.sha256[:16]}`; mean absolute error "
+        "of held-out inspirations, cmH2O:",
         "",
         "| breaths held out | as given | refitted | corrected | cut | named |",
         "|---|---|---|---|---|---|",

@@ -74,8 +74,9 @@ def rig(
             lambda part, what, share: tell(part, share, text=f"{part}: {what}"),
         )
     sections = proof_sections(result)
-    for name, text in sections.items() if page is not None else ():
-        write_section(page, name, text)
+    if page is not None:
+        for name, text in sections.items():
+            write_section(page, name, text)
     emit(result.as_dict(), json)
     typer.echo("\n\n".join(sections.values()), err=str(json) == "-")
     if not result.met:

@@ -30,11 +30,11 @@ def test_a_search_finds_what_it_is_told_of(monkeypatch):
     """On a made-up error whose optimum is beyond the grid of the paper."""
     optimum = np.log([40.0, 3.0, 0.5])
 
-    def errors(rigs, drawn, lung, gains, together=None):
+    def errors(rigs, rig_draws, lung, gains, together=None):
         away = np.log(np.maximum(np.asarray(gains, float), 1e-9)) - optimum
         return np.sum(away**2, axis=-1)[..., None]
 
-    monkeypatch.setattr(pid_search, "drawn_errors", errors)
+    monkeypatch.setattr(pid_search, "errors_on_draws", errors)
     found = pid_search.best_pids(load_rigs(), drawn=load_rigs().of_training.draws(1))
     assert found.agree.all()
     np.testing.assert_allclose(np.log(found.gains), np.tile(optimum, (6, 1)), atol=0.03)

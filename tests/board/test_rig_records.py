@@ -178,6 +178,21 @@ def test_stress_is_ranked_and_shown(board, built):
     assert np.isnan(table.stress_cmH2O["zero"])
 
 
+def test_an_entry_shows_what_it_fails_under(board, built):
+    """By runs and cells alone: errors of a condition less those of the same cells without one."""
+    track = next(x for x in frames.load_tracks(board) if x.stress)
+    row = next(row for row in track.stress if row.name == "soft")
+    error = row.tables.error
+    adds = {c.id: np.mean(error[k] - error[0]) for k, c in enumerate(row.tables.conditions) if k}
+    wanted = sorted(adds, key=adds.__getitem__, reverse=True)[: pages.WORST]
+    shown = pages.stress_order(row)
+    assert [line["title"] for line in shown] == [pages.title_of(name) for name in wanted]
+    assert [line["rise"] for line in shown] == [pages.signed(adds[name], 2) for name in wanted]
+    page = (built / pages.address(row.row.record)).read_text()
+    assert shown[0]["small"] in page
+    assert "Which physics it fails under" in page
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -217,6 +217,7 @@ def _entry_pages(
         values["hardware"] = [pages.hardware_shown(own) for own in measured]
         stressed = [own for own in track.stress if own.name == name]
         values["stress"] = pages.stress_shown(stressed[0]) if stressed else None
+        values["worst"] = pages.stress_order(stressed[0]) if stressed else []
         values["chart"] = pages.stress_chart(stressed)
         values["root"] = "../" * path.count("/")
         made[path] = template.render(values).encode()

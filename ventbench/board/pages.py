@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 #: Shown where there is nothing to show.
 NONE = "–"
 
+#: Most conditions that are listed by what they add to the error of an entry.
+WORST = 12
+
 #: Shares of survived runs below which a field of the stress chart gets the next darker shade.
 SHARES = (1.0, 0.95, 0.85, 0.7, 0.5, 0.3)
 
@@ -188,6 +191,7 @@ def stress_shown(row: StressRow) -> dict[str, Any]:
         "family": row.row.record.manifest.family,
         "score": None if row.score is None else interval(row.score, 2),
         "unstressed": figure(row.tables.unstressed, 2),
+        "unstressed_survived": f"{100 * figures['survived_unstressed']:.0f}",
         "rise": signed(_float(figures["rise"]), 2),
         "rise_value": "" if figures["rise"] is None else f"{figures['rise']:.6f}",
         "survived": f"{100 * figures['survived']:.1f}",
@@ -197,6 +201,31 @@ def stress_shown(row: StressRow) -> dict[str, Any]:
         "worst": figure(_float(figures["worst_error"]), 1),
         "worst_where": title_of(figures["worst_condition"]),
     }
+
+
+def stress_order(row: StressRow) -> list[dict[str, str]]:
+    """Conditions by what they add to the error of the same cells without a stressor, most first.
+
+    Each has a ``title``, the ``rise`` with its 95 % interval ``small``, cmH2O, and the share of the
+    runs that it leaves, ``survived``, %. A condition in which a run failed comes first.
+    """
+    each = row.tables.by_condition[1:]
+
+    def rise(own: dict[str, Any]) -> float:
+        return math.inf if own["rise_cmH2O"] is None else own["rise_cmH2O"]
+
+    lines = []
+    for own in sorted(each, key=rise, reverse=True)[:WORST]:
+        low, high = (_float(limit) for limit in own["rise_ci95"])
+        lines.append(
+            {
+                "title": title_of(own["condition"]),
+                "rise": signed(_float(own["rise_cmH2O"]), 2),
+                "small": f"{signed(low, 2)} to {signed(high, 2)}" if math.isfinite(low) else "",
+                "survived": f"{100 * own['survived']:.0f}",
+            }
+        )
+    return lines
 
 
 def stress_chart(made: Sequence[StressRow]) -> list[dict[str, Any]]:

@@ -364,6 +364,9 @@ class Mechanism:
     rank: int = 0
     #: True if it has a continuous state, which starts at :meth:`initial_state`.
     stateful: bool = False
+    #: True if its state follows its input however fast that moves, as of play: each stage of the
+    #: integrator then starts it where the substep began, not on the line that stages lie on.
+    rate_independent: bool = False
     #: True if it keeps a memory from sample to sample, which starts as the resting command.
     has_memory: bool = False
     #: Steps of the integrator in a substep that a fit needs where the mechanism acts. One that
@@ -415,8 +418,13 @@ class Mechanism:
         """Own state after a step with this flow into the lung, L/s."""
         return state
 
-    def reading(self, values: Values, pressure: Array, state: Array, length: Array) -> Pair:
-        """Pressure after the sensor's dynamics, cmH2O, and the own state after the step."""
+    def reading(
+        self, values: Values, pressure: Array, flow: Array, state: Array, length: Array
+    ) -> Pair:
+        """Pressure behind a part of the sensor, cmH2O, and the own state after the step.
+
+        ``flow`` goes into the lung, L/s; ``length`` is that of the step, s.
+        """
         return pressure, state
 
     def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:

@@ -517,7 +517,7 @@ class ValveStiction(Mechanism):
                 0.0,
                 2.0,
                 5.0,
-                scan=tuple(0.5 * k for k in range(1, 21)),
+                scan=tuple(0.2 * k for k in range(2, 51)),
             ),
         ),
         source="Stick-slip of sliding seals, one-parameter model of Stenman, Gustafsson and "

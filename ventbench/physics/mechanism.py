@@ -45,8 +45,8 @@ class Parameter:
     #: values that a search must also try, as it may end in the wrong minimum; of the strength of an
     #: event of some breaths, all that it tries.
     scan: tuple[float, ...] = ()
-    #: True for a dead time: the likelihood is flat between two samples and falls off steeply where
-    #: an edge passes one, so that its interval is a profile's.
+    #: True for a dead time or a threshold: the likelihood is flat between two samples, or commands,
+    #: and falls off steeply where an edge passes one, so that its interval is a profile's.
     kinked: bool = False
     #: standard deviation before any data, in coordinates, around ``neutral``; given for what must
     #: stay there where no data bear on it, be it a strength.

@@ -517,7 +517,10 @@ class ValveStiction(Mechanism):
                 0.0,
                 2.0,
                 5.0,
+                # A command that no longer lets go changes all that come after it: the likelihood
+                # is jagged within tenths of a percent.
                 scan=tuple(0.2 * k for k in range(2, 51)),
+                kinked=True,
             ),
         ),
         source="Stick-slip of sliding seals, one-parameter model of Stenman, Gustafsson and "

@@ -416,7 +416,7 @@ def open_loop(
     return OpenLoopReport(
         plant=simulator if isinstance(simulator, str) and simulator in names() else tested.name,
         simulators=frozen.load().about(),
-        about=None if tested.kind in names() else dict(tested.about),
+        about=None if tested.name in names() else dict(tested.about),
         lungs={lung: figures(index) for lung, index in breaths.by_lung_index.items()},
         not_judged=tuple(breaths.breath_id[np.isnan(error)].tolist()),
         perhaps_copies=tuple(perhaps),

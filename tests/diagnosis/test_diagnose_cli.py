@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import diagnose as command
 from ventbench.plants.plant_files import load_plants
+from ventbench.plants.python_simulators import PythonSimulators
+from ventbench.plants.simulators import SimulatedPressures
 from ventbench.recordings import write
 
 from . import made
@@ -147,7 +149,8 @@ def test_simulated_pressures_and_drive(recording, tmp_path, calls):
     out = tmp_path / "out"
     run(both, "--plant", both, "--drive", "valve", "--out", out)
     given = calls[0]["simulator"]
-    assert (given.kind, given.name, calls[0]["drive"]) == ("pressures", "both.csv", "valve")
+    assert (type(given), given.name) == (SimulatedPressures, "both.csv")
+    assert calls[0]["drive"] == "valve"
     breaths = calls[0]["breaths"]
     np.testing.assert_allclose(given.pressures(breaths), breaths.pressure + 1.0, atol=1e-6)
     assert "choose auto, valve or flow" in run(both, "--drive", "gas", "--out", out, code=2)
@@ -165,7 +168,7 @@ def test_a_simulator_in_plain_python(recording, tmp_path, calls, monkeypatch):
     )
     run(recording, "--plant", "plain_lungs:Lung", "--out", tmp_path / "out")
     given = calls[0]["simulator"]
-    assert (given.kind, given.name) == ("function", "plain_lungs:Lung")
+    assert (type(given), given.name) == (PythonSimulators, "plain_lungs:Lung")
     assert np.isfinite(given.pressures(calls[0]["breaths"])).all()
 
 

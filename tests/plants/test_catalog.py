@@ -15,6 +15,8 @@ from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators, names
 from ventbench.plants.plant_files import save_plants
+from ventbench.plants.python_simulators import PythonSimulators
+from ventbench.plants.simulators import FrozenSimulators, SimulatedPressures
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import nominal_plants, open_loop_breaths
 from ventbench.plants.two_balloon import two_balloon
@@ -87,7 +89,7 @@ def test_a_folder_is_official_only_if_its_manifest_is(tmp_path):
     with open(tmp_path / frozen.MANIFEST, "a") as file:
         file.write("# another\n")
     other = load_simulators(str(tmp_path))
-    assert (other.kind, other.official) == ("frozen", None)
+    assert (type(other), other.official) == (FrozenSimulators, None)
     assert other.sha256 != found.sha256
 
 
@@ -125,7 +127,7 @@ def test_one_plant_is_every_lung(breaths):
 
 def test_a_function_of_commands(breaths):
     found = load_simulators(first_order)
-    assert (found.kind, found.name, found.has_plants) == ("function", "first_order", False)
+    assert (type(found), found.name) == (PythonSimulators, "first_order")
     same = closed(breaths)
     wanted = load_simulators("physics").pressures(same)
     np.testing.assert_allclose(found.pressures(same), wanted, atol=1e-9)
@@ -188,7 +190,7 @@ def test_simulated_pressures_from_a_table_or_an_array(breaths, tmp_path):
     path = tmp_path / "simulated.csv"
     write(dataclasses.replace(breaths, pressure=simulated), path)
     for found in (load_simulators(path), load_simulators(simulated, breaths=breaths)):
-        assert (found.kind, found.has_plants, found.lungs) == ("pressures", False, ())
+        assert (type(found), found.has_plants, found.lungs) == (SimulatedPressures, False, ())
         np.testing.assert_allclose(found.pressures(breaths), simulated, atol=1e-5)
         some = breaths.select([2, 0])
         np.testing.assert_allclose(found.pressures(some), simulated[[2, 0]], atol=1e-5)

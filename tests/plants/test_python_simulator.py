@@ -12,7 +12,7 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.plants.catalog import load_simulators
-from ventbench.plants.simulators import is_jax_plant
+from ventbench.plants.python_simulators import is_jax_plant
 from ventbench.task.interfaces import Signals
 
 SETTINGS = ["R20C50", "R5C10"]

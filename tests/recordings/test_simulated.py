@@ -11,6 +11,7 @@ import pytest
 import ventbench
 from ventbench.base.errors import InputError
 from ventbench.plants.catalog import load_simulators
+from ventbench.plants.simulators import SimulatedPressures
 from ventbench.recordings import load
 
 
@@ -29,7 +30,7 @@ def test_the_recording_itself_with_one_more_column(table, tmp_path):
         table.to_csv(path, index=False) if name.endswith("csv") else table.to_parquet(path)
         expected = table.simulated.to_numpy().reshape(recorded.pressure.shape)
         found = load_simulators(path)
-        assert (found.kind, found.name) == ("pressures", name)
+        assert (type(found), found.name) == (SimulatedPressures, name)
         np.testing.assert_allclose(found.pressures(recorded), expected)
         some = recorded.select([3, 1])
         np.testing.assert_allclose(found.pressures(some), expected[[3, 1]])

@@ -49,6 +49,7 @@ from ventbench.diagnosis.validation import check_residuals, detection_limits, ex
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.python_simulators import PythonSimulators
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
@@ -99,7 +100,7 @@ def diagnose(
             simulated pressures of these breaths, cmH2O, ``(n, T)``, or a Python function of one
             breath's commands, ``f(u_in, u_out, dt, *, R, C, initial_pressure)``, that returns the
             pressures, cmH2O, ``(T,)``, or a class with ``step``, in plain Python or NumPy; see
-            :mod:`~ventbench.plants.simulators`.
+            :mod:`~ventbench.plants.python_simulators`.
         lung: use only the breaths of this label.
         patient: True if the lung is a patient's or an active simulator's, so that somebody may
             breathe; False for a test lung, which makes no effort.
@@ -521,8 +522,9 @@ def _of_lung(breaths: Breaths, lung: str) -> Breaths:
 
 def _name(given: Given, simulators: Simulators) -> str:
     """Name of a simulator in reports."""
-    has_name = isinstance(given, str | Path | Simulators) or simulators.kind == "function"
-    return simulators.name if has_name else "given"
+    if isinstance(given, str | Path | Simulators) or isinstance(simulators, PythonSimulators):
+        return simulators.name
+    return "given"
 
 
 def _note_on_unchanged(correction: Correction) -> str:

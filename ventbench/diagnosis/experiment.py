@@ -21,7 +21,7 @@ from ventbench.diagnosis import flow_drive
 from ventbench.diagnosis.findings import OpenLoopError
 from ventbench.diagnosis.residual_analysis import Excess, amplitudes, excess_over_noise
 from ventbench.diagnosis.settings import DEFAULT, DataSettings
-from ventbench.plants.simulators import Simulators
+from ventbench.plants.simulators import SimulatedPressures, Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.decimation import decimate, is_fast
 from ventbench.system_id.data import Data, Noise, make_data
@@ -272,7 +272,7 @@ class Experiment:
                 return changed
             decimated = self.recorded.u_in.shape != u_in.shape
             if (
-                self.simulators.kind == "pressures"
+                isinstance(self.simulators, SimulatedPressures)
                 or decimated
                 or (~uses.sealed & kept[:, 0]).any()
             ):

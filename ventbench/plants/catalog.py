@@ -13,7 +13,7 @@ What is given                         What it stands for
 a plant                               that plant for every lung
 a mapping                             plants, functions or classes by lung id
 a function, class or object           a simulator in plain Python or NumPy; see
-                                      :mod:`~ventbench.plants.simulators`
+                                      :mod:`~ventbench.plants.python_simulators`
 an array                              simulated pressures of given breaths
 ====================================  ============================================================
 """
@@ -39,7 +39,17 @@ from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.plant_files import FAMILIES, load_plants
-from ventbench.plants.simulators import Simulators, is_jax_plant, python_simulator
+from ventbench.plants.python_simulators import (
+    PythonSimulators,
+    is_jax_plant,
+    python_simulator,
+)
+from ventbench.plants.simulators import (
+    FrozenSimulators,
+    PlantSimulators,
+    SimulatedPressures,
+    Simulators,
+)
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
@@ -49,7 +59,7 @@ from ventbench.task.lungs import LUNGS, Lung, lung
 
 
 class Stepping(Protocol):
-    """A simulator in plain Python that runs sample by sample; see ``simulators``."""
+    """A simulator in plain Python that runs sample by sample; see ``python_simulators``."""
 
     @property
     def step(self) -> Callable[..., Any]:
@@ -142,7 +152,7 @@ def _python_by_lung(given: Mapping[str, Any], name: str, sha256: str | None = No
         return by_lung[label](arguments)
 
     about = _about("function", sha256, function=name, lungs=sorted(given))
-    return Simulators("function", name, about, sha256=sha256, _function=run)
+    return PythonSimulators(name=name, about=about, sha256=sha256, function=run)
 
 
 def _about(kind: str, sha256: str | None, **more: Any) -> dict[str, Any]:
@@ -198,17 +208,15 @@ def _trained(path: Path) -> Simulators:
 def _frozen(
     loaded: frozen.Frozen, name: str, lungs: tuple[Lung, ...], official: bool
 ) -> Simulators:
-    return Simulators(
-        "frozen",
-        name,
-        loaded.about(),
-        lungs,
-        loaded.manifest_sha256,
-        loaded if official else None,
-        lambda: loaded.plants,
-        loaded.for_breaths,
-        loaded.cross_fitted,
-        loaded,
+    return FrozenSimulators(
+        name=name,
+        about=loaded.about(),
+        lungs=lungs,
+        sha256=loaded.manifest_sha256,
+        official=loaded if official else None,
+        stack=lambda: loaded.plants,
+        of_breaths=loaded.for_breaths,
+        trained=loaded,
     )
 
 
@@ -219,8 +227,14 @@ def _at_label(name: str, make: Callable[[Lung], Plant], for_breaths: PlantsFor) 
         with compilation.float64():
             return stack_heterogeneous([make(entry) for entry in LUNGS])
 
-    return Simulators(
-        name, name, {"kind": name}, LUNGS, None, None, stacked, for_breaths, _make=make
+    return PlantSimulators(
+        name=name,
+        about={"kind": name},
+        lungs=LUNGS,
+        stack=stacked,
+        of_breaths=for_breaths,
+        at_label=make,
+        is_base_physics=name == "physics",
     )
 
 
@@ -262,15 +276,13 @@ def _plants(
             )
         return stack_heterogeneous([plants[key] for key in breaths.lung_ids.tolist()])
 
-    return Simulators(
-        "plants",
-        name,
-        about,
-        tuple(lung(key) for key in plants),
-        sha256,
-        None,
-        lambda: stack_heterogeneous(list(plants.values())),
-        for_breaths,
+    return PlantSimulators(
+        name=name,
+        about=about,
+        lungs=tuple(lung(key) for key in plants),
+        sha256=sha256,
+        stack=lambda: stack_heterogeneous(list(plants.values())),
+        of_breaths=for_breaths,
     )
 
 
@@ -278,15 +290,13 @@ def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
     def repeated(count: int) -> Plant:
         return jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), plant)
 
-    return Simulators(
-        "plants",
-        name,
-        _about("plant", sha256, plant=name),
-        LUNGS,
-        sha256,
-        None,
-        partial(repeated, len(LUNGS)),
-        lambda breaths: VmappedPlant(repeated(len(breaths))),
+    return PlantSimulators(
+        name=name,
+        about=_about("plant", sha256, plant=name),
+        lungs=LUNGS,
+        sha256=sha256,
+        stack=partial(repeated, len(LUNGS)),
+        of_breaths=lambda breaths: VmappedPlant(repeated(len(breaths))),
     )
 
 
@@ -299,7 +309,7 @@ def _plant_file(path: Path) -> Simulators:
 
 def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:
     adapted, about = python_simulator(function, name), _about("function", sha256, function=name)
-    return Simulators("function", name, about, sha256=sha256, _function=adapted)
+    return PythonSimulators(name=name, about=about, sha256=sha256, function=adapted)
 
 
 def _imported(module: str, attribute: str) -> Simulators:
@@ -352,4 +362,4 @@ def _of_table(
 ) -> Simulators:
     about = _about("pressures", sha256, **({} if sha256 is None else {"file": name}))
     answers = partial(simulated_pressures, table, file, sha256=sha256)
-    return Simulators("pressures", name, about, sha256=sha256, _answers=answers)
+    return SimulatedPressures(name=name, about=about, sha256=sha256, answers=answers)

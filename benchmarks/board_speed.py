@@ -16,16 +16,15 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-
 from ventbench.board import build, canonical, create, record, store
-from ventbench.board.replay import ReplayPlants, replay
+from ventbench.board.replay import ReplayPlants, run_of
 from ventbench.board.verify import verify
 from ventbench.entries.folder import open_submission
-from ventbench.entries.scoring import run_protocol
+from ventbench.entries.scoring import run_protocol, runs_of
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
+from ventbench.task import environment
 
 #: Largest times for 1,000 records, s.
 BUILD_LIMIT_S, VERIFY_LIMIT_S = 10.0, 300.0
@@ -37,25 +36,13 @@ FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
 def drafts(plants: ReplayPlants) -> list[create.Draft]:
     """Return real records whose commands are those of the PID times a factor."""
     result = run_protocol(open_submission("pid_best"), rigs_of(plants), draws=draw_tables.COUNT)
-    assert result.rig_draws is not None
     made = []
     for factor in FACTORS:
-        requested = result.requested * factor
-        (new,) = replay(plants, result.pips, [requested], result.rig_draws)
-        errors = np.concatenate([new.nominal[None], new.drawn])
-        shape = result.runs.error.shape
-        varied = dataclasses.replace(
-            result,
-            runs=dataclasses.replace(
-                result.runs,
-                error=np.moveaxis(errors, 0, 1).reshape(shape),
-                peak=np.moveaxis(new.peak, 0, 1).reshape(shape),
-                safe=np.broadcast_to(new.safe[None, :, None], shape),
-                requested=requested.reshape(*shape, *requested.shape[3:]),
-            ),
-            controllable=np.moveaxis(new.controllable, 0, 1),
-            sandbox=SANDBOX,
-        )
+        cells, requested = result.protocol.cells, result.requested * factor
+        runs = runs_of(run_of(cells, environment.resolved(requested)[None]), cells)
+        commands = requested.reshape(*runs.error.shape, *requested.shape[3:])
+        runs = dataclasses.replace(runs, requested=commands)
+        varied = dataclasses.replace(result, runs=runs, sandbox=SANDBOX)
         made.append(create.create(varied, plants))
     return made
 
@@ -90,7 +77,7 @@ def main() -> None:
     made = drafts(plants)
     share = arguments.records / 1000
     print(f"{arguments.records} records on {os.cpu_count()} cores")
-    sizes = [len(x.content) + len(x.commands) for x in made]
+    sizes = [len(x.content) + sum(map(len, x.commands)) for x in made]
     print(f"largest record with its commands: {max(sizes) / 1e3:.0f} kB")
     with tempfile.TemporaryDirectory() as temporary:
         folder, site = Path(temporary) / "large", Path(temporary) / "site"

@@ -136,7 +136,7 @@ def breathe(lungs: Lungs, labels: Ints, pips: Floats, act: Act, guarded: bool) -
     states = [fallback.init(LUNGS[k]) for k in labels]
     watched = [safety.init(LUNGS[k]) for k in labels]
     ended, vented, tripped = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
-    pressure = np.full((n, protocol.BREATHS, protocol.INSPIRATION_STEPS), np.nan)
+    pressure = np.full((n, protocol.BREATHS, protocol.BREATH_STEPS), np.nan)
     u_in, ahead = np.full(n, BIAS), [waveform.targets_ahead(k, 1.0) for k in range(34)]
     for index in range(protocol.BREATHS * protocol.BREATH_STEPS):
         breath, step = divmod(index, protocol.BREATH_STEPS)
@@ -148,8 +148,7 @@ def breathe(lungs: Lungs, labels: Ints, pips: Floats, act: Act, guarded: bool) -
             watched[i] = safety.step(safety.DEFAULT, watched[i], sample)
             tripped[i] = bool(watched[i].trips)
         vented |= ~ended & (read >= protocol.SAFETY_PRESSURE)
-        if inspired:
-            pressure[:, breath, step] = np.where(ended, pips, read)
+        pressure[:, breath, step] = np.where(ended, pips, read)
         ended |= vented | tripped
         previous = np.full(n, BIAS) if step == 0 else u_in
         if inspired:

@@ -54,6 +54,8 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=DRAWS, help="with --run: number of draws")
     given = parser.parse_args()
     tables = anew(given.draws) if given.run else recorded()
+    if not tables:
+        raise SystemExit(f"{LEADERBOARD} has no stressed commands at hand")
     scores = [{"name": name, **own.headline()} for name, own in tables.items()]
     text = table(scores)
     print(text)
@@ -71,9 +73,10 @@ def main() -> None:
 
 
 def recorded() -> dict[str, Runs]:
-    """Tables of the records of the leaderboard, best first."""
-    track, *_ = (x for x in load_tracks(LEADERBOARD, track="robustness") if x.stress)
-    return {row.name: row.tables for row in track.stress}
+    """Tables of the records of the leaderboard, best first; empty where none are at hand."""
+    tracks = load_tracks(LEADERBOARD, track="robustness")
+    rows = next((track.stress for track in tracks if track.stress), ())
+    return {row.name: row.tables for row in rows}
 
 
 def anew(draws: int) -> dict[str, Runs]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 from ci import workflow
@@ -17,7 +18,7 @@ from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, gate, record, rounds, store
 from ventbench.board.record import Record
-from ventbench.board.replay import ReplayPlants
+from ventbench.board.replay import ReplayPlants, require_replay
 
 TITLE = "Round"
 
@@ -59,7 +60,7 @@ def add(
     for sha256 in result.records.values():
         path = scored / canonical.RECORDS / f"{sha256}{record.SUFFIX}"
         _content(path)
-        new = store.add(leaderboard, path, simulators)
+        new = store.add(leaderboard, path, partial(require_replay, simulators))
         if not isinstance(new, Record) or new.header.draws.sha256 != own.commitment:
             raise InputError(f"{path.name} is no record of round {name}")
         if secret:

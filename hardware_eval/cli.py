@@ -50,12 +50,6 @@ Lungs = Annotated[
         autocompletion=options.known_lungs,
     ),
 ]
-Control = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="SOCKET", help="Control socket of an emulator, which then disturbs the tube itself."
-    ),
-]
 Skip = Annotated[
     list[str] | None,
     typer.Option(
@@ -78,54 +72,21 @@ def run(
     ],
     port: Port,
     lung: Lungs,
+    plan: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="How to run, in TOML; the manual lists the keys."),
+    ] = None,
     pips: Annotated[
         str | None, typer.Option(metavar="LIST", help="PIPs, such as 10,20,35. Default: all six.")
     ] = None,
-    repeats: Annotated[int, typer.Option(min=1, max=100, help="Runs of each lung and PIP.")] = 10,
-    track: Annotated[
-        str | None,
-        typer.Option(help="performance (the lung is told) or robustness; default: the entry's."),
+    repeats: Annotated[
+        int | None, typer.Option(min=1, max=100, help="Runs of each lung and PIP. Default: 10.")
     ] = None,
-    perturb: Annotated[
-        list[str] | None,
-        typer.Option(help="Also run with a disturbed tube: leak or pinch; repeatable."),
-    ] = None,
-    control_every: Annotated[
-        int, typer.Option(min=0, help="Scored runs between two control runs of the PID; 0: none.")
-    ] = 10,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the order of the runs; drawn if not given.")
-    ] = None,
-    blind: Annotated[
-        bool, typer.Option("--blind", help="Call entries by numbers until the plan is done.")
-    ] = False,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Log, recording and records; a plan continues.")
     ] = Path("runs/hardware"),
     operator: Annotated[str, typer.Option(help="Who stands at the bench, for the record.")] = "",
-    notes: Annotated[str, typer.Option(help="Notes for the record.")] = "",
-    largest_u_in: Annotated[
-        float, typer.Option(help="Commands are cut to this, %; the record says so.")
-    ] = 100.0,
-    largest_rise: Annotated[
-        float, typer.Option(help="Largest rise of the command in one step, %.")
-    ] = 100.0,
-    fallback: Annotated[
-        bool, typer.Option(help="A safe controller takes over when an entry is late or unsafe.")
-    ] = True,
     in_process: options.InProcess = False,
-    dry_run: Annotated[
-        bool, typer.Option(help="Run the plan on the frozen simulators first.")
-    ] = True,
-    selftest: Annotated[bool, typer.Option(help="Test the bench once each lung is set.")] = True,
-    skip: Skip = None,
-    rest: Annotated[float, typer.Option(min=0.5, help="Time at rest before each run, s.")] = 4.0,
-    rerun: Annotated[
-        str | None,
-        typer.Option(metavar="FILE|live", help="Also show breaths in rerun: a file, or live."),
-    ] = None,
-    calibration: Calibrated = None,
-    control: Control = None,
     yes: Yes = False,
     json: JsonFile = None,
 ) -> None:
@@ -138,35 +99,34 @@ def run(
     from hardware_eval.bench.console import Blind, RerunView, show_bars
     from hardware_eval.bench.fallback import DEFAULT as FALLBACK
     from hardware_eval.bench.loop import Bench
-    from hardware_eval.bench.plan import make_plan
+    from hardware_eval.bench.plan import make_plan, read_procedure
     from hardware_eval.bench.safety import SafetySettings
     from hardware_eval.bench.selftest import Sheet, chosen_parts
     from hardware_eval.bench.selftest import selftest as run_selftest
     from hardware_eval.results import evaluate as ev
-    from ventbench.task import protocol
 
-    chosen = numbers("--pips", pips) or list(protocol.PIPS)
-    entries, track = ev.open_entries(submissions, track)
+    how = read_procedure(plan)
+    entries, track = ev.open_entries(submissions, how.track)
     files.claim_folder(out)
-    if seed is None:
-        begun = ev.begun_plan(out)
-        seed = secrets.randbits(32) if begun is None else int(begun["seed"])
-    plan = make_plan(
+    begun = ev.begun_plan(out)
+    seed = secrets.randbits(32) if begun is None else int(begun["seed"])
+    planned = make_plan(
         [x.manifest.name for x in entries],
         lung,
         track=track,
-        pips=chosen,
-        repeats=repeats,
-        control_every=control_every,
-        perturbations=perturb or (),
-        seed=seed,
+        pips=numbers("--pips", pips) or how.pips,
+        repeats=repeats or how.repeats,
+        control_every=how.control_every,
+        perturbations=how.perturb,
+        seed=seed if how.seed is None else how.seed,
     )
-    settings = SafetySettings(largest_u_in=largest_u_in, largest_rise=largest_rise)
-    shows = [show_bars, *([RerunView(rerun).breath] if rerun else [])]
-    left_out = chosen_parts(skip or ())
+    settings = SafetySettings(largest_u_in=how.largest_u_in, largest_rise=how.largest_rise)
+    shows = [show_bars, *([RerunView(how.rerun).breath] if how.rerun else [])]
+    left_out = chosen_parts(how.skip)
+    control, calibration = (None if x is None else Path(x) for x in (how.control, how.calibration))
 
     def before_lung(bench: Bench, mounted: str) -> Sheet | None:
-        if not selftest:
+        if not how.selftest:
             return None
         sheet = run_selftest(bench, mounted, **baseline_of(calibrated), skip=left_out)
         files.write_json(out / f"selftest-{mounted}.json", sheet.as_dict())
@@ -175,25 +135,25 @@ def run(
 
     with bench_on(port, yes=yes, control=control, kept=out) as (line, _, person):
         calibrated = calibration_of(line, calibration)
-        masked = Blind(person, plan)
+        masked = Blind(person, planned)
         done = ev.evaluate(
             entries,
             line,
             out,
-            masked if blind else person,
-            plan=plan,
-            shows=[masked.hiding(show) for show in shows] if blind else shows,
+            masked if how.blind else person,
+            plan=planned,
+            shows=[masked.hiding(show) for show in shows] if how.blind else shows,
             sandbox=not in_process,
-            dry=dry_run,
+            dry=how.dry_run,
             before_lung=before_lung,
             settings=settings,
             operator_name=operator,
-            notes=notes,
-            rest=rest,
+            notes=how.notes,
+            rest=how.rest,
             calibration=calibrated,
-            fallback=FALLBACK if fallback else None,
+            fallback=FALLBACK if how.fallback else None,
         )
-    reason = masked.hidden(done.reason) if blind else done.reason
+    reason = masked.hidden(done.reason) if how.blind else done.reason
     emit(
         {
             "complete": done.complete and not done.stopped,
@@ -211,7 +171,7 @@ def run(
         print(f"what is done is in {done.log}; the same command continues", file=shown)
         raise typer.Exit(1)
     for name, path in done.records.items():
-        if blind:
+        if how.blind:
             print(f"{masked.called[name]} is {name}", file=shown)
         print(f"{name}: record {path}", file=shown)
         if name in done.stopped:

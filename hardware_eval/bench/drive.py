@@ -35,6 +35,8 @@ from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, write
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
+from ventbench.task.metrics.measured import worst
+from ventbench.task.metrics.score import time_above
 from ventbench.train.exploration import RANGES, explore
 
 #: Chooses valves from the step and the pressure.
@@ -215,6 +217,9 @@ class BenchVentilator(Watched):
     """A device as the exploration drives it; see ``VentilatorInterface`` there.
 
     After a check has tripped, or the device has vented, it gives no pressures until the next start.
+    What explores opens the valve again as soon as the pressure is below the limit, but the safety
+    gate counts a breath's samples in all, and a late valve shows a command for two or three. So the
+    first one above halves what the valve may open from then on, and the second closes it.
     """
 
     width = 1
@@ -227,7 +232,10 @@ class BenchVentilator(Watched):
 
     def step(self, u_in: Floats, u_out: Floats) -> Floats:
         """Hold a command until the next step's deadline."""
-        self.send(float(u_in[0]), int(u_out[0]))
+        above = float(time_above(worst(self._safety.breath), self.pip, protocol.DT)) / protocol.DT
+        halved = 0.5 * max(self.log.u_in, default=0.0)
+        largest = (protocol.U_MAX, halved, 0.0)[min(round(above), 2)]
+        self.send(min(float(u_in[0]), largest), int(u_out[0]))
         return np.full(1, self.look())
 
 

@@ -39,7 +39,7 @@ from ventbench.mechanics.labels import APPARATUS, TOLERANCE_R
 from ventbench.task import protocol
 from ventbench.task.lungs import Lung
 from ventbench.task.metrics import measured
-from ventbench.task.metrics.score import safety_limit
+from ventbench.task.metrics.score import is_brief, safety_limit
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,6 @@ class FallbackSettings:
         delays: shares of a command's flow that the readings 1, 2 and 3 steps later show.
         noise: most by which a reading is too low, cmH2O.
         readings: newest readings that bound the future.
-        above: steps of a breath that the pressure may be above the safety gate's limit.
         hand_back: answers in a row, in time and inside, after which the entry commands again.
     """
 
@@ -71,7 +70,6 @@ class FallbackSettings:
     )
     noise: float = 1.0
     readings: int = 4
-    above: int = int(protocol.SAFETY_TIME / protocol.DT)
     hand_back: int = 3
 
     @property
@@ -238,14 +236,13 @@ def reachable(settings: FallbackSettings, state: FallbackState, answer: float) -
 
 def is_inside(settings: FallbackSettings, state: FallbackState, pip: float, answer: float) -> bool:
     """Whether no rig within the bounds comes to harm by a command, if the valve closes after it."""
-    limit = float(safety_limit(pip))
-    above = reachable(settings, state, answer) > limit
-    if above[:, -1].any():
+    ahead = reachable(settings, state, answer)
+    if ahead[:, -1].max() > safety_limit(pip):
         return False
     if len(state.pressures) <= settings.last:  # no reading tells the resistor's drop yet
         return True
-    seen = int((measured.worst(state.pressures) > limit).sum())
-    return bool(seen + above.sum(axis=1).max() <= settings.above)
+    seen = np.broadcast_to(measured.worst(state.pressures), (len(ahead), len(state.pressures)))
+    return bool(is_brief(np.concatenate([seen, ahead], axis=1), pip, protocol.DT).all())
 
 
 def largest_inside(

@@ -318,6 +318,7 @@ class _Loop:
             bench.client.vent()
             raise EmergencyStop
         self._disturb(breath, step)
+        last = bench.client.reading
         try:
             reading: Reading | None = bench.client.heartbeat()
         except NoAnswerError:
@@ -329,7 +330,8 @@ class _Loop:
         log.time.append((bench.clock.now() if reading is None else began) - start)
         # A controller must see each breath begin; what the last command's answer told is at most a
         # step old, at the end of an expiration.
-        seen = bench.client.reading if reading is None and step == 0 else reading
+        lost = reading is None or not math.isfinite(reading.pressure)
+        seen = last if lost and step == 0 else reading
         log.pressure.append(math.nan if seen is None else seen.pressure)
         log.flow.append(math.nan if seen is None else seen.flow)
         log.target.append(target)
@@ -375,7 +377,8 @@ class _Loop:
         requested, budget, cut = math.nan, 0.0, False
         if inspiring:
             previous = _BIAS if step == 0 else self._command[0]
-            if reading is not None:
+            # A reading without a number would poison the averages of the entry that sees it.
+            if reading is not None and math.isfinite(reading.pressure):
                 row = _row(step, reading.pressure, target, run.pip, previous)
                 budget = deadline + ANSWER_BY - bench.clock.now()
                 self._asked += 1

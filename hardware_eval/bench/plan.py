@@ -9,10 +9,13 @@ plan, so that a restarted session continues it.
 from __future__ import annotations
 
 import itertools
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 
 from ventbench.base.errors import InputError
@@ -95,6 +98,43 @@ class Plan:
         values = asdict(self)
         del values["runs"]
         return values
+
+
+class Procedure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a session runs its plan, as a file of TOML says; every key may be left out."""
+
+    pips: tuple[float, ...] = protocol.PIPS  #: cmH2O.
+    repeats: Annotated[int, msgspec.Meta(ge=1, le=100)] = REPEATS  #: runs of each lung and PIP.
+    #: ``performance`` (the lung is told) or ``robustness``; the first entry's if not given.
+    track: Literal["performance", "robustness"] | None = None
+    perturb: tuple[str, ...] = ()  #: also run with a disturbed tube, see :data:`PERTURBATIONS`.
+    control_every: Annotated[int, msgspec.Meta(ge=0)] = CONTROL_EVERY  #: see there; 0 for none.
+    seed: Annotated[int, msgspec.Meta(ge=0)] | None = None  #: of the order; drawn if not given.
+    blind: bool = False  #: call entries by numbers until the plan is done.
+    notes: str = ""  #: for the record.
+    largest_u_in: float = protocol.U_MAX  #: commands are cut to this, %; the record says so.
+    largest_rise: float = protocol.U_MAX  #: of the command in one step, %.
+    fallback: bool = True  #: a safe controller takes over when an entry is late or unsafe.
+    dry_run: bool = True  #: run the plan on the frozen simulators first.
+    selftest: bool = True  #: test the bench once each lung is set.
+    skip: tuple[str, ...] = ()  #: parts that the self-test leaves out.
+    rest: Annotated[float, msgspec.Meta(ge=0.5)] = 4.0  #: before each run, s.
+    calibration: str | None = None  #: file of this device's calibration.
+    rerun: str | None = None  #: also show breaths in rerun: a file, or ``live``.
+    control: str | None = None  #: control socket of an emulator, which disturbs the tube itself.
+
+
+def read_procedure(path: Path | None) -> Procedure:
+    """Read how a session runs its plan; without a file, as usual.
+
+    Raises:
+        InputError: if the file cannot be read, is no TOML, or a key is unknown or wrong.
+    """
+    try:
+        given = {} if path is None else tomllib.loads(path.read_text("utf-8"))
+        return msgspec.convert(given, Procedure)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--plan {path}: {error}") from error
 
 
 def make_plan(

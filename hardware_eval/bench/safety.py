@@ -19,6 +19,8 @@ from typing import NamedTuple
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import Lung
+from ventbench.task.metrics.measured import worst
+from ventbench.task.metrics.score import passes_safety_gate, safety_limit, time_above
 
 #: Flow of the fully open PVP inspiratory valve, mL/s per % of command (137 L/min).
 VALVE_GAIN = 22.8
@@ -53,11 +55,12 @@ class SafetySettings:
 
     #: see the reasons of the checks themselves, also for those that follow.
     over_pressure: Check = Check(
-        protocol.SAFETY_MARGIN,
-        "cmH2O above PIP",
         protocol.SAFETY_TIME,
+        "s above min(60, PIP + 15) cmH2O",
+        0.0,
         False,
-        "Protocol's safety gate: pressure above min(60, PIP + 15) for longer than 0.1 s.",
+        "The protocol's safety gate, by its own function: a breath may be above that limit for so "
+        "long in all.",
     )
     peak_pressure: Check = Check(
         protocol.SAFETY_PRESSURE + 5.0,
@@ -243,6 +246,7 @@ class SafetyState:
     volume: float = 0.0  #: estimate of the volume above that at PEEP, mL.
     delivered: float = 0.0  #: volume given since this inspiration began, mL.
     start: float = protocol.PEEP  #: pressure when this inspiration began, cmH2O.
+    breath: tuple[float, ...] = ()  #: readings of this breath, cmH2O; NaN where there was none.
     switched: float = -math.inf  #: when the expiratory valve last changed its command, s.
     switched_pressure: float = protocol.PEEP  #: pressure then, cmH2O.
     unchanged: float = -math.inf  #: since when the reading has been the same, s.
@@ -256,11 +260,6 @@ class SafetyState:
 def init(lung: Lung) -> SafetyState:
     """State before the first sample, for a lung at rest."""
     return SafetyState(lung)
-
-
-def pressure_limit(settings: SafetySettings, pip: float) -> float:
-    """Pressure that a breath may not exceed for long, cmH2O."""
-    return min(protocol.SAFETY_PRESSURE, pip + settings.over_pressure.threshold)
 
 
 def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> SafetyState:
@@ -282,7 +281,13 @@ def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> 
     seen = sample if number else state.seen
     last = protocol.PEEP if seen is None else seen.pressure
     sample = sample._replace(pressure=last)
-    state = _estimated(state, sample)
+    before = state.previous
+    # The reading at which an inspiration begins comes before the valve's command does.
+    breath = state.breath
+    if before is not None and before.u_out > sample.u_out:
+        breath = (before.pressure,)
+    breath = (*breath, sample.pressure if number else math.nan)
+    state = replace(_estimated(state, sample), breath=breath)
     values = _values(settings, state, sample, number, jump)
     since: dict[str, float] = {}
     trips = list(state.trips)
@@ -303,7 +308,8 @@ def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> 
                     held,
                     value,
                     f"{name.replace('_', ' ')}: {value:.3g} {check.unit}, the limit is "
-                    f"{check.threshold:g} for {check.duration:g} s",
+                    f"{check.threshold:g}"
+                    + (f" for {check.duration:g} s" if check.duration else ""),
                     check.bench,
                 )
             )
@@ -381,7 +387,9 @@ def _values(
     the reading, cmH2O a step.
     """
     pressure, C = sample.pressure, state.lung.C
-    limit = pressure_limit(settings, sample.pip)
+    limit = float(safety_limit(sample.pip))
+    # At or below the limit no breath that was safe becomes unsafe.
+    readings = worst(state.breath) if pressure > limit else ()
     open_for = sample.time - state.switched if sample.u_out else 0.0
     rise = state.delivered / C
     share = (pressure - state.start) / rise if rise > _SHOWS else math.nan
@@ -393,7 +401,10 @@ def _values(
     apart = abs(sample.applied - sample.u_in)
     left = (pressure - protocol.PEEP) / max(state.switched_pressure - protocol.PEEP, 1.0)
     return {
-        "over_pressure": (pressure - sample.pip, pressure > limit),
+        "over_pressure": (
+            float(time_above(readings, sample.pip, protocol.DT)),
+            not passes_safety_gate(readings, sample.pip, protocol.DT),
+        ),
         "peak_pressure": (pressure, pressure > settings.peak_pressure.threshold),
         "over_volume": (
             state.volume / (C * (limit - protocol.PEEP)),

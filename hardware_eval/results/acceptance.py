@@ -129,7 +129,7 @@ def report(session: Session) -> str:
             f"{session.path}: no scored run is complete, so there is nothing to report"
         )
     missing = [
-        f"{entry} has no run {condition}; `run --perturb leak` makes them"
+        f'{entry} has no run {condition}; `perturb = ["leak"]` in the plan makes them'
         for entry in session.plan.entries
         for condition, tube in CONDITIONS.items()
         if not settings_of(session, entry, tube)

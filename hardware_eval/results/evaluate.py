@@ -314,7 +314,7 @@ def evaluate(
         if problems:
             raise InputError(
                 "the dry run on the simulators stopped: " + "; ".join(problems) + ". Nothing was "
-                "sent to the bench; --no-dry-run skips this"
+                "sent to the bench; `dry_run = false` in the plan skips this"
             )
     device = device_about(line)
     if line.bringup:

@@ -23,7 +23,8 @@ from proofs.studies.networks import MEASURED
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.board import store
+from ventbench.board import replay, store
+from ventbench.board.canonical import RECORDS
 from ventbench.entries.scoring import score
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
@@ -108,7 +109,8 @@ def on_rigs(leaderboard: Path) -> tuple[str, Floats, Floats] | None:
     """Errors of the best PIDs and of the residual network on the rigs of the newest round.
 
     Returns:
-        Its name, and errors of the ranked draws, cmH2O, shape ``(L, P)``; None without one.
+        Its name, and errors of the ranked draws without the first step of an inspiration, cmH2O,
+        shape ``(L, P)``; None without one.
     """
     kept = store.load(leaderboard)
     scored = {entry.key: entry for entry in kept.scores}
@@ -116,9 +118,12 @@ def on_rigs(leaderboard: Path) -> tuple[str, Floats, Floats] | None:
     for held in kept.rounds:
         entry = scored.get((held.name, track, name))
         if entry is not None:
-            own = entry.headroom
-            ranked = np.flatnonzero(own.ranked) + 1
-            return held.name, own.pid[ranked].mean(axis=0), own.error[ranked].mean(axis=0)
+            replayed = replay.derived_of(
+                entry, leaderboard / RECORDS, frozen.load(), held, {}, cached=True
+            )
+            ranked = np.flatnonzero(replayed.ranked) + 1
+            pid, error = replayed.pid[ranked], replayed.controllable[ranked]
+            return held.name, pid.mean(axis=0), error.mean(axis=0)
     return None
 
 

@@ -231,5 +231,5 @@ def score_controller(
             run, _ = rollouts.closed_loop(plant, wide, cells)
             errors.append(run_error(run.pressure, np.asarray(cells.pip)[..., None, None]))
             requested.append(np.asarray(run.requested))
-    nominal = np.stack(requested)[None][:, :, 0]
+    nominal = np.stack(requested)[:, 0]
     return np.stack(errors), float(spread(simulators, pips, nominal).mean())

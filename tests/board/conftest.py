@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import runpy
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,23 +14,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.board import build, canonical, create, gate, record, rounds, store
+from ventbench.board import build, canonical, create, gate, record, replay, rounds, store
 from ventbench.board.record import Record, Withdrawal
-from ventbench.board.replay import Replayed, ReplayPlants, replay
+from ventbench.board.replay import ReplayPlants, run_of
 from ventbench.entries import reference as references
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, Protocol, protocol_of
 from ventbench.entries.folder import open_submission, resolve
 from ventbench.entries.result import Score
-from ventbench.entries.runs import CellFailure, Runs
-from ventbench.entries.scoring import run_protocol
+from ventbench.entries.runs import DRAWS, CellFailure, Runs
+from ventbench.entries.scoring import run_protocol, runs_of
 from ventbench.plants import frozen
 from ventbench.sandbox.child.cell import Failure
 from ventbench.task import draws as draw_tables
-from ventbench.task import protocol
+from ventbench.task import environment, protocol
 from ventbench.task.lungs import LUNG_IDS
 
 from ..textbook_rigs import TextbookRigs
 from . import referee
+
+#: Loads the frozen simulators, in whose place the tests have textbook lungs.
+OFFICIAL = frozen.load
 
 SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
 NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
@@ -106,6 +110,13 @@ def reference(
 
 
 @pytest.fixture(autouse=True)
+def _textbook(monkeypatch: pytest.MonkeyPatch, simulators: TextbookRigs) -> None:
+    """Textbook lungs in the place of the frozen ones; nothing is kept on disk."""
+    monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
+    monkeypatch.setattr(replay, "_place", lambda key: None)
+
+
+@pytest.fixture(autouse=True)
 def _witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
     """No commands attain a tenth of the PID's errors: nobody asks for them here."""
     monkeypatch.setattr(references, "witness_errors", lambda made, *_: made.attainable)
@@ -125,7 +136,7 @@ def scores(
             reference=reference,
             runner=InProcessRunner(),
         )
-        rigs = dataclasses.replace(result.protocol.rigs, sha256=frozen.load().manifest_sha256)
+        rigs = dataclasses.replace(result.protocol.rigs, sha256=frozen.MANIFEST_SHA256)
         protocol = dataclasses.replace(result.protocol, rigs=rigs)
         found[name] = dataclasses.replace(result, sandbox=SANDBOX, protocol=protocol)
     return found
@@ -136,7 +147,10 @@ Draft = Callable[..., create.Draft]
 
 @pytest.fixture(scope="session")
 def draft(
-    scores: dict[str, Score], simulators: TextbookRigs, tmp_path_factory: pytest.TempPathFactory
+    scores: dict[str, Score],
+    simulators: TextbookRigs,
+    reference: references.Reference,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Draft:
     """Make a record: the commands of a PID times a factor, under any name."""
 
@@ -150,7 +164,7 @@ def draft(
         failed: int = 0,
         wide_open: bool = False,
         change: Callable[[np.ndarray], None] | None = None,
-        stress: Callable[[Score], Runs] | None = None,
+        stress: Callable[[Protocol, np.ndarray], Runs] | None = None,
         **about: Any,
     ) -> create.Draft:
         score = scores[base]
@@ -176,49 +190,33 @@ def draft(
         cells = [(i, j) for i in range(6) for j in range(6)][:failed]
         for i, j in cells:
             requested[i, 0, j] = 0.0
-        assert score.rig_draws is not None
-        (found,) = replay(simulators, score.pips, [requested], score.rig_draws)
-        nominal, controllable = found.nominal.copy(), found.controllable.copy()
         failures = []
         for i, j in cells:
-            nominal[i, j] = controllable[0, i, j] = np.nan
             what = Failure("act", texts or "raised ValueError", texts or "", 1, 2)
             message = what.message(str(folder), LUNG_IDS[i])
             failures.append(CellFailure("none", LUNG_IDS[i], score.pips[j], None, what, message))
-        varied = dataclasses.replace(
-            score,
-            submission=opened,
-            sandbox=sandbox,
-            controllable=np.moveaxis(controllable, 0, 1),
-            runs=rerun(
-                score.runs, np.concatenate([nominal[None], found.drawn]), found, requested, failures
-            ),
-        )
-        own = None if stress is None else stress(varied)
-        varied = dataclasses.replace(varied, stressed=own)
+        runs = again(score, requested, failures)
+        varied = dataclasses.replace(score, submission=opened, sandbox=sandbox, runs=runs)
+        if stress is not None:
+            what = protocol_of(
+                score.protocol.rigs, drawn=score.rig_draws, stress=DRAWS, reference=reference
+            )
+            own = stress(what, requested)
+            varied = dataclasses.replace(varied, protocol=what, stressed=own)
         return create.create(varied, simulators, now=NOW, **about)
 
     return make
 
 
-def rerun(
-    runs: Runs, errors: np.ndarray, found: Replayed, requested: np.ndarray, failures: Any = ()
-) -> Runs:
-    """Runs with other errors, (1 + K, L, P), pressures and commands."""
-
-    def flat(values: np.ndarray) -> np.ndarray:
-        return np.moveaxis(values, 0, 1).reshape(runs.error.shape)
-
-    safe = found.safe[None, :, None] & np.isfinite(flat(errors))
-    commands = requested.reshape(1, 6, -1, *requested.shape[3:])
-    return dataclasses.replace(
-        runs,
-        error=flat(errors),
-        peak=flat(found.peak),
-        safe=safe,
-        requested=commands,
-        failures=failures,
-    )
+def again(score: Score, requested: np.ndarray, failures: Sequence[CellFailure] = ()) -> Runs:
+    """Runs of other commands on the cells of a score."""
+    cells = score.protocol.cells
+    run = run_of(cells, environment.resolved(requested)[None])
+    lungs = [lung.id for lung in cells.lungs]
+    failed = {(0, lungs.index(x.lung), 0, score.pips.index(x.pip)): x.failure for x in failures}
+    runs = runs_of(dataclasses.replace(run, failures=failed), cells)
+    commands = requested.reshape(np.shape(runs.requested))
+    return dataclasses.replace(runs, failures=failures, requested=commands)
 
 
 def entry_folder(folder: Path, base: str, name: str) -> Path:
@@ -260,11 +258,11 @@ def full(
 
 
 @pytest.fixture(scope="session")
-def site(full: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(full: Path, simulators: TextbookRigs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built pages of :func:`full`."""
     pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
     out = tmp_path_factory.mktemp("site") / "site"
-    build.build(full, out)
+    build.build(full, out, lambda: simulators)
     return out
 
 
@@ -276,7 +274,8 @@ def leaderboard(full: Path, tmp_path: Path) -> Path:
 
 def put(folder: Path, made: create.Draft, simulators: ReplayPlants | None = None) -> Record:
     """Save a draft and add it, accepted as official if it says so."""
-    added = store.add(folder, made.save(folder.parent / "drafts"), simulators)
+    require = None if simulators is None else functools.partial(replay.require_replay, simulators)
+    added = store.add(folder, made.save(folder.parent / "drafts"), require)
     accept(folder)
     assert isinstance(added, Record)
     return added
@@ -336,3 +335,16 @@ def opened(made: create.Draft) -> Record:
     found = record.from_bytes(made.content, "draft")
     assert isinstance(found, Record)
     return found
+
+
+def derived(made: create.Draft, simulators: ReplayPlants, own: rounds.Round) -> Record:
+    """Return the record of a draft with its figures."""
+    found = opened(made)
+    commands = [
+        store.decode(content, x.shape, "draft")
+        for content, x in zip(made.commands, found.commands, strict=True)
+    ]
+    what = replay.protocol_of(found.header, simulators, own)
+    stressed = commands[1] if len(commands) > 1 else None
+    figures = replay.figures_of(found.header, commands[0], stressed, what, simulators)
+    return dataclasses.replace(found, derived=figures)

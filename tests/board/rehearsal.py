@@ -6,8 +6,9 @@ in a clone of their own; every step is a commit that the others pull. Usage::
 
     python tests/board/rehearsal.py --out runs/rehearsal --workers 2
 
-With ``--entries`` only some bundled submissions take part. At the end a changed byte of the
-beacon, of an entry, of the protocol and of a record must each be found.
+With ``--entries`` only some bundled submissions take part. A round to publish has a ``--name``, a
+``--key`` of the maintainer, as ``ventbench board new-key`` prints it, and no ``--newcomer``. At the
+end a changed byte of the beacon, of an entry, of the protocol and of a record must each be found.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ sys.path.insert(0, str(ROOT))
 from ci import apart  # noqa: E402
 from tests.board import referee  # noqa: E402
 
-NAME, SECRET, DELAY_S = "rehearsal-1", 271828182845904523536, 5
+SECRET, DELAY_S = 271828182845904523536, 5
 
 
 class Person:
@@ -98,6 +99,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "rehearsal")
     parser.add_argument("--entries", default="", help="bundled submissions, by comma; default: all")
     parser.add_argument("--workers", default="2")
+    parser.add_argument("--name", default="rehearsal-1")
+    parser.add_argument("--key", type=Path, help="default: a new one, which nobody keeps")
+    parser.add_argument("--newcomer", default="newcomer", help="the author's entry; empty: none")
     given = parser.parse_args()
     begun, out = time.perf_counter(), given.out.resolve()
     out.mkdir(parents=True)
@@ -106,7 +110,8 @@ def main() -> None:
 
     # The keys come first, and alone.
     new_key = (sys.executable, "-m", "ventbench", "board", "new-key")
-    secret, public = maintainer.run(*new_key).split("# public", 1)  # the secret is not printed
+    printed = given.key.read_text("utf-8") if given.key else maintainer.run(*new_key)
+    secret, public = printed.split("# public", 1)  # the secret is not printed
     key = next(line for line in secret.splitlines() if not line.startswith("#") and line)
     listed = maintainer.folder / "leaderboard" / "attestations.toml"
     listed.parent.mkdir()
@@ -122,7 +127,7 @@ def main() -> None:
     maintainer.ventbench(
         "round",
         "open",
-        NAME,
+        given.name,
         "--closes",
         f"{closes:%Y-%m-%dT%H:%M:%S}",
         "--delay",
@@ -133,36 +138,37 @@ def main() -> None:
     maintainer.share("The round is open")
 
     author.pull()
-    author.ventbench("new", "newcomer", "--dir", "submissions")
-    author.share("An entry")
+    if given.newcomer:
+        author.ventbench("new", given.newcomer, "--dir", "submissions")
+        author.share("An entry")
     requests = out / "requests.json"  # what the platform would say
-    requests.write_text(
-        json.dumps([{"name": "newcomer", "account": "author", "asked": closes.isoformat()}])
-    )
+    asked = [{"name": given.newcomer, "account": "author", "asked": closes.isoformat()}]
+    requests.write_text(json.dumps(asked if given.newcomer else []))
 
     maintainer.pull()
     time.sleep(max(0.0, (closes - datetime.now(UTC)).total_seconds()))
-    maintainer.ventbench("round", "freeze", NAME, "--requests", str(requests))
+    maintainer.ventbench("round", "freeze", given.name, "--requests", str(requests))
     maintainer.share("The round is frozen")
 
     author.pull()  # anybody can see now which value is due
-    show = (sys.executable, "-m", "ventbench", "round", "show", NAME, "--json", "-")
+    show = (sys.executable, "-m", "ventbench", "round", "show", given.name, "--json", "-")
     shown = json.loads(author.run(*show))
     time.sleep(DELAY_S)
     value = out / "value.json"
     value.write_bytes(referee.value(SECRET, shown["beacon_round"]))
-    maintainer.ventbench("round", "draw", NAME, "--beacon", str(value))
+    maintainer.ventbench("round", "draw", given.name, "--beacon", str(value))
     maintainer.share("The round is drawn")
 
     maintainer.environ["VENTBENCH_SIGNING_KEY"] = key
     scoring = time.perf_counter()
-    maintainer.ventbench("round", "score", NAME, "--workers", given.workers)
+    maintainer.ventbench("round", "score", given.name, "--workers", given.workers)
     del maintainer.environ["VENTBENCH_SIGNING_KEY"]
+    maintainer.run(sys.executable, "benchmarks/board_tables.py", "--write")
     maintainer.share("The round is scored")
     author.pull()
     author.ventbench("board", "verify")
     author.ventbench("board", "build", "--out", str(out / "site"))
-    author.ventbench("round", "show", NAME)
+    author.ventbench("round", "show", given.name)
     took = time.perf_counter() - scoring
     print(
         f"scored, verified and shown in {took:.0f} s; all of it in "
@@ -171,10 +177,10 @@ def main() -> None:
     )
     board = author.folder / "leaderboard"
     for path in (
-        board / "rounds" / NAME / "beacon.json",
-        board / "rounds" / NAME / "protocol.json",
+        board / "rounds" / given.name / "beacon.json",
+        board / "rounds" / given.name / "protocol.json",
         next((board / "records").glob("*.json")),
-        author.folder / "submissions" / "newcomer" / "controller.py",
+        author.folder / "submissions" / (given.newcomer or "pid_best") / "controller.py",
     ):
         content = path.read_bytes()
         path.write_bytes(content[:-20] + bytes([content[-20] ^ 1]) + content[-19:])

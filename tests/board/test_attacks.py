@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from ventbench.board import canonical, gate, ranking, store
+from ventbench.board import canonical, gate, ranking, replay, store
 from ventbench.board.verify import verify
 
 from .conftest import KEY, ROUND
@@ -36,7 +36,8 @@ def without(board: Path, *names: str) -> None:
     """Remove the records of entries and their commands."""
     for score in store.load(board).scores:
         if score.name in names:
-            store.commands_path(score, board / store.RECORDS).unlink()
+            for commands in score.commands:
+                store.commands_path(commands, board / store.RECORDS).unlink()
             store.path_of(board, score.sha256).unlink()
 
 
@@ -98,9 +99,9 @@ def test_an_attack_is_noticed(leaderboard: Path, simulators, attack: str) -> Non
 
 
 def test_a_withdrawal_without_a_key_changes_no_rank(leaderboard: Path) -> None:
-    before = [x.record.name for x in ranking.board(store.load(leaderboard))[0].ranked]
+    before = [x.record.name for x in ranking.board(replay.load(leaderboard))[0].ranked]
     withdrawn(leaderboard)
-    after = [x.record.name for x in ranking.board(store.load(leaderboard))[0].ranked]
+    after = [x.record.name for x in ranking.board(replay.load(leaderboard))[0].ranked]
     assert after == before != []
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from ventbench.board import build, canonical, store
 
-from .conftest import HOSTILE, put
+from .conftest import HOSTILE, accept, put
 
 
 def read(folder: Path) -> dict[str, bytes]:
@@ -45,7 +45,8 @@ def test_a_build_in_another_process_gives_the_same_bytes(
     full: Path, site: Path, tmp_path: Path
 ) -> None:
     code = "import sys; from pathlib import Path; from ventbench.board import build; "
-    code += "build.build(Path(sys.argv[1]), Path(sys.argv[2]))"
+    code += "from tests.textbook_rigs import TextbookRigs; "
+    code += "build.build(Path(sys.argv[1]), Path(sys.argv[2]), TextbookRigs)"
     # Another seed of str hashes: no order of a set may reach a page.
     environment = {"PYTHONHASHSEED": "1", "PYTHONPATH": ":".join(filter(None, sys.path))}
     command = [sys.executable, "-c", code, full, tmp_path / "other"]
@@ -129,6 +130,7 @@ def test_a_new_leaderboard_has_a_page(tmp_path: Path) -> None:
 def test_a_correction_takes_the_place_of_its_record(leaderboard, out, draft, simulators) -> None:
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     store.withdraw(leaderboard, old.sha256, "a bug")
+    accept(leaderboard)
     new = put(leaderboard, draft("softer", factor=0.95), simulators)
     done = build.build(leaderboard, out)
     page = (out / "entries/r1/performance/softer.html").read_text()

@@ -15,17 +15,10 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.board import frames, store
 from ventbench.cli import app
-from ventbench.plants import frozen
 
-from ..textbook_rigs import TextbookRigs
 from .conftest import accept
 
 RUN = CliRunner()
-
-
-@pytest.fixture(autouse=True)
-def _textbook(monkeypatch: pytest.MonkeyPatch, simulators: TextbookRigs) -> None:
-    monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
 
 
 def run(*arguments: object, code: int = 0) -> str:
@@ -46,7 +39,7 @@ def test_from_records_to_a_verified_board(drafts, entered: Path, tmp_path: Path)
         assert f"added {name} (performance)" in added
     accept(folder)
     build = ("build", "--folder", folder, "--out", tmp_path / "site")
-    assert "3 records, 6 pages, 19 files changed" in run(*build)
+    assert "3 records, 6 pages, 21 files changed" in run(*build)
     assert "3 records, 6 pages, 0 files changed" in run(*build)
     output = run("verify", "--folder", folder)
     assert "no problems: 3 records, 3 replayed" in output
@@ -78,6 +71,8 @@ def test_withdraw(leaderboard: Path) -> None:
     item = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     output = run("withdraw", item.sha256[:12], "--reason", "a bug", "--folder", leaderboard)
     assert item.sha256 in output
+    assert "next: ventbench board sign" in output
+    accept(leaderboard)
     run("build", "--folder", leaderboard, "--out", leaderboard.parent / "site")
     assert "withdrawn: a bug" in (leaderboard.parent / "site" / "index.html").read_text()
     assert "no problems" in run("verify", "--folder", leaderboard)
@@ -97,7 +92,7 @@ def test_outside_a_checkout_the_last_rounds_board_is_shown(
     found = RUN.invoke(app, ["board", "show"])
     assert "no folder leaderboard here; the board of the last round, which came" in found.stderr
     assert "identify_plan" in found.stdout
-    assert "rehearsal-4: scored" in RUN.invoke(app, ["round", "show"]).stdout
+    assert "rehearsal-5: scored" in RUN.invoke(app, ["round", "show"]).stdout
     assert "there is no such folder; the published leaderboard" in run("verify", code=2)
     (tmp_path / "leaderboard").mkdir()
     assert "leaderboard holds no record" in run("show", code=2)

@@ -12,7 +12,8 @@ import pandas as pd
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, frames, gate, store
+from ventbench.board import canonical, frames, gate, replay
+from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 
 from .conftest import KEY
@@ -72,14 +73,15 @@ def test_seeds_stand_beside_the_entry_that_the_round_scored(leaderboard: Path) -
 
 def test_cells_are_those_of_the_records(full: Path) -> None:
     cells = frames.load_cells(full)
-    record = store.load(full).scores[0]
+    record = replay.load(full).scores[0]
+    figures = record.figures
     own = cells[cells["name"] == record.name].set_index(["draw", "lung", "pip"]).sort_index()
     assert len(own) == 21 * 6 * 6
-    lung, pip = record.lungs[2], record.pips[4]
-    assert own.loc[(0, lung, pip), "error_cmH2O"] == record.nominal[2, 4]
-    assert own.loc[(7, lung, pip), "error_cmH2O"] == record.drawn[6, 2, 4]
-    assert own.loc[(7, lung, pip), "peak_cmH2O"] == record.peak[7, 2, 4]
-    assert own.loc[(7, lung, pip), "steps_above"] == record.steps_above[7, 2, 4]
+    lung, pip = LUNG_IDS[2], protocol.PIPS[4]
+    assert own.loc[(0, lung, pip), "error_cmH2O"] == figures.nominal[2, 4]
+    assert own.loc[(7, lung, pip), "error_cmH2O"] == figures.drawn[6, 2, 4]
+    assert own.loc[(7, lung, pip), "peak_cmH2O"] == figures.peak[7, 2, 4]
+    assert own.loc[(7, lung, pip), "steps_above"] == figures.steps_above[7, 2, 4]
     board = frames.load_board(full).set_index("name")
     for name, score in board["score_cmH2O"].dropna().items():
         drawn = cells[(cells["name"] == name) & (cells["draw"] > 0)]

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, frames, gate, record, store
+from ventbench.board import canonical, frames, gate, record, replay, store
 from ventbench.board.gate import Evidence
 from ventbench.board.record import HardwareRecord
 from ventbench.task import protocol
 
-from .conftest import accept, opened
+from .conftest import accept
 
 #: The key of the leaderboard; it may sign what was simulated, and no bench.
 SECRET = "07" * 32
@@ -200,28 +200,31 @@ def test_an_emulators_record_is_no_hardware(leaderboard: Path, template) -> None
     assert not any(x.rank for x in rows)
 
 
-def test_invented_stress_has_no_rank(leaderboard: Path, drafts, simulators) -> None:
+def test_an_invented_record_has_no_rank(leaderboard: Path) -> None:
     """Nobody vouches for the changed record: its hash is another one."""
-    honest = opened(drafts["pid_robust"])
-    evidence = store.load(leaderboard).evidence
+    board = replay.load(leaderboard)
+    honest = next(x for x in board.scores if x.name == "pid_robust")
+    evidence = board.evidence
     assert gate.simulated(honest, evidence) == (), "control"
-    assert gate.stressed(honest, evidence) == ("it did not run under missing physics",)
+    assert gate.stressed(honest, evidence) == (
+        "it did not run under missing physics, or its commands there are not at hand",
+    )
     forged = dataclasses.replace(honest, sha256="f" * 64)
     assert gate.UNATTESTED in gate.simulated(forged, evidence)
 
 
-def test_what_a_record_says_of_itself_ranks_nothing(leaderboard: Path, drafts) -> None:
+def test_what_a_record_says_of_itself_ranks_nothing(leaderboard: Path) -> None:
     for path in (leaderboard / canonical.ATTESTATIONS, *leaderboard.rglob("*.sig")):
         path.unlink()
-    evidence = store.load(leaderboard).evidence
+    board = replay.load(leaderboard)
+    named = {score.name: score for score in board.scores}
     for name in ("softer", "robust", "pid_best"):
-        item = opened(drafts[name])
-        assert item.official
-        assert gate.simulated(item, evidence) == (gate.UNATTESTED,)
+        assert named[name].official
+        assert gate.simulated(named[name], board.evidence) == (gate.UNATTESTED,)
     accept(leaderboard)
     evidence = store.load(leaderboard).evidence
-    assert gate.simulated(opened(drafts["softer"]), evidence) == ()
-    home = gate.simulated(opened(drafts["home"]), evidence)
+    assert gate.simulated(named["softer"], evidence) == ()
+    home = gate.simulated(named["home"], evidence)
     assert home[0].startswith("not official: its sandbox lacked a layer")
 
 

@@ -8,16 +8,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from ventbench.board import ranking
+from ventbench.board import ranking, rounds
 from ventbench.board.ranking import Entry
 from ventbench.board.record import Record
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
 
-from .conftest import opened
+from .conftest import ROUND, derived
 
 
 @pytest.fixture(scope="module")
-def base(drafts) -> Record:
-    return opened(drafts["pid_best"])
+def base(drafts, simulators, entered, reference) -> Record:
+    return derived(drafts["pid_best"], simulators, rounds.load(entered, ROUND))
 
 
 def _entry(base: Record, name: str, by_draw: np.ndarray) -> Entry:
@@ -25,14 +27,12 @@ def _entry(base: Record, name: str, by_draw: np.ndarray) -> Entry:
     manifest = msgspec.structs.replace(base.manifest, name=name)
     submission = msgspec.structs.replace(base.header.submission, manifest=manifest)
     header = msgspec.structs.replace(base.header, submission=submission)
-    own = base.headroom
-    error = own.error.copy()
+    own = base.figures
+    error = own.controllable.copy()
     scale = np.maximum(own.pid - own.attainable, 0.1)[1:]
     error[1:] = own.attainable[1:] + by_draw[:, None, None] / 100.0 * scale
-    # A fresh object: the cached properties of the old one do not come along.
-    fields = {f.name: getattr(base, f.name) for f in dataclasses.fields(base)}
-    headroom = type(own)(own.session, own.member, error, own.attainable, own.pid)
-    record = Record(**{**fields, "header": header, "headroom": headroom})
+    figures = dataclasses.replace(own, controllable=error)
+    record = dataclasses.replace(base, header=header, derived=figures)
     return Entry(record, (record,), ())
 
 
@@ -40,12 +40,12 @@ def test_score_is_the_mean_over_draws_lungs_and_pips(base: Record) -> None:
     (row,) = ranking.rank([Entry(base, (), ())], "performance")
     assert row.error is not None
     assert row.normalised is not None
-    assert row.error.value == pytest.approx(base.drawn.mean(), abs=1e-12)
-    own = base.headroom
-    expected = 100 * (own.error - own.attainable) / np.maximum(own.pid - own.attainable, 0.1)
+    assert row.error.value == pytest.approx(base.figures.drawn.mean(), abs=1e-12)
+    own = base.figures
+    expected = 100 * (own.controllable - own.attainable) / np.maximum(own.pid - own.attainable, 0.1)
     assert row.normalised.score.value == pytest.approx(expected[1:].mean(), abs=1e-9)
-    i, j = np.unravel_index(np.argmax(base.drawn.mean(axis=0)), (6, 6))
-    assert row.worst[1:] == (base.lungs[i], base.pips[j])
+    i, j = np.unravel_index(np.argmax(own.drawn.mean(axis=0)), (6, 6))
+    assert row.worst[1:] == (LUNG_IDS[i], protocol.PIPS[j])
     assert row.normalised.to_baseline is None
     assert row.normalised.to_above is None
 

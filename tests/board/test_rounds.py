@@ -21,7 +21,7 @@ from ci import propose
 from ci.git import Git
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.board import canonical, gate, official_runs, rounds, store
+from ventbench.board import canonical, gate, official_runs, replay, rounds, store
 from ventbench.board.gate import PRACTICE
 from ventbench.board.rounds import Request
 from ventbench.board.verify import verify
@@ -37,12 +37,13 @@ from ventbench.entries.folder import (
     open_submission,
 )
 from ventbench.entries.scoring import run_protocol
+from ventbench.plants import frozen
 from ventbench.plants.rigs import load_rigs
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
 
 from . import referee
-from .conftest import FROZEN, KEY, ROUND, SECRET, attest, entry_folder, opened, put
+from .conftest import FROZEN, KEY, OFFICIAL, ROUND, SECRET, attest, entry_folder, put
 from .test_verify import flip
 
 SPEED = Path(__file__).parents[2] / "docs" / "speed.md"
@@ -197,14 +198,14 @@ def test_what_was_not_frozen_has_no_rank(leaderboard: Path, drafts, simulators) 
     changed["submission"]["manifest"]["name"] = "unknown"
     made = type(drafts["softer"])(canonical.canonical(changed), drafts["softer"].commands)
     put(leaderboard, made, simulators)
-    board = store.load(leaderboard)
+    board = replay.load(leaderboard)
     record = next(x for x in board.scores if x.name == "unknown")
     assert gate.simulated(record, board.evidence) == ("its code was not frozen in round r1",)
     assert own.exists()
 
 
-def test_practice_is_never_ranked(drafts) -> None:
-    record = opened(drafts["softer"])
+def test_practice_is_never_ranked(full: Path) -> None:
+    record = next(x for x in replay.load(full).scores if x.name == "softer")
     vouched = gate.Evidence(frozenset([record.sha256]))
     assert gate.simulated(record, vouched) == (PRACTICE,)
 
@@ -283,10 +284,10 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
     report = verify(fresh, lambda: simulators)
     assert report.problems == []
     assert report.replayed == len(done.result.records)
-    for record in store.load(fresh).scores:
+    for record in replay.load(fresh).scores:
         key = f"{record.name} ({record.track})"
         same, other = done.result.seeds[key]
-        assert same == pytest.approx(record.ranked_values.mean(), abs=1e-9)
+        assert same == pytest.approx(record.figures.ranked_values.mean(), abs=1e-9)
         assert abs(other - same) > 1
         assert done.result.failed[f"{key}, seed 2"] == "a cell failed"
     _proposed(fresh, checkout, simulators)
@@ -298,13 +299,13 @@ def _proposed(scored: Path, leaderboard: Path, simulators) -> None:
     other = shutil.copytree(scored, scored.parent / "other")
     path, _ = sorted((other / "records").glob("*.json"))
     values = json.loads(path.read_bytes())
-    values["errors"]["drawn"][0][0][0] *= 0.5
+    values["simulators"] = {"manifest_sha256": "9" * 64}
     content = canonical.canonical(values)
     (path.parent / f"{canonical.digest(content)}.json").write_bytes(content)
     result = json.loads((other / "rounds/r2/result.json").read_bytes())
     result["records"] = dict.fromkeys(result["records"], canonical.digest(content))
     (other / "rounds/r2/result.json").write_bytes(canonical.canonical(result))
-    with pytest.raises(InputError, match="does not replay"):
+    with pytest.raises(InputError, match="those of this ventbench are not those of the record"):
         propose.add(other, forged, "r2", simulators)
     assert not store.load(forged).scores
     added = propose.add(scored, leaderboard, "r2", simulators)
@@ -522,8 +523,11 @@ class LookUp:
         return float(self.chosen[min(step, len(self.chosen) - 1)])
 
 
-def test_a_table_of_public_files_is_worse_than_the_pid_in_a_round(entered: Path) -> None:
+def test_a_table_of_public_files_is_worse_than_the_pid_in_a_round(
+    entered: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """And far better than it on the draws that the files are of."""
+    monkeypatch.setattr(frozen, "load", OFFICIAL)
     rigs, pips = load_rigs(), (15.0, 30.0)
     seed = rounds.load(entered, ROUND).seed
     means = {}

@@ -25,9 +25,11 @@ from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
-from ventbench.task import rollouts
+from ventbench.task import environment, rollouts
 from ventbench.task.lungs import LUNG_IDS, LUNGS
 from ventbench.task.protocol import PIPS
+
+from ..valve import Stepped
 
 HERE = Path(__file__).parents[2] / "submissions"
 KINDS = {"ppo": (GaussianPolicy, 1), "dqn": (GreedyPolicy, len(CHOICES))}
@@ -62,6 +64,11 @@ def make(name: str) -> dict[str, GaussianPolicy | GreedyPolicy]:
 def test_numpy_and_jax_act_alike(name, track, tmp_path):
     folder = tmp_path / name
     shutil.copytree(HERE / name, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    # The policy alone, without what keeps the submission safe.
+    controller = folder / "controller.py"
+    controller.write_text(
+        controller.read_text().replace("ABOVE, SHARE = 8.0", "ABOVE, SHARE = 1e9")
+    )
     made = make(name)
     save_policies(folder / "weights.npz", made)
     with compilation.float64():
@@ -76,9 +83,10 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
             policy = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), policy)
             plant = jax.tree.map(lambda x, i=i: x[i], plants)
             cells = jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), every)
-            wanted, _ = rollouts.closed_loop(plant, policy, cells)
+            wanted, _ = rollouts.closed_loop(plant, Stepped(policy), cells)
             assert np.ptp(wanted.requested) > 20.0
-            np.testing.assert_allclose(found.requested[i], wanted.requested, rtol=0, atol=1e-9)
+            applied = environment.resolved(found.requested[i])
+            np.testing.assert_allclose(applied, wanted.requested, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["ppo", "dqn"])

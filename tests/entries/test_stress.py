@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from ventbench.base import compilation
 from ventbench.base.errors import InputError
+from ventbench.board import replay
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.entries.cells import Cells, InProcessRunner, ProtocolRun, protocol_of
@@ -315,7 +316,7 @@ def test_nothing_is_changed_without_a_stressor(runs: Runs, cells: Cells) -> None
             lambda leaf: jnp.asarray(np.asarray(leaf)[:, :, 0], float),
             (cells.plants, cells.scenario),
         )
-        commands = np.asarray(runs.requested)[0].reshape(6, 1, -1)
+        commands = environment.resolved(np.asarray(runs.requested)[0]).reshape(6, 1, -1)
         varied: Any = environment.vary(plant, scenario, 2)
         assert float(varied.R[0, 0]) != np.asarray(jax.tree.leaves(cells.plants)[0])[0, 0, 0]
         alone, _ = rollouts.closed_loop(plant, Script(jnp.asarray(commands)), scenario)
@@ -367,21 +368,14 @@ def test_stressors_act_as_a_person_expects(runs: Runs) -> None:
     assert np.median(runs.volume_ratio[off]) < 0.7
 
 
-def _recorded_errors() -> dict[str, tuple[list[str], np.ndarray]]:
-    found = {}
-    for path in sorted((Path(__file__).parents[2] / "leaderboard" / "records").glob("*.json")):
-        stress = json.loads(path.read_text()).get("stress")
-        if stress:
-            found[path.stem] = stress["conditions"], np.array(stress["errors"], float)
-    return found
-
-
 def test_no_condition_is_more_than_a_tenth_of_level_or_rise() -> None:
-    found = _recorded_errors()
-    assert len(found) >= 5
-    for names, errors in found.values():
-        mean = errors.mean(axis=(1, 2))
-        weight = np.array([WEIGHTS.get(name, 1.0) for name in names[1:]])
+    scores = replay.load(Path(__file__).parents[2] / "leaderboard").scores
+    found = [score.derived.stressed for score in scores if score.derived is not None]
+    stressed = [each for each in found if each is not None]
+    assert len(stressed) >= 5
+    for each in stressed:
+        mean = each.error.mean(axis=(1, 2))
+        weight = np.array([WEIGHTS.get(condition.id, 1.0) for condition in each.conditions[1:]])
         for value in (mean[1:], mean[1:] - mean[0]):
             assert np.max(weight * value) < 0.1 * np.sum(weight * value)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,6 +24,14 @@ def _ports_are_patient() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hardware_eval.wire.client.WRITE_TIMEOUT", 600.0)
         yield
+
+
+@pytest.fixture
+def scored_only(tmp_path: Path) -> Path:
+    """A plan of scored runs alone."""
+    path = tmp_path / "plan.toml"
+    path.write_text("control_every = 0\ndry_run = false\nselftest = false\nrest = 0.5\n")
+    return path
 
 
 @pytest.fixture(scope="session")

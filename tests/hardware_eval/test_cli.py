@@ -6,16 +6,19 @@ import json
 import os
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer.main
 from mcap.reader import make_reader
+from msgspec.structs import asdict
 from typer.testing import CliRunner
 
 from hardware_eval import cli
 from hardware_eval.bench.controllers import ControllerFailedError, SubmissionController
+from hardware_eval.bench.plan import read_procedure
 from hardware_eval.bench.raw_log import breaths
 from hardware_eval.device.program import Identity
 from hardware_eval.emulation.emulator import LoopbackDevice
@@ -41,33 +44,21 @@ def invoke(*words: str) -> Any:
     return CliRunner().invoke(cli.app, list(words))
 
 
-def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> None:
-    out, result = tmp_path / "out", tmp_path / "result.json"
-    done = invoke(
-        "run",
-        "pid_best",
-        "--port",
-        "p",
-        "--lung",
-        "R5C20",
-        "--pips",
-        "10",
-        "--repeats",
-        "1",
-        "--control-every",
-        "0",
-        "--no-dry-run",
-        "--no-selftest",
-        "--in-process",
-        "--rest",
-        "0.5",
-        "--yes",
-        "--out",
-        str(out),
-        "--json",
-        str(result),
-        "--blind",
-    )
+def scored(out: Path, plan: Path) -> tuple[Any, Path]:
+    """One scored run of an entry, in this process; what `run` said, and its JSON."""
+    result = out.with_suffix(".json")
+    line = "run pid_best --port p --lung R5C20 --pips 10 --repeats 1 --in-process --yes"
+    line += f" --plan {plan} --out {out} --json {result}"
+    return invoke(*shlex.split(line)), result
+
+
+def test_run_makes_a_record_and_replay_agrees(
+    on_line: Line, tmp_path: Path, scored_only: Path
+) -> None:
+    with scored_only.open("a") as plan:
+        plan.write("blind = true\n")
+    out = tmp_path / "out"
+    done, result = scored(out, scored_only)
     assert done.exit_code == 0, done.output
     # Who stands at the bench learns at the end which entry it was.
     blinded, _, revealed = done.output.partition("entry 1 is pid_best")
@@ -101,19 +92,11 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
     assert "no whole dry run" in analysed.output
 
 
-def test_without_a_terminal_and_without_yes_nothing_moves(on_line: Line, tmp_path: Path) -> None:
-    done = invoke(
-        "run",
-        "pid_best",
-        "--port",
-        "p",
-        "--lung",
-        "R5C20",
-        "--no-dry-run",
-        "--in-process",
-        "--out",
-        str(tmp_path / "out"),
-    )
+def test_without_a_terminal_and_without_yes_nothing_moves(
+    on_line: Line, tmp_path: Path, scored_only: Path
+) -> None:
+    words = f"run pid_best --port p --lung R5C20 --in-process --plan {scored_only}".split()
+    done = invoke(*words, "--out", str(tmp_path / "out"))
     assert done.exit_code == 1
     assert "did not confirm" in done.output
 
@@ -128,34 +111,15 @@ def raises(self: Any, row: Any, budget: float) -> float:
     ids=["raises", "late"],
 )
 def test_an_entry_of_which_every_run_failed_has_no_score(
-    act: Any, said: str, on_line: Line, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    act: Any,
+    said: str,
+    on_line: Line,
+    tmp_path: Path,
+    scored_only: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(SubmissionController, "act", act)
-    out, result = tmp_path / "out", tmp_path / "result.json"
-    done = invoke(
-        "run",
-        "pid_best",
-        "--port",
-        "p",
-        "--lung",
-        "R5C20",
-        "--pips",
-        "10",
-        "--repeats",
-        "1",
-        "--control-every",
-        "0",
-        "--no-dry-run",
-        "--no-selftest",
-        "--in-process",
-        "--rest",
-        "0.5",
-        "--yes",
-        "--out",
-        str(out),
-        "--json",
-        str(result),
-    )
+    done, result = scored(tmp_path / "out", scored_only)
     assert done.exit_code == 1, done.output
     assert "no score: 1 of 1 runs failed" in done.output
     assert said in done.output
@@ -236,22 +200,40 @@ def test_wrong_numbers_and_ports_are_bad_input(
         assert said in capsys.readouterr().err
 
 
+def test_the_manual_lists_every_key_of_a_plan(tmp_path: Path) -> None:
+    (block,) = re.findall(r"^```toml\n(.*?)^```", MANUAL.read_text("utf-8"), re.M | re.S)
+    path = tmp_path / "plan.toml"
+    path.write_text(block)
+    given, usual = asdict(read_procedure(path)), asdict(read_procedure(None))
+    assert set(tomllib.loads(block)) == set(usual)
+    shown = {name: value for name, value in given.items() if usual[name] not in (None, "", ())}
+    assert shown == {name: usual[name] for name in shown}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("repeats = 0", "Expected `int` >= 1 - at `$.repeats`"),
+        ("repaets = 3", "unknown field `repaets`"),
+        ("pips = 10", "Expected `array`, got `int` - at `$.pips`"),
+        ("rest = nan", "$.rest"),
+        ("repeats == 3", "line 1, column"),
+    ],
+)
+def test_a_wrong_plan_is_refused_with_its_key(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=re.escape(said)) as refused:
+        read_procedure(path)
+    assert str(path) in str(refused.value)
+
+
 @pytest.mark.parametrize("ease", ["nan", "5", "99"])
 def test_pressures_that_would_not_ease_are_refused_before_the_port_is_opened(
     ease: str, tmp_path: Path
 ) -> None:
-    done = invoke(
-        "collect",
-        "--port",
-        "/dev/nothing",
-        "--lung",
-        "R5C20",
-        "--ease",
-        ease,
-        "--yes",
-        "--out",
-        str(tmp_path / "out"),
-    )
+    words = f"collect --port /dev/nothing --lung R5C20 --ease {ease} --yes --out".split()
+    done = invoke(*words, str(tmp_path / "out"))
     assert isinstance(done.exception, InputError)
     assert f"--ease {ease} cmH2O: give more than 5 and at most" in str(done.exception)
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
 """What every room uses and what knows nothing of lungs: errors, files, text, work in parallel."""
 
 #: Version of ventbench.
-VERSION = "0.1.0"
+VERSION = "0.2.0"

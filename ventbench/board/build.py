@@ -12,20 +12,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.text import flatten
-from ventbench.board import canonical, frames, pages, ranking, store
-from ventbench.board.frames import Line
+from ventbench.board import canonical, frames, pages, ranking, replay
+from ventbench.board.figures import Figures
+from ventbench.board.frames import Column, Line
 from ventbench.board.gate import Evidence
 from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.record import Record
+from ventbench.board.replay import TRACE_BREATH, Load
 from ventbench.board.rounds import Round
-from ventbench.board.schema import ScoreHeader
+from ventbench.board.schema import ScoreContent
 from ventbench.board.store import Store
 from ventbench.task import protocol
-from ventbench.task.lungs import lung as parse_lung
+from ventbench.task.lungs import LUNG_IDS, LUNGS
 
 if TYPE_CHECKING:
     import jinja2
@@ -63,16 +64,17 @@ def content(leaderboard: Store) -> dict[str, bytes]:
     return built
 
 
-def build(folder: Path, out: Path) -> Built:
+def build(folder: Path, out: Path, simulators: Load | None = None) -> Built:
     """Write the site of a leaderboard into a folder: pages, CSV, and the records that they link to.
 
-    Only files that differ are written; pages of an earlier build that are no more are removed.
+    The frozen simulators replay the records, unless others are given. Only files that differ are
+    written; pages of an earlier build that are no more are removed.
 
     Raises:
         InputError: if a record was changed, or jinja2 is not installed.
         OSError: if a file cannot be read or written.
     """
-    leaderboard = store.load(folder)
+    leaderboard = replay.load(folder, simulators)
     built = content(leaderboard)
     named = sorted(filter(canonical.named, canonical.walk(folder)[0]))
     changed = []
@@ -97,14 +99,19 @@ def _index(
 ) -> str:
     """Return the page of the board, or that of a round; ``root`` leads to the page of the board."""
     lines = frames.lines(tracks)
+    columns = _telling(lines)
+    first = lines[0].row.record.figures if lines else None
     shown = own or next((track.round for track in tracks if track.round), None)
     header = lines[0].row.record.header if lines else None
     # Under missing physics, practice is shown only where nothing is ranked.
     of_first = [track for track in tracks if track.draws == tracks[0].draws] if tracks else []
     stressed = [row for track in of_first for row in track.stress]
     return environment.get_template("index.html.j2").render(
-        tracks=[_track(track) for track in tracks],
-        columns=SHOWN,
+        tracks=[_track(track, columns) for track in tracks],
+        columns=columns,
+        titles=[column.title for column in columns],
+        ranking=first and {"ranked": int(first.ranked.sum()), "drawn": first.ranked.size},
+        measured=any(track.hardware for track in tracks),
         aside=[_aside(line) for line in lines if line.status not in ("ranked", "practice")],
         simulators=flatten(header.simulators) if header else [],
         draws=header.draws if header else None,
@@ -121,6 +128,17 @@ def _index(
         rounds=[_round(x) for x in leaderboard.rounds],
         root=root,
     )
+
+
+def _telling(lines: Sequence[Line]) -> list[Column]:
+    """Columns of the page that do not say the same of every entry that is shown in its tables."""
+    shown = [line for line in lines if line.status in ("ranked", "practice")]
+    cells = {one.names[0]: [one.cell(line) for line in shown] for one in SHOWN}
+    return [
+        one
+        for one in SHOWN
+        if len(shown) < 2 or any(cell != cells[one.names[0]][0] for cell in cells[one.names[0]])
+    ]
 
 
 def _round(own: Round) -> dict[str, Any]:
@@ -143,7 +161,7 @@ def _round(own: Round) -> dict[str, Any]:
     }
 
 
-def _track(track: Track) -> dict[str, Any]:
+def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
     scores = [row.normalised.score for row in track.ranked if row.normalised is not None]
     low = min((x.low for x in scores), default=1.0)
     high = max((x.high for x in scores), default=1.0)
@@ -152,7 +170,7 @@ def _track(track: Track) -> dict[str, Any]:
         measured = pages.hardware_of(track.hardware, row.record.name)
         rows.append(
             {
-                "cells": [column.cell(Line(track, "ranked", row)) for column in SHOWN],
+                "cells": [column.cell(Line(track, "ranked", row)) for column in columns],
                 "path": pages.address(row.record),
                 "baseline": row.record.name == BASELINES[track.name],
                 "plot": pages.interval_plot(row, low, high),
@@ -207,7 +225,7 @@ def _entry_pages(
 
 def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, Any]:
     track, status, row = line
-    record, header = row.record, row.record.header
+    record, header, figures = row.record, row.record.header, row.record.figures
     cells = {column.names[0]: column.cell(line) for column in SHOWN}
     return {
         "record": record,
@@ -217,23 +235,23 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
         "reasons": row.entry.reasons,
         "track": track.name,
         "count": len(track.ranked),
+        "counted": int(figures.ranked.sum()),
+        "runs": figures.error.size,
         "cells": cells,
         "figures": [
             (column.title, cells[column.names[0]])
             for column in SHOWN
             if column.names[0] not in ("rank", "name", "normalised")
         ],
-        "scaled": pages.heat_map(record.headroom.normalised, record, pages.NORMALISED_LIMITS, 0),
+        "scaled": pages.heat_map(_ranking(figures, figures.normalised), pages.NORMALISED_LIMITS, 0),
         "compared": base.name if base else None,
-        "heat": pages.heat_map(
-            np.concatenate([record.nominal[None], record.drawn]), record, pages.ERROR_LIMITS
-        ),
+        "heat": pages.heat_map(_ranking(figures, figures.error), pages.ERROR_LIMITS),
         "safety": _safety(record),
         "failures": header.failures[:MAX_FAILURES],
-        "frames": [pages.trusted(pages.frame(pip)) for pip in record.pips],
-        "pips": [f"{pip:g}" for pip in record.pips],
-        "lungs": [(x.id, f"{x.R:g}", f"{x.C:g}") for x in map(parse_lung, record.lungs)],
-        "breath": record.breath,
+        "frames": [pages.trusted(pages.frame(pip)) for pip in protocol.PIPS],
+        "pips": [f"{pip:g}" for pip in protocol.PIPS],
+        "lungs": [(x.id, f"{x.R:g}", f"{x.C:g}") for x in LUNGS],
+        "breath": TRACE_BREATH + 1,
         "provenance": _provenance(header),
         "history": _history(row, evidence),
         "protocol": protocol,
@@ -241,21 +259,27 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
     }
 
 
+def _ranking(figures: Figures, values: Floats) -> Floats:
+    """Nominal runs and the draws that rank, of a table of runs."""
+    return values[[True, *figures.ranked]]
+
+
 def _safety(record: Record) -> list[dict[str, Any]]:
     """A row a lung: highest pressure, longest time above the limit, whether the gate is passed."""
-    highest, steps = record.peak.max(axis=(0, 2)), record.steps_above.max(axis=(0, 2))
+    own = record.figures
+    highest, steps = own.peak.max(axis=(0, 2)), own.steps_above.max(axis=(0, 2))
     return [
         {
             "name": name,
             "peak": pages.figure(float(highest[i]), 1),
             "above": int(steps[i]),
-            "safe": record.header.safe[i],
+            "safe": bool(own.safe[i]),
         }
-        for i, name in enumerate(record.lungs)
+        for i, name in enumerate(LUNG_IDS)
     ]
 
 
-def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
+def _provenance(header: ScoreContent) -> list[tuple[str, list[tuple[str, str]]]]:
     submission = header.submission
     groups = (
         ("Training, as the authors state it", submission.manifest.training),

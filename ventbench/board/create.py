@@ -10,7 +10,7 @@ import dataclasses
 import os
 import platform
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
@@ -20,16 +20,14 @@ from typing import Any
 import numpy as np
 
 from ventbench.base import files
-from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, record, schema, store
-from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
+from ventbench.board.replay import TOLERANCE, ReplayPlants, figures_of
 from ventbench.entries.folder import combined_hash, file_hashes
 from ventbench.entries.result import Score, package_versions
-from ventbench.entries.runs import DRAWS, CellFailure, Runs
+from ventbench.entries.runs import DRAWS, CellFailure
 from ventbench.task import draws as draw_tables
 from ventbench.task import stressors
-from ventbench.task.draws import Draws
 
 #: How many failures keep their whole text, and how much of it the others keep, characters.
 _IN_FULL, _SHORT = 40, 240
@@ -43,16 +41,17 @@ _ISA = ("asimd", "sve", "sve2", "sse4_2", "avx", "avx2", "fma", "avx512f")
 
 @dataclass(frozen=True)
 class Draft:
-    """A new record and its commands as bytes of two files, not yet in any folder."""
+    """A new record and its commands as bytes of files, not yet in any folder."""
 
     content: bytes
-    commands: bytes
+    commands: tuple[bytes, ...]  #: those under missing physics last.
 
     def save(self, folder: Path) -> Path:
-        """Write both files, each named by its hash; return the record's path."""
-        commands = folder / f"{canonical.digest(self.commands)}{canonical.ACTIONS_SUFFIX}"
+        """Write all files, each named by its hash; return the record's path."""
+        for commands in self.commands:
+            name = f"{canonical.digest(commands)}{canonical.ACTIONS_SUFFIX}"
+            files.write_bytes(folder / name, commands)
         path = folder / f"{canonical.digest(self.content)}{record.SUFFIX}"
-        files.write_bytes(commands, self.commands)
         files.write_bytes(path, self.content)
         return path
 
@@ -87,17 +86,29 @@ def create(
     hashes = file_hashes(score.submission.folder)
     if combined_hash(hashes) != score.submission.sha256:
         raise InputError(f"{label} was changed while it was scored; score it again")
-    (replayed,) = replay(simulators, score.pips, [score.requested], score.rig_draws)
-    commands = store.encode(score.requested)
-    errors = np.concatenate([score.nominal[None], score.drawn])
+    stressed = score.stressed
+    if stressed is not None and not stressed.complete:
+        raise InputError(f"{label}: a record needs all stressors on {DRAWS} draws, or none")
+    of_runs = [score.requested] + ([] if stressed is None else [stressed.requested])
+    requested = [np.asarray(x) for x in of_runs]
+    commands = tuple(map(store.encode, requested))
+    described = [
+        {"sha256": canonical.digest(own), "bytes": len(own), "shape": list(x.shape)}
+        for own, x in zip(commands, requested, strict=True)
+    ]
+    stress = None
+    if stressed is not None:
+        stress = {
+            "stressors": stressors.VERSION,
+            "commands": described[1],
+            "failures": _failures(score, stressed.failures),
+        }
     content: dict[str, Any] = {
         "format": schema.FORMAT,
         "kind": "score",
         "protocol": schema.PROTOCOL,
         "created": record.timestamp(now),
         "official": score.official,
-        "supersedes": None,
-        "reason": "",
         "provenance": dict(source or {}),
         "track": score.track,
         "submission": {
@@ -107,32 +118,9 @@ def create(
         },
         "simulators": dict(simulators.about()),
         "draws": score.rig_draws.about(),
-        **_headroom(score, score.rig_draws),
-        **_stressed(score),
-        "lungs": list(score.lungs),
-        "pips": list(score.pips),
-        "errors": {"nominal": _plain(score.nominal), "drawn": _plain(score.drawn)},
-        "safe": score.safe.tolist(),
-        "peak_pressure_cmH2O": score.peak.tolist(),
-        "safety": {
-            "peak_centi_cmH2O": np.round(100.0 * replayed.peak).astype(int).tolist(),
-            "steps_above": replayed.steps_above.tolist(),
-        },
-        "clipped": {
-            "below": replayed.below.tolist(),
-            "above": replayed.above.tolist(),
-            "commands": score.requested.size,
-        },
-        "spread": _plain(np.where(np.isnan(score.nominal), np.nan, replayed.spread)),
-        "failures": [_failure(score, f, n < _IN_FULL) for n, f in enumerate(score.failures)],
-        "failed_cells": int(np.isnan(errors).sum()),
-        "trace": trace(replayed),
-        "actions": {
-            "sha256": canonical.digest(commands),
-            "bytes": len(commands),
-            "encoding": schema.ENCODING,
-            "shape": list(score.requested.shape),
-        },
+        "commands": described[0],
+        "failures": _failures(score, score.failures),
+        "stress": stress,
         "sandbox": None if sandbox is None else dict(sandbox),
         "versions": versions(),
         "machine": machine(),
@@ -141,59 +129,33 @@ def create(
     draft = Draft(canonical.canonical(content), commands)
     made = record.from_bytes(draft.content, f"the record of {label}")
     assert isinstance(made, record.Record)
-    problems = differences(made, replayed)
-    if problems:
-        raise InputError(f"{label}: the score does not replay: {'; '.join(problems)}")
+    _require_replay(made, draft, score, simulators)
     return draft
 
 
-def _headroom(score: Score, drawn: Draws) -> dict[str, Any]:
-    """Rigs of the draws, and what the score is relative to."""
-    reference = score.protocol.reference
-    if reference is None:
-        raise InputError(
-            f"{score.submission.label}: there are no reference errors of these simulators and "
-            "draws; make them with `ventbench board headroom`"
-        )
-    tables = {
-        "error": score.controllable,
-        "attainable": reference.attainable,
-        "pid": reference.pid,
-    }
-    return {
-        "rigs": {"session": drawn.rig.tolist(), "member": drawn.member.tolist()},
-        "headroom": {key: _plain(np.moveaxis(table, 1, 0)) for key, table in tables.items()},
-    }
-
-
-def _stressed(score: Score) -> dict[str, Any]:
-    """What missing physics adds to a record."""
-    stress = score.stressed
-    if stress is None:
-        return {}
-    if not stress.complete:
-        raise InputError(
-            f"{score.submission.label}: a record needs all stressors on {DRAWS} draws, or none"
-        )
-    return {
-        "stress": {
-            "stressors": stressors.VERSION,
-            "conditions": [condition.id for condition in stress.conditions],
-            "pips": stress.pips.tolist(),
-            "errors": _plain(stress.error),
-            "safe": stress.safe.tolist(),
-            "survived": stress.survived.tolist(),
-            "above_alarm_ms": np.round(1e3 * stress.alarm_s).astype(int).tolist(),
-            "peak_centi_cmH2O": np.round(100.0 * stress.peak).astype(int).tolist(),
-            "volume_mL": np.round(stress.volume).astype(int).tolist(),
-            "commands_sha256": stress_digest(stress),
-        }
-    }
-
-
-def stress_digest(stressed: Runs) -> str:
-    """SHA-256 of the commands of stressed runs."""
-    return canonical.digest(np.ascontiguousarray(stressed.requested, "<f8").tobytes())
+def _require_replay(
+    made: record.Record, draft: Draft, score: Score, simulators: ReplayPlants
+) -> None:
+    """Refuse a record whose commands do not give the errors of the score again."""
+    label, header = score.submission.label, made.header
+    decoded = [
+        store.decode(content, own.shape, label)
+        for content, own in zip(draft.commands, made.commands, strict=True)
+    ]
+    under_stress = decoded[1] if len(decoded) > 1 else None
+    found = figures_of(header, decoded[0], under_stress, score.protocol, simulators)
+    if made.track == "robustness" and found.leak:
+        raise InputError(f"{label}, key commands: {found.leak}")
+    pairs = [("errors", np.concatenate([score.nominal[None], score.drawn]), found.error)]
+    if score.stressed is not None and found.stressed is not None:
+        pairs.append(("errors under stress", score.stressed.error, found.stressed.error))
+    for what, scored, replayed in pairs:
+        off = np.abs(scored - replayed)
+        if np.any(np.isnan(scored) != np.isnan(replayed)) or np.nanmax(off, initial=0) > TOLERANCE:
+            raise InputError(
+                f"{label}: the score does not replay: its {what} differ by up to "
+                f"{np.nanmax(off, initial=0):.1e} cmH2O from those of its commands"
+            )
 
 
 def versions() -> dict[str, str]:
@@ -238,22 +200,14 @@ def _cpuinfo() -> dict[str, str]:
     return fields
 
 
-def trace(replayed: Replayed) -> dict[str, Any]:
-    """What the page draws, in whole numbers."""
-    return {
-        "breath": TRACE_BREATH + 1,
-        "pressure_centi_cmH2O": np.round(100.0 * replayed.pressure).astype(int).tolist(),
-        "u_in_tenths_percent": np.round(10.0 * replayed.u_in).astype(int).tolist(),
-    }
-
-
-def _plain(values: Floats) -> Any:
-    """Nested lists, null for NaN."""
-    return files.json_values(values.tolist())
+def _failures(score: Score, failures: Sequence[CellFailure]) -> list[dict[str, Any]]:
+    """Failures for a record; the first ones with their whole text."""
+    return [_failure(score, failure, n < _IN_FULL) for n, failure in enumerate(failures)]
 
 
 def _failure(score: Score, failure: CellFailure, in_full: bool) -> dict[str, Any]:
-    cell = {"lung": failure.lung, "pip": failure.pip, "draw": failure.draw}
+    names = ("condition", "lung", "pip", "draw")
+    cell = {name: getattr(failure, name) for name in names}
     # By its name, wherever its folder was.
     description = failure.message.removeprefix(score.submission.label)
     message = f"{score.submission.manifest.name}{description}"

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
-from ventbench.board import comparison, pages, ranking, store
+from ventbench.board import comparison, pages, ranking, replay
 from ventbench.board.ranking import Interval, Row, Track
 from ventbench.board.record import Record
 from ventbench.entries.manifest import TRACKS
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -81,7 +83,9 @@ def _of_three(name: str, stem: str = "") -> tuple[str, str, str]:
 
 
 def _ranks(line: Line) -> str:
-    return "" if line.row.ranks is None else f"{line.row.ranks[0]} to {line.row.ranks[1]}"
+    """Ranks that it may have, where they are several."""
+    low, high = line.row.ranks or (0, 0)
+    return f"{low} to {high}" if low < high else ""
 
 
 def _family(line: Line) -> str:
@@ -96,8 +100,9 @@ def _compared(name: str) -> Callable[[Line], Interval | None]:
 
 def _held_out_gap(line: Line) -> float:
     """NaN in practice, where draws are on all rigs."""
-    seen = line.row.record.training_values
-    return float(line.row.record.ranked_values.mean() - seen.mean()) if seen.size else math.nan
+    own = line.row.record.figures
+    seen = own.training_values
+    return float(own.ranked_values.mean() - seen.mean()) if seen.size else math.nan
 
 
 def _seeds(line: Line) -> Interval | None:
@@ -110,18 +115,16 @@ def _seeds(line: Line) -> Interval | None:
 
 
 def _stress(line: Line) -> Interval | None:
-    own = line.row.record.stress
-    if own is None:
-        return None
-    return Interval(own.tables.score, *own.tables.interval(own.tables.by_lung_and_draw))
+    own = line.row.record.figures.stressed
+    return None if own is None else Interval(own.score, *own.interval(own.by_lung_and_draw))
 
 
 def _of_stress(figure: Callable[[Any], Any], missing: Any = math.nan) -> Callable[[Line], Any]:
     """A figure of the stressed runs; ``missing`` where there are none."""
 
     def value(line: Line) -> Any:
-        own = line.row.record.stress
-        return missing if own is None else figure(own.tables)
+        own = line.row.record.figures.stressed
+        return missing if own is None else figure(own)
 
     return value
 
@@ -152,7 +155,7 @@ COLUMNS = (
     Column(
         _of_three("normalised"),
         _compared("score"),
-        "0 = best attainable, 100 = best PID of the lung; mean over the draws",
+        "0 = best attainable, 100 = best PID of the lung; mean over the draws that rank",
         title="Normalised",
         digits=1,
         terminal=("score", "95 %"),
@@ -160,23 +163,23 @@ COLUMNS = (
     Column(
         _of_three("normalised_to_pid"),
         _compared("to_baseline"),
-        "Difference of the normalised score to the PID of this track",
-        title="To the PID",
+        "Difference of the normalised score to the track's baseline, pid_best or pid_robust",
+        title="To the baseline",
         digits=1,
         sign=True,
     ),
     Column(
         _of_three("normalised_to_above"),
         _compared("to_above"),
-        "Normalised score minus that of the entry one rank above",
-        title="To the rank above",
+        "Normalised score minus that of the entry above it",
+        title="To the entry above",
         digits=1,
         sign=True,
     ),
     Column(
         _of_three("score_cmH2O", "score"),
         lambda x: x.row.error,
-        "The paper's figure: mean |pressure − target| over the draws, cmH₂O",
+        "The paper's figure: mean |pressure − target| over the draws that rank, cmH₂O",
         title="Error",
         terminal=("error",),
     ),
@@ -185,12 +188,16 @@ COLUMNS = (
         lambda x: x.row.nominal,
         "error without noise and deviations on the reference rigs, as in the paper, cmH2O",
     ),
-    Column(("worst_cmH2O",), lambda x: x.row.worst[0], "highest mean of one lung and PIP, cmH2O"),
+    Column(
+        ("worst_cmH2O",),
+        lambda x: x.row.worst[0],
+        "highest mean of one lung and PIP over all draws, cmH2O",
+    ),
     Column(("worst_lung",), lambda x: x.row.worst[1], "lung of the worst cell"),
     Column(("worst_pip",), lambda x: x.row.worst[2], "PIP of the worst cell, cmH₂O"),
     Column(
         ("exploitation_cmH2O",),
-        lambda x: x.row.record.exploitation,
+        lambda x: x.row.record.figures.exploitation,
         "how far the ensemble of simulators disagrees on this entry's pressures, cmH2O",
     ),
     Column(
@@ -212,11 +219,6 @@ COLUMNS = (
         ("derived_from",),
         lambda x: x.row.entry.source,
         "earlier entry whose commands it follows nearly everywhere",
-    ),
-    Column(
-        ("clipped_share",),
-        lambda x: x.row.record.clipped_share,
-        "share of commands outside 0 to 100 %, 0 to 1",
     ),
     Column(
         ("act_median_us",),
@@ -242,8 +244,10 @@ COLUMNS = (
         _of_stress(lambda t: int((~t.safe[1:]).sum()), None),
         "stressed runs with unsafe pressure",
     ),
-    Column(("failed_cells",), lambda x: x.row.record.header.failed_cells, "cells that failed"),
-    Column(("safe",), lambda x: all(x.row.record.header.safe), "all lungs pass the safety gate"),
+    Column(("failed_cells",), lambda x: len(x.row.record.header.failures), "cells that failed"),
+    Column(
+        ("safe",), lambda x: bool(x.row.record.figures.safe.all()), "all lungs pass the safety gate"
+    ),
     Column(("reasons",), lambda x: plain("; ".join(x.row.entry.reasons)), "why it is not ranked"),
     Column(("created",), lambda x: x.row.record.header.created, "when it was scored, UTC"),
     Column(("draws",), lambda x: x.row.record.header.draws.season, "name of the draws"),
@@ -303,8 +307,8 @@ def load_cells(folder: Path | str | None = None, *, track: str | None = None) ->
 
     Columns: ``track``, ``draws``, ``name``, ``lung``, ``pip`` (cmH2O), ``draw`` (0 is the nominal
     run, draws count from 1), ``error_cmH2O`` (mean absolute error over the scored
-    inspirations; NaN if the cell failed), ``peak_cmH2O`` (highest pressure, to 0.01) and
-    ``steps_above`` (longest time above the safety limit, control steps).
+    inspirations; NaN if the cell failed), ``peak_cmH2O`` (highest pressure) and
+    ``steps_above`` (samples above the safety limit in a breath, the most of the run).
     """
     import numpy as np
     import pandas as pd
@@ -313,7 +317,7 @@ def load_cells(folder: Path | str | None = None, *, track: str | None = None) ->
     for tracks in load_tracks(folder, track=track):
         for _, row in tracks.rows:
             record = row.record
-            errors = np.concatenate([record.nominal[None], record.drawn])
+            errors = record.figures.error
             draw, lung, pip = np.indices(errors.shape).reshape(3, -1)
             parts.append(
                 pd.DataFrame(
@@ -321,12 +325,12 @@ def load_cells(folder: Path | str | None = None, *, track: str | None = None) ->
                         "track": tracks.name,
                         "draws": record.header.draws.season,
                         "name": record.name,
-                        "lung": np.array(record.lungs)[lung],
-                        "pip": np.array(record.pips)[pip],
+                        "lung": np.array(LUNG_IDS)[lung],
+                        "pip": np.array(protocol.PIPS)[pip],
                         "draw": draw,
                         "error_cmH2O": errors.ravel(),
-                        "peak_cmH2O": record.peak.ravel(),
-                        "steps_above": record.steps_above.ravel(),
+                        "peak_cmH2O": record.figures.peak.ravel(),
+                        "steps_above": record.figures.steps_above.ravel(),
                     }
                 ),
             )
@@ -337,7 +341,7 @@ def load_tracks(folder: Path | str | None = None, *, track: str | None = None) -
     """Read and rank a leaderboard; arguments and errors as of :func:`load_board`."""
     if track is not None and track not in TRACKS:
         raise InputError(f"track {track!r} is not one of {', '.join(TRACKS)}")
-    leaderboard = store.load(path := folder_of(folder))
+    leaderboard = replay.load(path := folder_of(folder))
     if not leaderboard.records:
         raise InputError(f"{path} holds no record; add one with `ventbench board add`")
     return [tracks for tracks in ranking.board(leaderboard) if track in (None, tracks.name)]
@@ -373,8 +377,8 @@ def markdown(tracks: Sequence[Track]) -> str:
     for line in (x for x in shown if x.track.draws == shown[0].track.draws):
         track, status, row = line
         ranks = f"{row.rank}" if status == "ranked" else status
-        if row.ranks and row.ranks[0] != row.ranks[1]:
-            ranks += f" ({_ranks(line)})"
+        if several := _ranks(line):
+            ranks += f" ({several})"
         stress, score = _stress(line), row.normalised and row.normalised.score
         if track.name == "performance":
             told = [f"{row.error.value:.3f}" if row.error else ""]
@@ -410,14 +414,14 @@ def _values(line: Line) -> dict[str, Any]:
 
 def _by_lung(record: Record) -> dict[str, float]:
     figures = {
-        "score_{}_cmH2O": record.drawn.mean(axis=(0, 2)),
-        "nominal_{}_cmH2O": record.nominal.mean(axis=1),
-        "normalised_{}": record.ranked_values.mean(axis=1),
+        "score_{}_cmH2O": record.figures.drawn.mean(axis=(0, 2)),
+        "nominal_{}_cmH2O": record.figures.nominal.mean(axis=1),
+        "normalised_{}": record.figures.ranked_values.mean(axis=1),
     }
     return {
         name.format(lung): float(values[i])
         for name, values in figures.items()
-        for i, lung in enumerate(record.lungs)
+        for i, lung in enumerate(LUNG_IDS)
     }
 
 

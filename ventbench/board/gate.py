@@ -24,7 +24,7 @@ submission; see ``ci/propose.py``.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -38,6 +38,7 @@ from ventbench.board import canonical, schema
 from ventbench.board.canonical import ATTESTATIONS, RECORDS, SIGNATURE_SUFFIX
 from ventbench.board.record import HardwareRecord, Record
 from ventbench.board.rounds import Round
+from ventbench.task.lungs import LUNG_IDS
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -93,21 +94,20 @@ def unfit(record: Record, evidence: Evidence) -> tuple[str, ...]:
     why = []
     if record.sha256 in evidence.withdrawn:
         why.append(f"withdrawn: {evidence.withdrawn[record.sha256]}")
-    failed = record.header.failed_cells
+    failed = len(record.header.failures)
     if failed:
-        cells = record.nominal.size + record.drawn.size
+        cells = record.figures.error.size
         first = record.header.failures[0].message.removesuffix("; the entry is not ranked.")
         cut = first if len(first) <= MAX_QUOTED else f"{first[:MAX_QUOTED]}…"
         why.append(f"{failed} of {cells} cells failed, the first: {cut}")
-    return (*why, *_unsafe(record.lungs, record.header.safe))
+    return (*why, *_unsafe(LUNG_IDS, record.figures.safe))
 
 
 def stressed(record: Record, evidence: Evidence) -> tuple[str, ...]:
     """Why a record has no rank under missing physics; empty if it has one."""
-    if record.stress is None:
-        return ("it did not run under missing physics",)
-    why = simulated(record, evidence)
-    return why if record.stress.tables.complete else (*why, "not all conditions were run")
+    if record.figures.stressed is None:
+        return ("it did not run under missing physics, or its commands there are not at hand",)
+    return simulated(record, evidence)
 
 
 def measured(record: HardwareRecord, evidence: Evidence) -> tuple[str, ...]:
@@ -128,7 +128,7 @@ def measured(record: HardwareRecord, evidence: Evidence) -> tuple[str, ...]:
     return (*why, *_unsafe(record.header.lungs, record.header.safe))
 
 
-def _unsafe(lungs: Sequence[str], safe: Sequence[bool]) -> list[str]:
+def _unsafe(lungs: Sequence[str], safe: Iterable[bool]) -> list[str]:
     unsafe = [lung for lung, passed in zip(lungs, safe, strict=True) if not passed]
     return [f"did not pass the safety gate on {', '.join(unsafe)}"] if unsafe else []
 

@@ -11,12 +11,12 @@ of the stress track. No file of an earlier run is trusted; several processes can
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,8 +31,8 @@ from ventbench.base.executor import executor, results
 from ventbench.base.resume import WorkFolder, kept_results
 from ventbench.board import canonical, create, gate, rounds, schema, store
 from ventbench.board.canonical import RECORDS
-from ventbench.board.record import Record, RecordStress
-from ventbench.board.replay import ReplayPlants, draws_of, worst
+from ventbench.board.record import Record
+from ventbench.board.replay import Load, ReplayPlants, protocol_of, require_replay
 from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
 from ventbench.entries import reference as references
 from ventbench.entries.cells import Runner
@@ -45,26 +45,18 @@ from ventbench.entries.folder import (
 )
 from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
-from ventbench.entries.runs import DRAWS, Runs
+from ventbench.entries.runs import DRAWS
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
-from ventbench.task import attainable, protocol, stressors
-
-#: Gives the simulators; outside of this process, a function of a module.
-Load = Callable[[], ReplayPlants]
+from ventbench.task import attainable, environment, protocol
 
 #: What a second run can show.
 REPRODUCED, DIFFERENT, NOT_RERUN = "reproduced", "different", "not re-run"
 
-#: Most that a command up to 100 % may differ from the recorded one, %; larger requests by the same
-#: share. Another processor, or simulators whose
-#: sums run in another order, move the last bit of a pressure; a controller in single precision
-#: makes up to 1e-5 % of that, and feedback some more. No score shows a thousandth of a percent.
-COMMAND_TOLERANCE = 1e-3
-
-#: Most that the error of a stress run may differ, cmH2O, where commands are not equal to the bit.
-STRESS_TOLERANCE = 1e-3
+#: Most that a command may differ from the recorded one, %: one step and rounding. Another
+#: processor, or sums in another order, move the last bit of a pressure, and of a request.
+COMMAND_TOLERANCE = 1.5 * protocol.RESOLUTION
 
 #: Most folders of submissions that are looked through in one place.
 MAX_FOLDERS = 5000
@@ -191,50 +183,37 @@ def _run(
     assert isinstance(score, Record)
     simulators, apart = load(), runner()
     try:
-        stress = 0 if score.stress is None else score.stress.tables.pips.shape[1]
-        known = store.load(folder).evidence.rounds
+        own = store.load(folder).evidence.rounds.get(score.header.draws.season)
+        what = protocol_of(score.header, simulators, own)
         with TemporaryDirectory() as place:
             result = run_protocol(
                 frozen_copy(code, score.header.submission.sha256, Path(place)),
-                rigs_of(simulators),
+                what.rigs,
                 track=score.track,
-                stress=stress,
+                stress=0 if score.header.stress is None else DRAWS,
                 runner=apart,
-                drawn=draws_of(score.header, simulators, known),
+                drawn=what.drawn,
             )
-        recorded = store.load_commands(score, folder / RECORDS)
-        detail = difference(score, recorded, result.requested)
-        closeness = _closeness(recorded, result.requested)
-        failed = {(x.lung, x.pip, x.draw) for x in result.failures}
-        if not detail and failed != {(x.lung, x.pip, x.draw) for x in score.header.failures}:
-            detail = f"{len(failed)} cells failed, {score.header.failed_cells} in the record"
-        if not detail and score.stress is not None and result.stressed is not None:
-            detail = stress_difference(score.stress, result.stressed)
-            same = create.stress_digest(result.stressed) == score.stress.commands_sha256
-            closeness += f", stress {'to the bit' if same else 'within tolerance'}"
+        runs = [(result.requested, result.failures, score.header.failures)]
+        if (stress := score.header.stress) is not None and result.stressed is not None:
+            again = result.stressed
+            runs.append((np.asarray(again.requested), tuple(again.failures), stress.failures))
+        detail, closest = "", []
+        for commands, (asked, failures, named) in zip(score.commands, runs, strict=True):
+            recorded = store.load_commands(commands, folder / RECORDS)
+            again = environment.resolved(asked)
+            detail = detail or difference(recorded, again)
+            closest.append(_closeness(recorded, again))
+            failed, before = (
+                {(x.condition, x.lung, x.pip, x.draw) for x in y} for y in (failures, named)
+            )
+            if not detail and failed != before:
+                detail = f"{len(failed)} cells failed, {len(before)} in the record"
+        closeness = ", under stress ".join(closest)
     except (InputError, FloatingPointError) as error:
         detail, closeness = f"its code cannot be run: {error}", ""
     state = DIFFERENT if detail else REPRODUCED
     return Outcome(score.sha256, score.name, score.track, state, detail or closeness)
-
-
-def stress_difference(recorded: RecordStress, again: Runs) -> str:
-    """Describe how runs of the stress track differ from the recorded ones; empty if they do not."""
-    if recorded.stressors != stressors.VERSION:
-        return f"stress: its stressors are version {recorded.stressors}, not {stressors.VERSION}"
-    tables = recorded.tables
-    pairs = (
-        ("errors", tables.error, again.error, STRESS_TOLERANCE),
-        ("safe", tables.safe, again.safe, 0.0),
-        ("survived", tables.survived, again.survived, 0.0),
-        ("above_alarm_ms", tables.alarm_s, again.alarm_s, 1e-3),
-        ("peak_centi_cmH2O", tables.peak, again.peak, 0.011),
-        ("volume_mL", tables.volume, again.volume, 1.0),
-    )
-    # A failed run has no error; -1 stands for it on both sides.
-    known = partial(np.nan_to_num, nan=-1.0)
-    checks = [(f"stress.{key}", known(old), known(new), off) for key, old, new, off in pairs]
-    return "; ".join(worst(checks, "the second run's commands"))
 
 
 def _closeness(recorded: Floats, again: Floats) -> str:
@@ -246,29 +225,24 @@ def _closeness(recorded: Floats, again: Floats) -> str:
     return f"commands within {np.abs(recorded - again).max():.1e} %"
 
 
-def difference(score: Record, recorded: Floats, again: Floats) -> str:
-    """Describe how commands ``(L, 1 + K, P, BREATHS, STEPS)`` differ; empty if they agree.
+def difference(recorded: Floats, again: Floats) -> str:
+    """Describe how commands ``(..., BREATHS, STEPS)`` differ; empty if they agree.
 
-    They agree within `COMMAND_TOLERANCE`, of which a processor's last bits are a small part.
+    They agree within `COMMAND_TOLERANCE`: a processor's last bits may move one by a step.
     """
     if recorded.shape != again.shape:
         return f"commands of shape {again.shape}, {recorded.shape} in the record"
     # Not `>`: whatever is no number is apart, too.
-    allowed = COMMAND_TOLERANCE * np.maximum(1.0, np.abs(recorded) / 100.0)
-    apart = ~(np.abs(recorded - again) <= allowed)
+    apart = ~(np.abs(recorded - again) <= COMMAND_TOLERANCE)
     if not apart.any():
         return ""
-    lung, draw, pip, breath, step = np.argwhere(apart)[0]
+    first = tuple(np.argwhere(apart)[0].tolist())
     cells = int(apart.any(axis=(-2, -1)).sum())
-    run = f"draw {draw}" if draw else "nominal"
-    where = (
-        f"{score.lungs[lung]}, PIP {score.pips[pip]:g}, {run}, breath {breath + 1}, step {step + 1}"
-    )
-    first = lung, draw, pip, breath, step
     return (
         f"commands differ in {cells} of {apart[..., 0, 0].size} cells, by up to "
-        f"{np.abs(recorded - again).max():.3g} %; first in {where}: {recorded[first]:.12g} % in "
-        f"the record, {again[first]:.12g} % now"
+        f"{np.abs(recorded - again).max():.3g} %; first in cell {first[:-2]}, breath "
+        f"{first[-2] + 1}, step {first[-1] + 1}: {recorded[first]:.12g} % in the record, "
+        f"{again[first]:.12g} % now"
     )
 
 
@@ -413,7 +387,7 @@ def score(
                 path = Path(outcome["record"])
                 kept = leaderboard / canonical.RECORDS / path.name
                 if not kept.exists():
-                    store.add(leaderboard, path, simulators)
+                    store.add(leaderboard, path, functools.partial(require_replay, simulators))
                 if secret:
                     gate.sign(leaderboard, kept, secret)
                 records[key] = path.stem

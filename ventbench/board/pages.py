@@ -27,6 +27,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.text import number, page_templates, plain
 from ventbench.board.ranking import HardwareRow, Interval, Row, StressRow
 from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
 
 if TYPE_CHECKING:
@@ -307,9 +308,7 @@ def interval_plot(row: Row, low: float, high: float) -> dict[str, str] | None:
     return {"x": f"{left:.1f}", "width": f"{max(right - left, 1.0):.1f}", "dot": f"{dot:.1f}"}
 
 
-def heat_map(
-    values: Floats, record: Record, limits: tuple[float, ...], digits: int = 2
-) -> list[dict[str, Any]]:
+def heat_map(values: Floats, limits: tuple[float, ...], digits: int = 2) -> list[dict[str, Any]]:
     """Rows of a map of means over draws of values ``(1 + K, L, P)``; the first ones stand beside.
 
     Shades change at the limits.
@@ -328,7 +327,7 @@ def heat_map(
             ],
             "mean": number(float(means[i].mean()), digits),
         }
-        for i, lung in enumerate(record.lungs)
+        for i, lung in enumerate(LUNG_IDS)
     ]
 
 
@@ -380,10 +379,10 @@ def panels(
 
 def paths(record: Record) -> list[list[tuple[str, str]]]:
     """Paths of pressure and command of each lung and PIP."""
-    valves = np.rint(VALVE_BOTTOM - VALVE_HEIGHT * record.u_in / protocol.U_MAX).astype(int)
+    valves = np.rint(VALVE_BOTTOM - VALVE_HEIGHT * record.figures.u_in / protocol.U_MAX).astype(int)
     columns = []
-    for j, pip in enumerate(record.pips):
-        heights = np.rint(_y(record.pressure[:, j], pip)).astype(int)
+    for j, pip in enumerate(protocol.PIPS):
+        heights = np.rint(_y(record.figures.pressure[:, j], pip)).astype(int)
         moves = np.diff(heights, axis=-1)
         rows = zip(heights[:, 0].tolist(), moves.tolist(), valves[:, j].tolist(), strict=True)
         columns.append(

@@ -18,17 +18,18 @@ from typing import Any
 import numpy as np
 
 from ventbench.base.arrays import Floats, Ints
-from ventbench.board import comparison, gate
+from ventbench.board import comparison, gate, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.comparison import CMH2O, POINTS, Ranks
 from ventbench.board.gate import Evidence
 from ventbench.board.record import HardwareRecord, Record
 from ventbench.board.rounds import Round
-from ventbench.board.store import Store, load_commands
+from ventbench.board.store import Store
 from ventbench.entries.manifest import TRACKS
 from ventbench.entries.runs import Runs
 from ventbench.task import protocol
 from ventbench.task.draws import DEVELOPMENT
+from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import bootstrap
 
 #: The PID that each track's entries are compared with.
@@ -186,7 +187,7 @@ def board(leaderboard: Store) -> tuple[Track, ...]:
     """Rank all records: both tracks of every round, the newest first, and practice last."""
     evidence = leaderboard.evidence
     grouped: dict[tuple[str, str], dict[str, list[Record]]] = defaultdict(dict)
-    for record in leaderboard.scores:
+    for record in (x for x in leaderboard.scores if x.derived):
         drawn = record.header.draws.season
         own = grouped[drawn if drawn in evidence.rounds else DEVELOPMENT, record.track]
         own.setdefault(record.name, []).insert(0, record)
@@ -272,9 +273,9 @@ def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:
 
 def _commands(leaderboard: Store, record: Record) -> Floats:
     """Drawn commands of the last scored breath as applied, %, shape ``(runs, steps)``."""
-    requested = load_commands(record, leaderboard.folder / RECORDS)
-    last = requested[:, 1:, :, max(protocol.SCORED_BREATHS)]
-    return np.clip(last, 0.0, protocol.U_MAX).reshape(-1, last.shape[-1])
+    commands = store.load_commands(record.header.commands, leaderboard.folder / RECORDS)
+    last = commands[:, 1:, :, max(protocol.SCORED_BREATHS)]
+    return last.reshape(-1, last.shape[-1])
 
 
 def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Row]:
@@ -283,11 +284,11 @@ def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Ro
     Best first, those of equal score by name; without ``ranks`` the order is only practice.
     """
     ordered = sorted(entries, key=lambda e: e.record.name)
-    ordered.sort(key=lambda e: round(float(np.mean(e.record.ranked_values)), DECIMALS))
+    ordered.sort(key=lambda e: round(float(np.mean(e.record.figures.ranked_values)), DECIMALS))
     if not ordered:
         return []
     records = [entry.record for entry in ordered]
-    made = ranks_of(ordered, [record.ranked_values for record in records])
+    made = ranks_of(ordered, [record.figures.ranked_values for record in records])
     compared = _comparisons(records, _baseline(records, track))
     rows = []
     for i, entry in enumerate(ordered):
@@ -299,8 +300,8 @@ def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Ro
 
 def ranks_of(entries: Sequence[Entry], values: Sequence[Floats]) -> Ranks:
     """Ranks of entries by their errors of the ranked draws, ``(L, k)``; less is better."""
-    rigs = entries[0].record.headroom
-    return _ranks(entries, values, rigs.session[:, rigs.ranked], POINTS)
+    own = entries[0].record.figures
+    return _ranks(entries, values, own.rig[:, own.ranked], POINTS)
 
 
 def _ranks(entries: Sequence[Entry], values: Sequence[Floats], rig: Ints, matters: float) -> Ranks:
@@ -314,15 +315,15 @@ def _row(
 ) -> Row:
     record, error = entry.record, None
     if compared is not None:
-        values = record.drawn[record.headroom.ranked].mean(axis=2).T
+        values = record.figures.drawn[record.figures.ranked].mean(axis=2).T
         error = _interval(values, _resampled(record, values))
-    nominal = float(record.nominal.mean())
+    nominal = float(record.figures.nominal.mean())
     return Row(entry, rank, ranks, compared, error, nominal, worst(record))
 
 
 def _comparisons(records: Sequence[Record], base: int | None) -> list[Comparison]:
     """Compare entries in the order of their ranks."""
-    values = [record.ranked_values for record in records]
+    values = [record.figures.ranked_values for record in records]
     means = [_resampled(*pair) for pair in zip(records, values, strict=True)]
     compared = []
     for i, own in enumerate(values):
@@ -339,7 +340,7 @@ def _unranked_rows(entries: Sequence[Entry]) -> list[Row]:
     """Rows of entries that are not ranked, by name; scores where they exist."""
     rows = []
     for entry in sorted(entries, key=lambda e: e.record.name):
-        whole = np.isfinite(entry.record.by_draw).all()
+        whole = np.isfinite(entry.record.figures.drawn).all()
         rows.append(
             _row(entry, None, None, _comparisons([entry.record], None)[0] if whole else None)
         )
@@ -354,17 +355,17 @@ def _baseline(records: Sequence[Record], track: str) -> int | None:
 
 def worst(record: Record) -> tuple[float, str, float]:
     """Highest mean over draws of one cell, cmH2O, with its lung and PIP; NaN if any failed."""
-    cells = record.drawn.mean(axis=0)
+    cells = record.figures.drawn.mean(axis=0)
     if not np.isfinite(cells).all():
         return np.nan, "", np.nan
     i, j = np.unravel_index(np.argmax(cells), cells.shape)
-    return float(cells[i, j]), record.lungs[i], record.pips[j]
+    return float(cells[i, j]), LUNG_IDS[i], protocol.PIPS[j]
 
 
 def _resampled(record: Record, values: Floats) -> Floats:
     """Resampled means of values of shape ``(L, k)``: the same ranked draws for every record."""
-    rigs, some = record.headroom, record.headroom.ranked
-    return bootstrap.resampled_scores(values, rigs.session[:, some], rigs.member[:, some])
+    own, some = record.figures, record.figures.ranked
+    return bootstrap.resampled_scores(values, own.rig[:, some], own.member[:, some])
 
 
 def _interval(values: Floats, means: Floats) -> Interval:
@@ -373,10 +374,8 @@ def _interval(values: Floats, means: Floats) -> Interval:
 
 def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:
     """Entries that ran under the newest table of stressors, best first; others are left out."""
-    ran = [(row, own) for row in rows if (own := row.record.stress) is not None]
-    newest = max((own.stressors for _, own in ran), default=0)
-    current = [(row, own.tables) for row, own in ran if own.stressors == newest]
-    alike = [StressRow(row, own) for row, own in current if own.comparable(current[0][1])]
+    ran = [(row, own) for row in rows if (own := row.record.figures.stressed) is not None]
+    alike = [StressRow(row, own) for row, own in ran]
     whole = [row for row in alike if math.isfinite(row.tables.score)]
     if not whole:
         return alike
@@ -422,11 +421,9 @@ def _nominal(record: HardwareRecord, row: Row | None) -> float:
     if row is None:
         return math.nan
     simulated, header = row.record, record.header
-    if not (set(header.lungs) <= set(simulated.lungs) and set(header.pips) <= set(simulated.pips)):
-        return math.nan
-    lungs = [simulated.lungs.index(lung) for lung in header.lungs]
-    pips = [simulated.pips.index(pip) for pip in header.pips]
-    return float(simulated.nominal[np.ix_(lungs, pips)].mean())
+    lungs = [LUNG_IDS.index(lung) for lung in header.lungs]
+    pips = [protocol.PIPS.index(pip) for pip in header.pips]
+    return float(simulated.figures.nominal[np.ix_(lungs, pips)].mean())
 
 
 def _hardware_rank(row: HardwareRow, all_rows: Sequence[HardwareRow]) -> HardwareRow:

@@ -18,15 +18,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
-from ventbench.entries.runs import Runs
-from ventbench.task import draws, protocol
+from ventbench.board.figures import Figures
+from ventbench.task import protocol
 from ventbench.task.metrics import measured
-from ventbench.task.metrics.score import normalised
-from ventbench.task.stressors import VERSION as STRESSORS_VERSION
-from ventbench.task.stressors import condition_of
 
 #: What the key ``track`` says of every such record.
 TRACK = "hardware"
@@ -48,59 +45,19 @@ SUFFIX = canonical.RECORD_SUFFIX
 
 
 @dataclass(frozen=True)
-class RecordHeadroom:
-    """Rigs of the draws, and the errors that the score is relative to; L lungs, P PIPs, K draws."""
-
-    session: Ints  #: rig of each draw, shape ``(L, K)``.
-    member: Ints  #: member of the ensemble, shape ``(L, K)``.
-    #: error without the first step, nominal runs first, cmH2O, shape ``(1 + K, L, P)``; NaN where a
-    #: controller failed.
-    error: Floats
-    attainable: Floats  #: best attainable error, cmH2O, of that shape.
-    pid: Floats  #: error of the lung's best PID, cmH2O, of that shape.
-
-    @property
-    def ranked(self) -> Bools:
-        """Whether each draw is on rigs that nobody trained on, shape ``(K,)``."""
-        return draws.ranked(self.session)
-
-    @cached_property
-    def normalised(self) -> Floats:
-        """Normalised score of each run, nominal runs first, shape ``(1 + K, L, P)``."""
-        return normalised(self.error, self.attainable, self.pid)
-
-
-@dataclass(frozen=True)
-class RecordStress:
-    """Runs under missing physics, as a record has them."""
-
-    stressors: int  #: version of the table of stressors.
-    tables: Runs  #: figures of all runs; volumes to 1 mL, times to 1 ms.
-    commands_sha256: str  #: of all commands.
-
-
-@dataclass(frozen=True)
 class Record(schema.Submitted):
-    """A record's content, checked; L lungs, P PIPs, K draws."""
+    """A record's content, checked, and the figures that follow from it once they are derived."""
 
     sha256: str  #: of its bytes: its name.
-    header: schema.ScoreHeader  #: everything but the tables that are arrays here.
-    #: error of the nominal runs, cmH2O, shape ``(L, P)``; NaN where a controller failed.
-    nominal: Floats
-    #: error of the drawn runs, cmH2O, shape ``(K, L, P)``; NaN where a controller failed.
-    drawn: Floats
-    #: disagreement of the ensemble, cmH2O, shape ``(L, P)``; NaN where a controller failed.
-    spread: Floats
-    breath: int  #: the breath that the page shows, counted from 1.
-    pressure: Floats  #: nominal inspirations of that breath, cmH2O, to 0.01, shape ``(L, P, S)``.
-    u_in: Floats  #: commands of that breath as applied, %, to 0.1, shape ``(L, P, S)``.
-    #: highest pressure of each run, nominal runs first, cmH2O, to 0.01, shape ``(1 + K, L, P)``.
-    peak: Floats
-    #: longest time above the safety limit of each run, steps, shape ``(1 + K, L, P)``.
-    steps_above: Ints
-    headroom: RecordHeadroom  #: rigs, and what the score is relative to.
-    #: runs under missing physics, on the robustness track; None without.
-    stress: RecordStress | None = None
+    header: schema.ScoreContent  #: its content.
+    derived: Figures | None = None  #: see :func:`ventbench.board.replay.with_figures`.
+
+    @property
+    def figures(self) -> Figures:
+        """What its commands give; InputError where nobody has replayed them."""
+        if self.derived is None:
+            raise InputError(f"record {self.sha256[:12]} ({self.name}) was not replayed")
+        return self.derived
 
     @property
     def track(self) -> str:
@@ -113,60 +70,24 @@ class Record(schema.Submitted):
         return self.header.official
 
     @property
+    def commands(self) -> tuple[schema.Commands, ...]:
+        """Its files of commands; those under missing physics last."""
+        stress = self.header.stress
+        return (self.header.commands, *(() if stress is None else (stress.commands,)))
+
+    @property
     def key(self) -> tuple[str, str, str]:
         """Draws, track and name: what one entry of the board is known by."""
         return self.header.draws.season, self.track, self.name
 
     @property
-    def lungs(self) -> list[str]:
-        """Lung ids."""
-        return self.header.lungs
-
-    @property
-    def pips(self) -> list[float]:
-        """Nominal PIPs, cmH2O."""
-        return self.header.pips
-
-    @cached_property
-    def by_draw(self) -> Floats:
-        """Score of each draw, cmH2O, shape ``(K,)``; NaN if any of its cells failed."""
-        return self.drawn.mean(axis=(1, 2))
-
-    @cached_property
-    def exploitation(self) -> float:
-        """Exploitation index, cmH2O: mean of the ensemble's spread over all cells; or NaN."""
-        return float(self.spread.mean())
-
-    @cached_property
-    def clipped_share(self) -> float:
-        """Share of all commands that were outside 0 to 100 %."""
-        clipped = self.header.clipped
-        return float(sum(clipped.below) + sum(clipped.above)) / max(1, clipped.commands)
-
-    @property
-    def basis(self) -> tuple[str, str, str]:
-        """What its scores depend on besides commands: simulators, draws, reference errors.
-
-        Canonical text of the first two; a hash of the third.
-        """
-        about = (self.header.simulators, self.header.draws.about())
-        simulators, draws = (canonical.canonical(value).decode() for value in about)
-        tables = np.stack([self.headroom.attainable, self.headroom.pid])
-        return simulators, draws, canonical.digest(tables.tobytes())
-
-    @cached_property
-    def ranked_values(self) -> Floats:
-        """What ranks: mean normalised score of each lung and ranked draw, shape ``(L, k)``."""
-        return self._by_draw[:, self.headroom.ranked]
-
-    @cached_property
-    def training_values(self) -> Floats:
-        """The same of the draws on rigs of the training, to compare."""
-        return self._by_draw[:, ~self.headroom.ranked]
-
-    @property
-    def _by_draw(self) -> Floats:
-        return self.headroom.normalised[1:].mean(axis=2).T
+    def basis(self) -> tuple[str, str]:
+        """Simulators and draws, which its figures depend on besides commands, as canonical text."""
+        simulators, draws = (
+            canonical.canonical(value).decode()
+            for value in (self.header.simulators, self.header.draws.about())
+        )
+        return simulators, draws
 
 
 class Device(schema.Table, frozen=True):
@@ -313,60 +234,7 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
     if isinstance(values, HardwareContent):
         return _checked(values, sha256, label)
     assert isinstance(values, schema.ScoreContent)
-    size = len(values.lungs), len(values.pips)
-    return Record(
-        sha256,
-        values.header(),
-        nominal=np.array(values.errors.nominal, float),
-        drawn=np.array(values.errors.drawn, float).reshape(values.draws.count, *size),
-        spread=np.array(values.spread, float),
-        breath=values.trace.breath,
-        pressure=np.array(values.trace.pressure_centi_cmH2O) / 100.0,
-        u_in=np.array(values.trace.u_in_tenths_percent) / 10.0,
-        peak=np.array(values.safety.peak_centi_cmH2O) / 100.0,
-        steps_above=np.array(values.safety.steps_above),
-        headroom=RecordHeadroom(
-            np.array(values.rigs.session),
-            np.array(values.rigs.member),
-            np.array(values.headroom.error, float),
-            np.array(values.headroom.attainable, float),
-            np.array(values.headroom.pid, float),
-        ),
-        stress=_stress(values, label),
-    )
-
-
-def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
-    own = values.stress
-    if own is None:
-        return None
-    chosen = tuple(condition_of(name, f"{label}, key stress.conditions") for name in own.conditions)
-    if chosen[0].stressors or len(set(chosen)) < len(chosen):
-        raise InputError(
-            f"{label}, key stress.conditions: must begin with none and name each condition once"
-        )
-    ranked = np.flatnonzero(draws.ranked(np.array(values.rigs.session)))[: len(own.pips[0])]
-    tables = Runs(
-        conditions=chosen,
-        lungs=tuple(values.lungs),
-        pips=np.array(own.pips, float),
-        rig=np.array(values.rigs.session)[:, ranked],
-        member=np.array(values.rigs.member)[:, ranked],
-        error=np.array(own.errors, float),
-        safe=np.array(own.safe, bool),
-        survived=np.array(own.survived, bool),
-        alarm_s=np.array(own.above_alarm_ms) / 1e3,
-        peak=np.array(own.peak_centi_cmH2O) / 100.0,
-        volume=np.array(own.volume_mL, float),
-        draw=np.arange(1, len(ranked) + 1),
-    )
-    if own.stressors == STRESSORS_VERSION and not tables.complete:
-        raise InputError(
-            f"{label}, key stress: does not have all conditions and draws of the stress track"
-        )
-    if np.any(tables.survived & ~(tables.safe & np.isfinite(tables.error))):
-        raise InputError(f"{label}, key stress.survived: a run that was not safe has survived")
-    return RecordStress(own.stressors, tables, own.commands_sha256)
+    return Record(sha256, values)
 
 
 def load(path: Path, *, strict: bool = True) -> AnyRecord:

@@ -1,58 +1,57 @@
 """Recorded commands through the frozen simulators again: no code of a submission is needed.
 
-All cells of several records advance together. Numbers agree with those of the scorer to 1e-9;
-matrix products of another batch size may round differently.
+Commands are whole numbers of the valve's step, so that every machine replays the same runs; what
+follows from them, :class:`~ventbench.board.figures.Figures`, is computed by the code that scores.
+Figures of records that were replayed before are kept in the user's cache, by the hash of all that
+they follow from; a verification never reads it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import contextlib
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
-from ventbench.base import compilation
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base import compilation, files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.board import canonical, store
+from ventbench.board.canonical import RECORDS
+from ventbench.board.figures import Figures
 from ventbench.board.record import Record
 from ventbench.board.rounds import Round
-from ventbench.board.schema import ScoreHeader
-from ventbench.entries.cells import as_float64
+from ventbench.board.schema import RecordedFailure, ScoreContent
+from ventbench.board.store import Store
+from ventbench.entries import cells as scored
+from ventbench.entries.cells import Cells, ProtocolRun, as_float64
+from ventbench.entries.reference import published, reference_of
+from ventbench.entries.runs import DRAWS, Runs
+from ventbench.entries.scoring import runs_of
+from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
-from ventbench.task import protocol, rollouts
+from ventbench.task import environment, protocol, rollouts, stressors
 from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Plant
-from ventbench.task.metrics.score import (
-    controllable_error,
-    longest_run,
-    passes_safety_gate,
-    run_error,
-    safety_limit,
-)
-from ventbench.task.rollouts import Script
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.metrics.score import controllable_error, safety_limit
 
-#: The breath whose nominal inspirations are kept for the page.
+#: The breath whose nominal inspirations pages show.
 TRACE_BREATH = max(protocol.SCORED_BREATHS)
 
-#: Records replayed together; the last ones are padded, so that one compilation does for all.
-BATCH = 4
-
-#: How far a replayed number may be off, cmH2O; matrix products round differently elsewhere.
+#: How far a replayed number may be from the scorer's, cmH2O: matrix products of another batch size
+#: round differently.
 TOLERANCE = 1e-9
-
-#: How far the mean over the cells of a draw may be off, cmH2O. Rounding differs from cell to cell
-#: (1e-14 on the machines tried); only a hand that lowers all cells moves their mean.
-MEAN_TOLERANCE = 1e-11
-
-# What is rounded to 0.01 cmH2O or 0.1 %: half of that, and a little for ties.
-_CENTI, _TENTH = 0.005 + 1e-6, 0.05 + 1e-6
 
 
 class ReplayPlants(Protocol):
@@ -71,63 +70,68 @@ class ReplayPlants(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Replayed:
-    """What the commands of one record give; L lungs, P PIPs, K draws."""
+#: Loads the frozen simulators.
+Load = Callable[[], ReplayPlants]
 
-    nominal: Floats  #: error of the nominal runs, cmH2O, shape ``(L, P)``.
-    drawn: Floats  #: error of the drawn runs, cmH2O, shape ``(K, L, P)``.
-    safe: Bools  #: whether all runs of a lung pass the safety gate, shape ``(L,)``.
-    #: highest pressure of each run, nominal ones first, cmH2O, shape ``(1 + K, L, P)``.
-    peak: Floats
-    #: longest time above the safety limit of each run, steps, shape ``(1 + K, L, P)``.
-    steps_above: Ints
-    below: Ints  #: how many commands were below 0 %, nominal and drawn, shape ``(L,)``.
-    above: Ints  #: how many commands were above 100 %, nominal and drawn, shape ``(L,)``.
-    spread: Floats  #: see :func:`spread`, cmH2O, shape ``(L, P)``.
-    pressure: Floats  #: nominal inspiration of :data:`TRACE_BREATH`, cmH2O, shape ``(L, P, S)``.
-    u_in: Floats  #: commands of that inspiration as applied, %, shape ``(L, P, S)``.
-    first: Floats  #: first command of each run, %, shape ``(1 + K, L, P)``.
-    controllable: Floats  #: error without the first step, cmH2O, shape ``(1 + K, L, P)``.
-    session: Ints  #: rig of each draw, shape ``(L, K)``.
-    member: Ints  #: member of the ensemble, shape ``(L, K)``.
+#: What was derived before, by hashes of all that it follows from.
+Kept = dict[Any, Any]
 
 
 @jax.jit
-def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
-    """Airway pressures of breaths for commands ``(N, L, ..., B, S)``; cells ``(L, ...)``."""
+def _breath(plants: Plant, scenario: Scenario, commands: Array, breath: Array) -> Any:
+    """Both phases of one breath, steps last, for commands ``(L, ..., S)``; cells ``(L, ...)``."""
 
-    def run(commands: Array, plant: Plant, cells: Scenario) -> Array:
-        script = Script(commands.reshape(*commands.shape[:-2], -1))
-        phases = rollouts.closed_loop(plant, script, cells, whole=True)
-        return jnp.concatenate([phase.pressure for phase in phases], axis=-1)
+    def run(plant: Plant, cells: Scenario, commands: Array) -> Any:
+        varied = environment.vary(plant, cells, breath)
+        inputs = jnp.moveaxis(commands, -1, 0)
+        loop, _, inspired = rollouts.inspiration(
+            varied, cells, rollouts.commanded, breath=breath, inputs=inputs
+        )
+        phases = inspired, rollouts.expiration(varied, cells, loop)[1]
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), phases)
 
-    return jax.vmap(jax.vmap(run), (0, None, None))(requested, plants, cells)
+    return jax.vmap(run)(plants, scenario, commands)
 
 
-_members = jax.jit(jax.vmap(_pressures, in_axes=(0, None, None)))
+def _breaths(plants: Sequence[Plant], scenario: Scenario, commands: Floats) -> Any:
+    """Both phases of all breaths, with the plants of each, for commands ``(L, ..., B, S)``."""
+    breaths = [
+        jax.tree.map(np.asarray, _breath(plant, scenario, jnp.asarray(commands[..., k, :]), k))
+        for k, plant in enumerate(plants)
+    ]
+    return jax.tree.map(lambda *x: np.stack(x, axis=-2), *breaths)
 
 
-def pressures(
-    simulators: ReplayPlants,
-    pips: Sequence[float],
-    requested: Floats,
-    draws: Draws | None,
-) -> Floats:
-    """Airway pressures that commands of L lungs give, cmH2O, ``(N, L, 1 + K, P, BREATHS, steps)``.
-
-    Whole breaths of ``BREATH_STEPS`` steps.
-
-    Args:
-        simulators: L lungs.
-        pips: cmH2O, length P.
-        requested: %, shape ``(N, L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``, nominal cells first.
-        draws: K of them; None for nominal cells alone.
-    """
+def run_of(cells: Cells, commands: Floats) -> ProtocolRun:
+    """What commands, %, ``(S, L, n, P, BREATHS, INSPIRATION_STEPS)``, give on cells."""
+    lungs, conditions = len(cells.lungs), len(cells.conditions)
+    parts = []
     with compilation.float64():
-        plants, cells = rigs_of(simulators).cells(draws, pips)
-        plants = as_float64(plants, requested.shape[1])
-        return np.asarray(_pressures(plants, cells, jnp.asarray(requested)))
+        if conditions == 1:
+            plants = [as_float64(cells.plants, lungs)] * protocol.BREATHS
+            found = _breaths(plants, cells.scenario, commands[0])
+            parts = [jax.tree.map(lambda x: x[None], found)]
+        else:
+            for draw in range(len(cells.draw)):
+                plants, scenario = cells.stressed(draw)
+                each = [
+                    jax.tree.map(lambda x, k=k: x[:, k], plants) for k in range(protocol.BREATHS)
+                ]
+                own = commands[:, :, draw, 0].reshape(conditions * lungs, *commands.shape[4:])
+                found = _breaths(each, scenario, own)
+                parts.append(
+                    jax.tree.map(lambda x: x.reshape(conditions, lungs, 1, 1, *x.shape[1:]), found)
+                )
+    inspired, expired = jax.tree.map(lambda *x: np.concatenate(x, axis=2), *parts)
+    return ProtocolRun(
+        inspired.pressure,
+        inspired.requested,
+        inspired.u_in,
+        expired.pressure,
+        inspired.volume,
+        {},
+        np.zeros(0),
+    )
 
 
 def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
@@ -137,183 +141,327 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
     over the scored inspiratory steps. An entry that lives on errors of one simulator shows a large
     one; its mean over all cells is the exploitation index.
 
-    Of nominal commands, %, ``(N, L, P, BREATHS, INSPIRATION_STEPS)``: cmH2O, ``(N, L, P)``; NaN for
-    fewer than two members.
+    Of nominal commands, %, ``(L, P, BREATHS, INSPIRATION_STEPS)``: cmH2O, ``(L, P)``; NaN for fewer
+    than two members.
     """
-    leaves = jax.tree.leaves(simulators.ensemble)
-    members, lungs = leaves[0].shape[:2]
+    members, lungs = jax.tree.leaves(simulators.ensemble)[0].shape[:2]
     if members < 2:
-        return np.full(requested.shape[:3], np.nan)
+        return np.full(requested.shape[:2], np.nan)
     with compilation.float64():
-        cells, _, _ = draw_tables.with_nominal(None, [0] * lungs, pips)
-        plants = as_float64(simulators.ensemble, members)
-        by_member = np.asarray(_members(plants, cells, jnp.asarray(requested[:, :, None])))
-    deviation = np.std(by_member[:, :, :, 0], axis=0, ddof=1)
-    assert deviation.shape[1] == lungs
-    scored = deviation[..., protocol.SCORED_BREATHS, : protocol.INSPIRATION_STEPS]
-    return np.mean(scored, axis=(-2, -1))
+        nominal, _, _ = draw_tables.with_nominal(None, [0] * lungs, pips)
+        wide = as_float64(simulators.ensemble, members)
+        by_member = []
+        for k in range(members):
+            plants = [jax.tree.map(lambda x, k=k: x[k], wide)] * protocol.BREATHS
+            by_member.append(_breaths(plants, nominal, requested[:, None])[0].pressure[:, 0])
+    deviation = np.std(by_member, axis=0, ddof=1)
+    return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
 
 
-def draws_of(header: ScoreHeader, simulators: ReplayPlants, rounds: Mapping[str, Round]) -> Draws:
-    """Make the draws that a record names again: the development draws, or those of a round by name.
+def _failed(failures: Sequence[RecordedFailure], cells: Cells) -> list[tuple[int, ...]]:
+    """Cells of failures: condition, lung, draw and place of the PIP.
+
+    Raises:
+        InputError: if there is no such cell.
+    """
+    conditions = [condition.id for condition in cells.conditions]
+    lungs, draws = [lung.id for lung in cells.lungs], cells.draw.tolist()
+    found = []
+    for one in failures:
+        try:
+            at = conditions.index(one.condition), lungs.index(one.lung), draws.index(one.draw or 0)
+            found.append((*at, cells.pips[at[1], at[2]].tolist().index(one.pip)))
+        except ValueError:
+            raise InputError(
+                f"key failures: there is no cell {one.condition}, {one.lung}, PIP {one.pip:g}, "
+                f"draw {one.draw}"
+            ) from None
+    return found
+
+
+def _runs(cells: Cells, commands: Floats, failures: Sequence[RecordedFailure]) -> Any:
+    """Runs of commands of any shape, and their series."""
+    shape = (len(cells.conditions), *cells.pips.shape, *commands.shape[-2:])
+    run = run_of(cells, commands.reshape(shape))
+    run = dataclasses.replace(run, failures=dict.fromkeys(_failed(failures, cells)))
+    return run, runs_of(run, cells)
+
+
+def figures_of(
+    content: ScoreContent,
+    commands: Floats,
+    stressed: Floats | None,
+    what: scored.Protocol,
+    simulators: ReplayPlants,
+) -> Figures:
+    """Derive the figures of a record.
+
+    Args:
+        content: of the record.
+        commands: %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
+        stressed: commands under missing physics, %; None without.
+        what: cells and bounds of its draws.
+        simulators: that they are of.
+
+    Raises:
+        InputError: if it names a cell that is not there, or there are no bounds of its draws.
+    """
+    run, runs = _runs(what.cells, commands, content.failures)
+    under_stress = None
+    if stressed is not None and what.stressed is not None and content.stress is not None:
+        _, under_stress = _runs(what.stressed, stressed, content.stress.failures)
+    if what.reference is None or what.drawn is None:
+        raise InputError("key draws: there are no reference errors of these simulators and draws")
+    size = what.cells.pips.shape
+    failed = np.isnan(runs.error[0]).reshape(size)
+    pip = np.asarray(what.cells.scenario.pip)[..., None, None]
+    above = np.sum(run.breaths[0] > safety_limit(pip), axis=-1).max(axis=-1)
+
+    def by_draw(values: Any) -> Any:
+        return np.moveaxis(np.asarray(values).reshape(size), 1, 0)
+
+    controllable = np.where(failed, np.nan, controllable_error(run.pressure[0], pip))
+    disagreement = spread(simulators, what.pips, commands[:, 0])
+    return Figures(
+        error=by_draw(runs.error[0]),
+        controllable=by_draw(controllable),
+        attainable=by_draw(what.reference.attainable),
+        pid=by_draw(what.reference.pid),
+        peak=by_draw(runs.peak[0]),
+        steps_above=by_draw(above),
+        safe=runs.safe[0].all(axis=-1),
+        spread=np.where(failed[:, 0], np.nan, disagreement),
+        pressure=run.pressure[0, :, 0, :, TRACE_BREATH],
+        u_in=run.u_in[0, :, 0, :, TRACE_BREATH],
+        first=np.where(failed[:, 0], np.nan, commands[:, 0, :, 0, 0]),
+        rig=what.drawn.rig,
+        member=what.drawn.member,
+        stressed=under_stress,
+    )
+
+
+def draws_of(header: ScoreContent, simulators: ReplayPlants, own: Round | None) -> Draws:
+    """Make the draws that a record names again: the development draws, or those of its round.
 
     Raises:
         InputError: if they are neither.
     """
-    recorded, rigs = header.draws.about(), rigs_of(simulators)
-    own = rounds.get(header.draws.season)
+    rigs = rigs_of(simulators)
     drawn = rigs.draws(draw_tables.COUNT) if own is None else own.draws(rigs)
-    if drawn.about() != recorded:
+    if drawn.about() != header.draws.about():
         raise InputError("key draws: neither the development draws nor those of a round")
     return drawn
 
 
-def replay(
-    simulators: ReplayPlants,
-    pips: Sequence[float],
-    requested: Sequence[Floats],
-    draws: Draws,
-) -> Iterator[Replayed]:
-    """Replay the commands of records of one shape over K draws, a few at a time.
+def protocol_of(
+    header: ScoreContent, simulators: ReplayPlants, own: Round | None
+) -> scored.Protocol:
+    """Cells and bounds of the draws that a record names; arguments as of :func:`draws_of`.
 
-    Each record has commands, %, of shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
+    Raises:
+        InputError: if there are none.
     """
-    if not requested:
-        return
-    with compilation.float64():
-        _, cells = rigs_of(simulators).cells(draws, pips)
-    size = min(BATCH, len(requested))
-    for first in range(0, len(requested), size):
-        batch = list(requested[first : first + size])
-        padded = np.stack([*batch, *[batch[-1]] * (size - len(batch))])
-        pressure = pressures(simulators, pips, padded, draws)
-        spreads = spread(simulators, pips, padded[:, :, 0])
-        for n, commands in enumerate(batch):
-            yield _measure(cells, draws, commands, pressure[n], spreads[n])
-
-
-def _measure(
-    cells: Scenario, draws: Draws, requested: Floats, breaths: Floats, spread: Floats
-) -> Replayed:
-    pip, dt = np.asarray(cells.pip), np.asarray(cells.dt)
-    pressure = breaths[..., : protocol.INSPIRATION_STEPS]
-    errors = run_error(pressure, pip[..., None, None])
-    gate = passes_safety_gate(breaths, pip[..., None], dt[..., None])
-    above = pressure > safety_limit(pip[..., None, None])
-    return Replayed(
-        nominal=errors[:, 0],
-        drawn=np.moveaxis(errors[:, 1:], 1, 0),
-        safe=np.all(gate, axis=(1, 2, 3)),
-        peak=np.moveaxis(pressure.max(axis=(3, 4)), 1, 0),
-        steps_above=np.moveaxis(longest_run(above).max(axis=-1), 1, 0),
-        below=np.sum(requested < 0.0, axis=(1, 2, 3, 4)),
-        above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3, 4)),
-        spread=spread,
-        pressure=pressure[:, 0, :, TRACE_BREATH],
-        u_in=np.clip(requested[:, 0, :, TRACE_BREATH], 0.0, protocol.U_MAX),
-        first=np.moveaxis(requested[..., 0, 0], 1, 0),
-        controllable=np.moveaxis(controllable_error(pressure, pip[..., None, None]), 1, 0),
-        session=draws.rig,
-        member=draws.member,
+    rigs, drawn = rigs_of(simulators), draws_of(header, simulators, own)
+    reference = reference_of(
+        rigs.about, drawn.about(), published() if own is None else own.bounds()
     )
+    return scored.protocol_of(rigs, drawn=drawn, stress=DRAWS, reference=reference)
 
 
-def deviation(record: Record, replayed: Replayed) -> float:
-    """Largest difference of an error, cmH2O; infinity where one of them does not exist."""
-    pairs = ((record.nominal, replayed.nominal), (record.drawn, replayed.drawn))
-    return max(float(np.max(_off(*pair), initial=0.0)) for pair in pairs)
+def with_figures(
+    leaderboard: Store,
+    load: Load,
+    problem: Callable[[str], object],
+    *,
+    note: Callable[[str], object] = lambda text: None,
+    progress: Callable[[int, int], None] | None = None,
+    kept: Kept | None = None,
+    cached: bool = False,
+) -> Store:
+    """Derive the figures of all records of a leaderboard.
 
-
-def differences(record: Record, replayed: Replayed) -> list[str]:
-    """What differs, by key of the record; empty if the record is what its commands give."""
-    header, clipped = record.header, record.header.clipped
-    size = int(np.prod(header.actions.shape))
-    failed = np.isnan(record.nominal).any(axis=1) | np.isnan(record.drawn).any(axis=(0, 2))
-    checks: tuple[Check, ...] = (
-        ("errors.nominal", record.nominal, replayed.nominal, TOLERANCE),
-        ("errors.drawn", record.drawn, replayed.drawn, TOLERANCE),
-        ("spread", record.spread, replayed.spread, TOLERANCE),
-        ("safe", header.safe, replayed.safe & ~failed, 0.0),
-        ("peak_pressure_cmH2O", header.peak_pressure_cmH2O, replayed.peak.max((0, 2)), TOLERANCE),
-        ("safety.peak_centi_cmH2O", record.peak, replayed.peak, _CENTI),
-        ("safety.steps_above", record.steps_above, replayed.steps_above, 0.0),
-        ("clipped.below", clipped.below, replayed.below, 0.0),
-        ("clipped.above", clipped.above, replayed.above, 0.0),
-        ("clipped.commands", clipped.commands, size, 0.0),
-        ("trace.pressure_centi_cmH2O", record.pressure, replayed.pressure, _CENTI),
-        ("trace.u_in_tenths_percent", record.u_in, replayed.u_in, _TENTH),
-        ("headroom.error", record.headroom.error, replayed.controllable, TOLERANCE),
-        # They decide which draws rank, and what the tests of ranks take as a unit.
-        ("rigs.session", record.headroom.session, replayed.session, 0.0),
-        ("rigs.member", record.headroom.member, replayed.member, 0.0),
-    )
-    texts = worst(checks)
-    for key, recorded, given in (
-        ("errors.nominal", record.nominal, replayed.nominal),
-        ("errors.drawn", record.drawn, replayed.drawn),
-        ("headroom.error", record.headroom.error, replayed.controllable),
-    ):
-        if np.all(_off(recorded, given) <= TOLERANCE):
-            of_draws, now = (
-                x.mean(axis=(-2, -1)) for x in (recorded, given)
-            )  # NaN if a cell failed
-            texts += worst([(f"{key}, mean over cells", of_draws, now, MEAN_TOLERANCE)])
-    return texts + lung_leaks(record, replayed)
-
-
-def lung_leaks(record: Record, replayed: Replayed) -> list[str]:
-    """Find first commands of the robustness track that differ from lung to lung.
-
-    The first observation of a nominal run is that of a lung at PEEP: start, target and step are
-    common to all lungs. A controller that is not told the lung cannot answer differently; one that
-    does has learned it, or nobody has computed its commands from observations. The reverse is no
-    proof of honesty. Failed runs are left out.
-
-    Returns:
-        One sentence for the first PIP that shows it; empty if none does.
+    Args:
+        leaderboard: without them.
+        load: gives the simulators.
+        problem: told why a record has none, and of a record whose lung was known.
+        note: told whose stressed commands are not at hand.
+        progress: called after each record.
+        kept: what earlier calls of this process derived.
+        cached: read the user's cache, and write to it.
     """
-    if record.track != "robustness":
-        return []
-    failed = np.isnan(record.nominal)
-    highest = np.max(np.where(failed, -np.inf, replayed.first[0]), axis=0)
-    lowest = np.min(np.where(failed, np.inf, replayed.first[0]), axis=0)
-    apart = np.flatnonzero(highest > lowest)
-    if not len(apart):
-        return []
-    pip = apart[0]
-    return [
-        f"key actions: in the nominal run at PIP {record.pips[pip]:g} the first command is "
-        f"{lowest[pip]:g} % on one lung and {highest[pip]:g} % on another, though the first "
-        "observation is the same: the lung was known"
-    ]
-
-
-#: A key of a record, its values there and now, and how far they may be off.
-Check = tuple[str, ArrayLike, ArrayLike, float]
-
-
-def worst(checks: Iterable[Check], source: str = "its commands") -> list[str]:
-    """Describe the worst value of each key that is off by more than its tolerance.
-
-    What has no value in the record is off by nothing; ``source`` says what gives the values now.
-    """
-    texts = []
-    for key, recorded, given, tolerance in checks:
-        recorded, given = np.asarray(recorded, float), np.asarray(given, float)
-        if recorded.shape != given.shape:
-            texts.append(f"key {key} has shape {recorded.shape}, {source} give {given.shape}")
+    kept = {} if kept is None else kept
+    made: dict[str, Record] = {}
+    simulators = loaded(load, problem) if leaderboard.scores else None
+    for at, record in enumerate(leaderboard.scores if simulators else ()):
+        assert simulators is not None
+        path = store.path_of(leaderboard.folder, record.sha256)
+        try:
+            own = leaderboard.evidence.rounds.get(record.header.draws.season)
+            folder = leaderboard.folder / RECORDS
+            derived = derived_of(record, folder, simulators, own, kept, cached=cached)
+        except (InputError, OSError) as error:
+            problem(str(error) if str(error).startswith(str(path.parent)) else f"{path}, {error}")
             continue
-        off = _off(recorded, given)
-        if not np.all(off <= tolerance):
-            at: Any = np.unravel_index(int(np.argmax(off)), off.shape)
-            place = "".join(f"[{i}]" for i in at)
-            said, now = f"{recorded[at]:.15g}", f"{given[at]:.15g}"
-            texts.append(f"key {key}{place} says {said}, {source} give {now}")
-    return texts
+        if record.track == "robustness" and derived.leak:
+            problem(f"{path}, key commands: {derived.leak}")
+        if record.header.stress is not None and derived.stressed is None:
+            note(f"{path}: its stressed commands are not at hand; it has no stress rank")
+        made[record.sha256] = dataclasses.replace(record, derived=derived)
+        if progress is not None:
+            progress(at + 1, len(leaderboard.scores))
+    records = tuple(made.get(entry.sha256, entry) for entry in leaderboard.records)
+    return dataclasses.replace(leaderboard, records=records)
 
 
-def _off(recorded: ArrayLike, replayed: ArrayLike) -> np.ndarray:
-    """Differences; 0 in failed cells, whose commands nobody gave, infinity where one is missing."""
-    recorded, replayed = np.asarray(recorded, float), np.asarray(replayed, float)
-    off = np.nan_to_num(np.abs(recorded - replayed), nan=np.inf)
-    return np.where(np.isnan(recorded), 0.0, off)
+def load(folder: Path, simulators: Load | None = None) -> Store:
+    """Read a leaderboard with the figures of its records; kept ones are not computed again.
+
+    Raises:
+        InputError: naming the file that was changed, or holds a wrong signature, or if the
+            simulators are others.
+        OSError: if a file cannot be read.
+    """
+
+    def problem(text: str) -> None:
+        raise InputError(text)
+
+    return with_figures(
+        store.load(folder),
+        simulators or frozen.load,
+        problem,
+        kept=_KEPT,
+        cached=simulators is None,
+    )
+
+
+#: Figures of this process.
+_KEPT: Kept = {}
+
+
+def loaded(load: Load, problem: Callable[[str], object]) -> ReplayPlants | None:
+    """Load the simulators; None, and a problem, where they are damaged."""
+    try:
+        simulators = load()
+        canonical.through_json(simulators.about())
+        return simulators
+    except InputError as error:
+        text = f"simulators: {error}"
+    # A damaged manifest can lack anything.
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        text = f"simulators: {error!r}"
+    problem(text)
+    return None
+
+
+def derived_of(
+    record: Record,
+    folder: Path,
+    simulators: ReplayPlants,
+    own: Round | None,
+    kept: Kept,
+    *,
+    cached: bool = False,
+) -> Figures:
+    """Figures of a record whose commands are in a folder, of a round, or of practice if None.
+
+    What was derived before, and ``cached``, are as of :func:`with_figures`.
+
+    Raises:
+        InputError: if it was scored on other simulators or draws, or commands are missing.
+    """
+    header, about = record.header, canonical.through_json(simulators.about())
+    if header.simulators != about:
+        every = {*about, *header.simulators}
+        keys = sorted(k for k in every if about.get(k) != header.simulators.get(k))
+        raise InputError(
+            "key simulators: those of this ventbench are not those of the record; "
+            f"{', '.join(keys)} differ"
+        )
+    bounds = "" if own is None or own.result is None else own.result.bounds
+    basis = (canonical.digest(canonical.canonical(about)), own and own.commitment, bounds)
+    commands, stressed = store.load_commands(header.commands, folder), None
+    stress = header.stress
+    if stress is not None and stress.stressors == stressors.VERSION:
+        at_hand = store.commands_path(stress.commands, folder).exists()
+        stressed = store.load_commands(stress.commands, folder) if at_hand else None
+    key = (*basis, record.sha256, stressed is not None)
+    place = _place(key) if cached else None
+    if key not in kept and place is not None and place.is_file():
+        kept[key] = _read(place)
+    if key not in kept:
+        what = once(kept, basis, protocol_of, header, simulators, own)
+        kept[key] = figures_of(header, commands, stressed, what, simulators)
+        if place is not None:
+            _write(place, kept[key])
+    return kept[key]
+
+
+def require_replay(
+    simulators: ReplayPlants, added: Record, folder: Path, leaderboard: Store
+) -> None:
+    """Replay a record, whose commands are in a folder, before it is added to a leaderboard.
+
+    Raises:
+        InputError: if it was scored on other simulators or draws, or cannot be honest.
+    """
+    own = leaderboard.evidence.rounds.get(added.header.draws.season)
+    figures = derived_of(added, folder, simulators, own, {})
+    if added.track == "robustness" and figures.leak:
+        name = store.path_of(folder, added.sha256).name
+        raise InputError(f"{name}, key commands: {figures.leak}")
+
+
+def once(kept: Kept, key: Any, make: Callable[..., Any], *of: Any) -> Any:
+    """Derive something, if it was not derived before."""
+    if key not in kept:
+        kept[key] = make(*of)
+    return kept[key]
+
+
+#: Code that figures depend on.
+_CODE = ("board", "entries", "physics", "plants", "task")
+
+_ARRAYS = [field.name for field in dataclasses.fields(Figures) if field.name != "stressed"]
+_OF_RUNS = [
+    "pips",
+    "rig",
+    "member",
+    "error",
+    "safe",
+    "survived",
+    "alarm_s",
+    "peak",
+    "volume",
+    "draw",
+]
+
+
+@functools.cache
+def _code() -> str:
+    """Hash of the code that figures depend on."""
+    root = Path(files.__file__).parents[1]
+    paths = (path for name in _CODE for path in sorted((root / name).rglob("*.py")))
+    return canonical.digest("".join(map(files.sha256, paths)).encode())
+
+
+def _place(key: tuple[Any, ...]) -> Path | None:
+    """Where figures are kept; None where nothing is."""
+    if os.environ.get("VENTBENCH_CACHE") == "":
+        return None
+    name = canonical.digest(repr((_code(), key)).encode())
+    return compilation.folder() / "figures" / f"{name}.npz"
+
+
+def _write(place: Path, figures: Figures) -> None:
+    arrays = {name: getattr(figures, name) for name in _ARRAYS}
+    if (runs := figures.stressed) is not None:
+        arrays |= {f"stressed.{name}": getattr(runs, name) for name in _OF_RUNS}
+    with contextlib.suppress(OSError):  # a read-only home is no reason to fail
+        files.write_atomically(place, lambda file: np.savez(file, **arrays))
+
+
+def _read(place: Path) -> Figures:
+    with np.load(place, allow_pickle=False) as npz:
+        runs = {name: npz[f"stressed.{name}"] for name in _OF_RUNS if f"stressed.{name}" in npz}
+        stressed = Runs(conditions=stressors.conditions(), lungs=LUNG_IDS, **runs) if runs else None
+        return Figures(**{name: npz[name] for name in _ARRAYS}, stressed=stressed)

@@ -22,14 +22,14 @@ from ventbench.base.text import deceptive, plain
 from ventbench.board import canonical
 from ventbench.entries.folder import CONTROLLER, combined_hash
 from ventbench.entries.manifest import FAMILIES, MANIFEST, NAME, TRACKS
+from ventbench.entries.runs import DRAWS
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.stressors import VERSION as STRESSORS_VERSION
+from ventbench.task.stressors import conditions
 
 #: What every record says of its form: records of another one are not read.
-FORMAT, PROTOCOL = 1, 2
-
-#: How the bytes of commands are laid out in their file, see :mod:`ventbench.board.store`.
-ENCODING = "zlib, byte planes of little-endian float64"
+FORMAT, PROTOCOL = 2, 3
 
 #: Largest record, bytes.
 MAX_BYTES = 2 * 2**20
@@ -143,31 +143,10 @@ class Draws(Table, frozen=True):
         return msgspec.structs.asdict(self)
 
 
-class Errors(Table, frozen=True):
-    """Mean absolute error of each cell, cmH2O: ``(L, P)`` nominal and ``(K, L, P)`` drawn."""
-
-    nominal: list[list[Error]]
-    drawn: list[list[list[Error]]]
-
-
-class Safety(Table, frozen=True):
-    """Highest pressure, 0.01 cmH2O, and longest time above the limit, steps: ``(1 + K, L, P)``."""
-
-    peak_centi_cmH2O: list[list[list[SmallInt]]]
-    steps_above: list[list[list[Annotated[int, msgspec.Meta(ge=0, le=2**31)]]]]
-
-
-class Clipped(Table, frozen=True):
-    """Commands below 0 % and above 100 % of each lung, ``(L,)``, and how many there were at all."""
-
-    below: list[Count]
-    above: list[Count]
-    commands: Count
-
-
 class RecordedFailure(Table, frozen=True):
-    """A failed cell; ``draw`` is null in the nominal run."""
+    """A failed cell; ``draw`` is null in the nominal run, ``condition`` none without a stressor."""
 
+    condition: Text
     lung: LungId
     pip: float
     draw: Count | None
@@ -179,59 +158,24 @@ class RecordedFailure(Table, frozen=True):
     message: Text
 
 
-class RecordedRigs(Table, frozen=True):
-    """Session and member of the ensemble of each lung and draw, ``(L, K)``."""
+class Commands(Table, frozen=True):
+    """A file of commands by its hash; whole numbers of :data:`protocol.RESOLUTION`.
 
-    session: list[list[Count]]
-    member: list[list[Count]]
-
-
-class RecordedHeadroom(Table, frozen=True):
-    """Errors without the first step of the entry, the best commands and the best PID.
-
-    Nominal runs first, cmH2O, ``(1 + K, L, P)``.
+    ``shape`` is ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``, nominal cells first, or
+    ``(S, L, n, BREATHS, INSPIRATION_STEPS)`` under missing physics.
     """
-
-    error: list[list[list[Error]]]
-    attainable: list[list[list[Annotated[float, msgspec.Meta(ge=0.0)]]]]
-    pid: list[list[list[Annotated[float, msgspec.Meta(ge=0.0)]]]]
-
-
-class RecordedStress(Table, frozen=True):
-    """Runs under missing physics; S conditions, L lungs, n of the record's draws.
-
-    Tables have shape ``(S, L, n)``, the first condition is none; ``pips`` has shape ``(L, n)``.
-    ``commands_sha256`` is that of all commands, float64, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``:
-    they are not kept, but a second run must give them again.
-    """
-
-    stressors: Version
-    conditions: Annotated[list[Text], msgspec.Meta(min_length=2, max_length=1000)]
-    pips: list[list[float]]
-    errors: list[list[list[Error]]]
-    safe: list[list[list[bool]]]
-    survived: list[list[list[bool]]]
-    above_alarm_ms: list[list[list[Annotated[int, msgspec.Meta(ge=0, le=2**31)]]]]
-    peak_centi_cmH2O: list[list[list[SmallInt]]]
-    volume_mL: list[list[list[SmallInt]]]
-    commands_sha256: Sha256
-
-
-class Trace(Table, frozen=True):
-    """A nominal inspiration of each cell, ``(L, P, S)``, for the page."""
-
-    breath: Count
-    pressure_centi_cmH2O: list[list[list[SmallInt]]]
-    u_in_tenths_percent: list[list[list[SmallInt]]]
-
-
-class Actions(Table, frozen=True):
-    """The file of the commands; ``shape`` is ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``."""
 
     sha256: Sha256
     bytes: Count
-    encoding: Annotated[str, _among([ENCODING])]
     shape: Annotated[list[Count], msgspec.Meta(min_length=5, max_length=5)]
+
+
+class RecordedStress(Table, frozen=True):
+    """Runs under missing physics: under all conditions of a version of the stressors, n draws."""
+
+    stressors: Version
+    commands: Commands
+    failures: list[RecordedFailure]
 
 
 class SubmittedContent(Table, frozen=True):
@@ -248,40 +192,16 @@ class SubmittedContent(Table, frozen=True):
     timing: FreeForm
 
 
-class ScoreHeader(SubmittedContent, frozen=True):
-    """A score's record without its large tables; L lungs, P PIPs, K draws."""
+class ScoreContent(SubmittedContent, frozen=True, tag_field="kind", tag="score"):
+    """The record of a score: what went into it, and nothing that follows from that."""
 
     official: bool
-    supersedes: None  # a correction is a withdrawal and a new record
-    reason: Text
     track: Track
     simulators: FreeForm
     draws: Draws
-    lungs: Annotated[list[LungName], msgspec.Meta(min_length=1)]
-    pips: Annotated[list[float], msgspec.Meta(min_length=1)]
-    safe: list[bool]
-    peak_pressure_cmH2O: list[Pressure]
-    clipped: Clipped
+    commands: Commands
     failures: list[RecordedFailure]
-    failed_cells: Count
-    actions: Actions
-
-
-class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
-    """The record of a score, all of it."""
-
-    errors: Errors
-    safety: Safety
-    spread: list[list[Error]]
-    trace: Trace
-    rigs: RecordedRigs
-    headroom: RecordedHeadroom
     stress: RecordedStress | None = None
-
-    def header(self) -> ScoreHeader:
-        """Everything but the large tables."""
-        keys = ScoreHeader.__struct_fields__
-        return ScoreHeader(**{key: getattr(self, key) for key in keys})
 
 
 class WithdrawalContent(Table, frozen=True, tag_field="kind", tag="withdrawal"):
@@ -327,7 +247,6 @@ def read(
         raise InputError(f"{label}, key submission.manifest.authors: {why}")
     _check_origin(record, label)
     if isinstance(record, ScoreContent):
-        _check_shapes(record, label)
         _check_consistent(record, label)
     return record
 
@@ -402,37 +321,6 @@ def check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
         check_free(part, where, depth - 1)
 
 
-def _check_shapes(record: ScoreContent, label: str) -> None:
-    """Check the lengths of all tables, before numpy makes arrays of them."""
-    lungs, draws = len(record.lungs), record.draws.count
-    cells, trace = (lungs, len(record.pips)), (lungs, len(record.pips), protocol.INSPIRATION_STEPS)
-    every = (1 + draws, *cells)
-    shapes: dict[str, tuple[int, ...]] = {
-        "errors.nominal": cells,
-        "errors.drawn": (draws, *cells),
-        "safe": (lungs,),
-        "peak_pressure_cmH2O": (lungs,),
-        "safety.peak_centi_cmH2O": every,
-        "safety.steps_above": every,
-        "clipped.below": (lungs,),
-        "clipped.above": (lungs,),
-        "spread": cells,
-        "trace.pressure_centi_cmH2O": trace,
-        "trace.u_in_tenths_percent": trace,
-        "rigs.session": (lungs, draws),
-        "rigs.member": (lungs, draws),
-        "headroom.error": every,
-        "headroom.attainable": every,
-        "headroom.pid": every,
-    }
-    if (own := record.stress) is not None:
-        of_pips = (lungs, min(draws, len(own.pips[0])) if own.pips else 0)
-        keys = ("errors", "safe", "survived", "above_alarm_ms", "peak_centi_cmH2O", "volume_mL")
-        shapes["stress.pips"] = of_pips
-        shapes |= {f"stress.{key}": (len(own.conditions), *of_pips) for key in keys}
-    check_shapes(record, label, shapes)
-
-
 def check_shapes(record: Any, label: str, shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Check the shapes of tables by their dotted keys; InputError names the first wrong one."""
     for key, shape in shapes.items():
@@ -448,40 +336,24 @@ def has_shape(table: Any, shape: tuple[int, ...]) -> bool:
 
 
 def _check_consistent(record: ScoreContent, label: str) -> None:
-    lungs, pips, draws = record.lungs, record.pips, record.draws.count
-    if record.stress is not None and record.track != "robustness":
+    stress, steps = record.stress, [protocol.BREATHS, protocol.INSPIRATION_STEPS]
+    if stress is not None and record.track != "robustness":
         raise InputError(f"{label}, key stress: belongs to the robustness track")
-    if tuple(lungs) != LUNG_IDS or tuple(pips) != protocol.PIPS:
-        raise InputError(f"{label}: does not cover all lungs and PIPs of the protocol")
-    runs_of = [len(lungs), 1 + draws, len(pips), protocol.BREATHS, protocol.INSPIRATION_STEPS]
-    if record.actions.shape != runs_of:
-        raise InputError(f"{label}, key actions.shape: does not fit lungs, draws and PIPs")
-    # Every failed cell has no error and one failure, and no other cell has either.
-    runs = [(None, record.errors.nominal), *enumerate(record.errors.drawn, 1)]
-    failed = [
-        (lung, pip, draw)
-        for draw, table in runs
-        for lung, row in zip(lungs, table, strict=True)
-        for pip, error in zip(pips, row, strict=True)
-        if error is None
-    ]
-    tables = [record.errors.nominal, *record.errors.drawn]
-    if [[[x is None for x in row] for row in rows] for rows in tables] != [
-        [[x is None for x in row] for row in rows] for rows in record.headroom.error
-    ]:
-        raise InputError(f"{label}, key headroom.error: does not fit the errors")
-    if len(failed) != record.failed_cells:
-        raise InputError(f"{label}, key failed_cells: does not fit the errors")
-    named = [(failure.lung, failure.pip, failure.draw) for failure in record.failures]
-    if len(named) != len(failed) or set(named) != set(failed):
-        raise InputError(f"{label}, key failures: do not fit the errors")
-    for lung, errors, spreads in zip(lungs, record.errors.nominal, record.spread, strict=True):
-        for pip, error, spread in zip(pips, errors, spreads, strict=True):
-            if (error is None) != (spread is None):
-                raise InputError(
-                    f"{label}, key spread: {lung} at PIP {pip:g} has an error without a spread of "
-                    "the ensemble, or the reverse"
-                )
+    lungs, pips = len(LUNG_IDS), len(protocol.PIPS)
+    shapes = [("commands", record.commands.shape, [lungs, 1 + record.draws.count, pips, *steps])]
+    if stress is not None and stress.stressors == STRESSORS_VERSION:
+        expected = [len(conditions()), lungs, DRAWS, *steps]
+        shapes.append(("stress.commands", stress.commands.shape, expected))
+    for key, shape, expected in shapes:
+        if shape != expected:
+            raise InputError(f"{label}, key {key}.shape: is not {expected}")
+    for key, failures in (
+        ("failures", record.failures),
+        ("stress.failures", stress and stress.failures),
+    ):
+        cells = [(x.condition, x.lung, x.pip, x.draw) for x in failures or ()]
+        if len(set(cells)) < len(cells):
+            raise InputError(f"{label}, key {key}: names a cell twice")
 
 
 def _check_claims(record: ScoreContent, label: str) -> None:

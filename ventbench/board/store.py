@@ -9,10 +9,9 @@ publishes refuses to drop one; see ``ci/publish.py``.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,11 +23,10 @@ from ventbench.board.canonical import RECORDS
 from ventbench.board.gate import Evidence
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
 from ventbench.board.rounds import Round
+from ventbench.board.schema import Commands
+from ventbench.task import environment, protocol
 
-if TYPE_CHECKING:
-    from ventbench.board.replay import ReplayPlants
-
-#: Largest file of commands, bytes: float64 noise does not compress, but hardly grows.
+#: Largest file of commands, bytes: those of the stress track, were they noise.
 MAX_COMMANDS_BYTES = 2_000_000
 
 
@@ -169,39 +167,17 @@ def find_signed(folder: Path, named: str) -> Path:
     return matches[0]
 
 
-def require_replay(
-    score: Record,
-    commands: bytes,
-    simulators: ReplayPlants,
-    label: str,
-    known: Mapping[str, Round],
-) -> None:
-    """Replay a record by the content of its action file; rounds that have draws are ``known``.
-
-    Raises:
-        InputError: if it was scored on other simulators, or does not replay; ``label`` names it.
-    """
-    from ventbench.board.replay import differences, draws_of, replay
-
-    if score.header.simulators != canonical.through_json(simulators.about()):
-        raise InputError(f"{label} was scored on other simulators than those of this ventbench")
-    requested = decode(commands, score.header.actions.shape, label)
-    drawn = draws_of(score.header, simulators, known)
-    (replayed,) = replay(simulators, score.pips, [requested], drawn)
-    problems = differences(score, replayed)
-    if problems:
-        raise InputError(f"{label} does not replay: {'; '.join(problems)}")
-
-
 def add(
-    folder: Path, path: Path, simulators: ReplayPlants | None = None
+    folder: Path, path: Path, require: Callable[[Record, Path, Store], object] | None = None
 ) -> Record | HardwareRecord:
     """Add a record, beside which its commands lie, to a leaderboard, which is made if missing.
 
     Args:
         folder: of the leaderboard.
         path: of the record.
-        simulators: to replay it on first; not replayed if not given.
+        require: called with a record of scores, the folder of its commands and the leaderboard
+            before anything is written, such as :func:`ventbench.board.replay.require_replay` on
+            the simulators; raises to refuse.
 
     Raises:
         InputError: if it is not a record, does not replay, or does not fit those that are there.
@@ -218,13 +194,13 @@ def add(
     if problems:
         raise InputError(f"{path}: {'; '.join(problems)}")
     if isinstance(added, Record):  # a hardware record has measured pressures, and no commands
-        load_commands(added, path.parent)
-        content = commands_path(added, path.parent).read_bytes()
-        if simulators is not None:
-            known = store.evidence.rounds
-            require_replay(added, content, simulators, str(path), known)
-        kept = commands_path(added, folder / RECORDS)
-        files.write_bytes(kept, content)
+        for commands in added.commands:
+            load_commands(commands, path.parent)
+        if require is not None:
+            require(added, path.parent, store)
+        for commands in added.commands:
+            content = commands_path(commands, path.parent).read_bytes()
+            files.write_bytes(commands_path(commands, folder / RECORDS), content)
     _write(folder, added, path.read_bytes())
     return added
 
@@ -294,8 +270,8 @@ def _conflicts(entry: Record, first: Record | None, counting: Record | None) -> 
     """Conflicts of a score with the first on its draws, and with the one of its entry."""
     name, sentences = f"record {entry.sha256}", list[str]()
     if first is not None:
-        # Records can only be compared over the same simulators, draws and reference errors.
-        keys = ("simulators", "draws", "headroom")
+        # Records can only be compared over the same simulators and draws.
+        keys = ("simulators", "draws")
         sentences = [
             f"{name} ({entry.name}), key {key}: differs from record {first.sha256[:12]} "
             f"({first.name})"
@@ -310,48 +286,44 @@ def _conflicts(entry: Record, first: Record | None, counting: Record | None) -> 
     return sentences
 
 
-def commands_path(record: Record, folder: Path) -> Path:
-    """Where the commands of a record lie."""
-    return folder / f"{record.header.actions.sha256}{canonical.ACTIONS_SUFFIX}"
+def commands_path(commands: Commands, folder: Path) -> Path:
+    """Where a file of commands lies."""
+    return folder / f"{commands.sha256}{canonical.ACTIONS_SUFFIX}"
 
 
-def load_commands(record: Record, folder: Path) -> Floats:
-    """Read the commands of a record from a folder.
+def load_commands(commands: Commands, folder: Path) -> Floats:
+    """Read a file of commands from a folder.
 
     Returns:
-        %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
+        %, of the shape that is stated.
 
     Raises:
-        InputError: if the file is missing, or not the one that the record names.
+        InputError: if the file is missing, or not the one that is named.
     """
-    path, named = commands_path(record, folder), record.header.actions
+    path = commands_path(commands, folder)
     if not path.is_file() or path.is_symlink():
-        raise InputError(f"{path} is missing: the commands of record {record.sha256[:12]}")
+        raise InputError(f"{path} is missing: the commands of a record")
     if path.stat().st_size > MAX_COMMANDS_BYTES:
         raise InputError(f"{path} is larger than {MAX_COMMANDS_BYTES / 1e6:g} MB")
     content = path.read_bytes()
     sha256 = canonical.digest(content)
-    if sha256 != named.sha256:
+    if sha256 != commands.sha256:
         raise InputError(f"{path} has been changed: its SHA-256 is {sha256}")
-    if len(content) != named.bytes:
-        raise InputError(f"record {record.sha256}, key actions.bytes: {path} has {len(content)}")
-    return decode(content, named.shape, str(path))
+    if len(content) != commands.bytes:
+        raise InputError(f"key commands.bytes: {path} has {len(content)}")
+    return decode(content, commands.shape, str(path))
 
 
-def encode(requested: Floats) -> bytes:
-    """Return the content of the file of finite commands, %, of any shape, bit for bit.
+def encode(commands: Floats) -> bytes:
+    """Return the content of a file of commands, %, of any shape, to the step of the valve.
 
-    The file is zlib over byte planes: the first bytes of all little-endian float64 numbers, then
-    their second bytes, and so on; sign and exponent then compress, the noisy mantissa does not.
-
-    Raises:
-        ValueError: if a command is not finite.
+    The file is zlib over byte planes of little-endian 32-bit numbers of steps, each less that of
+    the command before: all first bytes, then all second bytes, and so on.
     """
-    if not np.all(np.isfinite(requested)):
-        raise ValueError("a command is not finite")
-    numbers: Any = np.ascontiguousarray(requested, "<f8")
-    planes = numbers.view(np.uint8).reshape(-1, 8).T
-    return zlib.compress(np.ascontiguousarray(planes).tobytes(), 6)
+    steps = np.rint(environment.resolved(commands) / protocol.RESOLUTION).astype(np.int64)
+    moves = np.diff(steps.ravel(), prepend=0).astype("<i4")
+    planes = moves.view(np.uint8).reshape(-1, 4).T
+    return zlib.compress(np.ascontiguousarray(planes).tobytes(), 9)
 
 
 def decode(content: bytes, shape: Sequence[int], label: str) -> Floats:
@@ -362,17 +334,17 @@ def decode(content: bytes, shape: Sequence[int], label: str) -> Floats:
     Raises:
         InputError: if the content is not such a file of this shape.
     """
-    size = 8 * int(np.prod(shape, dtype=np.int64))
+    size = 4 * int(np.prod(shape, dtype=np.int64))
     inflate = zlib.decompressobj()
     try:
         raw = inflate.decompress(content, size + 1)
     except zlib.error as error:
-        raise InputError(f"{label} is not an action file: {error}") from None
+        raise InputError(f"{label} is not a file of commands: {error}") from None
     if len(raw) != size or not inflate.eof or inflate.unused_data:
         raise InputError(f"{label} does not hold commands of shape {tuple(shape)}")
-    planes = np.frombuffer(raw, np.uint8).reshape(8, -1)
-    values: Any = np.ascontiguousarray(planes.T)
-    requested = values.view("<f8").reshape(tuple(shape)).astype(np.float64)
-    if not np.all(np.isfinite(requested)):
-        raise InputError(f"{label} holds a command that is not finite")
-    return requested
+    planes = np.ascontiguousarray(np.frombuffer(raw, np.uint8).reshape(4, -1).T)
+    steps = np.cumsum(planes.view("<i4").ravel(), dtype=np.int64)
+    most = round(protocol.U_MAX / protocol.RESOLUTION)
+    if steps.size and not 0 <= steps.min() <= steps.max() <= most:
+        raise InputError(f"{label} holds a command outside 0..{protocol.U_MAX:g} %")
+    return environment.resolved(steps.reshape(tuple(shape)) * protocol.RESOLUTION)

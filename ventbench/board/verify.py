@@ -13,52 +13,33 @@ that errors follow from commands; who computed them is for :mod:`ventbench.board
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ventbench.base import files
-from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, gate, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
-from ventbench.board.official_runs import STRESS_TOLERANCE, folders
+from ventbench.board.official_runs import folders
 from ventbench.board.record import AnyRecord, Record, Withdrawal
-from ventbench.board.replay import (
-    Replayed,
-    ReplayPlants,
-    deviation,
-    differences,
-    draws_of,
-    replay,
-    worst,
-)
+from ventbench.board.replay import Kept, Load, ReplayPlants, loaded, once, with_figures
 from ventbench.board.rounds import Round
 from ventbench.board.store import Store
 from ventbench.entries import reference as references
 from ventbench.entries.folder import combined_hash, file_hashes
-from ventbench.entries.reference import published, reference_of
-from ventbench.entries.runs import pip_columns
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import protocol
-from ventbench.task.draws import Draws
-from ventbench.task.metrics.score import LEAST_HEADROOM, normalised
+from ventbench.task.metrics.score import LEAST_HEADROOM
 
 #: Most that errors of bounds may differ from what their commands give, cmH2O, and that an entry
 #: may lie below them: what no cell tells apart.
 BOUNDS_TOLERANCE, BOUNDS_LEAD = 1e-9, LEAST_HEADROOM
 
-#: Loads the frozen simulators.
-Load = Callable[[], ReplayPlants]
-
 #: Told how many records of how many have been replayed.
 Progress = Callable[[int, int], None]
-
-#: What was derived before, by hashes of all that it follows from.
-Kept = dict[Any, Any]
 
 #: Marks of the board's table in the README beside a leaderboard.
 _TABLE = re.compile(r"<!-- board -->\n(.*?)\n<!-- end -->", re.S)
@@ -74,7 +55,6 @@ class Report:
     reproduced: int = 0
     #: what each second run showed, one sentence a record.
     second_runs: list[str] = field(default_factory=list)
-    deviation: float = 0.0  #: largest difference between a recorded error and its replay, cmH2O.
     problems: list[str] = field(default_factory=list)  #: one sentence each; empty if all is well.
     #: what could not be checked, which is no problem.
     notes: list[str] = field(default_factory=list)
@@ -126,10 +106,19 @@ def verify(
     report.problems += [] if problems else _unsigned(leaderboard)
     for own in leaderboard.rounds:
         report.problems += _unaccounted(own, leaderboard)
-    by_draw = _check_replay(leaderboard, load, report, progress, kept)
+    leaderboard = with_figures(
+        leaderboard,
+        load,
+        report.problems.append,
+        note=report.notes.append,
+        progress=progress,
+        kept=kept,
+    )
+    report.replayed = sum(score.derived is not None for score in leaderboard.scores)
+    report.problems += _below_bounds(leaderboard)
     if not report.problems:  # else whatever is wrong has been said, and moves ranks and pages
-        report.problems += _check_ranks(leaderboard, by_draw)
         report.problems += _check_shown(leaderboard, site, folder.parent / "README.md", kept)
+    report.problems = list(dict.fromkeys(report.problems))
     return report
 
 
@@ -142,7 +131,7 @@ def _strange_files(
     """
     problems = []
     named = {entry.sha256 for entry in entries}
-    commands = {entry.header.actions.sha256 for entry in entries if isinstance(entry, Record)}
+    commands = {x.sha256 for entry in entries if isinstance(entry, Record) for x in entry.commands}
     for name in sorted(plain - {ATTESTATIONS}):
         path = Path(name)
         if not canonical.named(name):
@@ -241,7 +230,7 @@ def _check_shown(leaderboard: Store, site: Path | None, readme: Path, kept: Kept
     plain, _ = canonical.walk(leaderboard.folder)
     inputs = {x: (leaderboard.folder / x).read_bytes() for x in filter(canonical.named, plain)}
     state = tuple(sorted((name, canonical.digest(content)) for name, content in inputs.items()))
-    expected = inputs | _once(kept, ("pages", state), build.content, leaderboard)
+    expected = inputs | once(kept, ("pages", state), build.content, leaderboard)
     found, odd = canonical.walk(site)
     for name in sorted({*expected, *found, *odd}):
         if name not in found:
@@ -253,66 +242,6 @@ def _check_shown(leaderboard: Store, site: Path | None, readme: Path, kept: Kept
         else:
             continue
         problems.append(f"{site / name} {what}")
-    return problems
-
-
-def _once(kept: Kept, key: Any, make: Callable[..., Any], *of: Any) -> Any:
-    """Derive something, if it was not derived before."""
-    if key not in kept:
-        kept[key] = make(*of)
-    return kept[key]
-
-
-def _check_replay(
-    leaderboard: Store, load: Load, report: Report, progress: Progress | None, kept: Kept
-) -> dict[str, Floats]:
-    """Replay records and note in the report what differs.
-
-    Returns:
-        What ranks as replayed, shape ``(L, k)``, by the record's hash; see
-        :attr:`ventbench.board.record.Record.ranked_values`.
-    """
-    by_draw: dict[str, Floats] = {}
-    groups: dict[tuple[str, str], list[Record]] = {}
-    for score in leaderboard.scores:
-        groups.setdefault(score.basis[:2], []).append(score)
-    for group in groups.values():
-        header = group[0].header
-        simulators = _simulators(header.simulators, load, report)
-        if simulators is None:
-            continue
-        try:
-            known = leaderboard.evidence.rounds
-            own = known.get(header.draws.season)
-            basis = (group[0].basis[:2], own and own.commitment)
-            drawn = _once(kept, basis, draws_of, header, simulators, known)
-        except InputError as error:
-            report.problems += [f"record {score.sha256}, {error}" for score in group]
-            continue
-        report.problems += _wrong_reference(group, own)
-        by_draw |= _replay_group(
-            leaderboard.folder, group, simulators, drawn, report, progress, kept
-        )
-    return by_draw
-
-
-def _check_ranks(leaderboard: Store, by_draw: Mapping[str, Floats]) -> list[str]:
-    """Ranks that recorded errors give and replayed ones do not: nobody gains by a rounding error.
-
-    A record without replayed values, ``(L, k)`` by its hash, keeps its own.
-    """
-    problems = []
-    for track in ranking.board(leaderboard):
-        if track.round is None or not track.ranked:
-            continue
-        entries = [row.entry for row in track.ranked]
-        again = [by_draw.get(x.record.sha256, x.record.ranked_values) for x in entries]
-        problems += [
-            f"record {row.record.sha256} ({row.record.name}): ranks {row.rank} on the "
-            f"{track.name} track by its recorded errors, {given} by those that all commands give"
-            for row, given in zip(track.ranked, ranking.ranks_of(entries, again).rank, strict=True)
-            if row.rank != given
-        ]
     return problems
 
 
@@ -338,7 +267,7 @@ def _rounds(folder: Path, load: Load, report: Report, kept: Kept) -> Iterator[Ro
         yield own
         if own.frozen is None:
             continue
-        simulators = _loaded(load, report)
+        simulators = loaded(load, report.problems.append)
         if simulators is None:
             return
         for key in rounds.protocol_differences(own, simulators.about()):
@@ -353,7 +282,23 @@ def _rounds(folder: Path, load: Load, report: Report, kept: Kept) -> Iterator[Ro
         if own.result is not None:
             state = (own.commitment, own.result.bounds, files.sha256(own.folder / rounds.BOUNDS))
             about = canonical.canonical(simulators.about())
-            report.problems += _once(kept, (state, about), _wrong_bounds, own, simulators)
+            report.problems += once(kept, (state, about), _wrong_bounds, own, simulators)
+
+
+def _below_bounds(leaderboard: Store) -> list[str]:
+    """Records that attain less than the least error of any commands: their bounds are none."""
+    leads = {
+        score.sha256: score.derived.attainable - score.derived.controllable
+        for score in leaderboard.scores
+        if score.derived is not None
+    }
+    return [
+        f"{store.path_of(leaderboard.folder, score.sha256)} ({score.name}) attains "
+        f"{np.nanmax(leads[score.sha256]):.3f} cmH2O less than the bound of a cell, which bounds "
+        "nothing"
+        for score in leaderboard.scores
+        if np.any(leads.get(score.sha256, 0.0) > BOUNDS_LEAD)
+    ]
 
 
 def _wrong_bounds(own: Round, simulators: ReplayPlants) -> list[str]:
@@ -367,119 +312,6 @@ def _wrong_bounds(own: Round, simulators: ReplayPlants) -> list[str]:
     plants, cells = rigs.cells(drawn, protocol.PIPS)
     attained = references.witness_errors(bounds, plants, cells) - bounds.attainable
     pid = references.pid_errors(plants, cells, bounds.gains) - bounds.pid
-    path = own.folder / rounds.BOUNDS
     if max(np.abs(attained).max(), np.abs(pid).max()) > BOUNDS_TOLERANCE:
-        return [f"{path}: its commands or PIDs do not attain its errors"]
+        return [f"{own.folder / rounds.BOUNDS}: its commands or PIDs do not attain its errors"]
     return []
-
-
-def _wrong_reference(group: Sequence[Record], own: Round | None) -> list[str]:
-    """Records whose reference errors are not those of their round, or the published ones."""
-    header = group[0].header
-    try:
-        given = published() if own is None else own.bounds()
-        reference = reference_of(header.simulators, header.draws.about(), given)
-    except (InputError, OSError) as error:
-        return [f"record {group[0].sha256}, key headroom: {error}"]
-    assert reference is not None
-    tables = {"attainable": reference.attainable, "pid": reference.pid}
-    below = [
-        f"record {score.sha256} ({score.name}): attains {lead:.3f} cmH2O less than the least error "
-        "of any commands in a cell; its bounds are none"
-        for score in group
-        if (lead := _lead(score)) > BOUNDS_LEAD
-    ]
-    return below + [
-        f"record {score.sha256}, key headroom.{key}: not the reference errors of its draws"
-        for score in group
-        for key, table in tables.items()
-        if not np.array_equal(getattr(score.headroom, key), np.moveaxis(table, 1, 0))
-    ]
-
-
-def _lead(score: Record) -> float:
-    """By how much a record lies below the bounds of a cell, cmH2O, at most."""
-    lead = score.headroom.attainable - score.headroom.error
-    return float(np.nan_to_num(lead, nan=-np.inf).max())
-
-
-def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> ReplayPlants | None:
-    """Load the simulators; None, and a problem, where they are not those that records name."""
-    simulators = _loaded(load, report)
-    if simulators is None:
-        return None
-    here = canonical.through_json(simulators.about())
-    if here == recorded:
-        return simulators
-    keys = sorted(key for key in {*here, *recorded} if here.get(key) != recorded.get(key))
-    report.problems.append(
-        f"simulators: those of this ventbench are not those of the records; {', '.join(keys)} "
-        "differ"
-    )
-    return None
-
-
-def _loaded(load: Load, report: Report) -> ReplayPlants | None:
-    """Load the simulators; None, and a problem, where they are damaged."""
-    try:
-        simulators = load()
-        canonical.through_json(simulators.about())
-        return simulators
-    # A damaged manifest can lack anything; InputError is a ValueError.
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        text = f"simulators: {error if isinstance(error, InputError) else repr(error)}"
-        report.problems += [text] if text not in report.problems else []
-        return None
-
-
-def _replay_group(
-    folder: Path,
-    group: Sequence[Record],
-    simulators: ReplayPlants,
-    drawn: Draws,
-    report: Report,
-    progress: Progress | None,
-    kept: Kept,
-) -> dict[str, Floats]:
-    """Replay records over the same draws; see :func:`_check_replay`."""
-    requested: dict[str, Floats] = {}
-    by_draw: dict[str, Floats] = {}
-    for score in group:
-        try:
-            requested[score.sha256] = store.load_commands(score, folder / RECORDS)
-        except (InputError, OSError) as error:
-            report.problems.append(str(error))
-    about = canonical.canonical(simulators.about()), drawn.commitment
-    todo = [x for x in requested if (*about, x) not in kept]
-    again = replay(simulators, group[0].pips, [requested[x] for x in todo], drawn)
-    for score in (x for x in group if x.sha256 in requested):
-        key = (*about, score.sha256)
-        replayed = kept[key] if key in kept else kept.setdefault(key, next(again))
-        report.replayed += 1
-        report.deviation = max(report.deviation, deviation(score, replayed))
-        path = folder / RECORDS / f"{score.sha256}{canonical.RECORD_SUFFIX}"
-        texts = differences(score, replayed) + unstressed_difference(score, replayed)
-        report.problems += [f"{path}, {text}" for text in texts]
-        own, failed = score.headroom, np.isnan(score.drawn)
-        values = normalised(replayed.controllable, own.attainable, own.pid)[1:]
-        by_draw[score.sha256] = np.where(failed, np.nan, values).mean(axis=2).T[:, own.ranked]
-        if progress is not None:
-            progress(len(by_draw), len(group))
-    return by_draw
-
-
-def unstressed_difference(record: Record, replayed: Replayed) -> list[str]:
-    """Say where runs of the stress track without a stressor are not those of the same draws.
-
-    They are the same cells, so that a record whose other figures replay holds these twice.
-    """
-    if record.stress is None:
-        return []
-    tables = record.stress.tables
-    draws = np.flatnonzero(record.headroom.ranked)[: tables.pips.shape[1]]
-    at = draws, np.arange(len(record.lungs))[:, None], pip_columns(*tables.pips.shape)
-    checks = (
-        ("stress.errors", tables.error[0], replayed.drawn[at], STRESS_TOLERANCE),
-        ("stress.peak_centi_cmH2O", tables.peak[0], replayed.peak[1:][at], 0.011),
-    )
-    return worst(checks, "the same draws without a stressor")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -66,18 +67,19 @@ def add(
     ],
     folder: Folder = FOLDER,
 ) -> None:
-    """Add records whose replay gives the recorded numbers.
+    """Add records that replay: on these simulators, with commands that can be honest.
 
     Example: `ventbench board add runs/record/3f2a....json`
     """
     from ventbench.board import store
+    from ventbench.board.replay import require_replay
     from ventbench.plants import frozen
 
-    done = []
+    require, done = partial(require_replay, frozen.load()), []
     try:
         with bar("replaying records") as replaying:
             for path in paths:
-                done.append(store.add(folder, path, frozen.load()))
+                done.append(store.add(folder, path, require))
                 replaying(len(done), len(paths))
     finally:  # also those before one that is refused
         for added in done:
@@ -269,8 +271,7 @@ def _summary(console: Console, report: Report) -> None:
     state = f"{count} problem{'s' if count > 1 else ''}" if count else "no problems"
     reproduced = f", {report.reproduced} reproduced by their code" if report.reproduced else ""
     console.print(
-        f"{state}: {report.records} records, {report.replayed} replayed "
-        f"(largest difference {report.deviation:.1e} cmH2O){reproduced}",
+        f"{state}: {report.records} records, {report.replayed} replayed{reproduced}",
         soft_wrap=True,
     )
 

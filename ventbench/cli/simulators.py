@@ -83,14 +83,15 @@ def coverage(
     from ventbench.board import record as records
     from ventbench.board import store
     from ventbench.plants import frozen
+    from ventbench.task.lungs import LUNG_IDS
     from ventbench.task.metrics import open_loop
 
     entry = records.load(record)
     if not isinstance(entry, records.Record):
         raise InputError(f"{record} is no record of a score that lies open")
     lungs = frozen.load().lungs()
-    commands = store.load_commands(entry, record.parent).clip(0.0, 100.0)
-    by_lung = open_loop.by_lung(dict(zip(entry.lungs, commands, strict=True)), lungs)
+    commands = store.load_commands(entry.header.commands, record.parent)
+    by_lung = open_loop.by_lung(dict(zip(LUNG_IDS, commands, strict=True)), lungs)
     columns = ("lung", "70 % and above", "ranges hardly recorded", "recorded at 70 % and above")
     rows = (
         (

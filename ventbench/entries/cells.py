@@ -462,7 +462,7 @@ def step_through(
             seconds.append((time.perf_counter() - start) / max(1, len(ready)))
             requested[ready, given[ready]] = commands
             u_in, moved = np.zeros(cells), np.zeros(cells, bool)
-            u_in[ready], moved[ready] = commands, True
+            u_in[ready], moved[ready] = env.resolved(commands), True
             for k, (varied, _) in enumerate(begun):
                 own = moved & (given // steps == k)
                 if own.any():

@@ -243,8 +243,13 @@ def enter(
     ]
 
 
-def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Sequence[Task]) -> Runs:
-    """Figures of a run of cells, batch shape ``(S, L, n, P)``; a task for each lung."""
+def runs_of(
+    run: ProtocolRun, cells: Cells, submission: Submission | None = None, tasks: Sequence[Task] = ()
+) -> Runs:
+    """Figures of a run of cells, batch shape ``(S, L, n, P)``; a task for each lung.
+
+    Without a submission failures have no messages.
+    """
     pip, dt = (
         np.broadcast_to(np.asarray(x), cells.pips.shape)
         for x in (cells.scenario.pip, cells.scenario.dt)
@@ -291,6 +296,7 @@ def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Seque
                 failure.message(submission.label, tasks[lung].lung),
             )
             for (s, lung, draw, at), failure in sorted(run.failures.items())
+            if submission is not None
         ],
     )
 

@@ -41,7 +41,7 @@ _SIGNATURE = "f(u_in, u_out, dt, *, R, C, initial_pressure)"
 PythonSimulator = Callable[[Mapping[str, Any]], ArrayLike]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class PythonSimulators(Simulators):
     """A function of whole commands, for any label."""
 

@@ -22,7 +22,7 @@ from ventbench.task.lungs import Lung, lung
 from ventbench.task.rollouts import open_loop
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Simulators:
     """Simulators of lungs; every kind answers to recorded commands.
 
@@ -160,7 +160,7 @@ class Simulators:
         raise InputError(f"{self.name} {self.shortage}. It cannot run in a closed loop.")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class SimulatedPressures(Simulators):
     """Pressures of recorded breaths that somebody's simulator gave."""
 
@@ -182,7 +182,7 @@ class SimulatedPressures(Simulators):
         return answers
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class PlantSimulators(Simulators):
     """Plants of lungs."""
 
@@ -237,7 +237,7 @@ class PlantSimulators(Simulators):
             return np.asarray(open_loop(plant, start, *commands))[0]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class FrozenSimulators(PlantSimulators):
     """Plants that were trained, which know their breaths: the official ones or another folder's."""
 

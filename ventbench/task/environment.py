@@ -116,6 +116,16 @@ def observe(
     return Observation(step * scenario.dt, scenario.dt, measured, now, ahead, loop.previous)
 
 
+def resolved(u_in: ArrayLike) -> Floats:
+    """What the valve gets of a controller's commands, %, of any shape: in range, to its step.
+
+    Only a submission's commands pass here: bounds and training follow derivatives, which steps have
+    not.
+    """
+    steps = round(1.0 / protocol.RESOLUTION)
+    return np.rint(np.clip(u_in, 0.0, protocol.U_MAX) * steps) / steps + 0.0  # no "-0.0"
+
+
 def inspire(
     plant: Plant, scenario: Scenario, loop: LoopState, u_in: Array
 ) -> tuple[LoopState, Array]:

@@ -30,8 +30,10 @@ PIPS = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
 FALL_START = 1.0
 FALL_END = 1.5
 
-#: Range of the inspiratory valve, %.
+#: Range of the inspiratory valve, and step of a controller's command, %: a hundredth of what any
+#: valve resolves, so that a record holds commands as whole numbers and loses nothing.
 U_MAX = 100.0
+RESOLUTION = 0.001
 
 #: How many targets ahead of now an observation holds.
 TARGETS_AHEAD = 10

@@ -84,7 +84,7 @@ def test_whatever_an_entry_asks_for_the_gate_holds(lung: Lung) -> None:
             limit = pip + protocol.SAFETY_MARGIN
             assert protocol.PEEP + 1e3 * rig.volume / rig.C <= limit
             # What the first commands did, unseen, has passed.
-            above = above + 1 if pressure > limit and step > 2 * DEFAULT.last else 0
+            above += pressure > limit and step > 2 * DEFAULT.last
             assert above * DT <= protocol.SAFETY_TIME
         assert state.taken >= state.longest > 3
 

@@ -5,13 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from hardware_eval.bench import safety
+from hardware_eval.bench.drive import BenchVentilator
+from hardware_eval.bench.loop import Bench
 from hardware_eval.bench.safety import DEFAULT, SafetySample, SafetyState
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import lung
+from ventbench.task.metrics import measured
+from ventbench.task.metrics.score import passes_safety_gate
 
 DT = protocol.DT
 LUNG = lung("R20C20")
@@ -109,6 +116,39 @@ def test_missing_readings_hide_no_fault_and_raise_no_alarm(
         lambda i, s: s._replace(pressure=math.nan, answered=False) if i % lacking == phase else s
     )
     assert not healthy_ones.trips
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.sampled_from([9.0, 24.9, 25.1, 40.0, 69.0, math.nan]), min_size=1, max_size=40),
+    st.integers(1, protocol.BREATH_STEPS - 1),
+)
+def test_over_pressure_is_the_gate_of_scoring(readings: list[float], inspired: int) -> None:
+    # A breath so far trips the check as soon as scoring would refuse it. The
+    # expiration counts, and a breath before it does not.
+    pip, state = 10.0, safety.init(LUNG)
+    before = [SafetySample(k * DT, 26.0, math.nan, 0.0, 1, pip, 0.0, 0.0) for k in (0, 1)]
+    for k, pressure in enumerate([9.0, *readings]):
+        u_out = int(k == 0 or k > inspired)
+        sample = SafetySample((2 + k) * DT, pressure, math.nan, 0.0, u_out, pip, 0.0, 0.0)
+        before.append(sample)
+    for k, sample in enumerate(before):
+        state = safety.step(DEFAULT, state, sample)
+        breath = [x.pressure for x in before[2 : k + 1]]
+        tripped = "over_pressure" in [trip.check for trip in state.trips]
+        assert tripped == (k > 2 and not measured.is_safe(breath, pip, DT))
+
+
+def test_a_valve_that_opens_again_and_again_stays_within_the_gate(bench: Bench) -> None:
+    ventilator, pip = BenchVentilator(bench, "R5C20", 10.0), 10.0
+    shown = [float(ventilator.start(protocol.PEEP)[0])]
+    for _ in range(protocol.INSPIRATION_STEPS):  # as exploring does
+        wanted = protocol.U_MAX if shown[-1] <= pip + protocol.SAFETY_MARGIN else 0.0
+        shown.append(float(ventilator.step(np.array([wanted]), np.zeros(1))[0]))
+    ventilator.vent()
+    assert not ventilator.trips
+    assert passes_safety_gate(shown, pip, DT)
+    assert max(shown) > pip + protocol.SAFETY_MARGIN
 
 
 def test_a_jump_that_no_valve_can_make_trips() -> None:

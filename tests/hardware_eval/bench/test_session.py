@@ -96,22 +96,37 @@ def test_an_entry_that_is_late_more_often_than_one_in_a_hundred_fails(bench: Ben
     assert math.isnan(result.error)
 
 
-def silent(device: LoopbackDevice, after: float, steps: float) -> None:
-    """Let the line be silent ``after`` a run of 2 s of rest begins, s, for some steps."""
+def silent(
+    device: LoopbackDevice,
+    after: float,
+    steps: float,
+    kind: FaultKind | LineFaultKind = LineFaultKind.SILENT,
+) -> None:
+    """Let line or sensor be silent ``after`` a run of 2 s of rest begins, s, for some steps."""
     begins = device.clock.now() - device.start + 2.0 + protocol.DT + after - 0.002
-    fault = Fault(LineFaultKind.SILENT, begins, begins + steps * protocol.DT)
-    device.line.faults = (fault,)
+    faulty: Any = device.line if isinstance(kind, LineFaultKind) else device.service.hal
+    faulty.faults = (Fault(kind, begins, begins + steps * protocol.DT),)
 
 
 @pytest.mark.parametrize("step", [0, 4])
-def test_a_step_without_an_answer_costs_no_run(
-    step: int, bench: Bench, device: LoopbackDevice
+@pytest.mark.parametrize(
+    ("kind", "early"),
+    [(LineFaultKind.SILENT, 0.0), (FaultKind.SENSOR_LOST, 0.006)],  # of a sample's age
+    ids=["answer", "reading"],
+)
+def test_a_step_without_an_answer_or_a_reading_costs_no_run(
+    kind: FaultKind | LineFaultKind,
+    early: float,
+    step: int,
+    bench: Bench,
+    device: LoopbackDevice,
 ) -> None:
     whole = run_once(bench, run(), Scripted())
-    silent(device, (protocol.BREATH_STEPS + step) * protocol.DT, 0.9)
+    silent(device, (protocol.BREATH_STEPS + step) * protocol.DT - early, 0.9, kind)
     controller = Scripted()
     result = run_once(bench, run(), controller)
     # The controller is told that a breath begins, by the answer to the last command.
+    assert np.isfinite(controller.rows).all()
     assert [row[0] for row in controller.rows].count(0.0) == protocol.BREATHS
     assert len(controller.rows) == result.asked == 102 - (step > 0)
     assert math.isnan(result.breaths[1].pressure[step]) == (step > 0)

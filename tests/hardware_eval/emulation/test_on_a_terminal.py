@@ -92,7 +92,9 @@ def invoke(app: Any, *words: str) -> Any:
     return CliRunner().invoke(app, list(words))
 
 
-def test_a_run_over_a_terminal(terminal: DeviceOnTerminal, tmp_path: Path) -> None:
+def test_a_run_over_a_terminal(
+    terminal: DeviceOnTerminal, tmp_path: Path, scored_only: Path
+) -> None:
     done = invoke(
         cli.app,
         "run",
@@ -105,13 +107,9 @@ def test_a_run_over_a_terminal(terminal: DeviceOnTerminal, tmp_path: Path) -> No
         "10",
         "--repeats",
         "1",
-        "--control-every",
-        "0",
-        "--no-dry-run",
-        "--no-selftest",
+        "--plan",
+        str(scored_only),
         "--in-process",
-        "--rest",
-        "0.5",
         "--yes",
         "--out",
         str(tmp_path / "out"),

@@ -244,7 +244,9 @@ def test_the_boards_watchdog_vents_and_resets_a_program_that_stands_still(tmp_pa
 
 
 @pytest.mark.slow
-def test_self_test_and_a_run_of_twelve_on_an_emulated_microcontroller(tmp_path: Path) -> None:
+def test_self_test_and_a_run_of_twelve_on_an_emulated_microcontroller(
+    tmp_path: Path, scored_only: Path
+) -> None:
     image = _made("mps2", tmp_path)
     tool("qemu-system-arm")
     link, out = tmp_path / "lung", tmp_path / "out"
@@ -285,12 +287,8 @@ def test_self_test_and_a_run_of_twelve_on_an_emulated_microcontroller(tmp_path: 
                 "10,15,20",
                 "--repeats",
                 "4",
-                "--rest",
-                "0.5",
-                "--control-every",
-                "0",
-                "--no-dry-run",
-                "--no-selftest",
+                "--plan",
+                str(scored_only),
                 "--in-process",
                 "--yes",
                 "--out",

@@ -22,7 +22,10 @@ from hardware_eval.results.trial import analyse
 from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, gate, record, store
 from ventbench.board.record import HardwareRecord
+from ventbench.board.replay import load as replay_of_board
 from ventbench.entries.folder import open_submission
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
 
 #: Page of the board.
 BOARD = "index.html"
@@ -145,18 +148,23 @@ def test_the_board_shows_it_beside_the_simulated_score(path: Path, tmp_path: Pat
     made = loaded(path)
     simulated = next(
         entry
-        for entry in reversed(store.load(folder).scores)
+        for entry in reversed(replay_of_board(folder).scores)
         if entry.official and entry.key[1:] == ("performance", "pid_best")
     )
-    lung, pips = simulated.lungs.index(LUNG), [simulated.pips.index(pip) for pip in PIPS]
-    gap = made.score - simulated.nominal[lung, pips].mean()
+    lung, pips = LUNG_IDS.index(LUNG), [protocol.PIPS.index(pip) for pip in PIPS]
+    gap = made.score - simulated.figures.nominal[lung, pips].mean()
     assert f"{made.score:.3f}" in page
     assert f"gap {gap:+.3f}".replace("-", "−") in page.replace("-", "−")
     assert "emulator" in page
     assert untouched.read_bytes() == other
     with pytest.raises(InputError, match="already"):
         store.add(folder, path)
-    store.withdraw(folder, made.sha256, "a test")
+    taken = store.withdraw(folder, made.sha256, "a test")
+    for signature in folder.rglob("*.sig"):
+        signature.unlink()
+    (folder / "attestations.toml").write_text(
+        f'[[second_runs]]\nrecord = "{taken.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
+    )
     build.build(folder, out)
     assert "withdrawn: a test" in (out / BOARD).read_text()
 

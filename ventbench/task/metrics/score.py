@@ -60,22 +60,35 @@ def safety_limit(pip: ArrayLike) -> Floats:
     return np.minimum(protocol.SAFETY_PRESSURE, np.asarray(pip, float) + protocol.SAFETY_MARGIN)
 
 
+def time_above(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> Floats:
+    """Time above the limit in all, s: n samples of a breath last ``n dt``, whatever is between.
+
+    Shapes as of :func:`passes_safety_gate`; a NaN is above.
+    """
+    # "Not below" instead of "above", so that NaN is unsafe.
+    above = ~(np.asarray(pressure, float) <= safety_limit(_column(pip)))
+    return np.sum(above, axis=-1) * np.asarray(dt, float)
+
+
+def is_brief(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> Bools:
+    """Whether breaths are above ``min(60, pip + 15)`` for 0.1 s at most; shapes as of the gate."""
+    # 1e-9: 0.1 s exactly passes despite rounding.
+    brief: Bools = time_above(pressure, pip, dt) <= protocol.SAFETY_TIME + 1e-9
+    return brief
+
+
 def passes_safety_gate(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> Bools:
     """Whether breaths pass the protocol's safety gate.
 
-    No sample may be above 70 cmH2O. The n samples above ``min(60, pip + 15)`` last ``n dt``,
-    whatever is between them; more than 0.1 s in a breath (4 samples at 30 ms) fails.
+    No sample may be above 70 cmH2O; more than 0.1 s in all above ``min(60, pip + 15)`` (4 samples
+    at 30 ms) fails.
 
     Pressure is that at the airway in a breath, or what was measured of it, cmH2O, ``(..., T)``;
     ``pip``, cmH2O, and the time between samples ``dt``, s, have shape ``(...)`` or broadcast
     against it. False if a pressure is NaN.
     """
-    pressure = np.asarray(pressure, float)
-    # "Not below" instead of "above", so that NaN is unsafe.
-    above = np.sum(~(pressure <= safety_limit(_column(pip))), axis=-1)
-    # 1e-9: 0.1 s exactly passes despite rounding.
-    brief = above * np.asarray(dt, float) <= protocol.SAFETY_TIME + 1e-9
-    return brief & np.all(pressure <= protocol.SAFETY_CAP, axis=-1)
+    capped = np.all(np.asarray(pressure, float) <= protocol.SAFETY_CAP, axis=-1)
+    return is_brief(pressure, pip, dt) & capped
 
 
 #: Least distance between the best PID and the best attainable, cmH2O, by which errors are divided:

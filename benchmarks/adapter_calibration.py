@@ -13,12 +13,12 @@ Usage:
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 from scipy.optimize import minimize
 from scipy.special import expit
 
@@ -83,18 +83,15 @@ def tell(what: str, scores: list[float], believed: list[tuple[float, float]]) ->
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("folders", nargs="+", type=Path)
-    parser.add_argument("--seed", action="append", required=True)
-    given = parser.parse_args()
-    if len(given.folders) != len(given.seed):
-        parser.error("give a seed for each folder, in their order")
+def main(folders: list[Path], seed: list[str]) -> None:
+    """What shares do the parts of a diagnosis deserve?"""
+    if len(folders) != len(seed):
+        raise typer.BadParameter("give a seed for each folder, in their order")
     cases: list[Case] = []
-    for path, seed in zip(given.folders, given.seed, strict=True):
+    for path, secret in zip(folders, seed, strict=True):
         folder = ChallengeFolder(path)
         answers = folder.answers("ventbench")
-        judged = reveal([folder], [seed], "ventbench").cases
+        judged = reveal([folder], [secret], "ventbench").cases
         cases += [
             (answers[n]["answer"]["notes"], c) for (_, n), c in judged.items() if not c.problem
         ]
@@ -119,4 +116,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

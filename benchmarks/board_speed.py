@@ -8,13 +8,14 @@ names. Verification runs on a part of the records; its time is scaled to all of 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import os
 import tempfile
 import time
 from pathlib import Path
+
+import typer
 
 from ventbench.board import build, canonical, create, record, store
 from ventbench.board.replay import ReplayPlants, run_of
@@ -68,20 +69,17 @@ def report(what: str, seconds: float, limit: float) -> None:
     print(f"{what:44}{seconds:8.1f} s   limit {limit:5.0f} s   ratio {seconds / limit:.2f}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--records", type=int, default=1000)
-    parser.add_argument("--verified", type=int, default=100)
-    arguments = parser.parse_args()
+def main(records: int = 1000, verified: int = 100) -> None:
+    """Time to build and to verify a leaderboard of many records."""
     plants = frozen.load()
     made = drafts(plants)
-    share = arguments.records / 1000
-    print(f"{arguments.records} records on {os.cpu_count()} cores")
+    share = records / 1000
+    print(f"{records} records on {os.cpu_count()} cores")
     sizes = [len(x.content) + sum(map(len, x.commands)) for x in made]
     print(f"largest record with its commands: {max(sizes) / 1e3:.0f} kB")
     with tempfile.TemporaryDirectory() as temporary:
         folder, site = Path(temporary) / "large", Path(temporary) / "site"
-        fill(folder, made, arguments.records)
+        fill(folder, made, records)
         begun = time.perf_counter()
         done = build.build(folder, site)
         report("first build", time.perf_counter() - begun, BUILD_LIMIT_S * share)
@@ -91,16 +89,16 @@ def main() -> None:
         if again.changed or len(done.changed) < done.files:
             raise SystemExit("the second build changed something")
         part = Path(temporary) / "part"
-        fill(part, made, min(arguments.verified, arguments.records))
+        fill(part, made, min(verified, records))
         begun = time.perf_counter()
         found = verify(part, lambda: plants)
         seconds = time.perf_counter() - begun
         if found.problems:
             raise SystemExit("\n".join(found.problems[:5]))
-        scaled = seconds * arguments.records / found.records
+        scaled = seconds * records / found.records
         what = f"verify ({found.replayed} took {seconds:.1f} s)"
         report(what, scaled, VERIFY_LIMIT_S * share)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

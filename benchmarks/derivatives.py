@@ -11,7 +11,6 @@ Usage:
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import typer
 
 from ventbench.base.compilation import float64
 from ventbench.physics import library, parameter, paths
@@ -126,18 +126,14 @@ def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
     print("  to compile, s: {:.1f}, {:.1f}, {:.1f}, {:.1f}".format(*firsts[0]))
 
 
-def main() -> None:
-    """Compare for all mechanisms, and for all mechanisms and basis terms."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--columns", type=int, default=8)
-    parser.add_argument("--repeats", type=int, default=5)
-    arguments = parser.parse_args()
-    if arguments.columns < 1 or arguments.repeats < 1:
-        parser.error("--columns and --repeats must be at least 1")
+def main(columns: int = 8, repeats: int = 5) -> None:
+    """Time of the derivatives of a fit, by differences and in forward mode."""
+    if columns < 1 or repeats < 1:
+        raise typer.BadParameter("--columns and --repeats must be at least 1")
     os.environ["VENTBENCH_THREADS"] = "1"
     for names in (paths(), paths((*library(), *basis_terms()))):
-        compare(names, arguments.columns, arguments.repeats)
+        compare(names, columns, repeats)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -13,13 +13,14 @@ include the sandboxed processes; on a busy machine only they mean something.
 
 from __future__ import annotations
 
-import argparse
 import resource
 import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from typing import Any
+
+import typer
 
 from ventbench.base.executor import executor, in_order
 from ventbench.entries.runs import DRAWS
@@ -65,23 +66,21 @@ def opened(workers: int, cluster: bool) -> Iterator[Executor]:
         yield pool
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--entries", type=int, default=4)
-    parser.add_argument("--draws", type=int, default=20)
-    parser.add_argument("--stress", action="store_true", help="the stress track too")
-    parser.add_argument("--cluster", action="store_true")
-    options = parser.parse_args()
+def main(entries: int = 4, draws: int = 20, stress: bool = False, cluster: bool = False) -> None:
+    """Official scores of several entries by one worker and by two: speed-up, and what 10,000 cost.
+
+    --stress: the stress track too.
+    """
     walls, used = {}, []
     for workers in (1, 2):
-        with opened(workers, options.cluster) as pool:
-            in_order(pool, scored, [(0, options.stress)] * workers)
+        with opened(workers, cluster) as pool:
+            in_order(pool, scored, [(0, stress)] * workers)
             begun = time.perf_counter()
-            used += in_order(pool, scored, [(options.draws, options.stress)] * options.entries)
+            used += in_order(pool, scored, [(draws, stress)] * entries)
             walls[workers] = time.perf_counter() - begun
         print(
-            f"{options.entries} entries, {workers} worker{'s' * (workers > 1)}: "
-            f"{walls[workers]:.1f} s wall-clock, {sum(used[-options.entries :]):.1f} s processor",
+            f"{entries} entries, {workers} worker{'s' * (workers > 1)}: "
+            f"{walls[workers]:.1f} s wall-clock, {sum(used[-entries:]):.1f} s processor",
             flush=True,
         )
     print(f"speed-up from 1 to 2 workers: {walls[1] / walls[2]:.2f}")
@@ -93,4 +92,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -4,12 +4,11 @@ All run rigs in single or double precision on as many cells, in turns, and the b
 counts, because other work on the machine slows all. The numpy loop is the rig of the entry
 ``identify_plan``, inspirations from rest without observations. Usage:
 
-    python benchmarks/gym_speed.py [--envs 64 1024 8192] [--rounds 20] [--json FILE]
+    python benchmarks/gym_speed.py [--rounds 20]
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import runpy
 import time
@@ -19,9 +18,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import typer
 
 from ventbench.base import compilation
-from ventbench.base.files import write_json
 from ventbench.controllers.pid import PID
 from ventbench.gym_env import STEPS, VentilatorVector
 from ventbench.plants import frozen
@@ -29,6 +28,9 @@ from ventbench.plants.stacking import take
 from ventbench.task import protocol
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.rollouts import closed_loop
+
+#: Numbers of environments side by side.
+ENVIRONMENTS = (64, 1024, 8192)
 
 INSPIRATION = protocol.INSPIRATION_STEPS
 
@@ -78,16 +80,11 @@ def rates(count: int, rounds: int) -> dict[str, float]:
     return {" ".join(key): count * jobs[key[0]][1] / seconds for key, seconds in best.items()}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--envs", type=int, nargs="+", default=[64, 1024, 8192])
-    parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+def main(rounds: int = 20) -> None:
+    """Steps per second through the Gymnasium interface, beside a compiled scan and a numpy loop."""
     print(f"{os.cpu_count()} cores, JAX {jax.__version__}; million steps/s")
-    found = {}
-    for count in options.envs:
-        found[str(count)] = made = rates(count, options.rounds)
+    for count in ENVIRONMENTS:
+        made = rates(count, rounds)
         for clock in ("wall", "processor"):
             scan, through, plain = (
                 made[f"{job} {clock}"] / 1e6 for job in ("scan", "gymnasium", "numpy")
@@ -97,9 +94,7 @@ def main() -> None:
                 f"({through / scan:.2f} of it), numpy {plain:.2f}",
                 flush=True,
             )
-    if options.json:
-        write_json(options.json, found)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -17,7 +17,6 @@ what is finished; the same command continues.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import multiprocessing
@@ -30,9 +29,10 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 from hardware_eval import realtime
 from hardware_eval.emulation.emulator import tell
@@ -295,48 +295,54 @@ def deaths(
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--death", choices=LIMITS, action="append", help="what dies; repeatable")
-    parser.add_argument("--valve", choices=("open", "closed"), help="without current; both if not")
-    parser.add_argument("--kills", type=int, default=100, help="of each death and valve")
-    parser.add_argument("--emulators", type=int, default=2)
-    parser.add_argument("--realtime", action="store_true", help="real-time scheduling of all")
-    parser.add_argument("--strict", action="store_true", help="exit 1 if any delay is too long")
-    parser.add_argument("--out", type=Path, default=Path("runs/deaths"), help="kept here")
-    given = parser.parse_args()
-    extra = ["--realtime"] * given.realtime
+def main(
+    death: list[str] | None = None,
+    valve: str | None = None,
+    kills: int = 100,
+    emulators: int = 2,
+    urgent: Annotated[bool, typer.Option("--realtime")] = False,
+    strict: bool = False,
+    out: Path = Path("runs/deaths"),
+) -> None:
+    """Deaths in inspirations, at random moments: how long until the valves have vented the lung.
+
+    --death: what dies; repeatable.
+    --valve: open or closed without current; both if not.
+    --kills: of each death and valve.
+    --realtime: real-time scheduling of all.
+    --strict: exit 1 if any delay is too long.
+    --out: kept here.
+    """
+    extra = ["--realtime"] * urgent
     # Not what it starts: an emulator that compiles would hold up everything else.
-    if given.realtime and not realtime.take_priority():
+    if urgent and not realtime.take_priority():
         raise SystemExit("no real-time scheduling: it wants root, or a limit rtprio")
     # In memory: a disk that others write to holds up whoever writes a line.
     memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
     rows: list[dict[str, Any]] = []
-    for death in given.death or LIMITS:
-        for valve in [given.valve] if given.valve else ["open", "closed"]:
-            kept = given.out / f"{death}-{valve}-{given.kills}.json"
+    for name in death or LIMITS:
+        for position in [valve] if valve else ["open", "closed"]:
+            kept = out / f"{name}-{position}-{kills}.json"
             if not kept.exists():
                 with tempfile.TemporaryDirectory(dir=memory) as folder:
-                    row = deaths(
-                        death, valve == "open", given.kills, given.emulators, Path(folder), extra
-                    )
+                    row = deaths(name, position == "open", kills, emulators, Path(folder), extra)
                 files.write_json(kept, {**row, "load": round(os.getloadavg()[0], 1)})
             rows.append(json.loads(kept.read_text()))
     print("| death | within bound | ms: bound, larger median, longest |\n|---|---|---|")
-    for death, vents in dict.fromkeys((row["death"], row["vents"]) for row in rows):
-        own = [row for row in rows if (row["death"], row["vents"]) == (death, vents)]
-        kills, within = (sum(row[name] for row in own) for name in ("kills", "within"))
+    for kind, vents in dict.fromkeys((row["death"], row["vents"]) for row in rows):
+        own = [row for row in rows if (row["death"], row["vents"]) == (kind, vents)]
+        count, within = (sum(row[name] for row in own) for name in ("kills", "within"))
         longest = [max(row[name] for row in own) for name in ("bound_ms", "median_ms", "worst_ms")]
-        name = TITLES[death] + ("" if vents else ", closed without current: nothing flows")
-        print(f"| {name} | {within}/{kills} | {', '.join(f'{ms:.0f}' for ms in longest)} |")
+        title = TITLES[kind] + ("" if vents else ", closed without current: nothing flows")
+        print(f"| {title} | {within}/{count} | {', '.join(f'{ms:.0f}' for ms in longest)} |")
     loads = [row["load"] for row in rows]
     print(f"load {min(loads)} to {max(loads)} on {os.cpu_count()} processors")
     print(f"held up by the machine for over 40 ms: {sum(row['held_up'] for row in rows)}")
     missed = sum(row["not_counted"] for row in rows)
     print(f"not counted, as the lung was vented before the death by a late host: {missed}")
-    if given.strict and any(row["within"] < row["kills"] for row in rows):
+    if strict and any(row["within"] < row["kills"] for row in rows):
         raise SystemExit(1)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

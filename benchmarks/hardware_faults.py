@@ -4,21 +4,19 @@ The paper's PID runs on an emulated lung on a virtual clock, with sensor noise a
 step of PVP. Each fault begins at random moments of the second breath. The time is that from the
 fault's beginning until the device holds the inspiratory valve closed and the expiratory one open.
 
-    python benchmarks/hardware_faults.py [--trials 10] [--lung R20C20] [--json FILE]
+    python benchmarks/hardware_faults.py [--trials 10] [--lung R20C20]
 
 Prints the table of ``hardware_eval/README.md``, and what a self-test says of each fault.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 
 from hardware_eval.bench.controllers import ControllerFailedError, Count, PIDController
 from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, run_once
@@ -217,34 +215,28 @@ def clear(device: LoopbackDevice) -> None:
     device.clock.advance(8.0)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--lung", default="R20C20")
-    parser.add_argument("--only", default="", help="only faults whose names hold this")
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+def main(trials: int = 10, lung: str = "R20C20", only: str = "") -> None:
+    """Every fault, what the bench did about it, and within how many milliseconds.
+
+    --only: only faults whose names hold this.
+    """
     random = np.random.default_rng(0)
-    device = LoopbackDevice(simulated_lung(given.lung, noise=0.1, quantum=0.0703))
-    rows = []
-    for fault in (fault for fault in FAULTS if given.only in fault.name):
+    device = LoopbackDevice(simulated_lung(lung, noise=0.1, quantum=0.0703))
+    for fault in (fault for fault in FAULTS if only in fault.name):
         done: dict[str, list[float]] = {}
-        for _ in range(given.trials):
+        for _ in range(trials):
             within = 1.0 if fault.inspiration else 3.0
             moment = 3.0 + protocol.DT * (
                 1 + int(random.integers(1, int(within / protocol.DT) - 3))
             )
-            what, took = trial(device, given.lung, fault, moment)
+            what, took = trial(device, lung, fault, moment)
             done.setdefault(what, []).append(took)
             clear(device)
-        found = "" if fault.lung is None else _selftest(device, given.lung, fault)
-        rows.append({"fault": fault.name, "did": done, "selftest": found})
+        found = "" if fault.lung is None else _selftest(device, lung, fault)
         times = [x for values in done.values() for x in values if np.isfinite(x)]
         span = f"{np.median(times):.0f}, {max(times):.0f}" if times else "-"
         what = ", ".join(f"{name} ({len(values)})" for name, values in done.items())
         print(f"| {fault.name} | {what} | {span} | {found} |", flush=True)
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=1))
 
 
 def _selftest(device: LoopbackDevice, lung: str, fault: Fault) -> str:
@@ -266,4 +258,4 @@ def _selftest(device: LoopbackDevice, lung: str, fault: Fault) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

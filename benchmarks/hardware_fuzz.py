@@ -10,12 +10,12 @@ Usage:
 
 from __future__ import annotations
 
-import argparse
 import time
 from binascii import crc32
 from collections import Counter
 
 import numpy as np
+import typer
 
 from hardware_eval.device import program
 from hardware_eval.device.program import Identity, Sample
@@ -125,23 +125,18 @@ class Damage:
 INTACT = ("none", "twice", "old frame again", "garbage before", "long garbage before")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--frames", type=int, default=50_000)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    rng = np.random.default_rng(arguments.seed)
+def main(frames: int = 50_000, seed: int = 0) -> None:
+    """A hostile line to the device: damaged, repeated, reordered, foreign and made-up frames."""
+    rng = np.random.default_rng(seed)
     damage = Damage(rng)
-    kinds = rng.choice(len(DAMAGES), arguments.frames, p=SHARES / SHARES.sum())
-    commands = np.stack(
-        [rng.integers(0, 10_001, arguments.frames), rng.integers(0, 2, arguments.frames)], axis=1
-    )
+    kinds = rng.choice(len(DAMAGES), frames, p=SHARES / SHARES.sum())
+    commands = np.stack([rng.integers(0, 10_001, frames), rng.integers(0, 2, frames)], axis=1)
     now, session, sequence = 0.0, 7, 0
     state = program.init(SETTINGS, now)
     sent: dict[int, tuple[float, int]] = {}
     count: Counter[str] = Counter()
     taken, begun = -1, time.perf_counter()
-    for k in range(arguments.frames):
+    for k in range(frames):
         now += 0.03
         sequence += 1
         kind = DAMAGES[kinds[k]]
@@ -184,12 +179,10 @@ def main() -> None:
     for name in ("wrong actuations", "intact frames lost"):
         print(f"{name.upper():45s} {count[name]:>9,}")
     print(f"device counters: {state.counters}")
-    print(
-        f"{arguments.frames:,} frames in {seconds:.0f} s: {1e6 * seconds / arguments.frames:.0f} us"
-    )
+    print(f"{frames:,} frames in {seconds:.0f} s: {1e6 * seconds / frames:.0f} us")
     if count["wrong actuations"] or count["intact frames lost"]:
         raise SystemExit(1)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -15,22 +15,20 @@ bounds of the fallback rest.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from hardware_selftests import QUANTUM, Generated, generated, interval
+import typer
+from hardware_selftests import QUANTUM, Generated, Lungs, Plants, generated, interval
 
 from hardware_eval.bench import fallback, safety
 from hardware_eval.bench.controllers import PIDController
 from hardware_eval.bench.loop import LATE_SHARE
 from hardware_eval.bench.plan import CONTROL_GAINS
 from hardware_eval.emulation.cases import Base
-from hardware_eval.emulation.simulated import breath_begun
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import bundled, open_submission
@@ -48,71 +46,6 @@ NOISE = 0.1
 
 #: Commands of the bias flow before an inspiration, %.
 BIAS = float(waveform.expiratory_command(protocol.BREATH_STEPS - 1))
-
-
-class Lungs(Protocol):
-    """Lungs side by side, at rest when they are made."""
-
-    def pressure(self) -> Floats:
-        """Airway pressures now, cmH2O, ``(n,)``."""
-        ...
-
-    def step(self, u_in: Floats, u_out: int, begins: bool) -> None:
-        """Hold commands, %, ``(n,)``, for a control step; ``begins``: an inspiration does."""
-        ...
-
-
-class Plants:
-    """Plants, leaves ``(n, ...)``."""
-
-    def __init__(self, plants: Any) -> None:
-        plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
-        n = jax.tree.leaves(plants)[0].shape[0]
-        rest = jnp.full(n, protocol.PEEP, jnp.float32)
-        self._state, _ = jax.jit(jax.vmap(lambda plant, peep: plant.init(peep, peep)))(plants, rest)
-        self._shown = np.asarray(rest, float)
-
-        def one(plant: Any, state: Any, u_in: Any, u_out: Any, begins: Any) -> Any:
-            return plant.step(breath_begun(state, begins), u_in, u_out, jnp.float32(protocol.DT))
-
-        mapped = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None, None)))
-        self._step: Callable[..., Any] = lambda *given: mapped(plants, *given)
-
-    def pressure(self) -> Floats:
-        """Airway pressures; see :class:`Lungs`."""
-        return self._shown
-
-    def step(self, u_in: Floats, u_out: int, begins: bool) -> None:
-        """Hold commands; see :class:`Lungs`."""
-        given = (jnp.asarray(x, jnp.float32) for x in (u_in, u_out, begins))
-        self._state, seen = self._step(self._state, *given)
-        self._shown = np.asarray(seen.reading, float)
-
-
-class Strangers:
-    """Lungs of the independent generator, whose labels are those of ``settings``, ``(n,)``."""
-
-    def __init__(self, settings: Sequence[str], at: Ints) -> None:
-        base, effects, dead = generated(settings, "right", np.random.default_rng(list(SEED)))
-
-        def taken(values: dict[str, Any]) -> dict[str, Any]:
-            return {name: np.asarray(value)[at] for name, value in values.items()}
-
-        chosen = {
-            name: replace(effect, parameters=taken(effect.parameters))
-            for name, effect in effects.items()
-        }
-        self._rig = Generated(Base(**taken(vars(base))), chosen, dead[at])
-        self._before = np.zeros(len(at))
-
-    def pressure(self) -> Floats:
-        """Airway pressures; see :class:`Lungs`."""
-        return self._rig.pressure()
-
-    def step(self, u_in: Floats, u_out: int, begins: bool) -> None:
-        """Hold commands; see :class:`Lungs`."""
-        self._rig.hold(self._before, u_in, np.full(len(u_in), float(u_out)))
-        self._before = u_in
 
 
 #: Asks the controllers of all cells for their commands, %, ``(n,)``, given their observations.
@@ -137,7 +70,8 @@ def breathe(lungs: Lungs, labels: Ints, pips: Floats, act: Act, guarded: bool) -
     watched = [safety.init(LUNGS[k]) for k in labels]
     ended, vented, tripped = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
     pressure = np.full((n, protocol.BREATHS, protocol.BREATH_STEPS), np.nan)
-    u_in, ahead = np.full(n, BIAS), [waveform.targets_ahead(k, 1.0) for k in range(34)]
+    u_in, acting = np.full(n, BIAS), np.zeros(n)
+    ahead = [waveform.targets_ahead(k, 1.0) for k in range(34)]
     for index in range(protocol.BREATHS * protocol.BREATH_STEPS):
         breath, step = divmod(index, protocol.BREATH_STEPS)
         inspired, now = step < protocol.INSPIRATION_STEPS, index * protocol.DT
@@ -162,7 +96,8 @@ def breathe(lungs: Lungs, labels: Ints, pips: Floats, act: Act, guarded: bool) -
         else:
             wanted = np.full(n, float(waveform.expiratory_command(step)))
         u_in = np.where(ended, 0.0, wanted)
-        lungs.step(u_in, not inspired, step == 0)
+        lungs.hold(acting, u_in, np.full(n, float(not inspired)), step == 0)
+        acting = u_in
     runs = zip(pressure, pips.tolist(), strict=True)
     safe = np.array([measured.is_safe(run, pip, protocol.DT).all() for run, pip in runs])
     taken, outside = (np.array([getattr(x, name) for x in states]) for name in ("taken", "outside"))
@@ -189,7 +124,7 @@ class Runaways:
         return np.where(self._step >= self._moment, wrong, asked)
 
 
-def entry(name: str, labels: Ints) -> Act:
+def controllers(name: str, labels: Ints) -> Act:
     """A bundled entry on each lung, in this process."""
     submission = open_submission(name)
     track = submission.manifest.tracks[0]
@@ -215,10 +150,22 @@ def families(rigs: int) -> dict[str, tuple[Ints, Callable[[Ints], Lungs]]]:
         return lambda at: Plants(jax.tree.map(lambda leaf: np.asarray(leaf)[at], plants))
 
     settings = [LUNGS[k].id for k in often]
+    base, effects, dead = generated(settings, "right", np.random.default_rng(list(SEED)))
+
+    def strangers(at: Ints) -> Lungs:
+        chosen = {
+            name: replace(
+                effect, parameters={k: np.asarray(v)[at] for k, v in effect.parameters.items()}
+            )
+            for name, effect in effects.items()
+        }
+        values: Any = {name: np.asarray(value)[at] for name, value in vars(base).items()}
+        return Generated(Base(**values), chosen, dead[at])
+
     return {
         "frozen": (once, taken(frozen)),
         "population": (often, taken(population)),
-        "independent": (often, lambda at: Strangers(settings, at)),
+        "independent": (often, strangers),
     }
 
 
@@ -227,9 +174,11 @@ def responses(lungs: Lungs, n: int) -> Floats:
 
     The pressure that remains is that of the fifth reading.
     """
-    shown = []
+    shown, before = [], np.zeros(n)
     for step in range(12):
-        lungs.step(np.full(n, 50.0 if 4 <= step < 8 else 0.0), 0, False)
+        u_in = np.full(n, 50.0 if 4 <= step < 8 else 0.0)
+        lungs.hold(before, u_in, np.zeros(n))
+        before = u_in
         shown.append(lungs.pressure())
     held, *after = (x - shown[-1] for x in shown[7:11])
     return np.array(after) / held
@@ -241,23 +190,24 @@ def percent(count: int, of: int) -> str:
     return f"{100.0 * count / of:.2f} ({low:.2f} to {high:.2f})"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rigs", type=int, default=4, help="of each lung and family")
-    parser.add_argument("--entry", action="append", help="bundled; repeatable; all if not")
-    given = parser.parse_args()
-    names = given.entry or bundled()
+def main(rigs: int = 4, entry: list[str] | None = None) -> None:
+    """How often the fallback and the host's checks are wrong, on three families of right lungs.
+
+    --rigs: of each lung and family.
+    --entry: bundled; repeatable; all if not.
+    """
+    names = entry or bundled()
     asked = protocol.BREATHS * protocol.INSPIRATION_STEPS
     print("| lungs | entry | harmless runs | steps taken, % | runs failed, % | checks tripped |")
     print("|---|---|---|---|---|---|")
     missed = []
-    for family, (rig_labels, make) in families(given.rigs).items():
+    for family, (rig_labels, make) in families(rigs).items():
         rig, place = (x.ravel() for x in np.indices((len(rig_labels), len(protocol.PIPS))))
         labels, pips = rig_labels[rig], np.array(protocol.PIPS)[place]
         for name in names:
-            free = breathe(make(rig), labels, pips, entry(name, labels), False)
+            free = breathe(make(rig), labels, pips, controllers(name, labels), False)
             harmless = ~(free.unsafe | free.vented)
-            held = breathe(make(rig), labels, pips, entry(name, labels), True)
+            held = breathe(make(rig), labels, pips, controllers(name, labels), True)
             count = int(harmless.sum())
             failed = harmless & (held.outside > LATE_SHARE * asked)
             print(
@@ -284,4 +234,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

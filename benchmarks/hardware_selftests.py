@@ -18,15 +18,15 @@ intervals (Clopper-Pearson). The folder keeps what is finished; the same command
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
+import typer
 from scipy import stats
 
 from hardware_eval.bench import safety, selftest
@@ -34,6 +34,7 @@ from hardware_eval.bench.drive import Driven
 from hardware_eval.bench.identity import Baseline, KnownLung, measured_lung, white_noise
 from hardware_eval.bench.safety import VALVE_GAIN
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Effect
+from hardware_eval.emulation.simulated import breath_begun
 from proofs.challenge.stranger.rig import Rig
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.resume import WorkFolder
@@ -55,7 +56,6 @@ LEAK = 5.0
 #: What is wrong with a lung of the right label; one that creeps is as right as its twin.
 SENSORS = {"sensor 5 % high": 1.05, "sensor 5 % low": 0.95}
 CREEPS, LEAKS, STUCK = "right, creeping", "leak of 5 mL/s", "valve stuck"
-FAMILIES = ("generator", "population", "frozen")
 KINDS = ("right", CREEPS, "another lung", *SENSORS, LEAKS, STUCK)
 
 #: Those that a plant can be.
@@ -77,8 +77,11 @@ PARTS_OF = {
 class Lungs(Protocol):
     """Lungs side by side, at rest; arrays of shape ``(n,)``."""
 
-    def hold(self, before: Floats, u_in: Floats, u_out: Floats) -> None:
-        """Hold commands, % and 0/1, for a control step; before them others were in force."""
+    def hold(self, before: Floats, u_in: Floats, u_out: Floats, begins: bool = False) -> None:
+        """Hold commands, % and 0/1, for a control step; before them others were in force.
+
+        ``begins`` tells that an inspiration does.
+        """
         ...
 
     def pressure(self) -> Floats:
@@ -118,7 +121,7 @@ class Generated:
         self._rig.start(np.asarray(base.peep))
         self._dead = dead
 
-    def hold(self, before: Floats, u_in: Floats, u_out: Floats) -> None:
+    def hold(self, before: Floats, u_in: Floats, u_out: Floats, begins: bool = False) -> None:
         """See :class:`Lungs`."""
         for fine in range(FINE):
             self._rig.advance(np.where(fine >= self._dead, u_in, before), u_out, 0.0, STEP)
@@ -135,7 +138,7 @@ class Generated:
 class Plants:
     """Plants with leaves ``(n, ...)``."""
 
-    def __init__(self, plants: Any, stuck: bool) -> None:
+    def __init__(self, plants: Any, stuck: bool = False) -> None:
         import jax
         import jax.numpy as jnp
 
@@ -144,11 +147,15 @@ class Plants:
         self._state, self._signals = jax.vmap(lambda plant, x: plant.init(x, x))(plants, start)
         self._open = 0.0 if stuck else 1.0
         dt = jnp.float32(protocol.DT)
-        self._step = jax.jit(jax.vmap(lambda plant, state, u, out: plant.step(state, u, out, dt)))
 
-    def hold(self, before: Floats, u_in: Floats, u_out: Floats) -> None:
+        def step(plant: Any, state: Any, u: Any, out: Any, begins: Any) -> Any:
+            return plant.step(breath_begun(state, begins), u, out, dt)
+
+        self._step = jax.jit(jax.vmap(step, in_axes=(0, 0, 0, 0, None)))
+
+    def hold(self, before: Floats, u_in: Floats, u_out: Floats, begins: bool = False) -> None:
         """See :class:`Lungs`."""
-        inputs = (np.float32(self._open * u_in), np.float32(u_out))
+        inputs = (np.float32(self._open * u_in), np.float32(u_out), np.float32(begins))
         self._state, self._signals = self._step(self._plants, self._state, *inputs)
 
     def pressure(self) -> Floats:
@@ -360,40 +367,47 @@ def interval(count: int, of: int) -> tuple[float, float]:
     return found.low, found.high
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--lungs", type=int, default=200, help="of each label and kind")
-    parser.add_argument("--family", choices=FAMILIES, default=FAMILIES[0])
-    parser.add_argument("--label", action="append", help="one of the nine; repeatable; all if not")
-    parser.add_argument("--kind", action="append", choices=KINDS, help="repeatable; all if not")
-    parser.add_argument("--blind", action="store_true", help="no flow sensor, a calibrated valve")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("runs/selftests"), help="kept here")
-    given = parser.parse_args()
-    possible = KINDS if given.family == "generator" else PLANTS
-    kinds, labels = given.kind or possible, given.label or labels_of(given.family)
+def main(
+    lungs: int = 200,
+    family: Literal["generator", "population", "frozen"] = "generator",
+    label: list[str] | None = None,
+    kind: list[str] | None = None,
+    blind: bool = False,
+    seed: int = 0,
+    out: Path = Path("runs/selftests"),
+) -> None:
+    """Error rates of the self-test on three families of lungs.
+
+    --lungs: of each label and kind.
+    --label: one of the nine; repeatable; all if not.
+    --kind: repeatable; all if not.
+    --blind: no flow sensor, a calibrated valve.
+    --out: kept here.
+    """
+    possible = KINDS if family == "generator" else PLANTS
+    kinds, labels = kind or list(possible), label or labels_of(family)
     if unfit := sorted(set(kinds) - set(possible)):
-        parser.error(f"{given.family} has no lungs of the kind {unfit[0]!r}")
-    about = {name: getattr(given, name) for name in ("family", "lungs", "blind", "seed")}
-    work, began = WorkFolder(given.out / given.family, about), time.process_time()
+        raise typer.BadParameter(f"{family} has no lungs of the kind {unfit[0]!r}")
+    about: dict[str, Any] = {"family": family, "lungs": lungs, "blind": blind, "seed": seed}
+    work, began = WorkFolder(out / family, about), time.process_time()
     table = {
-        label: {
-            kind: work.get(f"{label}-{KINDS.index(kind)}", partial(of_label, label, kind, **about))
-            for kind in kinds
+        name: {
+            each: work.get(f"{name}-{KINDS.index(each)}", partial(of_label, name, each, **about))
+            for each in kinds
         }
-        for label in labels
+        for name in labels
     }
-    print(f"| of {given.lungs} refused | {' | '.join(kinds)} |\n|---{len(kinds) * '|---'}|")
-    for label, of in table.items():
-        print(f"| {label} | {' | '.join(str(_refused(of[kind])) for kind in kinds)} |")
+    print(f"| of {lungs} refused | {' | '.join(kinds)} |\n|---{len(kinds) * '|---'}|")
+    for name, of in table.items():
+        print(f"| {name} | {' | '.join(str(_refused(of[each])) for each in kinds)} |")
     cells, parts = [], []
-    for kind in kinds:
-        every = [x for of in table.values() for x in of[kind]]
+    for each in kinds:
+        every = [x for of in table.values() for x in of[each]]
         low, high = interval(_refused(every), len(every))
         share = 100.0 * _refused(every) / len(every)
         cells.append(f"{share:.1f} ({100.0 * low:.1f} to {100.0 * high:.1f})")
         by = {name: sum(name in x["bad"] for x in every) for x in every for name in x["bad"]}
-        parts.append(f"{kind}: {by}")
+        parts.append(f"{each}: {by}")
     print(f"| all, % (95 %) | {' | '.join(cells)} |")
     wrong = [x for of in table.values() for x in of.get("another lung", ()) if x["bad"]]
     print(f"of {len(wrong)} other lungs that were refused {sum(map(_named, wrong))} were named")
@@ -410,4 +424,4 @@ def _named(lung: dict[str, Any]) -> bool:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -14,13 +14,11 @@ Two questions, on reference rigs and without noise:
 
 Usage:
 
-    python benchmarks/learning_bound.py [--pips 15 30] [--steps 0 1 2 3 5] [--json FILE]
+    python benchmarks/learning_bound.py
 """
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -28,7 +26,7 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-from ventbench.base import compilation, files
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.entries.reference import published
 from ventbench.plants.rigs import load_rigs
@@ -39,6 +37,9 @@ from ventbench.task.metrics.score import normalised
 
 #: Shares of the gain's distribution that stand for it.
 QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
+
+#: PIPs, cmH2O, and numbers of shared steps, in rising order.
+PIPS, STEPS = (15.0, 30.0), (0, 1, 2, 3, 5)
 
 #: Most linear programs of a start, the first trust region, %, and that at which a start ends.
 ITERATIONS, FIRST, LAST = 30, 20.0, 0.02
@@ -101,10 +102,10 @@ def planned(plants: Any, cells: Any, start: Floats, shared: int) -> tuple[Floats
     return np.abs(miss).mean(axis=1), u_in
 
 
-def bound(plants: Any, cells: Any, start: Floats, steps: list[int]) -> list[Floats]:
-    """Errors of the plants for each number of shared steps, in rising order, cmH2O."""
+def bound(plants: Any, cells: Any, start: Floats) -> list[Floats]:
+    """Errors of the plants for each of :data:`STEPS`, cmH2O."""
     found, before = [], start
-    for shared in steps:
+    for shared in STEPS:
         tries = [planned(plants, cells, begun, shared) for begun in (start, before)]
         errors, before = min(tries, key=lambda x: x[0].mean())
         found.append(errors)
@@ -112,15 +113,11 @@ def bound(plants: Any, cells: Any, start: Floats, steps: list[int]) -> list[Floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--pips", type=float, nargs="+", default=[15.0, 30.0])
-    parser.add_argument("--steps", type=int, nargs="+", default=[0, 1, 2, 3, 5])
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    """What a controller must miss because it has to learn the rig: a second bound, by lung."""
     compilation.keep()
-    rigs, reference, steps = load_rigs(), published(), sorted(given.steps)
+    rigs, reference = load_rigs(), published()
     names = [lung.id for lung in rigs.lungs]
-    columns = [protocol.PIPS.index(pip) for pip in given.pips]
+    columns = [protocol.PIPS.index(pip) for pip in PIPS]
     scatter = np.exp(np.interp(QUANTILES, np.linspace(0, 1, len(GAIN_QUANTILES)), GAIN_QUANTILES))
     points: dict[str, list[Floats]] = {"gain": [], "lung": []}
     with compilation.float64():
@@ -141,22 +138,18 @@ def main() -> None:
         for column in columns:
             for lung in range(len(names)):
                 chosen = [lung] * len(scatter)
-                errors = bound(*some(chosen, column, scatter), steps)
+                errors = bound(*some(chosen, column, scatter))
                 points["gain"].append(scored(chosen, column, errors).mean(axis=1))
             every = list(range(len(names)))
-            errors = bound(*some(every, column, np.ones(len(names))), steps)
+            errors = bound(*some(every, column, np.ones(len(names))))
             points["lung"] += list(scored(every, column, errors).T)
     print("points of the normalised score above the attainable error of a known plant, by lung")
-    print(f"reference rigs, PIP {given.pips} cmH2O, revealed after {steps} steps")
-    table = {}
+    print(f"reference rigs, PIP {PIPS} cmH2O, revealed after {STEPS} steps")
     for question, rows in points.items():
-        values = np.array(rows).reshape(len(columns), len(names), len(steps)).mean(axis=0)
+        values = np.array(rows).reshape(len(columns), len(names), len(STEPS)).mean(axis=0)
         values -= values[:, :1]
-        table[question] = {name: row.tolist() for name, row in zip(names, values, strict=True)}
         for name, row in [*zip(names, values, strict=True), ("mean", values.mean(axis=0))]:
             print(f"{question} {name:7}" + "".join(f"{value:8.1f}" for value in row))
-    if given.json:
-        files.write_json(given.json, {"steps": steps, "pips": given.pips, "points": table})
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ Usage:
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import typer
 
 BARS = {"check": (10.0, 400.0), "import": (2.0, 300.0)}
 """Most processor seconds and MB of a check and of an import."""
@@ -100,17 +100,16 @@ def measure(body: str, path: Path) -> tuple[int, float, float]:
     return count, seconds, peak
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--breaths", type=int, default=75_450)
-    parser.add_argument("--rows", type=int, default=900_000)
-    parser.add_argument("--folder", default=None, help="folder of the temporary files")
-    options = parser.parse_args()
+def main(breaths: int = 75_450, rows: int = 900_000, folder: str | None = None) -> None:
+    """Time and memory to read recordings, each in a process of its own, imports included.
+
+    --folder: folder of the temporary files.
+    """
     good = True
-    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        schema, foreign = Path(folder) / "schema.csv", Path(folder) / "foreign.csv"
-        write_schema(schema, options.breaths)
-        write_foreign(foreign, options.rows)
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        schema, foreign = Path(place) / "schema.csv", Path(place) / "foreign.csv"
+        write_schema(schema, breaths)
+        write_foreign(foreign, rows)
         for name, body, path in (
             ("plain pyarrow", PLAIN, schema),
             ("load", LOAD, schema),
@@ -126,8 +125,8 @@ def main() -> int:
                     "yes" if holds else "NO"
                 )
             print(said)
-    return 0 if good else 1
+    raise typer.Exit(not good)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    typer.run(main)

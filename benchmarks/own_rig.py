@@ -10,26 +10,26 @@ a valve that nobody has looked at. The steps are those that a laboratory would t
 5. train the same controllers on each (``ventbench tune pid``, ``ventbench train residual``), and
    run all of them on the rig, under noise and deviations that are the same for all.
 
-Usage: ``python benchmarks/own_rig.py [--out DIR] [--rig NAME] [--json FILE]``.
+Usage: ``python benchmarks/own_rig.py [--out DIR] [--rig NAME]``.
 Diagnosis, simulators and each training are kept in ``--out`` when they are finished, so that the
 same command continues.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import typer
 
 from ventbench import recordings
-from ventbench.base import compilation, files
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.base.resume import WorkFolder
 from ventbench.controllers.pid import PID
@@ -247,29 +247,24 @@ def table(name: str, result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--out", type=Path, default=Path("runs/own_rig"))
-    parser.add_argument("--rig", choices=[*RIGS, "all"], default="all")
-    parser.add_argument("--breaths", type=int, default=36)
-    parser.add_argument("--iterations", type=int, default=240, help="of learning; 0 leaves it out")
-    parser.add_argument("--seeds", type=int, default=3, help="of networks; 0: only a PID")
-    parser.add_argument("--updates", type=int, default=600)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    names = list(RIGS) if options.rig == "all" else [options.rig]
-    seeds = range(options.seeds)
-    results = {
-        name: run(
-            name, options.out / name, options.breaths, options.iterations, seeds, options.updates
-        )
-        for name in names
-    }
-    for name, result in results.items():
+def main(
+    out: Path = Path("runs/own_rig"),
+    rig: Literal["late", "leak", "droop", "all"] = "all",
+    breaths: int = 36,
+    iterations: int = 240,
+    seeds: int = 3,
+    updates: int = 600,
+) -> None:
+    """A rig of one's own, end to end: recordings, what a simulator lacks, a better controller.
+
+    --iterations: of learning; 0 leaves it out.
+    --seeds: of networks; 0: only a PID.
+    """
+    names = list(RIGS) if rig == "all" else [rig]
+    for name in names:
+        result = run(name, out / name, breaths, iterations, range(seeds), updates)
         print(table(name, result), end="\n\n")
-    if options.json is not None:
-        files.write_json(options.json, results)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

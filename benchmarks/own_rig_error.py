@@ -12,7 +12,6 @@ Usage:
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -21,8 +20,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import typer
 from scipy.special import ndtri
 
+from proofs.paper.published import OPEN_LOOP
 from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.plants import frozen
@@ -39,9 +40,6 @@ from ventbench.train.rigs.data import (
 )
 from ventbench.train.rigs.fit import FitConfig, Noise, Scales, centre, fit, plants, simulate
 from ventbench.train.rigs.train import UNRECORDED_SLOPE
-
-#: Mean open-loop errors of the paper's networks, cmH2O, in the order of the lungs.
-PAPER = (0.64, 0.72, 0.39, 0.72, 0.60, 0.85)
 
 #: What is fitted to single breaths, and the deviations tried: logarithms; s; cmH2O.
 GRIDS = {
@@ -172,7 +170,7 @@ def row(name: str, error: Floats, lung: Ints) -> str:
 def goals(error: Floats, lung: Ints) -> str:
     """On how many lungs the median and the mean are at or below the paper's figure."""
     at = [error[lung == k] for k in range(6)]
-    pairs = list(zip(at, PAPER, strict=True))
+    pairs = list(zip(at, OPEN_LOOP.values(), strict=True))
     median = sum(np.median(own) <= paper for own, paper in pairs)
     mean = sum(own.mean() <= paper for own, paper in pairs)
     return f"median {median} of 6, mean {mean} of 6"
@@ -200,7 +198,7 @@ def same_commands(recordings: RigRecordings, simulators: frozen.Frozen) -> Float
     breaths = recordings.breaths
     session = simulators.sessions.assign(breaths)
     data = inspirations(breaths, simulators.sessions, recordings.labels)
-    known = np.asarray(data.start_known) > 0
+    known = np.asarray(data.start_measured) > 0
     data = data.replace(start=jnp.where(known, data.start, Noise().unknown_start))  # type: ignore[attr-defined]
     at = (np.zeros_like(session), session)
     plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[at], float), simulators.members)
@@ -304,7 +302,7 @@ def report(recordings: RigRecordings, write: Callable[..., None] = print) -> Non
     held_out = breath_error(plant, data, {})
     write(f"| | {' | '.join(LUNG_IDS)} | all |")
     write("|---" * 8 + "|")
-    write(f"| paper | {' | '.join(f'{value:.2f}' for value in PAPER)} | |")
+    write(f"| paper | {' | '.join(f'{value:.2f}' for value in OPEN_LOOP.values())} | |")
     write(row("held out", held_out, lung))
     narrow = breath_error(without_spread(plant, chosen, simulators), data, {})
     write(row(f"held out, without the spread above {WIDE_OPEN:g} %", narrow, lung))
@@ -338,34 +336,35 @@ def report(recordings: RigRecordings, write: Callable[..., None] = print) -> Non
     write(f"  pressures differ by {np.median(pairs):.2f} (median), {pairs.mean():.2f} (mean)")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--recordings", type=Path, default=recordings_dir())
-    parser.add_argument("--fits", nargs="*", help="fit anew too: all variants, or those named")
-    parser.add_argument("--unseen", action="store_true", help="by fits that have not seen the rig")
-    options = parser.parse_args()
-    if options.recordings is None or not options.recordings.is_dir():
+def main(recordings: Path | None = None, fits: bool = False, unseen: bool = False) -> None:
+    """Why simulators err on breaths of their own rigs: a table of docs/simulators.md.
+
+    --fits: by fits of other kinds that have not seen the breath.
+    --unseen: by fits that have not seen the rig.
+    """
+    folder = recordings or recordings_dir()
+    if folder is None:
         print("no recordings: give --recordings DIR or set VENTBENCH_RECORDINGS")
         return
     compilation.keep()
-    recordings = load_rig_recordings(options.recordings, folds=5, seed=0)
+    measured = load_rig_recordings(folder, folds=5, seed=0)
     simulators = frozen.load()
-    if options.fits is None and not options.unseen:
+    if not fits and not unseen:
         with compilation.float64():
-            report(recordings)
+            report(measured)
         return
     with compilation.float32():
-        chosen = judged(recordings, simulators)
-        if options.unseen:
-            plant = unseen_plants(recordings, simulators, chosen)
+        chosen = judged(measured, simulators)
+        if unseen:
+            plant = unseen_plants(measured, simulators, chosen)
             error = breath_error(plant, chosen.data, {})
             print(row("unseen rig", error, chosen.lung))
             rows(plant, chosen, print)
             return
-        for name in options.fits or VARIANTS:
-            error = variant_errors(recordings, simulators, chosen, VARIANTS[name])
+        for name, variant in VARIANTS.items():
+            error = variant_errors(measured, simulators, chosen, variant)
             print(row(name, error, chosen.lung), goals(error, chosen.lung), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -4,7 +4,7 @@ Prints environment steps/s of each plant in float32, milliseconds of one run of 
 and the share that it reaches of its own roofline: the time that its operations would take at the
 rates that vector kernels of the same operations reach in the same run. Usage:
 
-    python benchmarks/rollout_speed.py [--batch 8192] [--small 1024] [--cpu-time] [--json FILE]
+    python benchmarks/rollout_speed.py [--batch 8192] [--small 1024] [--cpu-time]
 
 With ``--cpu-time`` the clock counts the processor seconds of this process over all threads, so that
 figures also hold on a busy machine; the rates are then those of one core.
@@ -12,18 +12,16 @@ figures also hold on a busy machine; the rates are then those of one core.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import typer
 
-from ventbench.base.files import write_json
 from ventbench.controllers.pid import PID
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
@@ -187,14 +185,12 @@ def latency(plant: Plant, repeats: int = 50) -> dict[str, float]:
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--batch", type=int, default=8192)
-    parser.add_argument("--small", type=int, default=1024, help="fits into the first cache")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--cpu-time", action="store_true")
-    options = parser.parse_args()
-    if options.cpu_time:
+def main(batch: int = 8192, small: int = 1024, cpu_time: bool = False) -> None:
+    """Speed of closed-loop rollouts of a PID on the plants, and of what limits them.
+
+    --small: fits into the first cache.
+    """
+    if cpu_time:
         _CLOCK[0] = time.process_time
     device = jax.devices()[0]
     print(f"{device.platform} {device.device_kind}, {os.cpu_count()} cores, JAX {jax.__version__}")
@@ -205,10 +201,10 @@ def main() -> None:
         jax.block_until_ready(run())
         return batch * STEPS / min(seconds(run) for _ in range(rounds))
 
-    print(f"\nclosed-loop PID, float32, batch {options.batch}: steps/s")
+    print(f"\nclosed-loop PID, float32, batch {batch}: steps/s")
     rates = {}
     for name, build in PLANTS.items():
-        rates[name] = rate(build(), options.batch, 10)
+        rates[name] = rate(build(), batch, 10)
         print(f"  {name:24} {rates[name]:12.0f}")
     hybrid = PLANTS["frozen hybrid"]()
     single = latency(hybrid)
@@ -216,21 +212,16 @@ def main() -> None:
     for key, value in single.items():
         print(f"  {key:24} {value:8.2f}")
     # With a batch that fits into the first cache, as the vector kernels have it.
-    small = rate(hybrid, options.small, 30)
-    share, counts = roofline_share(hybrid, options.small, small)
+    fast = rate(hybrid, small, 30)
+    share, counts = roofline_share(hybrid, small, fast)
     listed = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    print(
-        f"\nfrozen hybrid, batch {options.small}: {small:.0f} steps/s, {share:.2f} of its roofline"
-    )
+    print(f"\nfrozen hybrid, batch {small}: {fast:.0f} steps/s, {share:.2f} of its roofline")
     print(f"  operations of one step: {listed}")
-    moved, loops = bytes_moved(hybrid, options.small)
-    stream = stream_rate(options.small)
-    print(f"  a step takes {1e9 / small:.0f} ns a cell; its {loops} loops move {moved:.0f} bytes,")
+    moved, loops = bytes_moved(hybrid, small)
+    stream = stream_rate(small)
+    print(f"  a step takes {1e9 / fast:.0f} ns a cell; its {loops} loops move {moved:.0f} bytes,")
     print(f"  which takes {1e9 * moved / stream:.0f} ns at {stream / 1e9:.0f} GB/s")
-    if options.json:
-        result = {"steps_per_s": rates, "latency": single}
-        write_json(options.json, result | {"roofline": share, "operations": counts})
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -7,11 +7,11 @@ Usage:
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 
 import numpy as np
+import typer
 
 from ventbench.entries.cells import InProcessRunner, Runner
 from ventbench.entries.folder import open_submission
@@ -50,22 +50,19 @@ def measure(runner: Runner, entry: str, cells: int) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--cells", type=int, default=756)
-    parser.add_argument("--entry", default="pid_best")
-    arguments = parser.parse_args()
+def main(cells: int = 756, entry: str = "pid_best") -> None:
+    """Cost of the sandbox: start of cells, one step and end, compared with the same process."""
     begun = time.perf_counter()
     sandbox = SandboxRunner()
     probe = time.perf_counter() - begun
-    print(f"{arguments.cells} cells of {arguments.entry} on {os.cpu_count()} cores")
+    print(f"{cells} cells of {entry} on {os.cpu_count()} cores")
     print(f"layers: {', '.join(sandbox.sandbox['layers'])}; first cell {probe:.2f} s")
     print(f"{'':24}{'sandbox':>10}{'in process':>12}")
-    apart = measure(sandbox, arguments.entry, arguments.cells)
-    plain = measure(InProcessRunner(), arguments.entry, arguments.cells)
+    apart = measure(sandbox, entry, cells)
+    plain = measure(InProcessRunner(), entry, cells)
     for name, value in apart.items():
         print(f"{name:24}{value:10.2f}{plain[name]:12.2f}")
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -7,19 +7,18 @@ development draws, one PIP of each lung and draw.
 
 Usage:
 
-    python benchmarks/stress_bound.py [--draws 1] [--json FILE]
+    python benchmarks/stress_bound.py [--draws 1]
 """
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+import typer
 
-from ventbench.base import compilation, files
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats
 from ventbench.entries.cells import Cells, protocol_of
 from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE
@@ -51,16 +50,13 @@ def best(cells: Cells, draw: int) -> tuple[Floats, Bools]:
     return np.mean(errors, axis=0).reshape(shape), (survived & held).reshape(shape)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--draws", type=int, default=1)
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+def main(draws: int = 1) -> None:
+    """What stress costs a controller that knows all: least error, and survival."""
     compilation.keep()
-    cells = protocol_of(load_rigs(), draws=given.draws, stress=given.draws).stressed
+    cells = protocol_of(load_rigs(), draws=draws, stress=draws).stressed
     assert cells is not None
     with compilation.float64():
-        errors, survived = zip(*(best(cells, k) for k in range(given.draws)), strict=True)
+        errors, survived = zip(*(best(cells, k) for k in range(draws)), strict=True)
     error, share = np.mean(errors, axis=(0, 2)), np.mean(survived, axis=(0, 2))
     names = [condition.id for condition in cells.conditions]
     for k in np.argsort(-error):
@@ -71,10 +67,7 @@ def main() -> None:
         f"nobody below {score:.2f} cmH2O, {100 * share[1:].mean():.1f} % of runs survived; without "
         f"a stressor {error[0]:.2f} cmH2O"
     )
-    if given.json:
-        table = {name: [e, s] for name, e, s in zip(names, error, share, strict=True)}
-        files.write_json(given.json, {"score": score, "conditions": table})
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -12,7 +12,6 @@ Usage:
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import sys
@@ -26,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import typer
 
 from hardware_eval.emulation.cases import random_generator
 from proofs import code_version
@@ -98,12 +98,9 @@ def trained(x: np.ndarray, y: np.ndarray, apart: np.ndarray, key: jax.Array) -> 
     return best
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    counts = {"faults": 120, "first": 220, "stranger": 220}
-    for world, count in counts.items():
-        parser.add_argument(f"--{world}", type=int, default=count)
-    counts = vars(parser.parse_args())
+def main(faults: int = 120, first: int = 220, stranger: int = 220) -> None:
+    """Train the classifier among the diagnosers; the options are numbers of recordings."""
+    counts = {"faults": faults, "first": first, "stranger": stranger}
     began = time.process_time()
     every = [row for world, count in counts.items() for row in drawn(world, count)]
     x = np.array([row for rows, _ in every for row in rows])
@@ -139,4 +136,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

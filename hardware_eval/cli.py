@@ -47,7 +47,7 @@ Lungs = Annotated[
         "--lung",
         metavar="LUNG",
         help="Lung, such as R20C50; repeatable.",
-        autocompletion=options.known_lungs,
+        autocompletion=options.complete_lungs,
     ),
 ]
 Skip = Annotated[
@@ -67,7 +67,7 @@ def run(
         list[str],
         typer.Argument(
             help="Folders of submissions, or names of bundled ones.",
-            autocompletion=options.known_entries,
+            autocompletion=options.complete_entries,
         ),
     ],
     port: Port,
@@ -385,7 +385,7 @@ def demo(
         str,
         typer.Option(
             help="Simulators that lack the concealed physics: physics or frozen.",
-            autocompletion=options.known_plants,
+            autocompletion=options.complete_plants,
         ),
     ] = "physics",
     in_process: options.InProcess = False,

@@ -12,7 +12,7 @@ import typer
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.cli.options import JsonFile, emit, known_lungs
+from ventbench.cli.options import JsonFile, complete_lungs, emit
 
 if TYPE_CHECKING:
     from hardware_eval.bench.calibrate import Calibration
@@ -29,7 +29,9 @@ Port = Annotated[
         "time."
     ),
 ]
-Lung = Annotated[str, typer.Option(help="Label of the mounted lung.", autocompletion=known_lungs)]
+Lung = Annotated[
+    str, typer.Option(help="Label of the mounted lung.", autocompletion=complete_lungs)
+]
 Yes = Annotated[
     bool, typer.Option("--yes", help="Confirm every question; for an emulator, not for a bench.")
 ]

@@ -154,35 +154,46 @@ def _cell(figure: Figure) -> str:
     return form.format(figure.value) + span
 
 
-def proof_section(proof: Proof) -> str:
-    """Figures of the finished parts of the proof on the real rig as Markdown."""
-    versions = sorted({part["code"] for part in proof.parts.values() if part.get("code")})
+def proof_sections(proof: Proof) -> dict[str, str]:
+    """Figures of each finished part of the proof on the real rig as Markdown, by its section.
+
+    A part that is run alone so replaces nothing but its own figures.
+    """
+    return {f"proof {name}": _part(name, proof) for name in (*proof.parts, *proof.impossible)}
+
+
+def _part(name: str, proof: Proof) -> str:
+    """Figures of a part of the proof, or why there are none, and its claims."""
+    part = proof.parts.get(name)
     lines = [
         "```sh",
-        "python -m proofs rig --recordings DIR --out runs/proof",
+        f"python -m proofs rig --recordings DIR --out runs/proof --only {name}",
         "```",
-        "",
-        f"Code {', '.join(versions) or 'unknown'}, recording `{proof.sha256[:16]}`; mean absolute "
-        "error of held-out inspirations, cmH2O:",
-        "",
-        "| part | breaths held out | as given | refitted | corrected | cut | named |",
-        "|---|---|---|---|---|---|---|",
     ]
-    for name, part in proof.parts.items():
-        errors = " | ".join(_error(part["mae"][stage]) for stage in ("before", "refit", "after"))
-        cut = "–" if part["cut_percent"] is None else f"{part['cut_percent']:.0f} %"
-        named = ", ".join(f"`{m['name']}`" for m in part["mechanisms"]) or "nothing"
-        if part["slot"]:
-            named += f"; place: {part['slot']['name']}"
-        lines.append(f"| `{name}` | {part['held_out']} | {errors} | {cut} | {named} |")
-    if "rc" in proof.parts:
-        lines += ["", *_by_lung(proof.parts["rc"])]
-    lines += ["", "| part | claim | outcome | met |", "|---|---|---|---|"]
+    if part is None:
+        return "\n".join([*lines, "", proof.impossible[name]])
+    errors = " | ".join(_error(part["mae"][stage]) for stage in ("before", "refit", "after"))
+    cut = "–" if part["cut_percent"] is None else f"{part['cut_percent']:.0f} %"
+    named = ", ".join(f"`{m['name']}`" for m in part["mechanisms"]) or "nothing"
+    if part["slot"]:
+        named += f"; place: {part['slot']['name']}"
     lines += [
-        f"| `{claim.part}` | {claim.what} | {claim.value} | {'yes' if claim.met else 'no'} |"
-        for claim in proof.claims
+        "",
+        f"Code {part['code'] or 'unknown'}, recording `{proof.sha256[:16]}`; mean absolute error "
+        "of held-out inspirations, cmH2O:",
+        "",
+        "| breaths held out | as given | refitted | corrected | cut | named |",
+        "|---|---|---|---|---|---|",
+        f"| {part['held_out']} | {errors} | {cut} | {named} |",
     ]
-    lines += [f"| `{name}` | – | {reason} | |" for name, reason in proof.impossible.items()]
+    if name == "rc":
+        lines += ["", *_by_lung(part)]
+    claims = [claim for claim in proof.claims if claim.part == name]
+    if claims:
+        lines += ["", "| claim | outcome | met |", "|---|---|---|"]
+    lines += [
+        f"| {claim.what} | {claim.value} | {'yes' if claim.met else 'no'} |" for claim in claims
+    ]
     return "\n".join(lines)
 
 
@@ -198,7 +209,7 @@ def pairs_section(report: str, half: str) -> str:
 def _by_lung(part: Mapping[str, Any]) -> list[str]:
     """Errors and strengths of a part lung by lung."""
     lines = [
-        "Lung by lung (part `rc`):",
+        "Lung by lung:",
         "",
         "| | as given | refitted | corrected |",
         "|---|---|---|---|",
@@ -207,7 +218,7 @@ def _by_lung(part: Mapping[str, Any]) -> list[str]:
         if group.startswith("lung "):
             errors = (_error(stages[stage]["mae"]) for stage in ("before", "refit", "after"))
             lines.append(f"| {group.removeprefix('lung ')} | {' | '.join(errors)} |")
-    lines += ["", "| named in part `rc` | value | 95 % interval |", "|---|---|---|"]
+    lines += ["", "| named | value | 95 % interval |", "|---|---|---|"]
     for mechanism in part["mechanisms"]:
         for name, estimate in mechanism["parameters"].items():
             low, high = estimate["ci95"]

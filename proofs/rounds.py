@@ -183,14 +183,14 @@ def play(
     own: Round,
     *,
     jobs: int = 1,
-    tell: Callable[..., None] = lambda what, done, count: None,
+    tell: Callable[[str, int, int], object] = lambda what, done, total: None,
 ) -> Board:
     """Make the cases, let all answer, judge, and write the board; what is finished is kept.
 
     Args:
         own: round that is drawn.
         jobs: number of cases at once.
-        tell: called with what is done, how much of it, and ``count``, of how much.
+        tell: called with what is done, how much of it, and of how much.
 
     Raises:
         InputError: if the code or a diagnoser is not that of the freeze, or as
@@ -214,7 +214,7 @@ def play(
                 count,
                 jobs=jobs,
                 source=world,
-                progress=partial(tell, f"make {world}", count=count),
+                progress=partial(tell, f"make {world}"),
             )
         for name in own.frozen.diagnosers:
             tell_this = partial(tell, f"{name}, {world}")

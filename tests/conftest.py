@@ -34,8 +34,9 @@ description = "A test."
 
 Make = Callable[..., Path]
 
-#: Compiler options of the fast tests. They run most functions once, so that optimising costs four
-#: times what it saves. The slow tests compile as users do; `XLA_FLAGS` of one's own come first.
+#: Compiler options where slow tests are left out: the others run most functions once, so that
+#: optimising costs four times what it saves. The slow tests compile as users do; `XLA_FLAGS` of
+#: one's own come first.
 QUICK_COMPILER = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
     "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
@@ -44,9 +45,6 @@ QUICK_COMPILER = (
 #: Objects that are made before Python looks for garbage, and how seldom it looks at older ones.
 #: Tracing makes many, and what collection has imported need not be gone through each time.
 GARBAGE_THRESHOLDS = (50_000, 20, 50)
-
-#: Slow tests that come last, the longest at the end: should time run out, the others have run.
-LAST = ("tests/train/", "tests/train/test_simulator.py::test_leads_to_the_frozen_simulators")
 
 #: Seconds of compiling from which the result is kept for other workers and later runs.
 KEPT_FROM_S = 0.1
@@ -69,7 +67,7 @@ def pytest_configure(config: pytest.Config) -> None:
         "any load", deadline=None, suppress_health_check=[HealthCheck.too_slow]
     )
     settings.load_profile("any load")
-    if config.option.markexpr == "not slow":
+    if "not slow" in config.option.markexpr.split(" and "):
         os.environ.setdefault("XLA_FLAGS", QUICK_COMPILER)
 
 
@@ -82,19 +80,12 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark what ``slow.txt`` lists, whole tests or one case of many; slow runs begin with it."""
+    """Mark what ``slow.txt`` lists, whole tests or one case of many."""
     text = (config.rootpath / "tests" / "slow.txt").read_text("utf-8")
-    slow = {line.strip() for line in text.splitlines() if line.strip() and line[0] != "#"}
-    listed = {x.nodeid for x in items if x.nodeid in slow or x.nodeid.partition("[")[0] in slow}
+    listed = {line.strip() for line in text.splitlines() if line.strip() and line[0] != "#"}
     for item in items:
-        if item.nodeid in listed:
-            item.add_marker(pytest.mark.slow)
-
-    def place(item: pytest.Item) -> tuple[bool, int]:
-        return item.nodeid not in listed, sum(item.nodeid.startswith(start) for start in LAST)
-
-    if "not slow" not in config.option.markexpr:
-        items.sort(key=place)
+        if item.nodeid in listed or item.nodeid.partition("[")[0] in listed:
+            item.add_marker(pytest.mark.listed)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -183,7 +183,7 @@ def _panel(pip: float, repeats: Sequence[LoggedBreath]) -> dict[str, Any]:
         clipped = np.clip(pressure, bottom, top)
         return panels.TOP + (top - clipped) / (top - bottom) * panels.PRESSURE_HEIGHT
 
-    x = panels.time_x(panels.shown_times())
+    x = panels.time_x(panels.sample_times())
     inspired = [x.log.pressure[: protocol.INSPIRATION_STEPS] for x in repeats]
     errors = [float(np.nanmean(np.abs(np.array(each) - pip))) for each in inspired]
     highest = max((float(np.nanmax(each)) for each in pressures), default=-math.inf)

@@ -27,7 +27,7 @@ def answer(
     limits: Limits | None = None,
     jobs: int = 1,
     only: tuple[str, ...] = (),
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> dict[str, str]:
     """Answer all cases that have no answer yet; each answer is written as soon as it is there.
 

@@ -17,6 +17,7 @@ from proofs.challenge.folder import ChallengeFolder, Withheld, encode_answers
 from proofs.challenge.generators import generator, generator_of
 from proofs.challenge.questions import DrawnCase, Kind
 from ventbench.base import files
+from ventbench.base.arrays import runs
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.recordings.breaths import Breaths, write
@@ -48,7 +49,7 @@ def make(
     jobs: int = 1,
     source: str = "first",
     record: Record = None,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> str:
     """Write a challenge.
 
@@ -62,7 +63,7 @@ def make(
         jobs: number of processes.
         source: name of the generator, one of :data:`~proofs.challenge.generators.GENERATORS`.
         record: see :data:`Record`; a function of a module if there are processes.
-        progress: called with the number of finished recordings.
+        progress: called with the numbers of finished and of all recordings.
 
     Returns:
         The commitment: SHA-256 of the answers.
@@ -85,7 +86,7 @@ def make(
         work = {question.case.name: (secret, folder, question, record) for question in drawn}
         for name, of_effects in results(pool, _make_case, work):
             nats[name] = of_effects
-            progress(len(nats))
+            progress(len(nats), count)
     text = encode_answers(secret, drawn, [nats[name] for name in names])
     files.write_text(folder.commitment, commitment(text) + "\n")
     entries = [
@@ -144,8 +145,7 @@ def _intervals(breaths: Breaths, active: Flags) -> dict[int, tuple[tuple[float, 
     """Where an effect acts, as intervals of time of the breaths."""
     found = {}
     for number, time, flags in zip(breaths.breath_id, breaths.time, active, strict=True):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-        spans = [(float(time[a]), float(time[b - 1])) for a, b in edges.reshape(-1, 2)]
+        spans = [(float(time[a]), float(time[b - 1])) for a, b in runs(flags)]
         if spans:
             found[int(number)] = tuple(spans)
     return found

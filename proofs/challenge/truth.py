@@ -17,17 +17,6 @@ from proofs.challenge.faults.effects import FaultsCase
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger import effects as stranger
 
-#: Terms that are right for an effect that the first generator's library does not have.
-_OUTSIDE: dict[str, set[str]] = {
-    "volume_resistance": {f"{UNKNOWN}airway"},
-    "cardiogenic": {f"{UNKNOWN}muscles"},
-    "pulsating_supply": {f"{UNKNOWN}supply", "supply_ripple"},
-    "direction_resistance": {f"{UNKNOWN}airway"},
-    "second_compartment": {f"{UNKNOWN}lung", "viscoelasticity"},
-    "sensor_nonlinearity": {f"{UNKNOWN}pressure_sensor", "sensor_curve"},
-    "expiratory_valve_orifice": {f"{UNKNOWN}expiratory_valve"},
-}
-
 #: Power of (true gain / nominal gain) by which a parameter's value changes when a fit assumes the
 #: nominal gain: flows are scaled, pressures are not.
 _POWERS = {
@@ -68,16 +57,16 @@ def concealed(drawn: DrawnCase, nats: Iterable[float]) -> tuple[Concealed, ...]:
 
 def _terms(case: Case, effect: Effect) -> tuple[frozenset[str], frozenset[str]]:
     right, beside = {effect.name}, set()
-    if isinstance(case, stranger.StrangerCase):
-        family = stranger.EFFECTS[effect.name]
-        if not family.inside:
-            right = {*TERMS.intersection(family.names), *(UNKNOWN + at for at in family.places)}
-        elif effect.name == "inertance":
+    of_stranger = isinstance(case, stranger.StrangerCase)
+    families = stranger.EFFECTS if of_stranger else EFFECTS
+    if isinstance(case, FaultsCase) or families[effect.name].inside:
+        if of_stranger and effect.name == "inertance":
             # It comes with a circuit's compliance, which may be named or not; alone below the
             # detection limit.
             beside = {"circuit_compliance"}
-    elif not (isinstance(case, FaultsCase) or EFFECTS[effect.name].inside):
-        right = _OUTSIDE[effect.name]
+    else:  # both generators have it in the same places
+        family = stranger.EFFECTS[effect.name]
+        right = {*TERMS.intersection(family.names), *(UNKNOWN + at for at in family.places)}
     return frozenset(right), frozenset(beside)
 
 

@@ -57,15 +57,7 @@ def make(
     from proofs.challenge.make import make as work
 
     with bar("recording") as recording:
-        hashed = work(
-            seed,
-            out,
-            kind,
-            cases,
-            jobs=jobs,
-            source=generator,
-            progress=lambda done: recording(done, cases),
-        )
+        hashed = work(seed, out, kind, cases, jobs=jobs, source=generator, progress=recording)
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
 
 

@@ -18,7 +18,7 @@ from ventbench.cli.options import (
     claim_out,
     emit,
     recordings_folder,
-    told,
+    written_console,
 )
 
 app = typer.Typer(
@@ -216,6 +216,6 @@ def _keep(store: Path | None, **section: Any) -> None:
 
 def _tell(values: Any, title: str, table: Any, out: Path, json: Path | None) -> None:
     # What is not reached is NaN in a table and null in JSON.
-    console = told(files.json_values(values), json)
+    console = written_console(files.json_values(values), json)
     text = table.to_string(na_rep="-", float_format="{:.3f}".format)
     console.print(f"{title}\n\n{text}\n\nwrote {out}", soft_wrap=True)

@@ -60,7 +60,7 @@ def rig(
     Example: `python -m proofs rig --recordings recordings --out runs/proof`
     """
     from proofs.real.rig import prove
-    from proofs.results_page import proof_section, write_section
+    from proofs.results_page import proof_sections, write_section
     from ventbench.base import compilation
 
     require("jinja2", "rerun")
@@ -73,11 +73,12 @@ def rig(
             only or (),
             lambda part, what, share: tell(part, share, text=f"{part}: {what}"),
         )
-    text = proof_section(result)
+    sections = proof_sections(result)
     if page is not None:
-        write_section(page, "proof", text)
+        for name, text in sections.items():
+            write_section(page, name, text)
     emit(result.as_dict(), json)
-    typer.echo(text, err=str(json) == "-")
+    typer.echo("\n\n".join(sections.values()), err=str(json) == "-")
     if not result.met:
         raise typer.Exit(1)
 

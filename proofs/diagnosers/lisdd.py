@@ -26,6 +26,7 @@ from proofs.diagnosers.common import (
     strength,
     templates,
 )
+from ventbench.base.arrays import runs
 from ventbench.system_id import fit
 
 Floats = NDArray[np.float64]
@@ -139,8 +140,7 @@ def _active(seen: Seen, flags: NDArray[np.bool_]) -> dict[str, list[list[float]]
     """Intervals of time of each breath in which samples are guilty."""
     found = {}
     for breath, time, row in zip(seen.breaths.breath_id, seen.breaths.time, flags, strict=True):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
-        spans = [[float(time[a]), float(time[b - 1])] for a, b in edges.reshape(-1, 2)]
+        spans = [[float(time[a]), float(time[b - 1])] for a, b in runs(row)]
         if spans:
             found[str(breath)] = spans
     return found

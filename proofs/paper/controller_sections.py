@@ -107,7 +107,7 @@ def beyond_the_grid(rigs: Rigs) -> Section:
     gains = np.array([(*pair, 0.0) for pair in itertools.product(BEYOND, BEYOND_I)])
     error = np.stack(
         [
-            pid_search.drawn_errors(rigs, drawn, k, gains)
+            pid_search.errors_on_draws(rigs, drawn, k, gains)
             .mean(axis=-1)
             .reshape(len(BEYOND), -1)
             .min(axis=1)

@@ -215,7 +215,8 @@ def again(score: Score, requested: np.ndarray, failures: Sequence[CellFailure] =
     lungs = [lung.id for lung in cells.lungs]
     failed = {(0, lungs.index(x.lung), 0, score.pips.index(x.pip)): x.failure for x in failures}
     runs = runs_of(dataclasses.replace(run, failures=failed), cells)
-    commands = requested.reshape(np.shape(runs.requested))
+    assert runs.requested is not None
+    commands = requested.reshape(runs.requested.shape)
     return dataclasses.replace(runs, failures=failures, requested=commands)
 
 

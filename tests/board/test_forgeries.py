@@ -56,6 +56,7 @@ def test_later_commands_and_failed_runs_may_differ(draft) -> None:
 def test_the_terminal_gets_no_commands(leaderboard: Path, drafts, monkeypatch) -> None:
     item = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     store.withdraw(leaderboard, item.sha256, "a \x1b]0;owned\x07\x1b[2J\x9b31m\u202e [red]bug")
+    accept(leaderboard)
     monkeypatch.setenv("COLUMNS", "300")
     arguments = ["board", "show", "--folder", str(leaderboard)]
     shown = CliRunner().invoke(app, arguments)

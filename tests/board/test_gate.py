@@ -18,7 +18,7 @@ from ventbench.board.gate import Evidence
 from ventbench.board.record import HardwareRecord
 from ventbench.task import protocol
 
-from .conftest import accept
+from .conftest import KEY, accept, attest
 
 #: The key of the leaderboard; it may sign what was simulated, and no bench.
 SECRET = "07" * 32
@@ -159,6 +159,10 @@ def test_only_a_bench_log_ranks_hardware(leaderboard: Path, template) -> None:
     listed = leaderboard / canonical.ATTESTATIONS
     before = listed.read_text()
 
+    def listing(text: str) -> None:
+        listed.write_text(text)
+        gate.sign(leaderboard, listed, KEY)
+
     def row():
         return frames.load_tracks(leaderboard, track="performance")[0].hardware[0]
 
@@ -168,17 +172,17 @@ def test_only_a_bench_log_ranks_hardware(leaderboard: Path, template) -> None:
         f'[[keys]]\nid = "{gate.key_id(public)}"\npublic = "{public.hex()}"\n'
         'added = 2026-11-23\nholder = "a test"\n'
     )
-    listed.write_text(before + key)
+    listing(before + key)
     gate.sign(leaderboard, store.path_of(leaderboard, made.sha256), SECRET)
     assert row().rank is None
     second = f'[[second_runs]]\nrecord = "{made.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
-    listed.write_text(before + key + second)
+    listing(before + key + second)
     with pytest.raises(InputError, match="was measured: it needs a bench log"):
         row()
-    listed.write_text(before + key + log_of(made.sha256, "8" * 64))
+    listing(before + key + log_of(made.sha256, "8" * 64))
     with pytest.raises(InputError, match="is not of recording 8888"):
         row()
-    listed.write_text(before + key + log_of(made.sha256))
+    listing(before + key + log_of(made.sha256))
     assert (row().rank, row().count, row().reasons) == (1, 1, ())
 
 
@@ -188,7 +192,7 @@ def test_an_emulators_record_is_no_hardware(leaderboard: Path, template) -> None
     honest = added(
         leaderboard, hardware(template, pressures(), device={**device, "emulated": True})
     )
-    (leaderboard / canonical.ATTESTATIONS).write_text(log_of(honest.sha256))
+    attest(leaderboard, log_of(honest.sha256))
     (row,) = frames.load_tracks(leaderboard, track="performance")[0].hardware
     assert row.rank is None
     assert row.reasons == ("software stood in for the ventilator and its lung",)

@@ -77,17 +77,11 @@ def test_no_byte_of_the_simulators_may_change(tmp_path: Path) -> None:
             flip(copy / name, place)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/stress.md"])
-def test_tables_of_the_docs_are_those_of_the_records(page: str) -> None:
+def test_tables_of_the_docs_are_those_of_the_records() -> None:
     root = FOLDER.parent
-    if page == "docs/stress.md":
-        tool = runpy.run_path(str(root / "benchmarks" / "stress.py"))
-        scores = [{"name": name, **own.headline()} for name, own in tool["recorded"]().items()]
-        table = tool["table"](scores)
-    else:
-        tool = runpy.run_path(str(root / "benchmarks" / "board_tables.py"))
-        table = tool["markdown"]()
-    assert table in (root / page).read_text("utf-8"), "run the benchmark with --write"
+    tables = runpy.run_path(str(root / "benchmarks" / "board_tables.py"))["tables"]()
+    for page, (_, table) in tables.items():
+        assert table in (root / page).read_text("utf-8"), f"{page}: board_tables.py --write"
 
 
 def test_only_unseen_draws_of_a_round_count() -> None:

@@ -228,7 +228,7 @@ def test_pages_show_both_scores(built):
     assert "Normalised" in index
     assert "Rehearsal, never official" in index
     page = (built / f"entries/{ROUND}/robustness/soft.html").read_text("utf-8")
-    assert "Normalised score over the draws" in page
+    assert f"Normalised score over the {draw_tables.COUNT} draws that rank" in page
     assert "--protocol" not in page
 
 

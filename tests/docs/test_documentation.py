@@ -6,6 +6,7 @@ import importlib.util
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -154,10 +155,12 @@ def furnish(folder: Path) -> Path:
     head = ", ".join(f"'{name}'" for name in (*names, "cycle_number"))
     rows = np.stack(logged, axis=1)
     np.savetxt(folder / "waveforms.csv", rows, "%.14g", ",", header=head, comments="")
-    commands = next((ROOT / "leaderboard" / "records").glob("*.actions"))
-    (folder / commands.name).write_bytes(commands.read_bytes())
-    texts = (path.read_bytes() for path in sorted(commands.parent.glob("*.json")))
-    (folder / "RECORD.json").write_bytes(next(x for x in texts if commands.stem.encode() in x))
+    records = ROOT / "leaderboard" / "records"
+    record = next(x for x in sorted(records.glob("*.json")) if '"commands"' in x.read_text("utf-8"))
+    shutil.copy(record, folder / "RECORD.json")
+    for commands in records.glob("*.actions"):
+        if commands.stem in record.read_text("utf-8"):
+            shutil.copy(commands, folder)
     return folder
 
 

@@ -60,26 +60,27 @@ def test_the_pid_scores_100_and_the_recorded_commands_0(rigs, found):
             return p * error + i * self.integral + d * self.derivative
 
     score = run_protocol(submission_of(BestPID), rigs, draws=2, reference=found)
-    np.testing.assert_allclose(np.asarray(score.normalised), 100.0, atol=1e-6)
+    # A command of 0.001 % moves a score by less than a fiftieth of a point.
+    np.testing.assert_allclose(np.asarray(score.normalised), 100.0, atol=0.02)
     value = score.to_json()["normalised"]
-    assert value["nominal"] == pytest.approx(100.0)
-    assert value["draws"]["score"] == pytest.approx(100.0)
-    assert list(score.summary()["normalised"]) == pytest.approx([100.0] * 6)
+    assert value["nominal"] == pytest.approx(100.0, abs=0.002)
+    assert value["draws"]["score"] == pytest.approx(100.0, abs=0.002)
+    assert list(score.summary()["normalised"]) == pytest.approx([100.0] * 6, abs=0.01)
 
     made = iter(np.ndindex(6, 3, 6))
 
     class Witness:
         def reset(self, task):
-            self.commands = found.commands[next(made)]
+            first, second = found.commands[next(made)]
+            self.breaths = iter([first, first, second])
 
         def act(self, observation):
             if observation.time == 0:
-                self.step = -1
-            self.step += 1
-            return float(np.append(self.commands, 0.0)[self.step])
+                self.steps = iter(next(self.breaths))
+            return float(next(self.steps, 0.0))
 
     best = run_protocol(submission_of(Witness), rigs, draws=2, reference=found)
-    np.testing.assert_allclose(np.asarray(best.normalised), 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(best.normalised), 0.0, atol=0.02)
 
 
 def test_saved_and_read_again(found, tmp_path):

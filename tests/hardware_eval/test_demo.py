@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -80,27 +79,13 @@ def test_what_the_simulator_lacks_costs_and_a_plan_with_it_does_better(tmp_path:
     assert mean["true"] == pytest.approx(planned["true"].error, abs=0.25)
 
 
-#: Words of the manual's table, and what they conceal.
-WORDS = {
-    "monday": "leak",
-    "february": "sensor_lag",
-    "wednesday": "supply_droop",
-    "black": "turbulent_resistance",
-    "friday": "nonlinear_compliance",
-    "thursday": "valve_delay",
-    "sunday": "valve_delay",
-    "april": "valve_lag",
-}
-
-
 @pytest.mark.slow
-@pytest.mark.skipif("VENTBENCH_LONG" not in os.environ, reason="minutes for each of the words")
-@pytest.mark.parametrize("words", WORDS)
-def test_the_loop_closes(words: str, tmp_path: Path) -> None:
+def test_the_loop_closes(tmp_path: Path) -> None:
+    words = "monday"  # the words that the command has if none are given
     out = tmp_path / "demo"
     done = demo(words, out, sandbox=False, tell=print)
     label, effect = reveal(out / "seal.json", words)
-    assert (label.id, effect.name) == (done.lung, WORDS[words])
+    assert (label.id, effect.name) == (done.lung, "leak")
     figures = json.loads((out / "demo.json").read_text())
     assert figures["truth"]["name"] == effect.name
     assert figures["steps"] == list(done.steps)

@@ -116,8 +116,9 @@ def test_who_cannot_take_part(frozen: Round, tmp_path: Path) -> None:
 
 
 def test_a_round_is_played_and_goes_on_where_it_stopped(frozen: Round) -> None:
-    own = draw(frozen, referee.value(SECRET, frozen.number))
-    result = play(own)
+    own, steps = draw(frozen, referee.value(SECRET, frozen.number)), []
+    result = play(own, tell=lambda name, done, total: steps.append((name, done, total)))
+    assert ("make faults", 1, 1) in steps, "as the bars of the command line are told"
     folder = ChallengeFolder(own.folder / "faults")
     assert set(folder.answers("mine")) == set(folder.answers("other")) == {"case_0001"}
     (rows,) = result.tables.values()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ventbench.mechanics import identify
 from ventbench.recordings import check, load, make_breaths, write
-from ventbench.recordings.bad_samples import clean, find_bad_samples, without
+from ventbench.recordings.bad_samples import blanked, clean, find_bad_samples
 
 RATE, PERIOD = 50.0, 3.0
 
@@ -76,7 +76,7 @@ def test_isolated_values_far_off_are_found_and_nothing_else(at, size, name):
     columns[name][rows] += size * np.ptp(columns[name]) * np.where(rows % 2, 1.0, -1.0)
     bad = find_bad_samples(columns)
     np.testing.assert_array_equal(np.sort(np.concatenate([x.rows for x in bad])), rows)
-    assert find_bad_samples(without(columns, bad)) == ()
+    assert find_bad_samples(blanked(columns, bad)) == ()
 
 
 def test_held_values_are_found_but_not_a_level_of_a_simulation():

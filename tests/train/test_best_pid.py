@@ -9,7 +9,7 @@ from ventbench.entries.reference import PID_GAINS
 from ventbench.plants.rigs import load_rigs
 from ventbench.task.draws import COUNT
 from ventbench.train import pid_search
-from ventbench.train.pid_search import drawn_errors
+from ventbench.train.pid_search import errors_on_draws
 
 
 @pytest.mark.slow
@@ -22,7 +22,7 @@ def test_no_neighbour_of_the_published_gains_and_no_pid_of_the_paper_is_better()
     paper = np.stack(np.meshgrid([2.0, 5.0, 10.0], [1.0, 4.0, 10.0], [0.0, 5.0]), -1).reshape(-1, 3)
     for lung, gains in enumerate(np.array(PID_GAINS)):
         tried = np.concatenate([gains[None], gains * corners, paper])
-        errors = drawn_errors(rigs, drawn, lung, tried).mean(axis=-1)
+        errors = errors_on_draws(rigs, drawn, lung, tried).mean(axis=-1)
         assert errors[0] <= errors.min() + pid_search.AGREEMENT, lung
 
 
@@ -30,11 +30,11 @@ def test_a_search_finds_what_it_is_told_of(monkeypatch):
     """On a made-up error whose optimum is beyond the grid of the paper."""
     optimum = np.log([40.0, 3.0, 0.5])
 
-    def errors(rigs, drawn, lung, gains, together=None):
+    def errors(rigs, rig_draws, lung, gains, together=None):
         away = np.log(np.maximum(np.asarray(gains, float), 1e-9)) - optimum
         return np.sum(away**2, axis=-1)[..., None]
 
-    monkeypatch.setattr(pid_search, "drawn_errors", errors)
+    monkeypatch.setattr(pid_search, "errors_on_draws", errors)
     found = pid_search.best_pids(load_rigs(), drawn=load_rigs().of_training.draws(1))
     assert found.agree.all()
     np.testing.assert_allclose(np.log(found.gains), np.tile(optimum, (6, 1)), atol=0.03)

@@ -169,7 +169,7 @@ def test_gains_are_tuned_on_draws_of_their_own():
 def test_an_error_on_draws_is_that_of_the_scorer():
     rigs = load_rigs("single_compartment")
     drawn = draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=pid_search.TUNING_SEED, n=1)
-    found = pid_search.drawn_errors(rigs, drawn, 2, PIDS[:1])
+    found = pid_search.errors_on_draws(rigs, drawn, 2, PIDS[:1])
 
     class Controller:
         def reset(self, task):

@@ -18,7 +18,7 @@ from ventbench.cli.options import (
     console_of,
     emit,
     notes,
-    told,
+    written_console,
 )
 
 if TYPE_CHECKING:
@@ -47,8 +47,8 @@ def at_hand(folder: Path) -> Path:
 
     path = frames.folder_of(folder)
     if path != folder:
-        said = f"no folder {folder} here; the board of the last round, which came with ventbench:"
-        typer.echo(said, err=True)
+        note = f"no folder {folder} here; the board of the last round, which came with ventbench:"
+        typer.echo(note, err=True)
     return path
 
 
@@ -168,10 +168,10 @@ def build(
     """
     from ventbench.board import build as builder
 
-    done = builder.build(folder, out)
-    emit({"records": done.records, "files": done.files, "changed": list(done.changed)}, json)
+    built = builder.build(folder, out)
+    emit({"records": built.records, "files": built.files, "changed": list(built.changed)}, json)
     typer.echo(
-        f"{out}: {done.records} records, {done.files} pages, {len(done.changed)} files changed",
+        f"{out}: {built.records} records, {built.files} pages, {len(built.changed)} files changed",
         err=str(json) == "-",
     )
 
@@ -225,7 +225,7 @@ def verify(
         report = verifier.verify(folder, frozen.load, site=site, progress=replaying)
     if rerun and not report.problems:  # else the records are not what they were
         _rerun(report, folder, records or [], source or [], jobs, scheduler)
-    console = told(dataclasses.asdict(report), json)
+    console = written_console(dataclasses.asdict(report), json)
     for note in report.notes:
         console.print(f"note: {plain(note)}")
     for problem in report.problems:
@@ -289,7 +289,9 @@ def show(
 
     folder = at_hand(folder)
     tracks = ranking.newest(frames.load_tracks(folder))
-    console = told({"rows": [frames.csv_row(line) for line in frames.lines(tracks)]}, json)
+    console = written_console(
+        {"rows": [frames.csv_row(line) for line in frames.lines(tracks)]}, json
+    )
     for track in tracks:
         _print_track(console, track)
 
@@ -311,8 +313,8 @@ def _print_track(console: Console, track: Track) -> None:
     for status, row in track.rows:
         if status not in ("ranked", "practice"):
             reasons = row.entry.reasons
-            said = any(reason.startswith(status) for reason in reasons)
-            why = plain("; ".join(reasons if said else (status, *reasons))[:300])
+            reported = any(reason.startswith(status) for reason in reasons)
+            why = plain("; ".join(reasons if reported else (status, *reasons))[:300])
             console.print(f"{row.record.name}: {why}")
     if track.stress:
         console.print(_stress_table(track))
@@ -337,17 +339,17 @@ def _table(track: Track) -> Table:
     """Return the ranking: the columns of the board that have a heading for the terminal."""
     from ventbench.board import frames
 
-    shown = [column for column in frames.COLUMNS if column.terminal]
+    columns = [column for column in frames.COLUMNS if column.terminal]
     table = _plain_table(f"{track.name}: 0 = best attainable, 100 = best PID")
     table.caption = f"{track.title}; error in cmH2O"
-    for name in (*(name for column in shown for name in column.terminal), "record"):
+    for name in (*(name for column in columns for name in column.terminal), "record"):
         table.add_column(name, justify="left" if name in ("entry", "record") else "right")
     for line in frames.lines([track]):
         texts = []
-        for column in shown:
+        for column in columns:
             cell = column.cell(line)
-            known = (cell["text"] if cell["value"] not in ("", None) else "", cell["small"])
-            texts += known[: len(column.terminal)]
+            values = (cell["text"] if cell["value"] not in ("", None) else "", cell["small"])
+            texts += values[: len(column.terminal)]
         table.add_row(*texts, line.row.record.sha256[:SHOWN])
     return table
 

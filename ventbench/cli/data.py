@@ -16,11 +16,11 @@ from ventbench.cli.options import (
     Pad,
     PlantName,
     bar,
+    complete_lungs,
     emit,
-    known_lungs,
     table_of,
-    told,
     waiting,
+    written_console,
 )
 
 #: Breaths that are explored side by side.
@@ -65,11 +65,11 @@ def examples(json: JsonFile = None) -> None:
     manifest = tomllib.loads(files.example("manifest.toml").read_text("utf-8"))["recordings"]
     columns = ("example", "breaths", "label", "what it is")
     rows = [
-        (Path(name).stem, str(about["breaths"]), about["label"], about["about"])
-        for name, about in manifest.items()
+        (Path(name).stem, str(entry["breaths"]), entry["label"], entry["about"])
+        for name, entry in manifest.items()
     ]
     values = [dict(zip(columns, row, strict=True)) for row in rows]
-    told({"examples": values}, json).print(
+    written_console({"examples": values}, json).print(
         table_of("Recordings to try things on", columns, rows, left=columns)
     )
 
@@ -259,7 +259,7 @@ def _numbers(given: list[str] | None, option: str) -> dict[str, float]:
 def explore(
     out: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet file to write.")],
     lung: Annotated[
-        str, typer.Option(help="Lung setting, such as R20C50.", autocompletion=known_lungs)
+        str, typer.Option(help="Lung setting, such as R20C50.", autocompletion=complete_lungs)
     ] = "R20C50",
     plant: PlantName = "frozen",
     breaths: Annotated[
@@ -286,9 +286,9 @@ def explore(
         chosen, min(breaths, _TOGETHER), noise=noise, seed=seed
     )
     with bar(f"exploring {lung}") as exploring:
-        made = exploration.explore(ventilator, lung, breaths, seed=seed, progress=exploring)
-    recordings.write(made, out)
-    for note in made.notes:
+        recording = exploration.explore(ventilator, lung, breaths, seed=seed, progress=exploring)
+    recordings.write(recording, out)
+    for note in recording.notes:
         typer.echo(f"note: {note}", err=True)
-    highest = float(made.pressure[made.valid].max())
-    typer.echo(f"wrote {len(made)} breaths of {lung} to {out}; highest {highest:.1f} cmH2O")
+    highest = float(recording.pressure[recording.valid].max())
+    typer.echo(f"wrote {len(recording)} breaths of {lung} to {out}; highest {highest:.1f} cmH2O")

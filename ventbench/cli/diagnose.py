@@ -17,11 +17,11 @@ from ventbench.cli.options import (
     PlantName,
     bar,
     claim_out,
-    known_lungs,
+    complete_lungs,
     notes,
     read_recording,
     table_of,
-    told,
+    written_console,
 )
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def mechanics(
     Example: `ventbench mechanics lab.csv`
     """
     named = _of_runs(recordings) or _of_session(recordings, clip=clip, pad=pad, missing=missing)
-    console = told([{"name": name} | _lung(lung) for name, lung in named.items()], json)
+    console = written_console([{"name": name} | _lung(lung) for name, lung in named.items()], json)
     console.print(_table(named))
     for name, lung in named.items():
         for note in lung.notes:
@@ -71,17 +71,17 @@ def _of_runs(path: Path) -> dict[str, Mechanics]:
     if runs and not measured:
         raise InputError(f"{path}: no run has flow or volume; log one of them beside pressure")
     if len(measured) < len(runs):
-        left = len(runs) - len(measured)
-        notes().print(f"note: {left} of {len(runs)} runs have neither flow nor volume")
-    found: dict[str, Mechanics] = {}
+        skipped = len(runs) - len(measured)
+        notes().print(f"note: {skipped} of {len(runs)} runs have neither flow nor volume")
+    by_run: dict[str, Mechanics] = {}
     with bar(f"identifying the lungs of {path}") as identifying:
         for name, breaths in measured.items():
-            found[name] = identify(breaths)[0]
-            identifying(len(found), len(measured))
-    for day in {name.rpartition(" ")[0] for name in found}:
-        own = [name for name in found if name.rpartition(" ")[0] == day]
-        found |= zip(own, share_faults([found[name] for name in own]), strict=True)
-    return {f"{name}: {lung.label}": lung for name, lung in found.items()}
+            by_run[name] = identify(breaths)[0]
+            identifying(len(by_run), len(measured))
+    for day in {name.rpartition(" ")[0] for name in by_run}:
+        of_day = [name for name in by_run if name.rpartition(" ")[0] == day]
+        by_run |= zip(of_day, share_faults([by_run[name] for name in of_day]), strict=True)
+    return {f"{name}: {lung.label}": lung for name, lung in by_run.items()}
 
 
 def _of_session(
@@ -92,12 +92,12 @@ def _of_session(
     from ventbench.recordings.read import session_files
 
     paths = session_files(path)
-    found = {
+    by_lung = {
         f"{file.stem}: {lung.label}" if len(paths) > 1 else lung.label: lung
         for file in paths
         for lung in _identify(file, clip=clip, pad=pad, missing=missing)
     }
-    return dict(zip(found, share_faults(list(found.values())), strict=True))
+    return dict(zip(by_lung, share_faults(list(by_lung.values())), strict=True))
 
 
 def _identify(
@@ -177,7 +177,7 @@ def diagnose(
     lung: Annotated[
         str | None,
         typer.Option(
-            metavar="R20C50", help="Only the breaths of this lung.", autocompletion=known_lungs
+            metavar="R20C50", help="Only the breaths of this lung.", autocompletion=complete_lungs
         ),
     ] = None,
     patient: Annotated[
@@ -213,10 +213,10 @@ def diagnose(
     breaths = read_recording(recordings, clip=clip, pad=pad, missing=missing)
     diagnosis = _diagnose(breaths, plant, lung, patient, drive)
     written = diagnosis.save(out)
-    console = told(diagnosis.as_dict(), json)
-    verdict, *others = str(diagnosis).splitlines()
+    console = written_console(diagnosis.as_dict(), json)
+    verdict, *sentences = str(diagnosis).splitlines()
     console.print(verdict, style="bold")
-    for text in others:
+    for text in sentences:
         console.print(text)
     for path in written:
         console.print(f"wrote {path}", soft_wrap=True)
@@ -241,7 +241,7 @@ def _diagnose(
             lung=lung,
             patient=patient,
             drive=drive,  # type: ignore[arg-type]
-            progress=lambda what, share: diagnosing(share, text=what),
+            progress=lambda stage, share: diagnosing(share, text=stage),
         )
 
 
@@ -264,7 +264,7 @@ def isolability(
         ),
     ],
     lung: Annotated[
-        str, typer.Option(metavar="R20C50", help="Its label.", autocompletion=known_lungs)
+        str, typer.Option(metavar="R20C50", help="Its label.", autocompletion=complete_lungs)
     ] = "R20C50",
     sensors: Annotated[
         str, typer.Option(metavar="pressure,flow", help="What is measured.")
@@ -286,25 +286,25 @@ def isolability(
     from ventbench.diagnosis.isolability import isolability as compute
 
     compilation.keep()
-    found = compute(
+    result = compute(
         controls,
         lung=lung,
-        sensors=[each.strip() for each in sensors.split(",")],
+        sensors=[sensor.strip() for sensor in sensors.split(",")],
         noise={"pressure": noise},
-        names=[each for each in names.split(",") if each] or None,
+        names=[sensor for sensor in names.split(",") if sensor] or None,
     )
-    console = told(found.as_dict(), json)
-    for group in found.groups:
+    console = written_console(result.as_dict(), json)
+    for group in result.groups:
         apart = "told from all others" if len(group) == 1 else "not told apart"
         console.print(f"{', '.join(group)}: {apart}")
     nothing = "nothing that is known"
     rows = [
         (" / ".join(pair.names), f"{pair.nats:.1f}", pair.remedy or nothing, f"{pair.gained:.1f}")
-        for pair in (*found.confused, *found.unseen)
+        for pair in (*result.confused, *result.unseen)
     ]
     if rows:
         title = "What the plan does not tell apart, or not show at a mild strength"
         columns = ("mechanisms", "nats", "what would", "nats then")
         console.print(table_of(title, columns, rows, left=["what would"]))
-    if found.confused:
+    if result.confused:
         raise typer.Exit(1)

@@ -13,7 +13,7 @@ from typing import Any
 import typer
 
 from ventbench.base.errors import InputError
-from ventbench.cli.options import JsonFile, told
+from ventbench.cli.options import JsonFile, written_console
 
 #: Packages whose version matters to a score, and those of each extra.
 _CORE = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy", "pandas", "pyarrow")
@@ -40,7 +40,7 @@ def doctor(json: JsonFile = None) -> None:
     from rich.table import Table
 
     report = examine()
-    console, table = told(report, json), Table(show_header=False)
+    console, table = written_console(report, json), Table(show_header=False)
     for name, value in report["facts"].items():
         table.add_row(name, value)
     console.print(table)

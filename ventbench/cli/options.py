@@ -53,14 +53,14 @@ def claim_json(path: Path | None) -> Path | None:
     return path
 
 
-def known_lungs(incomplete: str) -> list[str]:
+def complete_lungs(incomplete: str) -> list[str]:
     """Ids of the six lungs, for completion by the shell."""
     from ventbench.task.lungs import LUNG_IDS
 
     return [name for name in LUNG_IDS if name.startswith(incomplete.upper())]
 
 
-def known_entries(incomplete: str) -> list[str]:
+def complete_entries(incomplete: str) -> list[str]:
     """Names of bundled submissions, and folders, for completion by the shell."""
     from ventbench.entries.folder import bundled
 
@@ -68,7 +68,7 @@ def known_entries(incomplete: str) -> list[str]:
     return [name for name in bundled() if name.startswith(incomplete)] + sorted(folders)
 
 
-def known_plants(incomplete: str) -> list[str]:
+def complete_plants(incomplete: str) -> list[str]:
     """Names of simulators, and files, for completion by the shell."""
     from ventbench.plants.catalog import names
 
@@ -81,7 +81,7 @@ Entries = Annotated[
     typer.Argument(
         metavar="SUBMISSION...",
         help="Folders or names of bundled submissions.",
-        autocompletion=known_entries,
+        autocompletion=complete_entries,
     ),
 ]
 OneTrack = Annotated[
@@ -126,8 +126,9 @@ PlantName = Annotated[
     str,
     typer.Option(
         "--plant",
+        "--simulator",
         metavar="PLANT",
-        autocompletion=known_plants,
+        autocompletion=complete_plants,
         help="Simulators: frozen (the official ones), physics, two_balloon, a file of plants such "
         "as corrected.json, a CSV or Parquet file of simulated pressures, or module:function.",
     ),
@@ -152,14 +153,16 @@ RecordingsDir = Annotated[
 ]
 
 
-def recordings_folder(given: Path | None) -> Path:
+def recordings_folder(folder_option: Path | None) -> Path:
     """Return the folder of the public recordings; InputError if there is none."""
     from ventbench.recordings import recordings_dir
 
-    folder = given or recordings_dir()
+    folder = folder_option or recordings_dir()
     if folder is None or not folder.is_dir():
-        what = "no folder of the public recordings" if folder is None else f"{folder} is no folder"
-        raise InputError(f"{what}; give --recordings DIR or set VENTBENCH_RECORDINGS")
+        reason = (
+            "no folder of the public recordings" if folder is None else f"{folder} is no folder"
+        )
+        raise InputError(f"{reason}; give --recordings DIR or set VENTBENCH_RECORDINGS")
     return folder
 
 
@@ -180,7 +183,7 @@ def console_of(err: bool, *, quiet: bool = False) -> Console:
     return Console(stderr=err, quiet=quiet, markup=False, highlight=False)
 
 
-def told(value: object, json: Path | None) -> Console:
+def written_console(value: object, json: Path | None) -> Console:
     """Write a result as of :func:`emit`; return the console for people, beside that of the JSON."""
     emit(value, json)
     return console_of(str(json) == "-")
@@ -198,9 +201,9 @@ def table_of(
     """Return a table of texts: the first column and those named stand to the left, others right."""
     from rich.table import Table
 
-    table, kept = Table(title=title, caption=caption), set(left)
+    table, left_aligned = Table(title=title, caption=caption), set(left)
     for place, name in enumerate(columns):
-        justify = "left" if place == 0 or name in kept else "right"
+        justify = "left" if place == 0 or name in left_aligned else "right"
         overflow = "ellipsis" if no_wrap else "fold"
         table.add_column(name, justify=justify, no_wrap=no_wrap, overflow=overflow)
     for row in rows:
@@ -220,8 +223,8 @@ def be_quiet(value: bool = True) -> None:
 def quiet_first(arguments: list[str]) -> list[str]:
     """Move ``--quiet`` to the front, where the program takes it whatever the command."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
-    own = [text for text in arguments[:end] if text != "--quiet"]
-    return ["--quiet"] * (len(own) < end) + own + arguments[end:]
+    arguments_of_command = [text for text in arguments[:end] if text != "--quiet"]
+    return ["--quiet"] * (len(arguments_of_command) < end) + arguments_of_command + arguments[end:]
 
 
 def notes() -> Console:
@@ -247,12 +250,12 @@ def bars() -> Iterator[Callable[..., None]]:
         Remaining(),
     )
     tasks: dict[str, TaskID] = {}
-    with _progress(*columns) as shown:
+    with _progress(*columns) as display:
 
-        def tell(name: str, done: float, total: float | None = 1.0, text: str = "") -> None:
+        def tell(name: str, completed: float, total: float | None = 1.0, text: str = "") -> None:
             if name not in tasks:
-                tasks[name] = shown.add_task(name, total=total)
-            shown.update(tasks[name], completed=done, total=total, description=text or name)
+                tasks[name] = display.add_task(name, total=total)
+            display.update(tasks[name], completed=completed, total=total, description=text or name)
 
         yield tell
 
@@ -292,8 +295,8 @@ def read_recording(
     return breaths
 
 
-def of_each_entry(
-    what: str,
+def map_entries(
+    task: str,
     work: Callable[..., ResultT],
     jobs: Sequence[tuple[Submission, str, *tuple[object, ...]]],
     workers: int = 0,
@@ -304,7 +307,7 @@ def of_each_entry(
     What JAX compiles for it is kept from one run to the next, see ``ventbench.base.compilation``.
 
     Args:
-        what: is done, such as ``scoring``.
+        task: what is done, such as ``scoring``.
         work: takes what a job holds, and ``progress`` in this process; side by side, a function of
             a module with arguments that can be sent.
         jobs: an entry each, its track, and what else the work is told; in the order of the
@@ -317,12 +320,12 @@ def of_each_entry(
 
     if not workers and scheduler is None:
         compilation.keep()
-        done = []
+        results = []
         for job in jobs:
-            with bar(f"{what} {job[0].label}, {job[1]}") as progress:
-                done.append(work(*job, progress=progress))
-        return done
-    with bar(f"{what}, {len(jobs)} jobs") as progress, executor(workers, scheduler) as pool:
+            with bar(f"{task} {job[0].label}, {job[1]}") as progress:
+                results.append(work(*job, progress=progress))
+        return results
+    with bar(f"{task}, {len(jobs)} jobs") as progress, executor(workers, scheduler) as pool:
         return in_order(pool, partial(_keeping, work), jobs, progress)
 
 
@@ -339,20 +342,20 @@ def waiting(text: str) -> Progress:
     from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-    shown = _progress(*columns)
-    shown.add_task(text, total=None)
-    return shown
+    display = _progress(*columns)
+    display.add_task(text, total=None)
+    return display
 
 
 #: Exit code after Ctrl-C, as shells have it.
 INTERRUPTED = 130
 
 
-def program(name: str, about: str, *, completion: bool = True) -> typer.Typer:
+def program(name: str, help_text: str, *, completion: bool = True) -> typer.Typer:
     """Return a command line without commands: its help, ``--version`` and ``--quiet``."""
     app = typer.Typer(
         name=name,
-        help=about,
+        help=help_text,
         no_args_is_help=True,
         add_completion=completion,
         pretty_exceptions_enable=False,
@@ -411,11 +414,11 @@ def run(app: typer.Typer, program: str, *, named: str | None = None, stopped: st
 def _stop(program: str, stopped: str) -> NoReturn:
     """End after Ctrl-C, and say whether the same command goes on from here."""
     resume = sys.modules.get("ventbench.base.resume")
-    kept = resume.opened() if resume else None
+    folder = resume.opened() if resume else None
     print(
         f"{program}: stopped"
         + (f"; {stopped}" if stopped else "")
-        + (f"; what is finished is kept in {kept}: the same command continues" if kept else ""),
+        + (f"; what is finished is kept in {folder}: the same command continues" if folder else ""),
         file=sys.stderr,
     )
     sys.stdout.flush()

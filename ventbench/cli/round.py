@@ -64,7 +64,7 @@ def open_(
     """
     from ventbench.board import beacon, rounds
 
-    made = rounds.open_round(
+    opened = rounds.open_round(
         folder,
         name,
         closes.replace(tzinfo=datetime.UTC),
@@ -73,7 +73,7 @@ def open_(
         limit=limit,
         chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
     )
-    _told(made, json)
+    _print_round(opened, json)
 
 
 @app.command()
@@ -99,8 +99,8 @@ def freeze(
     from ventbench.board import rounds
     from ventbench.plants import frozen
 
-    asked = [] if requests is None else rounds.read_requests(requests)
-    _told(rounds.freeze(folder, name, submissions, asked, frozen.load().about()), json)
+    entries = [] if requests is None else rounds.read_requests(requests)
+    _print_round(rounds.freeze(folder, name, submissions, entries, frozen.load().about()), json)
 
 
 @app.command()
@@ -124,11 +124,11 @@ def draw(
     from ventbench.board import beacon as beacons
     from ventbench.board import rounds
 
-    own = rounds.load(folder, name)
-    if own.frozen is None:
-        raise InputError(f"round {name} is {own.state}; freeze its entries first")
-    content = beacon.read_bytes() if beacon else beacons.fetch(own.opened.chain, own.number)
-    _told(rounds.draw(folder, name, content), json)
+    round_ = rounds.load(folder, name)
+    if round_.frozen is None:
+        raise InputError(f"round {name} is {round_.state}; freeze its entries first")
+    content = beacon.read_bytes() if beacon else beacons.fetch(round_.opened.chain, round_.number)
+    _print_round(rounds.draw(folder, name, content), json)
 
 
 @app.command()
@@ -165,9 +165,9 @@ def score(
     from ventbench.base.executor import executor
     from ventbench.board import gate, official_runs, rounds
 
-    own = rounds.load(folder, name)
+    round_ = rounds.load(folder, name)
     if plan:
-        runs = official_runs.plan(own)
+        runs = official_runs.plan(round_)
         seconds = sum(official_runs.SECONDS[track] for _, track in runs)
         emit({"runs": runs, "processor_s": seconds}, json)
         typer.echo(
@@ -177,7 +177,7 @@ def score(
         )
         return
     with bars() as tell, executor(workers, scheduler) as pool:
-        made = official_runs.score(
+        result = official_runs.score(
             folder,
             name,
             pool,
@@ -187,7 +187,7 @@ def score(
             secret=os.environ.get(gate.SECRET) or None,
             progress=tell,
         )
-    _told(made, json)
+    _print_round(result, json)
 
 
 @app.command()
@@ -206,49 +206,49 @@ def show(
 
     folder = at_hand(folder)
     if name is None:
-        made = rounds.load_all(folder)
-        emit({"rounds": [_about(own) for own in made]}, json)
-        for own in made:
-            typer.echo(f"{own.name}: {own.state}", err=str(json) == "-")
+        every_round = rounds.load_all(folder)
+        emit({"rounds": [_summary(round_) for round_ in every_round]}, json)
+        for round_ in every_round:
+            typer.echo(f"{round_.name}: {round_.state}", err=str(json) == "-")
         return
-    own = rounds.load(folder, name)
-    _told(own, json)
-    if own.result is not None:
+    round_ = rounds.load(folder, name)
+    _print_round(round_, json)
+    if round_.result is not None:
         tables_of(folder, name, err=str(json) == "-")
 
 
-def _about(own: Round) -> dict[str, object]:
+def _summary(round_: Round) -> dict[str, object]:
     """What is known of a round, as JSON values."""
-    frozen = own.frozen
+    frozen = round_.frozen
     return {
-        "name": own.name,
-        "state": own.state,
-        "rehearsal": own.opened.rehearsal,
-        "closes": own.opened.closes.isoformat(),
-        "beacon_round": own.number if frozen else None,
-        "beacon_time": own.opened.chain.time_of(own.number).isoformat() if frozen else None,
+        "name": round_.name,
+        "state": round_.state,
+        "rehearsal": round_.opened.rehearsal,
+        "closes": round_.opened.closes.isoformat(),
+        "beacon_round": round_.number if frozen else None,
+        "beacon_time": round_.opened.chain.time_of(round_.number).isoformat() if frozen else None,
         "entries": [entry.name for entry in frozen.entries] if frozen else [],
         "left_out": frozen.left_out if frozen else {},
-        "failed": own.result.failed if own.result else {},
-        "draws": own.commitment if own.value else None,
+        "failed": round_.result.failed if round_.result else {},
+        "draws": round_.commitment if round_.value else None,
     }
 
 
-def _told(own: Round, json: Path | None) -> None:
+def _print_round(round_: Round, json: Path | None) -> None:
     """Say how far a round is, and what comes next."""
-    about, err = _about(own), str(json) == "-"
-    emit(about, json)
-    kind = "rehearsal" if own.opened.rehearsal else "round"
-    typer.echo(f"{kind} {own.name} is {own.state}", err=err)
-    if own.frozen is not None:
+    summary, err = _summary(round_), str(json) == "-"
+    emit(summary, json)
+    kind = "rehearsal" if round_.opened.rehearsal else "round"
+    typer.echo(f"{kind} {round_.name} is {round_.state}", err=err)
+    if round_.frozen is not None:
         typer.echo(
-            f"{len(own.frozen.entries)} entries, {own.frozen_sha256}; value {own.number} of the "
-            f"beacon, at {about['beacon_time']}",
+            f"{len(round_.frozen.entries)} entries, {round_.frozen_sha256}; value "
+            f"{round_.number} of the beacon, at {summary['beacon_time']}",
             err=err,
         )
-        reasons = {**own.frozen.left_out, **(own.result.failed if own.result else {})}
+        reasons = {**round_.frozen.left_out, **(round_.result.failed if round_.result else {})}
         for entry, why in reasons.items():
             typer.echo(f"{entry}: {plain(why)}", err=err)
-    following = {"open": "freeze", "frozen": "draw", "drawn": "score"}.get(own.state)
-    next_ = f"ventbench round {following} {own.name}" if following else "ventbench board build"
+    following = {"open": "freeze", "frozen": "draw", "drawn": "score"}.get(round_.state)
+    next_ = f"ventbench round {following} {round_.name}" if following else "ventbench board build"
     typer.echo(f"next: {next_}", err=err)

@@ -24,14 +24,14 @@ from ventbench.cli.options import (
     Workers,
     bar,
     claim_out,
+    complete_entries,
+    complete_lungs,
     emit,
-    known_entries,
-    known_lungs,
+    map_entries,
     notes,
-    of_each_entry,
     table_of,
-    told,
     waiting,
+    written_console,
 )
 
 if TYPE_CHECKING:
@@ -138,9 +138,9 @@ def score(
         stress = DRAWS if draws >= 20 else 0
     jobs = [job for entry in opened for job in _jobs(entry, track, stress)]
     work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process)
-    scores = of_each_entry("scoring", work, jobs, workers, scheduler)
+    scores = map_entries("scoring", work, jobs, workers, scheduler)
     results = [result.to_json() for result in scores]
-    console = told(results[0] if len(results) == 1 else {"submissions": results}, json)
+    console = written_console(results[0] if len(results) == 1 else {"submissions": results}, json)
     for result in scores:
         console.print(str(result), soft_wrap=True, markup=False, highlight=False)
     if len(scores) > 1 or draws:
@@ -166,7 +166,7 @@ def _jobs(entry: Submission, track: Track | None, stress: int) -> list[tuple[Sub
     tracks = entered if track == "all" else (track or entered[0],)
     if stress and "robustness" not in tracks:
         notes().print(f"{entry.manifest.name} is told its lung: no score under missing physics")
-    return [(entry, each, stress if each == "robustness" else 0) for each in tracks]
+    return [(entry, name, stress if name == "robustness" else 0) for name in tracks]
 
 
 def _run(
@@ -212,9 +212,9 @@ def _compare(console: Console, scores: list[Score]) -> None:
     import math
 
     stressed = [(score.submission.manifest.name, score.stressed) for score in scores]
-    found = [(name, runs) for name, runs in stressed if runs is not None]
-    for name, runs in found[1:]:
-        first, base = found[0]
+    stressed_runs = [(name, runs) for name, runs in stressed if runs is not None]
+    for name, runs in stressed_runs[1:]:
+        first, base = stressed_runs[0]
         difference, (low, high) = runs.difference(base)
         if math.isfinite(difference):
             console.print(
@@ -279,7 +279,7 @@ def transfer(
         for result, own in zip(results, errors, strict=True)
     ]
     title = "Mean |pressure - target| on rigs, cmH2O (lower is better)"
-    told({"entries": results}, json).print(table_of(title, columns, rows))
+    written_console({"entries": results}, json).print(table_of(title, columns, rows))
 
 
 def new(
@@ -319,7 +319,7 @@ def check(
     submission: Annotated[
         str,
         typer.Argument(
-            help="Folder or name of a bundled submission.", autocompletion=known_entries
+            help="Folder or name of a bundled submission.", autocompletion=complete_entries
         ),
     ],
     in_process: InProcess = False,
@@ -383,14 +383,14 @@ def headroom(
     from ventbench.train.pid_search import best_pids
 
     rigs = load_rigs()
-    drawn = rigs.draws(draws.COUNT)
-    plants, cells = rigs.cells(drawn, protocol.PIPS)
-    about = references.settings(rigs.about, drawn.about())
+    rig_draws = rigs.draws(draws.COUNT)
+    plants, cells = rigs.cells(rig_draws, protocol.PIPS)
+    about = references.settings(rigs.about, rig_draws.about())
     if check is not None:
         computed = references.load(check)
-        references.reference_of(rigs.about, drawn.about(), computed)
+        references.reference_of(rigs.about, rig_draws.about(), computed)
         result = references.checked(computed, plants, cells, every=_EVERY)
-        console = told(result, json)
+        console = written_console(result, json)
         for key, value in result.items():
             console.print(f"{key}: {value}")
         if not result["sound"]:
@@ -418,7 +418,7 @@ def headroom(
         "pid": float(computed.pid.mean()),
         "largest_gap": float(np.max(computed.attainable - computed.lower)),
     }
-    told(summary, json).print(
+    written_console(summary, json).print(
         f"wrote {out}\nmean over cells, first step left out: best attainable "
         f"{summary['attainable']:.3f} cmH2O (at least {summary['lower']:.3f}), best PID "
         f"{summary['pid']:.3f}\nSHA-256 {sha256}",
@@ -442,7 +442,7 @@ def stressors(json: JsonFile = None) -> None:
         rows.append((line.category, line.name, line.title, line.strength + how, *strengths))
     columns = ("category", "stressor", "what happens", "changes", "mild", "strong")
     lines, pairs = [dataclasses.asdict(x) for x in STRESSORS], [list(pair) for pair in PAIRS]
-    console = told({"version": VERSION, "stressors": lines, "pairs": pairs}, json)
+    console = written_console({"version": VERSION, "stressors": lines, "pairs": pairs}, json)
     console.print(table_of(f"Stressors, version {VERSION}", columns, rows, left=columns[:4]))
     console.print("Pairs, both mild: " + ", ".join(" + ".join(pair) for pair in PAIRS))
 
@@ -458,7 +458,7 @@ def entries(json: JsonFile = None) -> None:
     columns = ("submission", "family", "tracks", "what it is")
     rows = [(m.name, m.family, ", ".join(m.tracks), m.description) for m in manifests]
     values = [dict(zip(columns, row, strict=True)) for row in rows]
-    told({"entries": values}, json).print(
+    written_console({"entries": values}, json).print(
         table_of("Submissions that come with ventbench", columns, rows, left=columns)
     )
 
@@ -469,13 +469,13 @@ def adversary(
         typer.Argument(
             metavar="SUBMISSION",
             help="Folder or name of a bundled submission.",
-            autocompletion=known_entries,
+            autocompletion=complete_entries,
         ),
     ],
     lung: Annotated[
         list[str] | None,
         typer.Option(
-            help="Lung to search on; may be repeated. Default: all.", autocompletion=known_lungs
+            help="Lung to search on; may be repeated. Default: all.", autocompletion=complete_lungs
         ),
     ] = None,
     stressor: Annotated[
@@ -508,7 +508,7 @@ def adversary(
 
     compilation.keep()
     with waiting(f"searching for what makes {name} unsafe"):
-        found = search(
+        adversaries = search(
             name,
             simulator=plant,
             track=track,
@@ -516,12 +516,17 @@ def adversary(
             stressors=stressor or (),
             sandbox=not in_process,
         )
-    values = {"submission": name, "lungs": [asdict(one) for one in found]}
-    text = "\n".join(line for one in found for line in one.lines())
+    values = {
+        "submission": name,
+        "lungs": [asdict(adversary_of_lung) for adversary_of_lung in adversaries],
+    }
+    text = "\n".join(
+        line for adversary_of_lung in adversaries for line in adversary_of_lung.lines()
+    )
     emit(values, json)
     typer.echo(text, err=str(json) == "-")
     if out is not None:
         files.write_json(out / "adversary.json", values)
         files.write_text(out / "adversary.txt", text + "\n")
-    if any(one.severity is not None for one in found):
+    if any(adversary_of_lung.severity is not None for adversary_of_lung in adversaries):
         raise typer.Exit(1)

@@ -16,10 +16,10 @@ from ventbench.cli.options import (
     Pad,
     PlantName,
     bar,
-    known_lungs,
+    complete_lungs,
     read_recording,
     table_of,
-    told,
+    written_console,
 )
 from ventbench.task import protocol
 
@@ -39,17 +39,17 @@ def lungs(json: JsonFile = None) -> None:
     from ventbench.plants import frozen
 
     official = frozen.load()
-    known = official.lungs()
+    summaries = official.lungs()
     kinds = {"own_rig": "own rig", "unseen_rig": "unseen rig", "held_out": "by clock"}
 
-    def shown(about: dict[str, Any], kind: str) -> str:
-        return f"{about[f'{kind}_mae']:.2f} / {about[f'{kind}_median_mae']:.2f}"
+    def shown(summary: dict[str, Any], kind: str) -> str:
+        return f"{summary[f'{kind}_mae']:.2f} / {summary[f'{kind}_median_mae']:.2f}"
 
     rows = []
-    for rigs, (lung_id, about) in zip(official.rigs, known.items(), strict=True):
-        setting = (f"{about['R']:g}", f"{about['C']:g}", str(len(rigs)))
-        figures = (shown(about, kind) for kind in kinds)
-        rows.append((lung_id, *setting, *figures, str(about["held_out_breaths"])))
+    for rigs, (lung_id, summary) in zip(official.rigs, summaries.items(), strict=True):
+        setting = (f"{summary['R']:g}", f"{summary['C']:g}", str(len(rigs)))
+        figures = (shown(summary, kind) for kind in kinds)
+        rows.append((lung_id, *setting, *figures, str(summary["held_out_breaths"])))
     table = table_of(
         "The six lungs: error of their simulators on breaths held out, cmH2O",
         ("lung", "R", "C", "rigs", *kinds.values(), "breaths"),
@@ -57,11 +57,11 @@ def lungs(json: JsonFile = None) -> None:
         no_wrap=True,
         caption="Mean / median. R in cmH2O/(L/s), C in mL/cmH2O.",
     )
-    console = told(known, json)
+    console = written_console(summaries, json)
     console.print(table)
     for session, reason in official.rejected.items():
         label = official.sessions.table[session].lung
-        if label in known:
+        if label in summaries:
             text = f"not scored: session {session} of {label}: {reason}"
             console.print(text, soft_wrap=True)
 
@@ -103,7 +103,7 @@ def coverage(
         for name, share in by_lung.items()
     )
     table = table_of("Commands beyond the recordings, % of all", columns, rows)
-    told({name: asdict(share) for name, share in by_lung.items()}, json).print(table)
+    written_console({name: asdict(share) for name, share in by_lung.items()}, json).print(table)
 
 
 def simulate(
@@ -116,7 +116,7 @@ def simulate(
         ),
     ],
     lung: Annotated[
-        str | None, typer.Option(help="Lung, such as R20C50.", autocompletion=known_lungs)
+        str | None, typer.Option(help="Lung, such as R20C50.", autocompletion=complete_lungs)
     ] = None,
     start: Annotated[
         float, typer.Option(min=0.0, max=60.0, help="Pressure at the first sample, cmH2O.")
@@ -142,11 +142,11 @@ def simulate(
     with open(controls, encoding="utf-8-sig", errors="replace") as file:
         many = "breath_id" in file.readline().replace('"', "").strip().split(",")
     if many:
-        done = simulation.simulate_breaths(controls, lung=lung, simulator=plant, start=start)
+        simulated = simulation.simulate_breaths(controls, lung=lung, simulator=plant, start=start)
         if out is None:
-            typer.echo(done.to_frame().to_csv(index=False), nl=False)
+            typer.echo(simulated.to_frame().to_csv(index=False), nl=False)
         else:
-            recordings.write(done, out)
+            recordings.write(simulated, out)
         return
     if lung is None:
         raise InputError("--lung is needed: the file names no lung; give one such as R20C50")
@@ -186,7 +186,7 @@ def open_loop(
         )
     with bar(f"simulating {len(breaths)} breaths") as simulating:
         result = simulation.open_loop(breaths, plant, progress=simulating)
-    console = told(result.as_dict(), json)
+    console = written_console(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
     for line in result.remarks():
         console.print(line)
@@ -226,15 +226,15 @@ def _read(folders: list[Path]) -> tuple[list[Trajectories], list[dict[str, Any]]
 
     runs, scores = [], []
     for folder in folders:
-        kept = folder / "trajectories.npz"
+        saved = folder / "trajectories.npz"
         if not folder.is_dir():
             raise InputError(f"{folder}: there is no such folder")
-        if not kept.is_file():
+        if not saved.is_file():
             raise InputError(
                 f"{folder} contains no scored run; make one with "
                 "`ventbench score SUBMISSION --out DIR` and give DIR/SUBMISSION"
             )
-        runs.append(trajectories.load(kept))
+        runs.append(trajectories.load(saved))
         try:
             scores.append(json.loads((folder / "score.json").read_text("utf-8")))
         except (OSError, ValueError) as error:

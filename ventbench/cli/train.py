@@ -17,10 +17,10 @@ from ventbench.cli.options import (
     bar,
     bars,
     claim_out,
-    known_lungs,
+    complete_lungs,
     recordings_folder,
     table_of,
-    told,
+    written_console,
 )
 
 app = typer.Typer(name="train", help="Train simulators and controllers.", no_args_is_help=True)
@@ -31,7 +31,7 @@ Lung = Annotated[
     typer.Option(
         metavar="ID",
         help="Train only the network for this lung, such as R20C50.",
-        autocompletion=known_lungs,
+        autocompletion=complete_lungs,
     ),
 ]
 All = Annotated[
@@ -90,7 +90,7 @@ def simulator(
             out,
             lungs=listed,
             config=RigConfig(laminar_share=laminar_share),
-            progress=lambda what, share: learning(share, text=what),
+            progress=lambda stage, share: learning(share, text=stage),
         )
     typer.echo(f"wrote {out}")
 
@@ -139,9 +139,6 @@ def residual(
             "--lambda", min=0.0, help="Weight of the size of the correction, cmH2O for each %."
         ),
     ] = 0.0,
-    round_robin: Annotated[
-        bool, typer.Option("--round-robin", help="Each update uses one lung at one PIP, in turn.")
-    ] = False,
     out: Annotated[
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/residual"),
@@ -163,14 +160,14 @@ def residual(
         raise InputError("give --lung ID or --all, not both")
     names = (ALL,) if every else None if lung is None else (lung,)
     updates = updates or ResidualConfig.updates
-    config = ResidualConfig(updates=updates, members=members, lam=penalty, round_robin=round_robin)
+    config = ResidualConfig(updates=updates, members=members, lam=penalty)
     with bars() as tell:
 
-        def report(what: str, progress: tuple[int, int, float] | None) -> None:
+        def report(stage: str, progress: tuple[int, int, float] | None) -> None:
             if progress is None:
-                tell(what, 0, None)
+                tell(stage, 0, None)
             else:
-                tell(what, *progress[:2], text=f"{what}: {progress[2]:.3f} cmH2O")
+                tell(stage, *progress[:2], text=f"{stage}: {progress[2]:.3f} cmH2O")
 
         trained = train_residual(
             names,
@@ -180,7 +177,7 @@ def residual(
             simulator=plant,
             progress=report,
         )
-    console = told(trained.report, json)
+    console = written_console(trained.report, json)
     console.print(_residual_table(trained.report))
     console.print(f"wrote {out}", soft_wrap=True)
 
@@ -196,7 +193,7 @@ def _residual_table(result: dict[str, Any]) -> Any:
     return table_of("Nominal mean |pressure - target|, cmH2O", columns, rows, left=["lung"])
 
 
-def _policies(method: str, what: str) -> Callable[..., None]:
+def _policies(method: str, purpose: str) -> Callable[..., None]:
     """The command that trains networks by a method of reinforcement learning."""
 
     def command(
@@ -213,7 +210,7 @@ def _policies(method: str, what: str) -> Callable[..., None]:
     ) -> None:
         _train_policies(method, lung, all_lungs, range(seed, seed + seeds), steps, out, plant, json)
 
-    command.__doc__ = f"""Train networks that {what}.
+    command.__doc__ = f"""Train networks that {purpose}.
 
     Writes training.json and weights.npz, which `submissions/{method}` can read. Without `--lung`
     and `--all` it trains seven networks: one for each lung, and one for all six. Ctrl-C keeps the
@@ -258,29 +255,29 @@ def _train_policies(
                 label, share, text=f"{method}, {label}: {best:.3f} cmH2O"
             ),
         )
-    console = told(trained.report, json)
+    console = written_console(trained.report, json)
     console.print(_trained(trained.report))
     console.print(f"wrote {out}", soft_wrap=True)
 
 
-def _trained(about: dict[str, Any]) -> Any:
+def _trained(report: dict[str, Any]) -> Any:
     def values(errors: list[float]) -> str:
         return " ".join(f"{error:.3f}" for error in errors)
 
     rows = (
         (
             name,
-            str(own["breaths"]),
-            f"{own['error_pid']:.3f}",
-            values(own["error_nominal_at_end"]),
-            values(own["error_fresh"]),
-            str(own["seed"]),
+            str(figures["breaths"]),
+            f"{figures['error_pid']:.3f}",
+            values(figures["error_nominal_at_end"]),
+            values(figures["error_fresh"]),
+            str(figures["seed"]),
         )
-        for name, own in about["networks"].items()
+        for name, figures in report["networks"].items()
     )
     columns = ("network", "breaths", "PID", "at the end", "fresh cells", "best seed")
     return table_of(
-        f"{about['method']}: mean |pressure - target|, cmH2O",
+        f"{report['method']}: mean |pressure - target|, cmH2O",
         columns,
         rows,
         caption="Fresh cells: new deviations, drawn like the published draws.",
@@ -300,7 +297,7 @@ def pid(
     lung: Annotated[
         str | None,
         typer.Option(
-            metavar="LUNG", help="Only this lung, such as R20C50.", autocompletion=known_lungs
+            metavar="LUNG", help="Only this lung, such as R20C50.", autocompletion=complete_lungs
         ),
     ] = None,
     every: Annotated[
@@ -362,18 +359,18 @@ def pid(
                 names, out, draws=draws, each=not robust, simulator=plant, progress=progress
             )
             written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
-    console = told(result, json)
+    console = written_console(result, json)
     console.print(_gains_table(result))
     for name in written:
         console.print(f"wrote {out / name}", soft_wrap=True)
 
 
-def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
+def _plot(path: Path, grid: Any, by_lung: bool, single: bool) -> list[str]:
     """Draw the picture if matplotlib is installed."""
     from ventbench.pages.report import gain_map_png
 
     try:
-        picture = gain_map_png(grid, each=each, single=single)
+        picture = gain_map_png(grid, each=by_lung, single=single)
     except InputError as error:
         typer.echo(f"no plot: {error}", err=True)
         return []

@@ -77,59 +77,60 @@ def problem_with(breaths: Breaths, resistance: Estimate, compliance: Estimate) -
     definite = math.isfinite(high) and 0.0 < low <= high and high / low < _WIDEST
     if possible and definite:
         return None
-    what = "flow" if breaths.flow is not None else "volume"
+    signal = "flow" if breaths.flow is not None else "volume"
     return (
-        f"No lung has the R and C that pressure and {what} ask for, so neither is given: "
+        f"No lung has the R and C that pressure and {signal} ask for, so neither is given: "
         f"{_symptom(breaths)}."
     )
 
 
 def _symptom(breaths: Breaths) -> str:
     """What is wrong with flow or volume, in words."""
-    what = "flow" if breaths.flow is not None else "volume"
+    signal = "flow" if breaths.flow is not None else "volume"
     for saturation in find_saturation(breaths):
-        if saturation.column == what:
+        if saturation.column == signal:
             return str(saturation)
     into, out, together = [], [], []
     for i in range(len(breaths)):
-        known = breaths.valid[i] & np.isfinite(breaths.pressure[i])
+        valid = breaths.valid[i] & np.isfinite(breaths.pressure[i])
         if breaths.flow is not None:
-            known = known & np.isfinite(breaths.flow[i])
-            flow = np.where(known, np.nan_to_num(breaths.flow[i]), 0.0)
+            valid = valid & np.isfinite(breaths.flow[i])
+            flow = np.where(valid, np.nan_to_num(breaths.flow[i]), 0.0)
             steps = flow * breaths.dt[i]
             volume = np.cumsum(steps)
         else:
             assert breaths.volume is not None
-            known = known & np.isfinite(breaths.volume[i])
+            valid = valid & np.isfinite(breaths.volume[i])
             volume = np.nan_to_num(breaths.volume[i])
-            steps = np.where(known[1:] & known[:-1], np.diff(volume), 0.0)
-        if known.sum() < 3:
+            steps = np.where(valid[1:] & valid[:-1], np.diff(volume), 0.0)
+        if valid.sum() < 3:
             continue
         into.append(float(steps[steps > 0].sum()))
         out.append(float(-steps[steps < 0].sum()))
-        p, v = breaths.pressure[i, known], volume[known]
+        p, v = breaths.pressure[i, valid], volume[valid]
         if np.ptp(p) > 0 and np.ptp(v) > 0:
             together.append(float(np.corrcoef(p, v)[0, 1]))
     if not into:
-        return f"{what} and pressure are hardly ever known together"
+        return f"{signal} and pressure are hardly ever known together"
     inspired, expired = float(np.median(into)), float(np.median(out))
     if expired < _CLOSES[0] * inspired:
         return (
             f"of {inspired:.0f} mL that flow in, {expired:.0f} mL are seen to leave (median of the "
-            f"breaths); the {what} misses part of the expirations, or gas leaks, or its zero is off"
+            f"breaths); the {signal} misses part of the expirations, or gas leaks, or its zero is "
+            "off"
         )
     if expired > _CLOSES[1] * inspired:
         return (
             f"{inspired:.0f} mL flow in and {expired:.0f} mL are seen to leave (median of the "
-            f"breaths); the {what} misses part of the inspirations, or its zero is off"
+            f"breaths); the {signal} misses part of the inspirations, or its zero is off"
         )
     if together and float(np.median(together)) < -_TOGETHER:
-        return f"volume falls while pressure rises; the sign of the {what} is reversed"
+        return f"volume falls while pressure rises; the sign of the {signal} is reversed"
     if breaths.flow is not None:
         peak = float(np.nanmedian(np.nanmax(np.where(breaths.valid, breaths.flow, np.nan), axis=1)))
         if not _FLOWS[0] < peak < _FLOWS[1]:
             return f"the peak flow is {peak:.3g} mL/s; its unit may be another one"
-    return f"pressure and {what} do not move together as those of one lung do"
+    return f"pressure and {signal} do not move together as those of one lung do"
 
 
 #: Units of R and C.
@@ -196,12 +197,12 @@ def identify(
     Raises:
         InputError: if neither is recorded, or too little of a lung to tell R from C.
     """
-    breaths, lungs, done = clean(breaths), [], 0
+    breaths, lungs, completed = clean(breaths), [], 0
     for name, part in breaths.by_lung().items():
         lungs.append(_identify_lung(name, part))
-        done += len(part)
+        completed += len(part)
         if progress is not None:
-            progress(done, len(breaths))
+            progress(completed, len(breaths))
     return share_faults(lungs)
 
 
@@ -215,27 +216,29 @@ def share_faults(lungs: Sequence[Mechanics]) -> tuple[Mechanics, ...]:
     Args:
         lungs: all lungs that were recorded with the same sensors, of one or several recordings.
     """
-    shown = {fault: sum(fault in lung.faults for lung in lungs) for fault in FAULTS}
-    return tuple(_doubted(lung, shown, len(lungs)) for lung in lungs)
+    counts = {fault: sum(fault in lung.faults for lung in lungs) for fault in FAULTS}
+    return tuple(_doubted(lung, counts, len(lungs)) for lung in lungs)
 
 
-def _doubted(lung: Mechanics, shown: dict[str, int], count: int) -> Mechanics:
+def _doubted(lung: Mechanics, counts: dict[str, int], count: int) -> Mechanics:
     match = lung.match
     if match.label_matches or not match.informative or not math.isfinite(match.fitted_C):
         return lung
     likely = {
-        fault: 1.0 if fault in lung.faults else session_fault(shown[fault], count, FAULTS[fault][1])
+        fault: 1.0
+        if fault in lung.faults
+        else session_fault(counts[fault], count, FAULTS[fault][1])
         for fault in FAULTS
         if not (fault in _FITTED and fault in lung.faults)
     }
     fault = max(likely, key=lambda name: likely[name])
     if likely[fault] <= WRONG:
         return lung
-    who = "It shows"
+    evidence = "It shows"
     if fault not in lung.faults:
-        who = f"{shown[fault]} of the {count} lungs of its session show"
+        evidence = f"{counts[fault]} of the {count} lungs of its session show"
     doubt = (
-        f"{who} {FAULTS[fault][0]}, which is likelier than a wrong label, so that whether "
+        f"{evidence} {FAULTS[fault][0]}, which is likelier than a wrong label, so that whether "
         f"{lung.label} holds is unknown."
     )
     match = replace(match, settings=(), informative=False, doubt=doubt)
@@ -243,7 +246,7 @@ def _doubted(lung: Mechanics, shown: dict[str, int], count: int) -> Mechanics:
 
 
 def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
-    breaths, unlikely = _without_unlikely(breaths)
+    breaths, unlikely = _drop_isolated(breaths)
     measured = segments(breaths)
     if not measured:
         raise InputError(
@@ -265,7 +268,7 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     shows = {fault: term in [s.name for s in selected] for fault, term in _FITTED.items()}
     shows |= {
         "unsound": problem is not None,
-        "clipped": any(found.column == "flow" for found in find_saturation(breaths)),
+        "clipped": any(saturation.column == "flow" for saturation in find_saturation(breaths)),
     }
     faults = tuple(fault for fault in FAULTS if shows[fault])
     if problem is not None:
@@ -300,7 +303,7 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     )
 
 
-def _without_unlikely(breaths: Breaths) -> tuple[Breaths, list[str]]:
+def _drop_isolated(breaths: Breaths) -> tuple[Breaths, list[str]]:
     """Breaths without single samples that no lung explains, and a note on them.
 
     What R and C leave of the pressure is smooth up to noise, whatever else the lung does: a sample
@@ -314,9 +317,9 @@ def _without_unlikely(breaths: Breaths) -> tuple[Breaths, list[str]]:
     r, elastance = fitted.coefficients[:2] / 1000.0
     flow = np.where(breaths.valid, breaths.flow, np.nan)
     volume = np.cumsum(np.nan_to_num(flow) * breaths.dt, axis=1)
-    left = (breaths.pressure - r * flow - elastance * volume)[breaths.valid]
+    residual = (breaths.pressure - r * flow - elastance * volume)[breaths.valid]
     out = np.zeros(breaths.valid.shape, bool)
-    out[breaths.valid] = isolated(left)
+    out[breaths.valid] = isolated(residual)
     count = int(out.sum())
     if not count:
         return breaths, []
@@ -343,9 +346,9 @@ def _fit_lung(
     blur, jump = 0.0, 0.0
     if breaths.volume is None and breaths.flow is not None:
         steps = np.abs(np.diff(np.where(breaths.valid, breaths.flow, np.nan), axis=1))
-        known = np.isfinite(steps).any(axis=1)
+        finite = np.isfinite(steps).any(axis=1)
         blur = 0.5 * float(np.median(breaths.dt[breaths.valid]))
-        jump = 0.001 * float(np.median(np.nanmax(steps[known], axis=1)))
+        jump = 0.001 * float(np.median(np.nanmax(steps[finite], axis=1)))
     return LungFit(fitted, covariance(table, fitted), table, segments, blur, jump)
 
 
@@ -389,8 +392,8 @@ def _with_equivalent_lag(delayed_by: Term | None, lung: LungFit) -> tuple[Term, 
 def _notes(
     breaths: Breaths, segments: tuple[Segment, ...], table: CrossProducts, noise: float
 ) -> list[str]:
-    found = check_roles(breaths)
-    notes = [str(finding) for finding in found]
+    issues = check_roles(breaths)
+    notes = [str(finding) for finding in issues]
     if len(table) < FEWEST_BREATHS:
         notes.append(
             f"Fewer than {FEWEST_BREATHS} breaths: R and C alone, nothing else could be tested."
@@ -404,7 +407,7 @@ def _notes(
             "left out."
         )
     peak = max(float(segment.flow.max()) for segment in segments)
-    if peak < _SMALL_FLOW and not any(finding.column == "flow" for finding in found):
+    if peak < _SMALL_FLOW and not any(finding.column == "flow" for finding in issues):
         notes.append(f"The flow stays below {1000 * peak:.0f} mL/s: R is known at small flow only.")
     if noise > _NOTED_NOISE:
         notes.append(
@@ -460,8 +463,8 @@ class LungFit:
         values = []
         for segment in (s for s in self.segments if s.first):
             rows = course(segment, [COLUMNS[c] for c in self.fitted.columns])[segment.rows]
-            left = segment.pressure - rows @ self.fitted.coefficients
-            line = np.polyfit(segment.time[segment.rows], left, 1)
+            residual = segment.pressure - rows @ self.fitted.coefficients
+            line = np.polyfit(segment.time[segment.rows], residual, 1)
             values.append(float(np.polyval(line, 0.0)))
         if not values:
             return Estimate(float("nan"), "cmH2O", (float("nan"), float("nan")))
@@ -475,9 +478,11 @@ class LungFit:
     def term(self, selected: SelectedTerm) -> Term:
         """The term with its parameters, in the units of the library if the library has it."""
         name = selected.name
-        others = selected.alternatives + _SENSORS.get(name, ())
+        alternatives = selected.alternatives + _SENSORS.get(name, ())
         size = effect_size(self.table, self.fitted, selected.column)
-        return Term(name, self._parameters(name, selected.column), selected.nats, size, others)
+        return Term(
+            name, self._parameters(name, selected.column), selected.nats, size, alternatives
+        )
 
     def _parameters(self, name: str, column: int) -> dict[str, Estimate]:
         coefficients = {

@@ -126,8 +126,8 @@ def matching_settings(
 
     def distance(setting: Lung) -> float:
         value = resistance(REFERENCE_FLOW).value
-        away = _log(value / setting.R) / math.log(TOLERANCE_R)
-        return away**2 + (_log(compliance.value / setting.C) / math.log(TOLERANCE_C)) ** 2
+        deviation = _log(value / setting.R) / math.log(TOLERANCE_R)
+        return deviation**2 + (_log(compliance.value / setting.C) / math.log(TOLERANCE_C)) ** 2
 
     within = [lung for lung in RECORDED_LUNGS if fits(resistance, compliance, lung, scale)]
     return tuple(sorted(within, key=distance))
@@ -148,30 +148,30 @@ def match_label(
     at = resistance(REFERENCE_FLOW)
     same = fits(resistance, compliance, label, scale)
     r, c = (at.ci95, APPARATUS), (compliance.ci95, 0.0)
-    known = all(_is_informative(*each) for each in (r, c))
+    informative = all(_is_informative(*bounds) for bounds in (r, c))
     # A fit that cannot tell one of them is not trusted with the other, but a wide interval that
     # the label lies beyond contradicts it.
     beyond = [
         off**2 > _CHI2 * (variance + (math.log(scale) / _Z95) ** 2)
-        for (off, variance), each in (
+        for (off, variance), bounds in (
             (_off_R(resistance, label), r),
             (_off_C(compliance, label), c),
         )
-        if not _is_informative(*each)
+        if not _is_informative(*bounds)
     ]
-    near = [setting.id for setting in matching_settings(resistance, compliance, scale)]
-    if same and known:  # what holds comes first, whatever is nearer
-        near.sort(key=lambda setting: setting != label.id)
+    candidates = [setting.id for setting in matching_settings(resistance, compliance, scale)]
+    if same and informative:  # what holds comes first, whatever is nearer
+        candidates.sort(key=lambda setting: setting != label.id)
     return LungMatch(
         label.id,
         at.value,
         compliance.value,
         at.ci95,
         compliance.ci95,
-        same and known,
+        same and informative,
         source,
-        tuple(near),
-        informative=known or any(beyond),
+        tuple(candidates),
+        informative=informative or any(beyond),
     )
 
 
@@ -190,14 +190,14 @@ def label_texts(match: LungMatch) -> tuple[str, str]:
     """Whether a label holds, and what else the lung may be, for tables."""
     if not math.isfinite(match.fitted_C):
         return "unknown", "unknown"
-    others = [setting for setting in match.settings if setting != match.label]
+    alternatives = [setting for setting in match.settings if setting != match.label]
     if match.doubt:
         return "unknown", match.label
     if not match.informative:
-        return "unknown", f"{match.label}, or {others[0]}" if others else match.label
+        return "unknown", f"{match.label}, or {alternatives[0]}" if alternatives else match.label
     if match.label_matches:
-        return "yes", f"{match.label}, or {others[0]}" if others else match.label
-    return "no", ", ".join(others[:2]) or "none known"
+        return "yes", f"{match.label}, or {alternatives[0]}" if alternatives else match.label
+    return "no", ", ".join(alternatives[:2]) or "none known"
 
 
 def tolerance_text() -> str:
@@ -242,7 +242,7 @@ def _log(ratio: float) -> float:
 _FAULTY, WRONG = 0.05, 0.05
 
 
-def session_fault(shown: int, count: int, stray: float) -> float:
+def session_fault(positives: int, count: int, stray: float) -> float:
     """Probability that a fault which some recordings of a session show is in all of them.
 
     A fault of the session shows in a share ``s`` of its recordings, uniform before it is seen, so
@@ -250,10 +250,10 @@ def session_fault(shown: int, count: int, stray: float) -> float:
     session each recording shows it by chance.
 
     Args:
-        shown: number k of recordings that show the fault.
+        positives: number k of recordings that show the fault.
         count: number n of recordings.
         stray: share of the recordings of a sound session that show it.
     """
-    by_fault = 1.0 / ((count + 1) * math.comb(count, shown))
-    by_chance = stray**shown * (1.0 - stray) ** (count - shown)
+    by_fault = 1.0 / ((count + 1) * math.comb(count, positives))
+    by_chance = stray**positives * (1.0 - stray) ** (count - positives)
     return _FAULTY * by_fault / (_FAULTY * by_fault + (1.0 - _FAULTY) * by_chance)

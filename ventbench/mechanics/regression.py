@@ -73,8 +73,8 @@ def _relaxing_volume(time: float, periodic: bool) -> Callable[[Segment], Floats]
         relaxed = [0.0]
         for _ in range(2 if periodic else 1):
             relaxed = [relaxed[-1]]
-            for kept, added in steps:
-                relaxed.append(relaxed[-1] * kept + added)
+            for decays, added in steps:
+                relaxed.append(relaxed[-1] * decays + added)
         return np.array(relaxed)
 
     return values
@@ -124,10 +124,10 @@ def lagged(time: Floats, values: Floats, lag: float) -> Floats:
     Exact for signals that are linear between the samples.
     """
     step = np.diff(time)[:, None]
-    kept = np.exp(-step / lag)
-    falls = lag * np.diff(values, axis=0) / step * (1.0 - kept)
+    decay = np.exp(-step / lag)
+    falls = lag * np.diff(values, axis=0) / step * (1.0 - decay)
     behind = np.zeros_like(values)
-    for k, (share, lost) in enumerate(zip(kept.tolist(), falls, strict=True)):
+    for k, (share, lost) in enumerate(zip(decay.tolist(), falls, strict=True)):
         behind[k + 1] = share[0] * behind[k] + lost
     return values - behind
 
@@ -200,15 +200,15 @@ def cross_products(
     for segment in segments:
         row = indices.index(segment.breath)
         time = segment.time[segment.rows]
-        seen = np.stack([segment.pressure, time - time.mean(), np.ones(len(time))], axis=1)
-        signals = np.concatenate([course(segment, chosen)[segment.rows], seen], axis=1)
+        targets = np.stack([segment.pressure, time - time.mean(), np.ones(len(time))], axis=1)
+        signals = np.concatenate([course(segment, chosen)[segment.rows], targets], axis=1)
         freedom[row] += len(segment) - 1
         white = _whiten(signals, segment.begins)
-        known = 0.5 * segment.begins.sum() * np.log(1.0 - rho**2)
+        constants_of_grid = 0.5 * segment.begins.sum() * np.log(1.0 - rho**2)
         if segment.lag > 0.0:
             start = np.exp(-(time - segment.time[0]) / segment.lag)[:, None]
-            white, factor = _without_start(white, _whiten(start, segment.begins)[..., 0])
-            known = known - factor
+            white, factor = _project_start(white, _whiten(start, segment.begins)[..., 0])
+            constants_of_grid = constants_of_grid - factor
         length = np.linalg.norm(white[..., -1], axis=1)
         level = white[..., -1] / length[:, None]
         white = white[..., :-1] - level[..., None] * (level[:, None] @ white[..., :-1])
@@ -216,14 +216,14 @@ def cross_products(
         squares = white.mT @ white
         along = (ramp[:, None] @ white)[:, 0]  # (r, K + 1)
         size_of_ramp = np.vecdot(ramp, ramp)
-        known = known - np.log(length)
+        constants_of_grid = constants_of_grid - np.log(length)
         # A drift of scatter s adds s2 times the outer product of the ramp to the covariance.
         scatter = np.square(_DRIFTS)
         grown = 1.0 + scatter * size_of_ramp[:, None]  # (r, d)
         outer = along[:, :, None] * along[:, None, :]
-        taken = (scatter / grown)[..., None, None] * outer[:, None]
-        products[row] += (squares[:, None] - taken).reshape(len(GRID), size, size)
-        constant[row] += (known[:, None] - 0.5 * np.log(grown)).reshape(-1)
+        shrinkage = (scatter / grown)[..., None, None] * outer[:, None]
+        products[row] += (squares[:, None] - shrinkage).reshape(len(GRID), size, size)
+        constant[row] += (constants_of_grid[:, None] - 0.5 * np.log(grown)).reshape(-1)
     return CrossProducts(products, freedom, constant)
 
 
@@ -321,10 +321,10 @@ def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
 
 def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> float:
     """Root mean square of what a column explains beyond the others, cmH2O."""
-    others = [c for c in fitted.columns if c != column]
+    nuisance = [c for c in fitted.columns if c != column]
     total = table.products[:, 0].sum(axis=0)
-    cross = total[others, column]
-    explained = cross @ solve(_regularised(total[np.ix_(others, others)]), cross)
+    cross = total[nuisance, column]
+    explained = cross @ solve(_regularised(total[np.ix_(nuisance, nuisance)]), cross)
     square = total[column, column] - explained
     x = fitted.coefficients[fitted.columns.index(column)]
     return float(abs(x) * np.sqrt(max(square, 0.0) / table.freedom.sum()))
@@ -339,7 +339,7 @@ def _whiten(values: Floats, begins: Bools) -> Floats:
     return white
 
 
-def _without_start(white: Floats, start: Floats) -> tuple[Floats, Floats]:
+def _project_start(white: Floats, start: Floats) -> tuple[Floats, Floats]:
     """Whiten signals ``(r, n, c)`` for what a lag still has in it from before the segment.
 
     ``start`` is its whitened course, ``(r, n)``. Also returns half the logarithm of the determinant
@@ -348,8 +348,8 @@ def _without_start(white: Floats, start: Floats) -> tuple[Floats, Floats]:
     length = np.maximum(np.linalg.norm(start, axis=1), 1e-12)
     grown = np.sqrt(1.0 + (_START * length) ** 2)
     unit = (start / length[:, None])[..., None]
-    taken = (1.0 - 1.0 / grown)[:, None, None]
-    return white - taken * unit * (unit.mT @ white), np.log(grown)
+    shrinkage = (1.0 - 1.0 / grown)[:, None, None]
+    return white - shrinkage * unit * (unit.mT @ white), np.log(grown)
 
 
 def _regularised(matrix: Floats) -> Floats:

@@ -106,10 +106,10 @@ def segments(breaths: Breaths) -> tuple[Segment, ...]:
 
 def _bridged(time: Floats, flow: Floats) -> tuple[Floats, Bools]:
     """Flow, L/s, with short gaps interpolated, and where, ``(m,)`` each."""
-    known = np.isfinite(flow)
+    finite = np.isfinite(flow)
     bridged = np.zeros(len(flow), bool)
-    at = np.flatnonzero(known)
-    if known.all() or len(at) < 2:
+    at = np.flatnonzero(finite)
+    if finite.all() or len(at) < 2:
         return flow, bridged
     volume = np.ptp(integrate(time[at], flow[at]))
     for k in np.flatnonzero(np.diff(at) > 1):
@@ -118,13 +118,13 @@ def _bridged(time: Floats, flow: Floats) -> tuple[Floats, Bools]:
         if gap <= _BRIDGED and 0.5 * gap * change <= _UNCERTAIN * volume:
             bridged[before + 1 : after] = True
     filled = np.interp(time, time[at], flow[at])
-    return np.where(known | bridged, np.where(known, flow, filled), np.nan), bridged
+    return np.where(finite | bridged, np.where(finite, flow, filled), np.nan), bridged
 
 
 def clipped_share(breaths: Breaths) -> float:
     """Share of the pressures that are clipped at an end of the sensor's range, 0..1."""
-    known = np.isfinite(breaths.pressure) & breaths.valid
-    return float(np.sum(_clipped(breaths.pressure) & known) / max(known.sum(), 1))
+    finite = np.isfinite(breaths.pressure) & breaths.valid
+    return float(np.sum(_clipped(breaths.pressure) & finite) / max(finite.sum(), 1))
 
 
 def _smoothed(
@@ -160,22 +160,22 @@ def _smoothed(
     return rows, begins, p, t, v, q, slope, dose
 
 
-def _compared(fine: NDArray[np.intp], known: Bools, half: int, step: int) -> tuple[Ints, Bools]:
+def _compared(fine: NDArray[np.intp], valid: Bools, half: int, step: int) -> tuple[Ints, Bools]:
     """Centres of windows of known samples, half a window apart, and which of them follow a gap.
 
     They are indices into ``fine``, centres of windows in which flow and volume are known, ``step``
     samples apart; at the samples ``known`` the pressure is known too.
     """
-    complete = np.zeros(len(known), bool)
-    for start, stop in runs(known):
+    complete = np.zeros(len(valid), bool)
+    for start, stop in runs(valid):
         complete[start + half : max(stop - half, 0)] = True
-    whole = complete[fine]
+    complete_windows = complete[fine]
     # A run ends where a window is incomplete, and where the next centre is further away.
     ends = np.flatnonzero(np.diff(fine) > step) + 1
     rows: list[Ints] = []
     for part in np.split(np.arange(len(fine)), ends):
         offset = int(part[0]) if len(part) else 0
-        for start, stop in runs(whole[part]):
+        for start, stop in runs(complete_windows[part]):
             rows.append(np.arange(offset + start, offset + stop, -(-(half + 1) // step)))
     if not rows:
         return np.zeros(0, np.int64), np.zeros(0, bool)
@@ -205,16 +205,16 @@ def window_weights(time: Floats, half: int, centres: NDArray[np.intp]) -> tuple[
 
     Hann's window and its derivative at the true times, corrected to be exact for straight lines.
     """
-    near = windows(time, half)[centres - half]
-    away = near - time[centres][:, None]
+    samples = windows(time, half)[centres - half]
+    offsets = samples - time[centres][:, None]
     width = (half + 1) * float(np.median(np.diff(time)))
-    angle = np.clip(0.5 * np.pi * away / width, -0.5 * np.pi, 0.5 * np.pi)
-    span = np.gradient(near, axis=1)
+    angle = np.clip(0.5 * np.pi * offsets / width, -0.5 * np.pi, 0.5 * np.pi)
+    span = np.gradient(samples, axis=1)
     value = span * np.cos(angle) ** 2
     value /= value.sum(axis=1, keepdims=True)
     change = span * np.sin(2.0 * angle)
     change -= value * change.sum(axis=1, keepdims=True)
-    change /= np.sum(change * away, axis=1, keepdims=True)
+    change /= np.sum(change * offsets, axis=1, keepdims=True)
     return value, change
 
 
@@ -223,9 +223,9 @@ def differentiate(time: Floats, values: Floats, half: int) -> Floats:
     fine = np.arange(half, len(time) - half)
     slope = np.full(len(time), np.nan)
     slope[fine] = weighted_sum(windows(values, half), window_weights(time, half, fine)[1])
-    known = np.flatnonzero(np.isfinite(slope))
-    nearest = np.clip(np.searchsorted(known, np.arange(len(time))), 0, max(len(known) - 1, 0))
-    return slope[known[nearest]] if len(known) else slope
+    finite = np.flatnonzero(np.isfinite(slope))
+    nearest = np.clip(np.searchsorted(finite, np.arange(len(time))), 0, max(len(finite) - 1, 0))
+    return slope[finite[nearest]] if len(finite) else slope
 
 
 def windows(values: Floats, half: int) -> Floats:
@@ -233,9 +233,9 @@ def windows(values: Floats, half: int) -> Floats:
     return np.lib.stride_tricks.sliding_window_view(values, 2 * half + 1)
 
 
-def weighted_sum(near: Floats, weights: Floats) -> Floats:
+def weighted_sum(samples: Floats, weights: Floats) -> Floats:
     """Weighted sum of each window, ``(c,)``."""
-    return np.einsum("cw,cw->c", near, weights)
+    return np.einsum("cw,cw->c", samples, weights)
 
 
 def integrate(time: Floats, values: Floats) -> Floats:

@@ -89,14 +89,16 @@ def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
         if not passing:
             break
         most = max(trial.gain for trial in passing)
-        near = [t for t in passing if t.gain >= most - max(LEAST_NATS, _ALTERNATIVE_SHARE * most)]
-        best = near[0]  # TERMS are in the order of how common they are
-        others = tuple(trial.name for trial in near[1:])
+        contenders = [
+            t for t in passing if t.gain >= most - max(LEAST_NATS, _ALTERNATIVE_SHARE * most)
+        ]
+        best = contenders[0]  # TERMS are in the order of how common they are
+        alternatives = tuple(trial.name for trial in contenders[1:])
         nats = best.nats if best.nats > LEAST_NATS else best.gain
-        selected.append(SelectedTerm(best.name, best.column, nats, others))
+        selected.append(SelectedTerm(best.name, best.column, nats, alternatives))
         # The new term may make an earlier one superfluous.
         for term in selected[:-1]:
-            rest = [other for other in selected if other is not term]
+            rest = [term_left for term_left in selected if term_left is not term]
             if not _trial(table, _columns(rest), term.name).passes:
                 selected = rest
                 dropped.add(term.name)
@@ -111,7 +113,7 @@ def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
     """Try one more term: its best column on all breaths, and its gain on held-out breaths."""
     every = np.ones(len(table), bool)
     column = _best_column(table, every, columns, name)
-    whole = fit(table, every, (*columns, column))
+    fitted = fit(table, every, (*columns, column))
     ratios, gains = [], []
     for train in splits(len(table)):
         trained = _best_column(table, train, columns, name)
@@ -122,21 +124,23 @@ def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
         ratio = log_likelihood(table, richer) - log_likelihood(table, null)
         ratio_of_all = float(ratio[~train].sum()) - null.log_prior
         ratios.append(ratio_of_all if _allowed(name, richer) else -np.inf)
-        known = log_likelihood(table, richer) - log_likelihood(table, fit(table, train, columns))
-        gains.append(np.where(train, np.nan, known))
+        gains_of_breaths = log_likelihood(table, richer) - log_likelihood(
+            table, fit(table, train, columns)
+        )
+        gains.append(np.where(train, np.nan, gains_of_breaths))
     nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
     by_breath = np.nanmean(gains, axis=0)
-    size = effect_size(table, whole, column)
+    size = effect_size(table, fitted, column)
     gain = float(by_breath.sum())
     scatter = float(np.std(by_breath, ddof=1)) * np.sqrt(len(by_breath))
     clear = gain > max(_LEAST_GAIN, _LEAST_GAIN_SCATTER * scatter)
     passes = bool(
         (nats > LEAST_NATS or (name in _BY_GAIN and clear))
         and float(np.mean(by_breath > 0)) >= _LEAST_AGREEMENT
-        and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * whole.sigma)
-        and _allowed(name, whole)
-        and abs(whole.coefficients[-1]) >= _LEAST_STRENGTH.get(name, 0.0)
-        and _plausible(table, whole)
+        and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * fitted.sigma)
+        and _allowed(name, fitted)
+        and abs(fitted.coefficients[-1]) >= _LEAST_STRENGTH.get(name, 0.0)
+        and _plausible(table, fitted)
     )
     return _Trial(name, column, nats, gain, passes)
 
@@ -231,14 +235,14 @@ def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None
     none, most = _value(circuit[0], every), max(gains[name] for name in candidates)
     least = most - max(LEAST_NATS, _ALTERNATIVE_SHARE * (most - none))
     chosen = next(estimate for name, estimate in candidates.items() if gains[name] >= least)
-    others = tuple(name for name in gains if name != chosen.name and gains[name] >= least)
+    alternatives = tuple(name for name in gains if name != chosen.name and gains[name] >= least)
     value = next(iter(chosen.parameters.values())).value
     if chosen.name == _SENSOR.name:
         delayed = tuple(replace(segment, lag=value) for segment in segments)
     else:
         pairs = zip(segments, smooth, strict=True)
-        delayed = tuple(behind_circuit(segment, own, value) for segment, own in pairs)
-    return delayed, replace(chosen, alternatives=others)
+        delayed = tuple(behind_circuit(segment, smoothed, value) for segment, smoothed in pairs)
+    return delayed, replace(chosen, alternatives=alternatives)
 
 
 def predicted(
@@ -256,15 +260,18 @@ def predicted(
         late = course(replace(segment, lag=lag), columns)
         rises = np.gradient(late, segment.time, axis=0)
         since = segment.time - segment.time[0]
-        own, own_rises = [np.ones(len(since)), since], [np.zeros(len(since)), np.ones(len(since))]
+        nuisances, nuisance_rises = (
+            [np.ones(len(since)), since],
+            [np.zeros(len(since)), np.ones(len(since))],
+        )
         if lag > 0.0:  # then the derivative is known: it drives the lag
             rises[:, delayed] = ((course(segment, columns) - late) / lag)[:, delayed]
-            own.append(np.exp(-since / lag))
-            own_rises.append(-own[-1] / lag)
-        lung, nuisance = late @ fitted.coefficients, np.stack(own, axis=1)
-        left = segment.pressure - lung[segment.rows]
-        size = np.linalg.lstsq(nuisance[segment.rows], left)[0]
-        rise = rises @ fitted.coefficients + np.stack(own_rises, axis=1) @ size
+            nuisances.append(np.exp(-since / lag))
+            nuisance_rises.append(-nuisances[-1] / lag)
+        lung, nuisance = late @ fitted.coefficients, np.stack(nuisances, axis=1)
+        residual = segment.pressure - lung[segment.rows]
+        size = np.linalg.lstsq(nuisance[segment.rows], residual)[0]
+        rise = rises @ fitted.coefficients + np.stack(nuisance_rises, axis=1) @ size
         result.append((lung + nuisance @ size, rise))
     return result
 
@@ -345,9 +352,9 @@ def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> Term | None
     for train in splits(count):
         best = max(tables, key=lambda table: _value(table, train))
         ratio = log_likelihood(best, fit(best, train, columns))
-        without = fit(null, ~train, columns)
-        ratio = ratio - log_likelihood(null, without)
-        ratios.append(float(ratio[~train].sum()) - without.log_prior)
+        null_fit = fit(null, ~train, columns)
+        ratio = ratio - log_likelihood(null, null_fit)
+        ratios.append(float(ratio[~train].sum()) - null_fit.log_prior)
     nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
     every = np.ones(count, bool)
     value = _peak(family, tables, every)

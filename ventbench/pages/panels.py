@@ -77,14 +77,14 @@ def labels(runs: Sequence[Trajectories], cut: str = "…") -> list[str]:
 
 def distinct(names: Sequence[str]) -> list[str]:
     """Names with a count behind those that were there before."""
-    seen: list[str] = []
+    unique: list[str] = []
     for name in names:
         candidate, count = name, 1
-        while candidate in seen:
+        while candidate in unique:
             count += 1
             candidate = f"{name} ({count})"
-        seen.append(candidate)
-    return seen
+        unique.append(candidate)
+    return unique
 
 
 def shared_tracks(runs: Sequence[Trajectories]) -> str:
@@ -115,45 +115,49 @@ class Scores:
 
 
 def collect(
-    runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None
+    runs: Sequence[Trajectories], scores: Sequence[Mapping[str, Any]] | None = None
 ) -> Scores:
     """Scores of matching runs by their files, in the same order, or computed if there is none.
 
     Raises:
         InputError: if the files are not as many as the runs, or lack one of their lungs.
     """
-    if given is None:
+    if scores is None:
         cells = np.stack([run.errors().to_numpy() for run in runs])
         lungs = cells.mean(axis=2)
         return Scores(lungs.mean(axis=1), lungs, cells)
-    if len(given) != len(runs):
-        raise InputError(f"{len(given)} scores for {len(runs)} runs; give one score for each run")
-    read = [_read(run, score) for run, score in zip(runs, given, strict=True)]
+    if len(scores) != len(runs):
+        raise InputError(f"{len(scores)} scores for {len(runs)} runs; give one score for each run")
+    read = [_read(run, score) for run, score in zip(runs, scores, strict=True)]
     overall, lungs, cells = (np.array(column) for column in zip(*read, strict=True))
     return Scores(overall, lungs, cells)
 
 
 def draws(score: Mapping[str, Any]) -> str:
     """Mean over the published draws with its interval, cmH2O; empty if there were none."""
-    drawn = score.get("draws")
-    if not isinstance(drawn, Mapping):
+    robustness = score.get("draws")
+    if not isinstance(robustness, Mapping):
         return ""
     name = str(score.get("name", "a run"))
-    mean, limits = _number(name, drawn.get("score")), drawn.get("ci95") or ()
+    mean, limits = _number(name, robustness.get("score")), robustness.get("ci95") or ()
     if not np.isfinite(mean) or len(limits) != 2 or None in limits:
         return number(mean)
     low, high = (number(_number(name, limit)) for limit in limits)
     return f"{number(mean)} [{low}, {high}]"
 
 
-def paired_draws(own: Mapping[str, Any], other: Mapping[str, Any]) -> bootstrap.Summary | None:
+def paired_draws(
+    first_score: Mapping[str, Any], second_score: Mapping[str, Any]
+) -> bootstrap.Summary | None:
     """Compare two scores draw by draw; None unless both have the same draws without a failure."""
-    first, second = own.get("draws"), other.get("draws")
+    first, second = first_score.get("draws"), second_score.get("draws")
     if not (isinstance(first, Mapping) and isinstance(second, Mapping)):
         return None
-    own_values = ("score", "ci95", "values")
-    about = [{k: v for k, v in draws.items() if k not in own_values} for draws in (first, second)]
-    if about[0] != about[1]:
+    value_keys = ("score", "ci95", "values")
+    settings = [
+        {k: v for k, v in draws.items() if k not in value_keys} for draws in (first, second)
+    ]
+    if settings[0] != settings[1]:
         return None
     values = [draws.get("values") or () for draws in (first, second)]
     if len(values[0]) != len(values[1]) or None in (*values[0], *values[1]) or not len(values[0]):
@@ -172,13 +176,13 @@ def failures(score: Mapping[str, Any]) -> list[str]:
 
 def provenance(score: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Provenance of a score, as flat pairs of text; not escaped."""
-    return flatten(_about(score))
+    return flatten(_provenance(score))
 
 
-def _about(value: Any) -> Any:
+def _provenance(value: Any) -> Any:
     if not isinstance(value, Mapping):
         return value
-    return {key: _about(part) for key, part in value.items() if key not in NOT_PROVENANCE}
+    return {key: _provenance(part) for key, part in value.items() if key not in NOT_PROVENANCE}
 
 
 def _read(run: Trajectories, score: Mapping[str, Any]) -> tuple[float, list[float], Floats]:
@@ -303,7 +307,7 @@ def inspiration(line: Floats) -> Floats:
 
 def _column(runs: Sequence[Trajectories], j: int) -> list[RunPanel]:
     pip, window = runs[0].pips[j], WINDOW
-    x = time_x(shown_times())
+    x = time_x(sample_times())
     low, high = pressure_limits(runs, j)
 
     def y(pressure: Floats | float) -> Floats:
@@ -334,7 +338,7 @@ def _column(runs: Sequence[Trajectories], j: int) -> list[RunPanel]:
     return column
 
 
-def shown_times() -> Floats:
+def sample_times() -> Floats:
     """Times of the samples that are shown, s since the start of the breath, ``(SHOWN + 1,)``."""
     return np.arange(SHOWN + 1, dtype=np.float64) * protocol.DT
 

@@ -107,14 +107,14 @@ def open_viewer(path: Path | str) -> bool:
 SHADE_LIMITS, SHADES = (0.02, 0.2, 0.7, 2.0), (12, 24, 38, 55)
 
 
-def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None) -> str:
+def html(runs: Sequence[Trajectories], scores: Sequence[Mapping[str, Any]] | None = None) -> str:
     """Return the page of matching runs, the one to look at first; differences are to the second.
 
     Raises:
         InputError: if the score files do not belong to the runs.
     """
     names = labels(runs)
-    numbers = panels.collect(runs, given)
+    numbers = panels.collect(runs, scores)
     page = page_templates("ventbench.pages").get_template("report.html.j2")
     return page.render(
         title=names[0],
@@ -124,20 +124,20 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
         colors=palette.css(),
         run_colors=palette.RUNS,
         shades=SHADES,
-        compared=[comparison(runs, names, numbers, k, given) for k in range(1, len(runs))],
+        compared=[comparison(runs, names, numbers, k, scores) for k in range(1, len(runs))],
         heading=shared_tracks(runs),
         tracks=[run.track for run in runs],
         table=table(runs[0].lungs, numbers),
-        draws=[panels.draws(score) for score in given or ()],
+        draws=[panels.draws(score) for score in scores or ()],
         lungs=sections(runs, names, numbers),
         pips=runs[0].pips,
         frame=frame(),
         protocol=protocol,
         scored=[breath + 1 for breath in protocol.SCORED_BREATHS],
         shown_breath=panels.BREATH + 1,
-        official=given is not None,
-        provenance=[panels.provenance(score) for score in given or ()],
-        failures=[panels.failures(score) for score in given or ()],
+        official=scores is not None,
+        provenance=[panels.provenance(score) for score in scores or ()],
+        failures=[panels.failures(score) for score in scores or ()],
         version=ventbench.__version__,
     )
 
@@ -146,15 +146,15 @@ def comparison(
     runs: Sequence[Trajectories],
     names: Sequence[str],
     numbers: panels.Scores,
-    other: int,
-    given: Sequence[Mapping[str, Any]] | None = None,
+    reference: int,
+    scores: Sequence[Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Where the first run is better than another one, by index, and where worse, cell by cell.
 
     With score files, in the order of the runs, the difference over their draws is paired.
     """
-    difference = numbers.cells[0] - numbers.cells[other]
-    lungs = numbers.lungs[0] - numbers.lungs[other]
+    difference = numbers.cells[0] - numbers.cells[reference]
+    lungs = numbers.lungs[0] - numbers.lungs[reference]
     texts = {}
     for key, value, at in (
         ("best", np.nanmin(difference, initial=0.0), np.nanargmin),
@@ -164,18 +164,20 @@ def comparison(
             i, j = np.unravel_index(at(difference), difference.shape)
             where = f"{runs[0].lungs[i]} at PIP {runs[0].pips[j]:g}"
             texts[key] = f"{number(abs(value))} cmH2O, {where}"
-    drawn = panels.paired_draws(given[0], given[other]) if given is not None else None
+    paired = panels.paired_draws(scores[0], scores[reference]) if scores is not None else None
     mean, low, high = (
-        ("", "", "") if drawn is None else (number(x, sign=True) for x in (drawn.mean, *drawn.ci95))
+        ("", "", "")
+        if paired is None
+        else (number(x, sign=True) for x in (paired.mean, *paired.ci95))
     )
     return {
-        "name": names[other],
+        "name": names[reference],
         "lungs": int(np.sum(lungs < 0.0)),
         "cells": int(np.sum(difference < 0.0)),
         "best": texts.get("best", ""),
         "worst": texts.get("worst", ""),
         "draws": f"{mean} [{low}, {high}]" if mean else "",
-        "count": 0 if drawn is None else drawn.count,
+        "count": 0 if paired is None else paired.count,
         "rows": [
             {
                 "name": lung,
@@ -320,8 +322,8 @@ def gain_map_png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> by
 
 def _row(figure: Any, axes: Any, name: str, gains: Floats, error: Floats) -> None:
     best = int(np.argmin(error))
-    shown = [d for d in SLICES if np.any(gains[:, 2] == d)]
-    slices = [("best: ", float(gains[best, 2])), *(("", d) for d in shown)]
+    slices_of_grid = [d for d in SLICES if np.any(gains[:, 2] == d)]
+    slices = [("best: ", float(gains[best, 2])), *(("", d) for d in slices_of_grid)]
     low, image = float(error[best]), None
     for axis, (prefix, d) in zip(axes, slices, strict=False):
         image = _map(axis, gains, error, d, (low, SATURATION * low))
@@ -335,12 +337,12 @@ def _row(figure: Any, axes: Any, name: str, gains: Floats, error: Floats) -> Non
 
 def _map(axis: Any, gains: Floats, error: Floats, d: float, limits: tuple[float, float]) -> Any:
     """One map; the values are not evenly spaced, so each is one cell wide."""
-    here = gains[:, 2] == d
+    selected = gains[:, 2] == d
     (P, row), (I, column) = (  # noqa: E741
-        np.unique(gains[here, k], return_inverse=True) for k in (0, 1)
+        np.unique(gains[selected, k], return_inverse=True) for k in (0, 1)
     )
     values = np.full((P.size, I.size), np.nan)
-    values[row, column] = error[here]
+    values[row, column] = error[selected]
     image = axis.imshow(
         values, origin="lower", cmap="viridis_r", vmin=limits[0], vmax=limits[1], aspect="auto"
     )

@@ -55,7 +55,7 @@ def recording(runs: Sequence[Trajectories]) -> bytes:
     Raises:
         InputError: if rerun is switched off by its environment variable.
     """
-    names = shown_names(runs)
+    names = viewer_names(runs)
 
     def log(stream: rr.RecordingStream) -> None:
         log_target(stream, runs[0])
@@ -88,14 +88,14 @@ def written(
         return file.read_bytes()
 
 
-def known(text: str) -> str:
+def displayable(text: str) -> str:
     """Text with characters of the viewer's font only: it ends itself over any other."""
     return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "\u017e" else "?" for c in text)
 
 
-def shown_names(runs: Sequence[Trajectories]) -> list[str]:
+def viewer_names(runs: Sequence[Trajectories]) -> list[str]:
     """Labels that the viewer's font can show."""
-    return distinct([known(label) for label in labels(runs, cut="...")])
+    return distinct([displayable(label) for label in labels(runs, cut="...")])
 
 
 def log_target(stream: rr.RecordingStream, run: Trajectories) -> None:
@@ -227,11 +227,11 @@ def reference_path(name: str, lung: str, quantity: str) -> str:
     return f"/compare/{rr.escape_entity_path_part(name)}/{lung}/{quantity}"
 
 
-def _lung_tab(lung: str, shown: Sequence[Plot], references: Sequence[str]) -> rrb.Vertical:
+def _lung_tab(lung: str, plots: Sequence[Plot], references: Sequence[str]) -> rrb.Vertical:
     """One lung in full with the references: the whole run, all plots on one time axis."""
     linked = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
-    views = [_view(lung, plot, linked, references, plot is shown[0]) for plot in shown]
-    return rrb.Vertical(*views, row_shares=[plot.share for plot in shown], name=lung)
+    views = [_view(lung, plot, linked, references, plot is plots[0]) for plot in plots]
+    return rrb.Vertical(*views, row_shares=[plot.share for plot in plots], name=lung)
 
 
 def _view(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,7 +24,7 @@ from ventbench.task.rollouts import open_loop
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Simulators:
+class Simulators(ABC):
     """Simulators of lungs; every kind answers to recorded commands.
 
     One kind has no more than that (:class:`SimulatedPressures`), one answers to any commands
@@ -119,6 +120,7 @@ class Simulators:
         """Whether the breath is perhaps one of the training, which blank pressures hide, (n,)."""
         return np.zeros(len(breaths), bool)
 
+    @abstractmethod
     def pressures(
         self,
         breaths: Breaths,
@@ -140,7 +142,6 @@ class Simulators:
             InputError: if there is no simulator for a lung, a function fails or answers with
                 another shape, or a table lacks a breath.
         """
-        raise NotImplementedError
 
     def respond(
         self, lung_id: str, u_in: Floats, u_out: Floats, dt: Floats, *, initial_pressure: float

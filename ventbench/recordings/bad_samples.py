@@ -95,8 +95,8 @@ def find_bad_samples(
     Returns:
         What is to be left out, by column.
     """
-    found: list[BadSamples] = []
-    kept: dict[str, Floats] = {}
+    collected: list[BadSamples] = []
+    cleaned: dict[str, Floats] = {}
     for name in (name for name in MEASURED if name in columns):
         values = np.asarray(columns[name], float)
         every = int(np.isfinite(values).sum())
@@ -106,8 +106,8 @@ def find_bad_samples(
             rows = np.flatnonzero(where & ~bad)  # noqa: B023
             if len(rows):
                 bad[rows] = True  # noqa: B023
-                shown = values[rows] if value is None else np.full(len(rows), value)  # noqa: B023
-                found.append(BadSamples(name, kind, rows, shown, every))  # noqa: B023
+                rejected = values[rows] if value is None else np.full(len(rows), value)  # noqa: B023
+                collected.append(BadSamples(name, kind, rows, rejected, every))  # noqa: B023
 
         for value in missing:
             add("mark", np.isclose(values, value, rtol=1e-6, atol=0.0))
@@ -123,18 +123,18 @@ def find_bad_samples(
                 if "u_in" in columns:
                     isolated &= ~_pulses(columns["u_in"])
                 add("isolated", isolated)
-        kept[name] = np.where(bad, np.nan, values)
-    held = _held(kept)
-    return (*found, *held)
+        cleaned[name] = np.where(bad, np.nan, values)
+    held = _held(cleaned)
+    return (*collected, *held)
 
 
-def without(columns: Mapping[str, Floats], bad: Iterable[BadSamples]) -> dict[str, Floats]:
+def blanked(columns: Mapping[str, Floats], bad: Iterable[BadSamples]) -> dict[str, Floats]:
     """The columns with NaN in place of bad samples."""
     out = dict(columns)
-    for each in bad:
-        values = out[each.column].astype(float)
-        values[each.rows] = np.nan
-        out[each.column] = values
+    for samples in bad:
+        values = out[samples.column].astype(float)
+        values[samples.rows] = np.nan
+        out[samples.column] = values
     return out
 
 
@@ -145,11 +145,11 @@ def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
     bad = find_bad_samples(columns, missing)
     if not bad:
         return breaths
-    kept, changes = without(columns, bad), {}
-    for name in {each.column for each in bad}:
+    cleaned, changes = blanked(columns, bad), {}
+    for name in {samples.column for samples in bad}:
         changes[name] = np.full(breaths.valid.shape, np.nan)
-        changes[name][breaths.valid] = kept[name]
-    notes = (*(each.what().capitalize() + "." for each in bad), *breaths.notes)
+        changes[name][breaths.valid] = cleaned[name]
+    notes = (*(samples.what().capitalize() + "." for samples in bad), *breaths.notes)
     return replace(breaths, notes=notes, **changes)
 
 
@@ -165,15 +165,15 @@ class _Signal:
 
     @classmethod
     def of(cls, values: Floats) -> _Signal:
-        known = values[np.isfinite(values)]
-        low, high = np.quantile(known, [0.05, 0.95])
-        kinds, counts = np.unique(known, return_counts=True)
+        finite = values[np.isfinite(values)]
+        low, high = np.quantile(finite, [0.05, 0.95])
+        kinds, counts = np.unique(finite, return_counts=True)
         gaps = np.diff(kinds, prepend=-np.inf, append=np.inf)
         apart = np.minimum(gaps[1:], gaps[:-1]) > _APART * max(high - low, 1e-12)
-        often = (counts >= _AGAIN) & (counts <= _MOST * len(known))
-        enough = len(kinds) >= _DISTINCT and high > low
-        marks = tuple(kinds[apart & often].tolist()) if enough else ()
-        good = known[~np.isin(known, marks)] if marks else known
+        often = (counts >= _AGAIN) & (counts <= _MOST * len(finite))
+        distinct = len(kinds) >= _DISTINCT and high > low
+        marks = tuple(kinds[apart & often].tolist()) if distinct else ()
+        good = finite[~np.isin(finite, marks)] if marks else finite
         bends = np.abs(np.diff(good, 2))
         noise = float(np.median(bends)) / (0.6745 * np.sqrt(6.0)) if len(bends) else 0.0
         inner = gaps[1:-1][(kinds[1:] > low) & (kinds[1:] < high)]
@@ -186,17 +186,17 @@ class _Signal:
         at = np.flatnonzero(np.isfinite(self.values) & ~bad)
         if len(at) < _READINGS or self.span <= 0.0:
             return out
-        own = self.values[at]
-        padded = np.pad(own, 3, mode="edge")  # at an end nothing is isolated
+        centre = self.values[at]
+        padded = np.pad(centre, 3, mode="edge")  # at an end nothing is isolated
         limit = _DEVIATIONS * self.noise + max(_RANGE * self.span, 3.0 * self.resolution)
-        moved = np.abs(np.diff(own, prepend=own[0], append=own[-1])) > limit
-        some = np.flatnonzero(moved[1:] | moved[:-1])  # others cannot be far from five of six
-        near = np.sort(padded[some[:, None] + np.array([0, 1, 2, 4, 5, 6])], axis=1)
-        low, high = near[:, 1], near[:, 4]
-        beyond = np.maximum(own[some] - high, low - own[some])
-        far = beyond > limit + _SPANS * (high - low)
-        if far.sum() <= _MOST * len(own):
-            out[at[some[far]]] = True
+        steps = np.abs(np.diff(centre, prepend=centre[0], append=centre[-1])) > limit
+        some = np.flatnonzero(steps[1:] | steps[:-1])  # others cannot be far from five of six
+        neighbours = np.sort(padded[some[:, None] + np.array([0, 1, 2, 4, 5, 6])], axis=1)
+        low, high = neighbours[:, 1], neighbours[:, 4]
+        beyond = np.maximum(centre[some] - high, low - centre[some])
+        remote = beyond > limit + _SPANS * (high - low)
+        if remote.sum() <= _MOST * len(centre):
+            out[at[some[remote]]] = True
         return out
 
     def slow(self) -> int | None:
@@ -236,7 +236,7 @@ def _held(columns: Mapping[str, Floats]) -> list[BadSamples]:
     together = np.zeros(len(next(iter(columns.values()), ())), bool)
     if every is not None:
         together = _improbable(every, float(np.prod(list(chances.values()))))
-    found = []
+    collected = []
     for name, values in columns.items():
         ends = (
             np.isin(values, [np.nanmin(values), np.nanmax(values)])
@@ -246,8 +246,8 @@ def _held(columns: Mapping[str, Floats]) -> list[BadSamples]:
         rows = np.flatnonzero(together | (_improbable(repeats[name], chances[name]) & ~ends))
         if len(rows):
             of = int(np.isfinite(values).sum())
-            found.append(BadSamples(name, "held", rows, values[rows], of))
-    return found
+            collected.append(BadSamples(name, "held", rows, values[rows], of))
+    return collected
 
 
 def _improbable(repeats: Bools, chance: float) -> Bools:
@@ -266,13 +266,13 @@ def _chance(values: Floats) -> float:
     Differences of the fourth order hold hardly anything but noise, and those of the quietest fifth
     of the signal the least that it has.
     """
-    known = values[np.isfinite(values)]
-    if len(known) < _READINGS or np.ptp(known) == 0.0:
+    finite = values[np.isfinite(values)]
+    if len(finite) < _READINGS or np.ptp(finite) == 0.0:
         return 1.0
-    kinds = np.unique(known)
-    span = float(np.diff(np.quantile(known, [0.05, 0.95]))[0])
+    kinds = np.unique(finite)
+    span = float(np.diff(np.quantile(finite, [0.05, 0.95]))[0])
     step = max(float(np.quantile(np.diff(kinds), 0.05)), 1e-4 * span)
-    fourth = np.abs(np.diff(known, 4))
+    fourth = np.abs(np.diff(finite, 4))
     moving = fourth[fourth > 0.0] if (fourth > 0.0).mean() > 0.5 else fourth
     noise = float(np.quantile(moving, 0.2)) / (0.2533 * np.sqrt(70.0))
     return min(1.0, step / (3.5 * noise)) if noise > 0.0 else 1.0
@@ -298,8 +298,8 @@ def repeated_rows(columns: Mapping[str, Floats]) -> Bools:
         slope = 0.25 * (
             values[single - 1] - values[single - 3] + values[single + 3] - values[single + 1]
         )
-        known = np.isfinite(slope) & np.isfinite(values[single + 1] - values[single])
+        finite = np.isfinite(slope) & np.isfinite(values[single + 1] - values[single])
         size = max(float(np.nanvar(values)), 1e-12)
-        jumps += float((slope * (values[single + 1] - values[single]))[known].sum()) / size
-        slopes += float((slope**2)[known].sum()) / size
+        jumps += float((slope * (values[single + 1] - values[single]))[finite].sum()) / size
+        slopes += float((slope**2)[finite].sum()) / size
     return repeats if slopes > 0.0 and jumps < 1.5 * slopes else np.zeros(len(repeats), bool)

@@ -82,8 +82,8 @@ class Breaths:
             for name, index in self.by_lung_index.items()
         }
         table = pd.DataFrame.from_dict(rows, orient="index").to_html(float_format="%.1f")
-        said = (repr(self), *self.notes)
-        return "".join(f"<p>{html.escape(text)}</p>" for text in said) + table
+        paragraphs = (repr(self), *self.notes)
+        return "".join(f"<p>{html.escape(text)}</p>" for text in paragraphs) + table
 
     def __getitem__(self, which: int | str | slice | list[int] | np.ndarray) -> Breaths:
         """Return some breaths: by place, slice, mask, places, or the id of a lung.
@@ -285,10 +285,10 @@ def make_breaths(
     if (times[:, 0] != 0.0).any() or not (np.diff(times, axis=1) > 0.0).all():
         raise ValueError("time must start at 0 in each breath and increase")
     labels = {"R": np.array(R, np.float64), "C": np.array(C, np.float64), "breath_id": ids}
-    given = {"u_in": u_in, "u_out": u_out, "pressure": pressure, "flow": flow, "volume": volume}
+    signals = {"u_in": u_in, "u_out": u_out, "pressure": pressure, "flow": flow, "volume": volume}
     samples = {
         name: np.array(values, np.int8 if name == "u_out" else np.float64)
-        for name, values in given.items()
+        for name, values in signals.items()
         if values is not None
     }
     for name, array in (labels | samples).items():
@@ -311,10 +311,10 @@ def join(parts: Sequence[Breaths]) -> Breaths:
         raise InputError("there are no recordings to join")
 
     def together(name: str, *, samples: bool) -> np.ndarray:
-        each = [getattr(part, name) for part in parts]
+        arrays = [getattr(part, name) for part in parts]
         if samples:
-            each = [values[part.valid] for values, part in zip(each, parts, strict=True)]
-        return np.concatenate(each)
+            arrays = [values[part.valid] for values, part in zip(arrays, parts, strict=True)]
+        return np.concatenate(arrays)
 
     labels = ("breath_id", "R", "C", "time_inferred")
     signals = [

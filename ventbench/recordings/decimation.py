@@ -71,16 +71,16 @@ def decimate(breaths: Breaths) -> Decimation:
     ``valid``, ``time`` and ``dt`` are of the kept samples. ``sha256`` still names the file.
     """
     lengths = breaths.valid.sum(axis=1)
-    kept = [_kept(breaths, i, int(length)) for i, length in enumerate(lengths)]
-    counts = np.array([len(nodes) for nodes, _ in kept])
+    grids = [_nodes(breaths, i, int(length)) for i, length in enumerate(lengths)]
+    counts = np.array([len(nodes) for nodes, _ in grids])
     columns: dict[str, list[NDArray]] = defaultdict(list)
-    for i, (nodes, _) in enumerate(kept):
+    for i, (nodes, _) in enumerate(grids):
         time = breaths.time[i, nodes]
         columns["time"].append(time)
         columns["u_out"].append(breaths.u_out[i, nodes])
         columns["u_in"].append(_means(breaths.u_in[i], breaths.dt[i], nodes))
         reading = breaths.pressure[i, nodes].copy()
-        reading[~np.isin(nodes, kept[i][1])] = np.nan
+        reading[~np.isin(nodes, grids[i][1])] = np.nan
         columns["pressure"].append(reading)
         for name in ("flow", "volume"):
             if (values := getattr(breaths, name)) is not None:
@@ -101,12 +101,12 @@ def decimate(breaths: Breaths) -> Decimation:
         notes=breaths.notes,
     )
     index = np.stack(
-        [np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes, _ in kept]
+        [np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes, _ in grids]
     )
     return Decimation(fewer, index)
 
 
-def _kept(breaths: Breaths, i: int, length: int) -> tuple[Ints, Ints]:
+def _nodes(breaths: Breaths, i: int, length: int) -> tuple[Ints, Ints]:
     """Samples of a breath that are kept, in order, and those of them that are readings.
 
     The first and the last sample are kept.
@@ -151,8 +151,8 @@ def _means(u_in: Floats, dt: Floats, nodes: Ints) -> Floats:
 
 def _spaced(time: Floats) -> Bools:
     """Whether a sample comes long enough after the last reading that is kept, ``(k,)``."""
-    kept, last = np.zeros(len(time), bool), -np.inf
+    selected, last = np.zeros(len(time), bool), -np.inf
     for k, now in enumerate(time.tolist()):
         if now - last >= _LEAST - 1e-9:
-            kept[k], last = True, now
-    return kept
+            selected[k], last = True, now
+    return selected

@@ -67,14 +67,14 @@ def conversion(quantity: str, unit: str | None) -> Conversion:
     Raises:
         InputError: if the quantity has no such unit.
     """
-    known = UNITS[quantity]
-    to = next(iter(known))
+    spellings = UNITS[quantity]
+    to = next(iter(spellings))
     name = to if unit is None else _spelled(quantity).get(_key(unit), unit)
-    if name not in known:
+    if name not in spellings:
         raise InputError(
-            f"{unit!r} is no unit of {quantity} that is known; choose one of {', '.join(known)}"
+            f"{unit!r} is no unit of {quantity} that is known; choose one of {', '.join(spellings)}"
         )
-    return Conversion(name, to, known[name])
+    return Conversion(name, to, spellings[name])
 
 
 def in_file_unit(change: Conversion, pascal: float) -> float:
@@ -91,7 +91,7 @@ def _in_words(factor: Fraction) -> str:
 @cache
 def _spelled(quantity: str) -> dict[str, str]:
     """Units of a quantity by every spelling of theirs."""
-    atoms = {unit: {unit, *others.split()} for unit, others in _DATA["spellings"].items()}
+    atoms = {unit: {unit, *synonyms.split()} for unit, synonyms in _DATA["spellings"].items()}
     table: dict[str, str] = {}
     for unit in UNITS[quantity]:
         over, _, under = unit.partition("/")
@@ -103,7 +103,7 @@ def _spelled(quantity: str) -> dict[str, str]:
                 | {"".join(parts) for parts in pairs}
                 | {f"{x}p{under[0]}" for x in atoms[over]}
             )
-        table |= {_key(way): unit for way in ways}
+        table |= {_key(spelling): unit for spelling in ways}
     return table
 
 
@@ -159,7 +159,7 @@ def read_header(text: str) -> Header:
         ('flow', 'L/min')
     """
     plain = unicodedata.normalize("NFKC", text).strip()
-    plain = _DOTTED.sub(lambda found: f" {(found[1] or found[2]).lower()}dot ", plain).strip()
+    plain = _DOTTED.sub(lambda matched: f" {(matched[1] or matched[2]).lower()}dot ", plain).strip()
     interval = None
     if (sampled := _SAMPLED.fullmatch(plain)) is not None:
         number, plain = float(sampled[2]), sampled[1]
@@ -168,14 +168,14 @@ def read_header(text: str) -> Header:
     name = _BRACKETS.sub(" ", plain).strip(" ,;")
     units = [inside for inside in bracketed if is_unit(inside)]
     rest = " ".join([name, *(inside for inside in bracketed if inside not in units)])
-    whole = text.strip()
+    stripped = text.strip()
     if units:
-        found = next(x for x in _BRACKETS.finditer(text) if is_unit(x[1]))
-        whole = (text[: found.start()] + text[found.end() :]).strip(" _,;") or whole
+        matched = next(x for x in _BRACKETS.finditer(text) if is_unit(x[1]))
+        stripped = (text[: matched.start()] + text[matched.end() :]).strip(" _,;") or stripped
         role, side, certain = _meaning(rest, units[0])
-        return _header(whole, role, units[0], side, certain, interval)
+        return _header(stripped, role, units[0], side, certain, interval)
     for at in sorted(
-        {found.start() for found in re.finditer(r"(?<![^\W_])\w|(?<=[a-z])[A-Z]|%", rest)}
+        {matched.start() for matched in re.finditer(r"(?<![^\W_])\w|(?<=[a-z])[A-Z]|%", rest)}
     ):
         tail, before = rest[at:], rest[:at]
         alone = not before.strip(" _,;:.-/")
@@ -183,18 +183,18 @@ def read_header(text: str) -> Header:
             role, side, certain = _meaning(before, tail)
             if certain:
                 comma = re.search(r"[,;]\s*$|\s$", before) is not None
-                short = before.strip(" ,;") if comma and before.strip(" ,;") in text else whole
+                short = before.strip(" ,;") if comma and before.strip(" ,;") in text else stripped
                 return _header(short, role, tail, side, certain, interval)
     role, side, certain = _meaning(rest, None)
-    return _header(whole, role, None, side, certain, interval)
+    return _header(stripped, role, None, side, certain, interval)
 
 
 def _header(
     name: str, role: str | None, unit: str | None, side: str, certain: bool, interval: float | None
 ) -> Header:
     tables = [_spelled(q) for q in ([role] if role in UNITS else UNITS)]
-    known = next((t[_key(unit)] for t in tables if unit and _key(unit) in t), unit)
-    return Header(name, role, known, side, certain, interval)
+    canonical = next((t[_key(unit)] for t in tables if unit and _key(unit) in t), unit)
+    return Header(name, role, canonical, side, certain, interval)
 
 
 def _meaning(text: str, unit: str | None) -> tuple[str | None, str, bool]:

@@ -69,8 +69,8 @@ def fingerprints(breaths: Breaths) -> Fingerprints:
     keys = [
         np.array(
             [
-                [_key(name, grid, cells) for grid, cells in enumerate(own)]
-                for name, own in zip(of, _cut(values)[0], strict=True)
+                [_key(name, grid, cells) for grid, cells in enumerate(grid_cells)]
+                for name, grid_cells in zip(of, _cut(values)[0], strict=True)
             ],
             np.uint64,
         ).reshape(-1, len(_GRIDS))
@@ -79,16 +79,16 @@ def fingerprints(breaths: Breaths) -> Fingerprints:
     return Fingerprints(keys[0], keys[1], _measured(pressure))
 
 
-def match(breaths: Breaths, known: Fingerprints) -> Matches:
+def match(breaths: Breaths, references: Fingerprints) -> Matches:
     """Look breaths up among known ones.
 
     Breaths with the same commands and other measured pressures are repeats, not copies.
     """
     rows: list[dict[int, list[int]]] = [{} for _ in _GRIDS]
     for grid, table in enumerate(rows):
-        for row, key in enumerate(known.commands[:, grid].tolist()):
+        for row, key in enumerate(references.commands[:, grid].tolist()):
             table.setdefault(key, []).append(row)
-    found = np.full(len(breaths), -1, np.int64)
+    rows_found = np.full(len(breaths), -1, np.int64)
     certain = np.zeros(len(breaths), bool)
     lungs, u_in, pressure = breaths.lung_ids.tolist(), *_values(breaths)
     commands, pressures = _cut(u_in), _cut(pressure)
@@ -100,11 +100,11 @@ def match(breaths: Breaths, known: Fingerprints) -> Matches:
             continue
         grid, keys = _possible("", pressures[0][i], pressures[1][i])
         possible = set(keys)
-        same = [row for row in like if int(known.pressures[row, grid]) in possible]
-        perhaps = [row for row in like if not (measured[i] and known.measured[row])]
+        same = [row for row in like if int(references.pressures[row, grid]) in possible]
+        perhaps = [row for row in like if not (measured[i] and references.measured[row])]
         if same or perhaps:
-            found[i], certain[i] = (same or perhaps)[0], bool(same)
-    return Matches(found, certain)
+            rows_found[i], certain[i] = (same or perhaps)[0], bool(same)
+    return Matches(rows_found, certain)
 
 
 def repetitions(breaths: Breaths) -> tuple[Ints, Ints]:
@@ -153,22 +153,22 @@ def _cut(values: Floats) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
     """
     scaled = np.nan_to_num(values, posinf=0.0)[:, None] / CELL + np.array(_GRIDS)[:, None]
     cells = np.floor(scaled)
-    inside, near = scaled - cells, TOLERANCE / CELL + 1e-9
-    other = (inside > 1.0 - near).astype(np.int8) - (inside < near).astype(np.int8)
+    inside, margin = scaled - cells, TOLERANCE / CELL + 1e-9
+    neighbour = (inside > 1.0 - margin).astype(np.int8) - (inside < margin).astype(np.int8)
     cells = np.clip(cells, -(2**30), 2**30).astype("<i4")
     values = np.broadcast_to(values[:, None], cells.shape)
     cells = np.where(np.isnan(values), _BLANK, np.where(np.isinf(values), _NONE, cells))
-    return cells.astype("<i4"), np.where(np.isfinite(values), other, 0)
+    return cells.astype("<i4"), np.where(np.isfinite(values), neighbour, 0)
 
 
 def _possible(
-    name: str, cells: NDArray[np.int32], other: NDArray[np.int8]
+    name: str, cells: NDArray[np.int32], neighbour: NDArray[np.int8]
 ) -> tuple[int, list[int]]:
     """The grid with fewest values near an edge, and every key that the original may have there."""
-    grid = int(np.argmin(np.count_nonzero(other, axis=1)))
-    own, shift = cells[grid].tolist(), other[grid].tolist()
-    ways = [(cell, cell + by) if by else (cell,) for cell, by in zip(own, shift, strict=True)]
-    return grid, [_key(name, grid, way) for way in product(*ways)]
+    grid = int(np.argmin(np.count_nonzero(neighbour, axis=1)))
+    central, shift = cells[grid].tolist(), neighbour[grid].tolist()
+    ways = [(cell, cell + by) if by else (cell,) for cell, by in zip(central, shift, strict=True)]
+    return grid, [_key(name, grid, combination) for combination in product(*ways)]
 
 
 _PACK = struct.Struct(f"<{SAMPLES}i").pack

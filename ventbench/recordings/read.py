@@ -69,7 +69,7 @@ def simulated_pressures(
         raise InputError(f"{name} is the recording itself; it has no column {COLUMNS[0]}")
     values = _numbers(table[column], name, column)
     times = next((_numbers(table[key], name, key) for key in _TIMES if key in table), None)
-    given = {key: _numbers(table[key], name, key) for key in ("R", "C", "u_in") if key in table}
+    columns = {key: _numbers(table[key], name, key) for key in ("R", "C", "u_in") if key in table}
     ids = _numbers(table["breath_id"], name, "breath_id")
     order = np.argsort(ids, kind="stable")
     starts = np.searchsorted(ids[order], breaths.breath_id)
@@ -77,29 +77,29 @@ def simulated_pressures(
     answers = np.full(breaths.pressure.shape, np.nan)
     for i, number in enumerate(breaths.breath_id.tolist()):
         rows = order[starts[i] : ends[i]]
-        wanted = breaths.time[i, breaths.valid[i]]
+        sampled = breaths.time[i, breaths.valid[i]]
         if len(rows) == 0:
             raise InputError(f"{name} has no breath {number} of the recording")
-        own, at = values[rows], None if times is None else times[rows] - times[rows][0]
-        if not np.all(np.isfinite(own)):
+        simulated, at = values[rows], None if times is None else times[rows] - times[rows][0]
+        if not np.all(np.isfinite(simulated)):
             raise InputError(
                 f"{name}: breath {number} has a blank or infinite {column}; simulate every sample"
             )
-        for key in set(given) - {"u_in"}:
-            if given[key][rows[0]] != getattr(breaths, key)[i]:
+        for key in set(columns) - {"u_in"}:
+            if columns[key][rows[0]] != getattr(breaths, key)[i]:
                 raise InputError(
-                    f"{name}: breath {number} is of {key} {given[key][rows[0]]:g}, in the "
+                    f"{name}: breath {number} is of {key} {columns[key][rows[0]]:g}, in the "
                     f"recording of lung {breaths.lung_ids[i]}"
                 )
-        if len(rows) != len(wanted):
+        if len(rows) != len(sampled):
             if at is None:
                 raise InputError(
-                    f"{name}: breath {number} has {len(rows)} rows, the recording {len(wanted)}; "
+                    f"{name}: breath {number} has {len(rows)} rows, the recording {len(sampled)}; "
                     "simulate the recorded samples, or add a column time_step, s"
                 )
-            own = _at_times(own, at, wanted, name, number)
-        elif "u_in" in given:
-            command = given["u_in"][rows]
+            simulated = _at_times(simulated, at, sampled, name, number)
+        elif "u_in" in columns:
+            command = columns["u_in"][rows]
             apart = np.abs(command - breaths.u_in[i, breaths.valid[i]])
             if np.nanmax(apart, initial=0.0) > _SAME_COMMAND:
                 k = int(np.nanargmax(apart))
@@ -107,7 +107,7 @@ def simulated_pressures(
                     f"{name}: breath {number} has another command than the recording, u_in "
                     f"{command[k]:g} at sample {k + 1}; simulate the recorded commands"
                 )
-        answers[i, : len(wanted)], answers[i, len(wanted) :] = own, own[-1]
+        answers[i, : len(sampled)], answers[i, len(sampled) :] = simulated, simulated[-1]
     return answers
 
 
@@ -128,18 +128,18 @@ def _by_rows(table: Mapping[str, np.ndarray], name: str, breaths: Breaths) -> di
 def _at_times(
     values: Floats,
     at: Floats,
-    wanted: Floats,
+    times: Floats,
     file: str,
     number: int,
 ) -> Floats:
     if len(at) < 2 or not np.all(np.diff(at) > 0):
         raise InputError(f"{file}: the times of breath {number} do not increase")
-    if at[-1] < wanted[-1] - (at[-1] - at[-2]) - 1e-9:
+    if at[-1] < times[-1] - (at[-1] - at[-2]) - 1e-9:
         raise InputError(
-            f"{file}: breath {number} ends at {at[-1]:g} s, the recorded one at {wanted[-1]:g} s; "
+            f"{file}: breath {number} ends at {at[-1]:g} s, the recorded one at {times[-1]:g} s; "
             "simulate the whole breath"
         )
-    return np.interp(wanted, at, values)
+    return np.interp(times, at, values)
 
 
 def read_simulated(path: Path) -> dict[str, np.ndarray]:
@@ -243,11 +243,11 @@ class RecordingReport:
             lungs = ", ".join(f"{name} {count}" for name, count in self.lungs.items())
             lines.append(f"breaths for each lung: {lungs}")
         if self.interval:
-            shown = {name: f"{1e3 * dt:.1f}" for name, dt in self.interval.items()}
+            ms = {name: f"{1e3 * dt:.1f}" for name, dt in self.interval.items()}
             lines.append(
-                f"sampling interval: median {shown['median']} ms (5 % to 95 % of breaths: "
-                f"{shown['p5']} to {shown['p95']} ms; single steps {shown['min']} to "
-                f"{shown['max']} ms)"
+                f"sampling interval: median {ms['median']} ms (5 % to 95 % of breaths: "
+                f"{ms['p5']} to {ms['p95']} ms; single steps {ms['min']} to "
+                f"{ms['max']} ms)"
             )
         lines += [f"note: {note}" for note in self.notes()[len(self.suspicious) :]]
         lines += [f"suspicious: {problem}" for problem in self.suspicious]
@@ -290,28 +290,30 @@ _ADVICE = "They count as missing; --missing VALUE names further values that do."
 def role_problems(source: Source, scanned: Scanned) -> dict[str, tuple[RecordingProblem, ...]]:
     """What was left out, and what the physics of a lung says about the columns, by its level."""
     file = source.file
-    found = findings(scanned.figures, scanned.interval, scanned.R, scanned.C)
+    issues = findings(scanned.figures, scanned.interval, scanned.R, scanned.C)
     problems = {
         level: tuple(
             RecordingProblem(file, f.what, f.advice, column=f.column, value=f"{f.value:g}")
-            for f in found
+            for f in issues
             if f.level == level
         )
         for level in ("refused", "suspicious")
     }
     unusable = {
         column
-        for column in {each.column for each in scanned.bad}
+        for column in {samples.column for samples in scanned.bad}
         if sum(x.share for x in scanned.bad if x.column == column and x.kind != "slow") > UNUSABLE
     }
-    for each in scanned.bad:
-        level = "refused" if each.column in unusable else "suspicious"
+    for samples in scanned.bad:
+        level = "refused" if samples.column in unusable else "suspicious"
         advice = (
-            "That is too much: the recording is unusable." if each.column in unusable else _ADVICE
+            "That is too much: the recording is unusable."
+            if samples.column in unusable
+            else _ADVICE
         )
-        places = sorted(x for x, _ in locate(source, each.rows[:6].tolist()).values())
-        what = each.what(f"{source.place}s", places)
-        problem = RecordingProblem(file, what, advice, column=each.column)
+        places = sorted(x for x, _ in locate(source, samples.rows[:6].tolist()).values())
+        message = samples.what(f"{source.place}s", places)
+        problem = RecordingProblem(file, message, advice, column=samples.column)
         problems[level] = (problem, *problems[level])
     return problems
 
@@ -337,30 +339,30 @@ def check_lengths(scanned: Scanned, log: ProblemLog, *, pad: bool) -> None:
         size = longest * len(lengths)
         if size > max(PAD_LIMIT * int(lengths.sum()), 10_000_000):
             at = np.flatnonzero(lengths == longest)[:1]
-            what = (
+            message = (
                 f"breath {{value}} has {longest} samples, so padding {len(lengths)} breaths to it "
                 f"would make {size} samples of {lengths.sum()}"
             )
             advice = "Put breaths of very different lengths into files of their own."
-            log.add(scanned.starts[at], "breath_id", what, advice, values=ids[at])
+            log.add(scanned.starts[at], "breath_id", message, advice, values=ids[at])
         return
     usual = int(np.bincount(lengths).argmax())
     for length in np.unique(lengths[lengths != usual]):
         at = np.flatnonzero(lengths == length)
-        what = f"breath {{value}} has {length} samples, the others have {usual}"
+        message = f"breath {{value}} has {length} samples, the others have {usual}"
         advice = "Fix the breath, or pass --pad to fill short ones."
-        log.add(scanned.starts[at], "breath_id", what, advice, values=ids[at])
+        log.add(scanned.starts[at], "breath_id", message, advice, values=ids[at])
 
 
 def check_inferable(scanned: Scanned, log: ProblemLog) -> None:
     """Check that the interval of every breath without times can be inferred."""
     for at in (i for i, dt in scanned.inferred.items() if dt is None):
-        what = (
+        message = (
             f"the times of breath {scanned.breath_id[at]} are blank and cannot be inferred: no "
             "breath of the file has times, and u_out does not switch from 0 to 1 in this one"
         )
         advice, first = "Fill in time_step, in seconds.", scanned.starts[at : at + 1]
-        log.add(first, "time_step", what, advice, values=np.array([np.nan]))
+        log.add(first, "time_step", message, advice, values=np.array([np.nan]))
 
 
 #: Environment variable that names the folder of public recordings.
@@ -407,9 +409,9 @@ def load(
     if isinstance(path, Breaths):
         return clean(path, missing)
     if isinstance(path, str | os.PathLike) and Path(path).is_dir():
-        first, *others = session_files(path)
-        if others:
-            return _joined((first, *others), clip, missing, progress)
+        first, *further = session_files(path)
+        if further:
+            return _joined((first, *further), clip, missing, progress)
         path = first
     source = open_source(path)
     log = ProblemLog(source.file)
@@ -438,9 +440,9 @@ def session_files(path: FilePath) -> tuple[Path, ...]:
     if (folder / SESSION).is_file():
         return (folder / SESSION,)
     files = (file for file in folder.iterdir() if file.name.endswith(_SUFFIXES))
-    if not (found := tuple(sorted(files))):
+    if not (recordings_found := tuple(sorted(files))):
         raise InputError(f"{folder} has no recording; name a file, or a folder with some")
-    return found
+    return recordings_found
 
 
 def _joined(
@@ -501,12 +503,12 @@ def check(
     if not report.ok:
         return report
     if report.blank_pressures == report.rows:
-        what = f"all {report.rows} pressures are blank"
+        message = f"all {report.rows} pressures are blank"
         advice = "Fill in the pressure in cmH2O: there is nothing to compare a simulator with."
-        refused = (RecordingProblem(source.file, what, advice, column="pressure"),)
+        refused = (RecordingProblem(source.file, message, advice, column="pressure"),)
     else:
         refused = role_problems(source, scanned)["refused"]
-    suspicious = tuple(found for found in report.suspicious if found not in refused)
+    suspicious = tuple(problem for problem in report.suspicious if problem not in refused)
     return replace(report, problems=refused, problem_count=len(refused), suspicious=suspicious)
 
 

@@ -90,8 +90,10 @@ class Saturation:
     def __str__(self) -> str:
         """The saturation as a phrase."""
         unit = {"pressure": "cmH2O", "flow": "mL/s"}[self.column]
-        what = "readings of pressure saturate" if self.column == "pressure" else "flow is clipped"
-        return f"{what} at {self.level:.4g} {unit} in {100 * self.share:.2g} % of the samples"
+        subject = (
+            "readings of pressure saturate" if self.column == "pressure" else "flow is clipped"
+        )
+        return f"{subject} at {self.level:.4g} {unit} in {100 * self.share:.2g} % of the samples"
 
 
 def breath_figures(
@@ -110,7 +112,9 @@ def breath_figures(
     """
     lengths = np.diff(starts, append=len(time))
     breath = np.repeat(np.arange(len(starts)), lengths)
-    left = (starts + lengths)[breath] - np.arange(len(time))  # samples to the end of the breath
+    remaining = (starts + lengths)[breath] - np.arange(
+        len(time)
+    )  # samples to the end of the breath
     pressure, u_in = samples["pressure"], np.nan_to_num(samples["u_in"])
     inside = samples["u_out"] == 0
 
@@ -121,7 +125,7 @@ def breath_figures(
 
     out = {
         "inspiration": np.add.reduceat(inside.astype(float), starts) / lengths,
-        "end": mean(pressure, left <= _END * lengths[breath]),
+        "end": mean(pressure, remaining <= _END * lengths[breath]),
         "inside": mean(pressure, inside),
         "outside": mean(pressure, ~inside),
         "u_in_inside": mean(u_in, inside),
@@ -144,10 +148,10 @@ def breath_figures(
 def _missing(time: Floats, starts: Ints, breath: Ints) -> Floats:
     """Rows that the clock of each breath jumps over."""
     steps = np.where(np.diff(breath, prepend=-1) == 0, np.diff(time, prepend=np.nan), np.nan)
-    known = steps[np.isfinite(steps)]
-    if len(known) == 0:
+    finite = steps[np.isfinite(steps)]
+    if len(finite) == 0:
         return np.zeros(len(starts))
-    usual = float(np.median(known))
+    usual = float(np.median(finite))
     jumps = np.where(steps > _JUMP * usual, np.round(steps / max(usual, 1e-9)) - 1.0, 0.0)
     return np.add.reduceat(jumps, starts)
 
@@ -167,9 +171,9 @@ def _commands_of(
     volume -= volume[starts][breath]
     sums = {}
     for shift in _SHIFTS:
-        other = np.clip(breath + shift, 0, len(starts) - 1)
-        at = np.minimum(starts[other] + within, len(time) - 1)
-        good = (other == breath + shift) & (within < lengths[other])
+        neighbour = np.clip(breath + shift, 0, len(starts) - 1)
+        at = np.minimum(starts[neighbour] + within, len(time) - 1)
+        good = (neighbour == breath + shift) & (within < lengths[neighbour])
         good &= np.isfinite(u_in[at]) & np.isfinite(pressure) & np.isfinite(u_in)
         columns = (u_in[at], volume[at], np.ones(len(time)), pressure)
         columns = [np.where(good, x, 0.0) for x in columns]
@@ -186,7 +190,7 @@ def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
         at = values == top[breath]
         below = np.where(at, np.nan, values)
         second = np.fmax.reduceat(below, starts)
-        next_to_it = values == second[breath]
+        adjacent = values == second[breath]
         steps = np.full(len(values), np.nan)
         edge = (at[1:] != at[:-1]) & (breath[1:] == breath[:-1])
         steps[1:][edge] = np.abs(values[1:] - values[:-1])[edge]
@@ -194,7 +198,7 @@ def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
     return {
         "": top,
         "_often": np.add.reduceat(at * 1.0, starts),
-        "_next": np.add.reduceat(next_to_it * 1.0, starts),
+        "_next": np.add.reduceat(adjacent * 1.0, starts),
         "_step": step,
     }
 
@@ -211,20 +215,20 @@ def _regression(
 
     With a measured volume also how many times the integrated flow it is, and their correlation.
     """
-    known = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
-    q = np.where(known, flow, 0.0)
+    finite = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
+    q = np.where(finite, flow, 0.0)
     same = np.diff(breath, prepend=-1) == 0
     dt = np.where(same, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0)
     volume = np.cumsum(0.5 * dt * (q + np.roll(q, 1)))
     volume -= volume[starts][breath]
-    columns = {"q": q, "v": volume, "1": np.ones(len(q)), "p": np.where(known, pressure, 0.0)}
+    columns = {"q": q, "v": volume, "1": np.ones(len(q)), "p": np.where(finite, pressure, 0.0)}
     sums = {
-        a + b: np.add.reduceat(columns[a] * columns[b] * known, starts)
+        a + b: np.add.reduceat(columns[a] * columns[b] * finite, starts)
         for a, b in ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p", "pp")
     }
     n = np.maximum(sums["11"], 1.0)
     if measured is not None:
-        both = known & np.isfinite(measured)
+        both = finite & np.isfinite(measured)
         count = np.maximum(np.add.reduceat(both * 1.0, starts), 1.0)
         v, w = (np.where(both, x, 0.0) for x in (volume, measured))
         v, w = (
@@ -246,7 +250,7 @@ def _ratio(a: Floats, b: Floats) -> Floats:
 
 def saturations(figures: Mapping[str, Floats]) -> tuple[Saturation, ...]:
     """Levels at which sensors end: reached again and again, exactly, and left by small steps."""
-    found = []
+    levels = []
     for name in ("pressure", "flow"):
         if not np.isfinite(figures.get(f"{name}_high", np.zeros(0))).any():
             continue
@@ -259,13 +263,13 @@ def saturations(figures: Mapping[str, Floats]) -> tuple[Saturation, ...]:
             count, after = (figures[f"{name}_{side}_{k}"][at].sum() for k in ("often", "next"))
             steps = figures[f"{name}_{side}_step"][at]
             small = np.isfinite(steps).any() and np.nanmedian(steps) < _STEP * span
-            enough = count >= max(_READINGS, _SHARE * total) and count >= 2 * at.sum()
-            if span > _FLAT and small and enough and count >= _TIMES * after:
+            frequent = count >= max(_READINGS, _SHARE * total) and count >= 2 * at.sum()
+            if span > _FLAT and small and frequent and count >= _TIMES * after:
                 signed = float(level if side == "high" else -level)
-                found.append(
+                levels.append(
                     Saturation(name, signed, side == "high", int(count), float(count / total))
                 )
-    return tuple(found)
+    return tuple(levels)
 
 
 def findings(
@@ -276,45 +280,47 @@ def findings(
     Takes figures of k breaths, from :func:`breath_figures`, their mean sampling intervals, s, NaN
     if unknown, and labels, cmH2O/(L/s) and mL/cmH2O, ``(k,)`` each.
     """
-    found: list[Finding] = []
+    collected: list[Finding] = []
     low, high = -figures["pressure_low"], figures["pressure_high"]
     if not np.isfinite(high).any():
         return ()
     spans = high - low
     moves = spans > _MOVES
     if np.nanmax(spans) < _FLAT:
-        what = f"pressure stays at {np.nanmedian(high):.4g} cmH2O, so there is nothing to identify"
+        message = (
+            f"pressure stays at {np.nanmedian(high):.4g} cmH2O, so there is nothing to identify"
+        )
         advice = "Say which column is the pressure with --map NAME=pressure."
-        return (Finding("pressure", what, advice, "refused", float(np.nanmedian(high))),)
-    found += _times(interval)
+        return (Finding("pressure", message, advice, "refused", float(np.nanmedian(high))),)
+    collected += _times(interval)
     if _agree(figures.get("correlation", np.zeros(0)), _OPPOSITE):
-        what = "flow goes out while pressure is high, so it is counted from the patient"
-        found.append(
+        message = "flow goes out while pressure is high, so it is counted from the patient"
+        collected.append(
             Finding(
                 "flow",
-                what,
+                message,
                 "Pass --invert flow to `ventbench data import`.",
                 "refused",
                 float(np.nanmedian(figures["correlation"])),
             )
         )
-    found += _volumes(figures)
-    found += _numbering(figures, R, C)
+    collected += _volumes(figures)
+    collected += _numbering(figures, R, C)
     if missing := int(figures["missing"].sum()):
         some = int((figures["missing"] > 0).sum())
-        what = f"the clock jumps over {missing} rows in {some} of {len(spans)} breaths"
+        message = f"the clock jumps over {missing} rows in {some} of {len(spans)} breaths"
         advice = "What was commanded meanwhile is unknown: leave such breaths out, or record again."
-        found.append(Finding("time_step", what, advice, value=missing))
+        collected.append(Finding("time_step", message, advice, value=missing))
     inverted = _agree((figures["inside"] - figures["outside"])[moves], 0.0)
-    if inverted and not any(f.column == "flow" for f in found):
-        what = "pressure is higher while u_out is 1 than while it is 0, so 0 and 1 are exchanged"
+    if inverted and not any(f.column == "flow" for f in collected):
+        message = "pressure is higher while u_out is 1 than while it is 0, so 0 and 1 are exchanged"
         advice = "Pass --invert u_out to `ventbench data import`."
-        found.append(Finding("u_out", what, advice))
+        collected.append(Finding("u_out", message, advice))
     elif not inverted:
-        found += _commands(figures)
-        found += _phases(figures, low, spans, moves)
-    found += _pressures(float(np.nanmedian(low)), float(np.nanmedian(high)))
-    found += [
+        collected += _commands(figures)
+        collected += _phases(figures, low, spans, moves)
+    collected += _pressures(float(np.nanmedian(low)), float(np.nanmedian(high)))
+    collected += [
         Finding(
             s.column,
             str(s),
@@ -324,9 +330,9 @@ def findings(
         )
         for s in saturations(figures)
     ]
-    if not any(f.level == "refused" for f in found):
-        found += _labels(figures, R, C)
-    return tuple(sorted(found, key=lambda f: f.level))  # what is refused comes first
+    if not any(f.level == "refused" for f in collected):
+        collected += _labels(figures, R, C)
+    return tuple(sorted(collected, key=lambda f: f.level))  # what is refused comes first
 
 
 def few_breaths(count: int) -> str | None:
@@ -344,8 +350,8 @@ def few_breaths(count: int) -> str | None:
 
 def _agree(values: Floats, limit: float) -> bool:
     """Whether nearly all of the known values are below a limit."""
-    known = values[np.isfinite(values)]
-    return len(known) > 0 and bool((known < limit).mean() >= _MOST)
+    finite = values[np.isfinite(values)]
+    return len(finite) > 0 and bool((finite < limit).mean() >= _MOST)
 
 
 def _times(interval: Floats) -> list[Finding]:
@@ -354,11 +360,11 @@ def _times(interval: Floats) -> list[Finding]:
     median = float(np.nanmedian(interval))
     if _INTERVALS[0] * 0.99 <= median <= _INTERVALS[1] * 1.01:
         return []
-    what = f"the median sampling interval is {median:g} s"
+    message = f"the median sampling interval is {median:g} s"
     unit = "ms" if median > _INTERVALS[1] else "min"
     advice = f"Rates are 20 to 1000 Hz: pass --time-unit {unit} (or --rate) to "
     level = "refused" if median > SLOW else "suspicious"
-    return [Finding("time_step", what, f"{advice}`ventbench data import`.", level, median)]
+    return [Finding("time_step", message, f"{advice}`ventbench data import`.", level, median)]
 
 
 def _volumes(figures: Mapping[str, Floats]) -> list[Finding]:
@@ -381,56 +387,58 @@ def _volumes(figures: Mapping[str, Floats]) -> list[Finding]:
     times = {2: "twice", 3: "three times"}.get(round(apart), f"{apart:.3g} times")
     if abs(apart / round(apart) - 1.0) > 0.05:
         share, times = f"1/{apart:.3g}", f"{apart:.3g} times"
-    what = (
+    message = (
         f"flow and volume contradict each other: they differ by a factor of {apart:.1f} (volume is "
         f"{share if factor < 1.0 else times}{' of' if factor < 1.0 else ''} the integrated flow)"
     )
     advice = "Say which is wrong: --map NAME=unused leaves it out, "
     advice += f"{' or '.join(units) or 'a unit such as --flow-unit L/min'} corrects it."
-    return [Finding("volume", what, advice, "refused", factor)]
+    return [Finding("volume", message, advice, "refused", factor)]
 
 
 def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding]:
     """Pressures that follow the commands of the breath before, or after, by far better."""
-    left = dict.fromkeys(_SHIFTS, 0.0)
+    residual = dict.fromkeys(_SHIFTS, 0.0)
     rows = dict.fromkeys(_SHIFTS, 0.0)
     for label in np.unique(np.stack([R, C]), axis=1).T:
-        own = (label[0] == R) & (label[1] == C)
+        same_lung = (label[0] == R) & (label[1] == C)
         for shift in _SHIFTS:
             A = np.zeros((4, 4))
             for i in range(4):
                 for j in range(i, 4):
-                    A[i, j] = A[j, i] = figures[f"shift{shift}:{i}{j}"][own].sum()
+                    A[i, j] = A[j, i] = figures[f"shift{shift}:{i}{j}"][same_lung].sum()
             solved = np.linalg.lstsq(A[:3, :3], A[:3, 3], rcond=1e-9)[0]
-            left[shift] += max(float(A[3, 3] - A[:3, 3] @ solved), 0.0)
+            residual[shift] += max(float(A[3, 3] - A[:3, 3] @ solved), 0.0)
             rows[shift] += A[2, 2]
     if min(rows.values()) < _NUMBERED:
         return []
-    variance = {shift: left[shift] / rows[shift] for shift in _SHIFTS}
+    variance = {shift: residual[shift] / rows[shift] for shift in _SHIFTS}
     best = min(variance, key=lambda shift: variance[shift])
     if best == 0 or variance[best] > _FOLLOWS * variance[0] or variance[0] < _MOVES**2:
         return []
     which = "before" if best < 0 else "after"
-    what = (
+    message = (
         f"pressures follow the commands of the breath {which} (to {variance[best] ** 0.5:.2g} "
         f"cmH2O, those of their own to {variance[0] ** 0.5:.2g}), so their numbers are off by one"
     )
     advice = "Put the pressures of each breath beside its own commands."
-    return [Finding("breath_id", what, advice, "refused", float(best))]
+    return [Finding("breath_id", message, advice, "refused", float(best))]
 
 
 def _commands(figures: Mapping[str, Floats]) -> list[Finding]:
     largest = float(figures["u_in"].max())
     if 0.0 < largest <= 1.0:
-        what = f"u_in is {largest:.3g} % at most, so it looks like 0 to 1"
+        message = f"u_in is {largest:.3g} % at most, so it looks like 0 to 1"
         return [
-            Finding("u_in", what, "Pass --u-in-unit 1 to `ventbench data import`.", value=largest)
+            Finding(
+                "u_in", message, "Pass --u-in-unit 1 to `ventbench data import`.", value=largest
+            )
         ]
     inside, outside = figures["u_in_inside"], figures["u_in_outside"]
     if largest > 0.0 and _agree(inside - outside, 0.0):
-        what = "u_in is larger while the expiratory valve is open than in inspiration"
+        message = "u_in is larger while the expiratory valve is open than in inspiration"
         advice = "Say which column is the inspiratory valve with --map NAME=u_in, or pass "
-        return [Finding("u_in", what, f"{advice}--invert u_in if 100 % is shut.")]
+        return [Finding("u_in", message, f"{advice}--invert u_in if 100 % is shut.")]
     return []
 
 
@@ -440,32 +448,32 @@ def _phases(
     share = float(np.nanmedian(figures["inspiration"]))
     height = _ratio(figures["end"] - low, spans)[moves]
     if _agree(-height, -_PEAK):
-        what = "breaths end at their highest pressure, so their number changes at expiration"
-        return [Finding("breath_id", what, "Pass --split-breaths to `ventbench data import`.")]
+        message = "breaths end at their highest pressure, so their number changes at expiration"
+        return [Finding("breath_id", message, "Pass --split-breaths to `ventbench data import`.")]
     if _INSPIRATION[0] <= share <= _INSPIRATION[1]:
         return []
-    what = f"inspiration (u_out = 0) is {100 * share:.3g} % of a breath; 10 to 70 % are usual"
+    message = f"inspiration (u_out = 0) is {100 * share:.3g} % of a breath; 10 to 70 % are usual"
     advice = "Pass --split-breaths, or say which column is the valve with --map NAME=u_out."
-    return [Finding("u_out", what, advice, value=share)]
+    return [Finding("u_out", message, advice, value=share)]
 
 
 def _pressures(peep: float, pip: float) -> list[Finding]:
     if _PEEP[0] <= peep <= _PEEP[1] and _PIP[0] <= pip <= _PIP[1]:
         return []
-    what = f"PEEP {peep:.2g} and PIP {pip:.3g} cmH2O (medians) are no ventilator's"
+    message = f"PEEP {peep:.2g} and PIP {pip:.3g} cmH2O (medians) are no ventilator's"
     unit = "kPa" if pip < _PIP[0] else "Pa"
     advice = f"If the unit is another one, pass such as --pressure-unit {unit} to "
-    return [Finding("pressure", what, f"{advice}`ventbench data import`.", value=pip)]
+    return [Finding("pressure", message, f"{advice}`ventbench data import`.", value=pip)]
 
 
 def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding]:
     """Labels whose R and C are exchanged, by a regression of pressure on flow and volume."""
-    found = []
+    collected = []
     pairs = np.unique(np.stack([R, C], axis=1), axis=0) if "qq" in figures else []
     for labelled_R, labelled_C in pairs:
-        own = (labelled_R == R) & (labelled_C == C)
+        same_label = (labelled_R == R) & (labelled_C == C)
         s = {
-            k: float(figures[k][own].sum())
+            k: float(figures[k][same_label].sum())
             for k in ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p")
         }
         A = np.array(
@@ -481,21 +489,21 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
         if np.abs(fit - swapped).max() < np.log(_EXCHANGED) and np.abs(fit - label).max() > np.log(
             _HELD
         ):
-            what = (
+            message = (
                 f"R and C look exchanged: the label is R{labelled_R:g}C{labelled_C:g}, pressure "
                 f"and flow ask for R {1000.0 * r:.3g} and C {1.0 / e:.3g}"
             )
             advice = f"Pass --lung R{labelled_C:g}C{labelled_R:g} to `ventbench data import`."
-            found.append(Finding("R", what, advice, value=float(labelled_R)))
-    return found
+            collected.append(Finding("R", message, advice, value=float(labelled_R)))
+    return collected
 
 
 def opposite_sign(pressure: Floats, flow: Floats) -> bool:
     """Whether flow is counted from the patient, by whole breaths of both, ``(m,)`` each."""
-    known = np.isfinite(pressure) & np.isfinite(flow)
-    if known.sum() < 3 or np.ptp(pressure[known]) < _FLAT or np.ptp(flow[known]) == 0.0:
+    finite = np.isfinite(pressure) & np.isfinite(flow)
+    if finite.sum() < 3 or np.ptp(pressure[finite]) < _FLAT or np.ptp(flow[finite]) == 0.0:
         return False
-    return bool(np.corrcoef(pressure[known], flow[known])[0, 1] < _OPPOSITE)
+    return bool(np.corrcoef(pressure[finite], flow[finite])[0, 1] < _OPPOSITE)
 
 
 def check_roles(breaths: Breaths) -> tuple[Finding, ...]:

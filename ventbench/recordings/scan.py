@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ventbench.recordings.bad_samples import BadSamples, find_bad_samples, without
+from ventbench.recordings.bad_samples import BadSamples, blanked, find_bad_samples
 from ventbench.recordings.roles import breath_figures
 from ventbench.recordings.schema import COLUMNS, OPTIONAL, Column, ProblemLog, fail
 from ventbench.recordings.sources import Source, to_numpy
@@ -75,26 +75,26 @@ def blocks_of(batches: Iterable[pa.RecordBatch]) -> Iterator[Rows]:
 
     A blank breath_id is that of the row before; at the start of the file, the first one known.
     """
-    kept: list[Rows] = []
+    pending: list[Rows] = []
     first, waiting = 0, 0
     for batch in batches:
-        columns = {x: to_numpy(batch.column(x), COLUMNS[x].whole) for x in batch.schema.names}
+        columns = {x: to_numpy(batch.column(x), COLUMNS[x].integer) for x in batch.schema.names}
         blank = np.zeros(batch.num_rows, bool)
         if batch.column("breath_id").null_count:
             blank = to_numpy(batch.column("breath_id").is_null()) > 0
-        kept.append(Rows(columns, blank, first))
+        pending.append(Rows(columns, blank, first))
         first, waiting = first + len(blank), waiting + len(blank)
         if waiting < 2 * ROWS:
             continue
-        rows = _joined(kept)
+        rows = _joined(pending)
         starts = rows.starts[(rows.starts >= ROWS) & (rows.starts < waiting)]
         if len(starts):
             cut = int(starts[-1])
             yield rows.part(0, cut)
             rows, waiting = rows.part(cut, waiting), waiting - cut
-        kept = [rows]
+        pending = [rows]
     if waiting:
-        yield _joined(kept)
+        yield _joined(pending)
 
 
 def _joined(parts: list[Rows]) -> Rows:
@@ -125,53 +125,53 @@ def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str
     _add_blank(rows, log, "breath_id", rows.blank_id)
     for name, values in rows.columns.items():
         column = COLUMNS[name]
-        if column.whole:
+        if column.integer:
             continue
         if not column.blank:
             _add_blank(rows, log, name, np.isnan(values))
         infinite = np.isinf(values)
         if infinite.any():
             at = np.flatnonzero(infinite)
-            what = "{value} is infinite"
-            log.add(at, name, what, "Fix the row.", values=values[at])
+            message = "{value} is infinite"
+            log.add(at, name, message, "Fix the row.", values=values[at])
         outside = _outside(values, column) & ~infinite
         if not outside.any():
             continue
         at = np.flatnonzero(outside)
         level, advice = "problem", column.advice
-        what = f"{{value}} is outside {column.span}"
+        message = f"{{value}} is outside {column.span}"
         if name == "u_in" and clip:
             level, advice = "warning", "It was clipped."
             columns[name] = np.where(infinite, values, np.clip(values, column.low, column.high))
         elif name == "u_out":
-            what = "{value} is neither 0 nor 1"
+            message = "{value} is neither 0 nor 1"
         elif column.positive:
-            what = f"{{value}} is not in {column.span}"
+            message = f"{{value}} is not in {column.span}"
         if name in ("R", "C"):  # the label of a whole recording: one mistake, not one a row
-            _add_once(at, name, what, advice, values[at], log)
+            _add_once(at, name, message, advice, values[at], log)
         else:
-            log.add(at, name, what, advice, values=values[at], level=level)
+            log.add(at, name, message, advice, values=values[at], level=level)
     return columns
 
 
 def _add_once(
-    at: np.ndarray, name: str, what: str, advice: str, values: np.ndarray, log: ProblemLog
+    at: np.ndarray, name: str, message: str, advice: str, values: np.ndarray, log: ProblemLog
 ) -> None:
     """Report a value that many rows repeat once."""
     kinds, first, counts = np.unique(values, return_index=True, return_counts=True)
     often = counts >= _OFTEN
     single = ~np.isin(values, kinds[often])
-    log.add(at[single], name, what, advice, values=values[single])
-    what = f"{what}, here and in more rows"
-    log.add(at[first[often]], name, what, advice, values=kinds[often])
+    log.add(at[single], name, message, advice, values=values[single])
+    message = f"{message}, here and in more rows"
+    log.add(at[first[often]], name, message, advice, values=kinds[often])
 
 
 def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: np.ndarray) -> None:
     if blank.any():
-        what = f"the cell is blank, but {name} is needed in every row"
+        message = f"the cell is blank, but {name} is needed in every row"
         at = np.flatnonzero(blank)
         values = np.full(len(at), np.nan)
-        log.add(at, name, what, "Fill it in or remove the breath.", values=values)
+        log.add(at, name, message, "Fill it in or remove the breath.", values=values)
 
 
 def _outside(values: np.ndarray, column: Column) -> np.ndarray:
@@ -181,19 +181,19 @@ def _outside(values: np.ndarray, column: Column) -> np.ndarray:
     return low | (values > column.high)
 
 
-def check_ids(rows: Rows, log: ProblemLog, seen: dict[int, int]) -> None:
+def check_ids(rows: Rows, log: ProblemLog, first_rows: dict[int, int]) -> None:
     """Check that the rows of each breath follow one another; ``seen`` are first rows by id."""
     starts = rows.starts + rows.first
     ids = rows.columns["breath_id"][rows.starts].tolist()
-    others = np.array(
-        [seen.setdefault(id_, at) for id_, at in zip(ids, starts.tolist(), strict=True)]
+    earlier = np.array(
+        [first_rows.setdefault(id_, at) for id_, at in zip(ids, starts.tolist(), strict=True)]
     )
-    again = np.flatnonzero(others != starts)
-    what = "breath {value} comes again, it is already at {other}"
+    again = np.flatnonzero(earlier != starts)
+    message = "breath {value} comes again, it is already at {other}"
     advice = "Keep the rows of a breath together, and give each breath an id of its own."
     values = rows.columns["breath_id"][rows.starts[again]]
     at = rows.starts[again]
-    log.add(at, "breath_id", what, advice, values=values, others=others[again] - rows.first)
+    log.add(at, "breath_id", message, advice, values=values, references=earlier[again] - rows.first)
 
 
 def check_lung(rows: Rows, log: ProblemLog) -> None:
@@ -206,27 +206,27 @@ def check_lung(rows: Rows, log: ProblemLog) -> None:
         if len(at) == 0:
             continue
         at = at[np.unique(rows.breath[at], return_index=True)[1]]
-        what = f"{name} changes to {{value}} within the breath, which starts at {{other}}"
+        message = f"{name} changes to {{value}} within the breath, which starts at {{other}}"
         advice = "A breath has one lung: give the second part its own breath_id, or fix the row."
-        others = rows.starts[rows.breath[at]]
-        log.add(at, name, what, advice, values=values[at], others=others)
+        first_row = rows.starts[rows.breath[at]]
+        log.add(at, name, message, advice, values=values[at], references=first_row)
 
 
 def check_single(rows: Rows, log: ProblemLog) -> None:
     """Check that each breath has at least two samples."""
     at = rows.starts[rows.lengths == 1]
-    what = "breath {value} has one sample, at least two are needed"
+    message = "breath {value} has one sample, at least two are needed"
     advice = "Remove it, or keep the rows of a breath together."
-    log.add(at, "breath_id", what, advice, values=rows.columns["breath_id"][at])
+    log.add(at, "breath_id", message, advice, values=rows.columns["breath_id"][at])
 
 
 def check_row_ids(rows: Rows, log: ProblemLog, last: int) -> int:
     """Warn where the column id, which is not used otherwise, does not increase; return the last."""
     ids = rows.columns["id"]
     at = np.flatnonzero(np.append(rows.first > 0 and ids[0] <= last, ids[1:] <= ids[:-1]))
-    what = "id {value} is not greater than the one before"
+    message = "id {value} is not greater than the one before"
     advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
-    log.add(at, "id", what, advice, values=ids[at], level="warning")
+    log.add(at, "id", message, advice, values=ids[at], level="warning")
     return int(ids[-1])
 
 
@@ -240,47 +240,47 @@ def check_times(rows: Rows, log: ProblemLog) -> None:
     row before in every column, including `id`.
     """
     time, breath = rows.columns["time_step"], rows.breath
-    known = np.flatnonzero(np.isfinite(time))
-    previous, here = known[:-1], known[1:]
-    late = (time[here] <= time[previous]) & (breath[here] == breath[previous])
+    finite = np.flatnonzero(np.isfinite(time))
+    previous, current = finite[:-1], finite[1:]
+    late = (time[current] <= time[previous]) & (breath[current] == breath[previous])
     if late.any():
-        _add_order(rows, log, previous[late], here[late])
+        _add_order(rows, log, previous[late], current[late])
     blank = np.isnan(time)
     at = np.flatnonzero(blank[1:] & blank[:-1] & (breath[1:] == breath[:-1])) + 1
     at = at[_same(rows, at - 1, at, rows.columns)] if len(at) else at
     _add_repeat(rows, log, at - 1, at, "id", rows.columns["id"])
 
 
-def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarray) -> None:
+def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, current: np.ndarray) -> None:
     time = rows.columns["time_step"]
-    equal = time[previous] == time[here]
+    equal = time[previous] == time[current]
     names = [name for name in rows.columns if name != "id"]
-    repeat = equal & _same(rows, previous, here, names)
-    _add_repeat(rows, log, previous[repeat], here[repeat], "time_step", time)
-    for chosen, what in (
+    repeat = equal & _same(rows, previous, current, names)
+    _add_repeat(rows, log, previous[repeat], current[repeat], "time_step", time)
+    for chosen, message in (
         (equal & ~repeat, "two rows of the breath have the time {value} s, the other is {other}"),
         (~equal, "time goes back to {value} s from {other}"),
     ):
-        at, before = here[chosen], previous[chosen]
-        log.add(at, "time_step", what, _SORT, values=time[at], others=before)
+        at, before = current[chosen], previous[chosen]
+        log.add(at, "time_step", message, _SORT, values=time[at], references=before)
 
 
 def _add_repeat(
     rows: Rows,
     log: ProblemLog,
     previous: np.ndarray,
-    here: np.ndarray,
+    current: np.ndarray,
     column: str,
     values: np.ndarray,
 ) -> None:
-    what, advice = "the row repeats {other}", "Remove one of the two."
-    log.add(here, column, what, advice, values=values[here], others=previous)
+    message, advice = "the row repeats {other}", "Remove one of the two."
+    log.add(current, column, message, advice, values=values[current], references=previous)
 
 
-def _same(rows: Rows, first: np.ndarray, other: np.ndarray, names: Iterable[str]) -> np.ndarray:
+def _same(rows: Rows, first: np.ndarray, second: np.ndarray, names: Iterable[str]) -> np.ndarray:
     same = np.ones(len(first), dtype=bool)
     for name in names:
-        a, b = rows.columns[name][first], rows.columns[name][other]
+        a, b = rows.columns[name][first], rows.columns[name][second]
         same &= (a == b) | ((a != a) & (b != b))
     return same
 
@@ -315,8 +315,8 @@ def interval_table(n_inspiratory: np.ndarray, interval: np.ndarray) -> IntervalT
         n_inspiratory: leading samples with u_out = 0, (k,).
         interval: mean sampling interval, s, NaN where times are blank, (k,).
     """
-    known = np.isfinite(interval)
-    counts, intervals = n_inspiratory[known], interval[known]
+    finite = np.isfinite(interval)
+    counts, intervals = n_inspiratory[finite], interval[finite]
     by_count = {
         int(n): float(np.median(intervals[counts == n]))
         for n, many in zip(*np.unique(counts, return_counts=True), strict=True)
@@ -346,7 +346,7 @@ class KnownTimes:
     shifted: np.ndarray  #: breaths that do not start at 0 in the file, (k,) bool.
 
 
-def known_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> KnownTimes:
+def complete_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> KnownTimes:
     """Interpolate single blank times and shift each breath to start at 0.
 
     Blank times between two known ones are linear in the sample number; those before the first or
@@ -370,10 +370,10 @@ def known_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> Kn
 
 def _interpolate(time: np.ndarray) -> np.ndarray:
     at = np.arange(len(time))
-    known = np.flatnonzero(np.isfinite(time))
-    first, last = known[0], known[-1]
+    finite = np.flatnonzero(np.isfinite(time))
+    first, last = finite[0], finite[-1]
     slope = (time[last] - time[first]) / (last - first)
-    filled = np.interp(at, known, time[known])
+    filled = np.interp(at, finite, time[finite])
     filled = np.where(at < first, time[first] + slope * (at - first), filled)
     return np.where(at > last, time[last] + slope * (at - last), filled)
 
@@ -443,14 +443,14 @@ def scan(
             if progress is not None:
                 progress(source.done, source.size)
 
-    parts, seen, last = [], dict[int, int](), 0
+    parts, first_rows, last = [], dict[int, int](), 0
     marks = set(missing)
     for rows in blocks_of(batches()):
         log.first = rows.first
         bad = find_bad_samples(rows.columns, marks)
-        marks |= {float(each.values[0]) for each in bad if each.kind == "mark"}
-        rows.columns.update(without(rows.columns, bad))
-        check_ids(rows, log, seen)
+        marks |= {float(samples.values[0]) for samples in bad if samples.kind == "mark"}
+        rows.columns.update(blanked(rows.columns, bad))
+        check_ids(rows, log, first_rows)
         for check in (check_single, check_lung, check_times):
             check(rows, log)
         last = check_row_ids(rows, log, last)
@@ -459,8 +459,8 @@ def scan(
             parts.append(_scanned(rows, columns, bad, keep))
     log.first = 0
     if not parts:
-        what = "the file has a header but no rows"
-        raise fail(source.file, what, "Write at least one breath.")
+        message = "the file has a header but no rows"
+        raise fail(source.file, message, "Write at least one breath.")
     return parts[0] if len(parts) == 1 else _together(parts)
 
 
@@ -468,7 +468,7 @@ def _scanned(
     rows: Rows, columns: dict[str, np.ndarray], bad: Sequence[BadSamples], keep: bool
 ) -> Scanned:
     starts, lengths = rows.starts, rows.lengths
-    times = known_times(columns["time_step"], starts, lengths)
+    times = complete_times(columns["time_step"], starts, lengths)
     names = ("u_in", "pressure", *OPTIONAL)
     samples = {name: columns[name] for name in names if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
@@ -490,7 +490,7 @@ def _scanned(
         blank_pressures=np.add.reduceat(np.isnan(samples["pressure"]).astype(int), starts),
         optional=tuple(name for name in OPTIONAL if name in samples),
         figures=breath_figures(times.time, samples, starts),
-        bad=tuple(replace(each, rows=each.rows + rows.first) for each in bad),
+        bad=tuple(replace(bad_samples, rows=bad_samples.rows + rows.first) for bad_samples in bad),
         samples={"time": times.time, **samples} if keep else {},
     )
 
@@ -502,13 +502,15 @@ def _together(parts: Sequence[Scanned]) -> Scanned:
         if isinstance(values[0], np.ndarray):
             return np.concatenate(values)
         if isinstance(values[0], dict):
-            return {name: joined([each.pop(name) for each in values]) for name in list(values[0])}
+            return {
+                name: joined([samples.pop(name) for samples in values]) for name in list(values[0])
+            }
         return values[0]
 
     merged: dict[tuple[str, str, float], list[BadSamples]] = {}
-    for each in (each for part in parts for each in part.bad):
-        value = float(each.values[0]) if each.kind == "mark" else 0.0
-        merged.setdefault((each.column, each.kind, value), []).append(each)
+    for samples in (samples for part in parts for samples in part.bad):
+        value = float(samples.values[0]) if samples.kind == "mark" else 0.0
+        merged.setdefault((samples.column, samples.kind, value), []).append(samples)
     bad = tuple(
         BadSamples(
             column,

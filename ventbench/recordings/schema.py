@@ -82,9 +82,9 @@ class RecordingError(InputError):
         return "\n".join(lines)
 
 
-def fail(file: str, what: str, advice: str, line: int | None = None) -> RecordingError:
+def fail(file: str, message: str, advice: str, line: int | None = None) -> RecordingError:
     """Make a RecordingError about a whole file or a line."""
-    return RecordingError(RecordingProblem(file, what, advice, line))
+    return RecordingError(RecordingProblem(file, message, advice, line))
 
 
 Level = Literal["problem", "warning"]
@@ -100,7 +100,7 @@ class _Entry:
     value: str | None
     what: str
     advice: str
-    other: int | None
+    reference: int | None
 
 
 @dataclass
@@ -121,7 +121,7 @@ class ProblemLog:
         advice: str,
         *,
         values: np.ndarray | None = None,
-        others: np.ndarray | None = None,
+        references: np.ndarray | None = None,
         level: Level = "problem",
     ) -> None:
         """Add a problem, or a warning, for each row.
@@ -132,27 +132,27 @@ class ProblemLog:
             what: a phrase; `{value}` stands for the cell and `{other}` for the other row's line.
             advice: a sentence.
             values: the values, shape (k,), or None.
-            others: another row that each problem refers to, shape (k,), or None.
+            references: another row that each problem refers to, shape (k,), or None.
             level: which of the two.
         """
         if len(rows) == 0:
             return
         self.counts[level] += len(rows)
-        kept = self._kept[level]
+        entries = self._kept[level]
         for i, row in enumerate(rows[:SHOWN]):
             value = None if values is None else _text(values[i])
-            other = None if others is None else int(others[i]) + self.first
-            kept.append(_Entry(int(row) + self.first, column, value, what, advice, other))
-        kept.sort(key=lambda entry: entry.row)
-        del kept[SHOWN:]
+            reference = None if references is None else int(references[i]) + self.first
+            entries.append(_Entry(int(row) + self.first, column, value, what, advice, reference))
+        entries.sort(key=lambda entry: entry.row)
+        del entries[SHOWN:]
 
     def listed(self, level: Level, locate: Locate, place: str) -> tuple[RecordingProblem, ...]:
         """Return up to `SHOWN` problems of a level, in file order, each with its line or row."""
-        kept = self._kept[level]
-        wanted = {entry.row for entry in kept}
-        wanted |= {entry.other for entry in kept if entry.other is not None}
-        places = locate(wanted) if wanted else {}
-        return tuple(self._problem(entry, places, place) for entry in kept)
+        entries = self._kept[level]
+        rows = {entry.row for entry in entries}
+        rows |= {entry.reference for entry in entries if entry.reference is not None}
+        places = locate(rows) if rows else {}
+        return tuple(self._problem(entry, places, place) for entry in entries)
 
     def raise_problems(self, locate: Locate, place: str) -> None:
         """Raise the problems as a RecordingError, if there are any."""
@@ -162,11 +162,11 @@ class ProblemLog:
     def _problem(self, entry: _Entry, places: Mapping[int, Place], place: str) -> RecordingProblem:
         line, cells = places.get(entry.row, (None, {}))
         value = cells.get(entry.column or "", entry.value)
-        what = entry.what.replace("{value}", value or "blank")
-        if entry.other is not None:
-            other = places.get(entry.other, (None, {}))[0]
-            what = what.replace("{other}", f"{place} {other}")
-        return RecordingProblem(self.file, what, entry.advice, line, entry.column, value, place)
+        message = entry.what.replace("{value}", value or "blank")
+        if entry.reference is not None:
+            referenced = places.get(entry.reference, (None, {}))[0]
+            message = message.replace("{other}", f"{place} {referenced}")
+        return RecordingProblem(self.file, message, entry.advice, line, entry.column, value, place)
 
 
 def _text(value: np.generic) -> str:
@@ -189,7 +189,7 @@ class Column:
     low: float = float("-inf")  #: smallest value that is accepted, in `unit`.
     high: float = float("inf")  #: largest value that is accepted, in `unit`.
     blank: bool = False  #: whether a cell may be blank (read as NaN).
-    whole: bool = False  #: whether the column holds integers of 64 bits.
+    integer: bool = False  #: whether the column holds integers of 64 bits.
     positive: bool = False  #: whether `low` itself is outside the range.
     advice: str = "Fix the row."  #: what to do about a value outside the range.
 
@@ -201,8 +201,8 @@ class Column:
         return f"{self.low:g}..{self.high:g} {self.unit}".rstrip()
 
 
-def _label(name: str, unit: str, what: str) -> Column:
-    advice = f"Write the {what} of the test lung in {unit}."
+def _label(name: str, unit: str, quantity: str) -> Column:
+    advice = f"Write the {quantity} of the test lung in {unit}."
     return Column(name, unit, 0.0, 500.0, positive=True, advice=advice)
 
 
@@ -214,8 +214,8 @@ def _measured(name: str, unit: str, low: float, high: float) -> Column:
 COLUMNS: dict[str, Column] = {
     column.name: column
     for column in (
-        Column("id", "", blank=True, whole=True),
-        Column("breath_id", "", whole=True),
+        Column("id", "", blank=True, integer=True),
+        Column("breath_id", "", integer=True),
         _label("R", "cmH2O/(L/s)", "resistance"),
         _label("C", "mL/cmH2O", "compliance"),
         Column("time_step", "s", blank=True),
@@ -244,13 +244,13 @@ def check_header(file: str, names: Sequence[str], line: int | None) -> tuple[Rec
     problems = []
     for name in dict.fromkeys(names):
         if name in COLUMNS and names.count(name) > 1:
-            what = f"the header names {name} {names.count(name)} times"
-            problems.append(RecordingProblem(file, what, "Keep one of them.", line, name, name))
+            message = f"the header names {name} {names.count(name)} times"
+            problems.append(RecordingProblem(file, message, "Keep one of them.", line, name, name))
     missing = [name for name in REQUIRED if name not in names]
     if missing:
         column = missing[0] if len(missing) == 1 else None
-        what = f"missing column{'s' if len(missing) > 1 else ''} {', '.join(missing)}"
-        problems.append(RecordingProblem(file, what, _advice(names, missing), line, column))
+        message = f"missing column{'s' if len(missing) > 1 else ''} {', '.join(missing)}"
+        problems.append(RecordingProblem(file, message, _advice(names, missing), line, column))
     if problems:
         raise RecordingError(problems)
     advice = f"Rename it if it is one of {HEADER}."
@@ -271,7 +271,11 @@ def _advice(names: Sequence[str], missing: Sequence[str]) -> str:
         return "The columns must be separated by commas; `ventbench data import` reads others."
     hints = []
     for name in missing:
-        plain = {other.strip().lower(): other for other in names if other not in COLUMNS}
+        plain = {
+            name_given.strip().lower(): name_given
+            for name_given in names
+            if name_given not in COLUMNS
+        }
         hints.extend(
             f"rename {plain[match]!r} to {name}"
             for match in get_close_matches(name.lower(), plain, n=1, cutoff=0.75)

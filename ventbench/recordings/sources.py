@@ -112,12 +112,13 @@ class CsvSource(Source):
         stream = pa.PythonFile(file, "r")
         if self.kind == "csv.gz":
             stream = pa.CompressedInputStream(stream, "gzip")
-        whole = {name: column.whole for name, column in COLUMNS.items() if name in self.names}
+        integers = {name: column.integer for name, column in COLUMNS.items() if name in self.names}
         convert = arrow_csv.ConvertOptions(
             column_types={
-                name: pa.int64() if is_whole else pa.float64() for name, is_whole in whole.items()
+                name: pa.int64() if is_integer else pa.float64()
+                for name, is_integer in integers.items()
             },
-            include_columns=list(whole),
+            include_columns=list(integers),
             null_values=BLANKS,
         )
         options = arrow_csv.ReadOptions(
@@ -136,8 +137,8 @@ def _header(file: str, kind: Kind) -> tuple[str, ...]:
     try:
         text = first.decode("utf-8-sig").rstrip("\r\n")
     except UnicodeDecodeError as error:
-        what = f"byte 0x{first[error.start]:02x} is not UTF-8"
-        raise fail(file, what, "Save the file as UTF-8 text.", 1) from None
+        message = f"byte 0x{first[error.start]:02x} is not UTF-8"
+        raise fail(file, message, "Save the file as UTF-8 text.", 1) from None
     if "\r" in text:
         raise fail(file, "lines end in CR alone", "Save the file with LF or CRLF line ends.", 1)
     if not text.strip():
@@ -194,27 +195,27 @@ def _in_line(file: str, number: int, text: bytes, names: Sequence[str]) -> list[
     if cells is None:
         return [RecordingProblem(file, "the line is not CSV", "Fix the row.", number)]
     if len(cells) != len(names):
-        what = f"the row has {len(cells)} cells, but the header has {len(names)} columns"
-        return [RecordingProblem(file, what, "Fix the row.", number)]
+        message = f"the row has {len(cells)} cells, but the header has {len(names)} columns"
+        return [RecordingProblem(file, message, "Fix the row.", number)]
     problems = []
     for name, cell in zip(names, cells, strict=True):
-        if name in COLUMNS and not _is_sound(cell, COLUMNS[name].whole):
-            kind = "a whole number" if COLUMNS[name].whole else "a number"
+        if name in COLUMNS and not _is_sound(cell, COLUMNS[name].integer):
+            kind = "a whole number" if COLUMNS[name].integer else "a number"
             value = cell if len(cell) <= 40 else cell[:37] + "..."
-            what, advice = f"{value!r} is not {kind}", "Fix the cell."
+            message, advice = f"{value!r} is not {kind}", "Fix the cell."
             try:
                 text.decode()
             except UnicodeDecodeError as error:
-                what += f" (byte 0x{text[error.start]:02x} is not UTF-8)"
+                message += f" (byte 0x{text[error.start]:02x} is not UTF-8)"
                 advice = "Save the file as UTF-8 text."
-            problems.append(RecordingProblem(file, what, advice, number, name, value))
+            problems.append(RecordingProblem(file, message, advice, number, name, value))
     return problems
 
 
-def _is_sound(cell: str, whole: bool) -> bool:
+def _is_sound(cell: str, integer: bool) -> bool:
     if cell in BLANKS:
         return True
-    if not whole:
+    if not integer:
         return _NUMBER.fullmatch(cell) is not None
     match = _WHOLE.fullmatch(cell)
     return match is not None and -(1 << 63) <= int(match[1]) < 1 << 63
@@ -290,14 +291,16 @@ class ParquetSource(Source):
 def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[RecordingProblem]:
     from pyarrow import types
 
-    if COLUMNS[name].whole:
+    if COLUMNS[name].integer:
         good, needed = types.is_integer(kind), "int64"
     else:
         good, needed = types.is_integer(kind) or types.is_floating(kind), "double"
         good = good or (name == "u_out" and types.is_boolean(kind))
     if not good:
-        what = f"the column has type {kind}, but numbers are needed"
-        yield RecordingProblem(file, what, f"Write it as {needed}.", None, name, str(kind), "row")
+        message = f"the column has type {kind}, but numbers are needed"
+        yield RecordingProblem(
+            file, message, f"Write it as {needed}.", None, name, str(kind), "row"
+        )
 
 
 def _damaged(file: str, error: Exception) -> RecordingError:
@@ -305,13 +308,13 @@ def _damaged(file: str, error: Exception) -> RecordingError:
     return fail(file, f"the Parquet file cannot be read ({text})", "Write or copy it again.")
 
 
-def to_numpy(array: pa.Array | pa.ChunkedArray, whole: bool = False) -> NDArray[Any]:
+def to_numpy(array: pa.Array | pa.ChunkedArray, integer: bool = False) -> NDArray[Any]:
     """Numbers of Arrow as float64, NaN where blank, or int64, 0 there; its own way needs pandas."""
     import pyarrow as pa
 
-    kind, blank = (pa.int64(), 0) if whole else (pa.float64(), float("nan"))
+    kind, blank = (pa.int64(), 0) if integer else (pa.float64(), float("nan"))
     if isinstance(array, pa.ChunkedArray):
-        parts = [to_numpy(chunk, whole) for chunk in array.chunks]
+        parts = [to_numpy(chunk, integer) for chunk in array.chunks]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
     array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
     array = array.cast(kind)
@@ -343,8 +346,8 @@ def _table_source(frame: object) -> ParquetSource:
     try:
         table = pa.Table.from_pandas(named, preserve_index=False)
     except (pa.ArrowException, ValueError) as error:
-        what = f"the table cannot be read ({str(error).splitlines()[0]})"
-        raise fail(_TABLE, what, "Write numbers in every column.") from None
+        message = f"the table cannot be read ({str(error).splitlines()[0]})"
+        raise fail(_TABLE, message, "Write numbers in every column.") from None
     return ParquetSource(_TABLE, "table", table)
 
 
@@ -383,9 +386,9 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
         return "csv.gz"
     spreadsheet = first == b"PK\x03\x04" and name.endswith(".xlsx")
     if spreadsheet or first in (b"MATL", b"\x89HDF"):
-        what = {b"MATL": "MATLAB", b"\x89HDF": "HDF5 (MATLAB 7.3)"}.get(first, "spreadsheet")
+        format_name = {b"MATL": "MATLAB", b"\x89HDF": "HDF5 (MATLAB 7.3)"}.get(first, "spreadsheet")
         advice = "Bring it into the schema with `ventbench data import`."
-        raise fail(name, f"this is a {what} file", advice)
+        raise fail(name, f"this is a {format_name} file", advice)
     if first.startswith(b"PK\x03\x04"):
         raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
     if first.startswith((b"\xff\xfe", b"\xfe\xff")):

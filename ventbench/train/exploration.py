@@ -179,22 +179,22 @@ def explore(
     while done < breaths and vented < _VENTED_BREATHS:
         pip = np.array([pips[(done + k) % len(pips)] for k in range(ventilator.width)])
         added = draw_disturbances(random, ranges, ventilator.width)
-        made = _breaths(ventilator, pip, ranges, ease, added)
-        columns.append(made)
+        recorded = _breaths(ventilator, pip, ranges, ease, added)
+        columns.append(recorded)
         done += ventilator.width
         progress(min(done, breaths), breaths)
-        vented += int(np.sum(made[1][:, : protocol.INSPIRATION_STEPS].any(axis=1)))
+        vented += int(np.sum(recorded[1][:, : protocol.INSPIRATION_STEPS].any(axis=1)))
     together = zip(*columns, strict=True)
     u_in, u_out, pressure = (np.concatenate(column)[:breaths] for column in together)
     n = len(u_in)
     time = np.tile(ventilator.dt * np.arange(protocol.BREATH_STEPS), (n, 1))
-    made = make_breaths(
+    recorded = make_breaths(
         np.arange(n) + 1, np.full(n, setting.R), np.full(n, setting.C), time, u_in, u_out, pressure
     )
     if vented < _VENTED_BREATHS:
-        return made
+        return recorded
     note = f"exploring stopped: {vented} breaths were vented, above {_VENT:g} cmH2O"
-    return replace(made, notes=(note,))
+    return replace(recorded, notes=(note,))
 
 
 def _breaths(
@@ -218,11 +218,11 @@ def _breaths(
             integral = integral + a * (error - integral)
             derivative = derivative + a * (error - before - derivative)
             before = error
-            wanted = P * error + I * integral + D * derivative + added.at(step * ventilator.dt)
+            requested = P * error + I * integral + D * derivative + added.at(step * ventilator.dt)
             # "Not below" instead of "above", so that a sensor that gives no number is unsafe.
             vented |= ~(pressure <= _VENT)
             closed = vented | ~(pressure <= gate)
-            u_in = np.where(closed, 0.0, np.clip(wanted, 0.0, protocol.U_MAX))
+            u_in = np.where(closed, 0.0, np.clip(requested, 0.0, protocol.U_MAX))
             u_out = vented.astype(float)
         else:
             u_in = np.full(ventilator.width, float(waveform.expiratory_command(step)))

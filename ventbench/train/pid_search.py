@@ -176,24 +176,24 @@ def _nominal_plants(rigs: Rigs, lung: int) -> Plant:
 
 def _nominal_grid(rigs: Rigs, lungs: Sequence[int], gains: Floats, progress: Progress) -> PIDGrid:
     """Mean error without noise over the rigs of some lungs, member 0."""
-    each = len(gains) * len(protocol.PIPS)
-    found: list[Floats] = []
-    progress(0, len(lungs) * each)
+    trajectories = len(gains) * len(protocol.PIPS)
+    grids: list[Floats] = []
+    progress(0, len(lungs) * trajectories)
     for lung in lungs:
-        found.append(errors(_nominal_plants(rigs, lung), gains).mean(axis=0, dtype=np.float64))
-        progress(len(found) * each, len(lungs) * each)
+        grids.append(errors(_nominal_plants(rigs, lung), gains).mean(axis=0, dtype=np.float64))
+        progress(len(grids) * trajectories, len(lungs) * trajectories)
     names = tuple(rigs.lungs[lung].id for lung in lungs)
-    return PIDGrid(names, protocol.PIPS, gains, np.stack(found).astype(np.float32))
+    return PIDGrid(names, protocol.PIPS, gains, np.stack(grids).astype(np.float32))
 
 
-def drawn_errors(
-    rigs: Rigs, drawn: Draws, lung: int, gains: Floats, *, together: int = TOGETHER
+def errors_on_draws(
+    rigs: Rigs, rig_draws: Draws, lung: int, gains: Floats, *, together: int = TOGETHER
 ) -> Floats:
     """Error of PIDs on draws of one lung, without the first step.
 
     Args:
         rigs: that the draws are of.
-        drawn: K draws.
+        rig_draws: K draws.
         lung: index of the lung.
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``.
         together: gains that are run together.
@@ -201,17 +201,17 @@ def drawn_errors(
     Returns:
         Mean over the draws, cmH2O, shape ``(G, P)``.
     """
-    plants, cells = rigs.cells(drawn, protocol.PIPS)
-    own = jax.tree.map(lambda x: np.asarray(x)[lung], plants)
+    plants, cells = rigs.cells(rig_draws, protocol.PIPS)
+    plants_of_lung = jax.tree.map(lambda x: np.asarray(x)[lung], plants)
     if rigs.sessions is not None:  # without the nominal cells
-        own = jax.tree.map(lambda x: x[1:], own)
+        plants_of_lung = jax.tree.map(lambda x: x[1:], plants_of_lung)
     cell = jax.tree.map(lambda x: np.asarray(x)[lung, 1:], cells)
     errors = []
     for first in range(0, len(gains), together):
         # The last batch is padded, so that all compile once.
         index = np.minimum(np.arange(first, first + together), len(gains) - 1)
         with compilation.float64():
-            arrays = jax.tree.map(jnp.asarray, (own, gains[index], cell))
+            arrays = jax.tree.map(jnp.asarray, (plants_of_lung, gains[index], cell))
             pressure = np.asarray(_pressures(*arrays))
         error = controllable_error(pressure, cell.pip[..., None, None]).mean(axis=1)
         errors.append(error[: len(gains) - first])
@@ -269,21 +269,21 @@ def tune_pid(
     weights, single = trained_on.weights[where], len(names) > 1 if single is None else single
     rigs = load_rigs(simulator).of_training
     count = FINALISTS if draws else 1
-    tried = paper_gains() if gains is None else np.asarray(gains, float)
-    grid = _nominal_grid(rigs, where, tried, progress or (lambda done, total: None))
+    candidates = paper_gains() if gains is None else np.asarray(gains, float)
+    grid = _nominal_grid(rigs, where, candidates, progress or (lambda done, total: None))
     nominal = grid.error.astype(float)
     weighted = np.einsum("lgp,lp->lg", nominal, weights)
     common = np.argsort(weighted.sum(axis=0), kind="stable")[: count if single else 0]
-    own = np.argsort(weighted, axis=1, kind="stable")[:, : count if each else 0]
-    lists = [np.concatenate([row, common]) for row in own]
+    ranked = np.argsort(weighted, axis=1, kind="stable")[:, : count if each else 0]
+    lists = [np.concatenate([row, common]) for row in ranked]
     if draws:
-        drawn = rigs.draws(draws, seed=TUNING_SEED, name=TUNING)
-        found = [
-            drawn_errors(rigs, drawn, lung, tried[some])
+        rig_draws = rigs.draws(draws, seed=TUNING_SEED, name=TUNING)
+        rows = [
+            errors_on_draws(rigs, rig_draws, lung, candidates[some])
             for lung, some in zip(where, lists, strict=True)
         ]
     else:
-        found = [error[some] for error, some in zip(nominal, lists, strict=True)]
+        rows = [error[some] for error, some in zip(nominal, lists, strict=True)]
     result: dict[str, Any] = {
         "trajectories": int(grid.error.size),
         "pips": list(grid.pips),
@@ -291,18 +291,18 @@ def tune_pid(
     }
     if each:
         result["lungs"] = {}
-        for lung, row, error, weight in zip(names, own, found, weights, strict=True):
+        for lung, row, error, weight in zip(names, ranked, rows, weights, strict=True):
             best = int(np.argmin(error[: len(row)] @ weight))
             entry = {"gains": grid.gains[row[best]].tolist(), "error": float(error[best].mean())}
             result["lungs"][lung] = entry
     if single:
-        together = np.stack([error[len(row) :] for row, error in zip(own, found, strict=True)])
+        together = np.stack([error[len(row) :] for row, error in zip(ranked, rows, strict=True)])
         best = int(np.argmin(np.einsum("lgp,lp->g", together, weights)))
-        on_each = together[:, best].mean(axis=-1)
+        by_lung = together[:, best].mean(axis=-1)
         result["single"] = {
             "gains": grid.gains[common[best]].tolist(),
-            "error": float(on_each.mean()),
-            "lungs": dict(zip(names, on_each.tolist(), strict=True)),
+            "error": float(by_lung.mean()),
+            "lungs": dict(zip(names, by_lung.tolist(), strict=True)),
         }
     result["simulators"] = dict(trained_on.about)
     if out is not None:
@@ -368,8 +368,8 @@ def best_pids(
     report = progress or (lambda done, total: None)
 
     def mean_error(group: Sequence[int], drawn: Draws, gains: Floats, **options: int) -> Floats:
-        each = [drawn_errors(rigs, drawn, at, gains, **options) * weight[at] for at in group]
-        return np.mean(each, axis=(0, 2))
+        per_lung = [errors_on_draws(rigs, drawn, at, gains, **options) * weight[at] for at in group]
+        return np.mean(per_lung, axis=(0, 2))
 
     few, ends = drawn.first(min(4, drawn.count)), []
     for done, group in enumerate(groups):
@@ -377,10 +377,10 @@ def best_pids(
         starts = _starts(partial(mean_error, group, few))
         ends.append([_search(partial(mean_error, group, drawn, together=1), x) for x in starts])
     report(len(groups), len(groups))
-    found = np.array([[gains for gains, _ in own] for own in ends])
-    error = np.array([[error for _, error in own] for own in ends])
+    best_gains = np.array([[gains for gains, _ in results] for results in ends])
+    error = np.array([[error for _, error in results] for results in ends])
     at = (np.arange(len(groups)), np.argmin(error, axis=1))
-    return BestPIDs(found[at], error[at], found, error)
+    return BestPIDs(best_gains[at], error[at], best_gains, error)
 
 
 def tune_beyond(
@@ -412,14 +412,14 @@ def tune_beyond(
     names = check_names(lungs, trained_on, all_lungs=False)
     rigs = load_rigs(simulator).of_training
     where = [trained_on.names.index(name) for name in names]
-    found = best_pids(
+    best_gains = best_pids(
         rigs,
         drawn=rigs.draws(draws, seed=TUNING_SEED, name=TUNING),
         groups=[[at] for at in where] * each + [where] * single,
         weights=trained_on.weights,
         progress=progress,
     )
-    pairs = zip(found.gains.tolist(), found.error.tolist(), strict=True)
+    pairs = zip(best_gains.gains.tolist(), best_gains.error.tolist(), strict=True)
     entries = [{"gains": gains, "error": error} for gains, error in pairs]
     result: dict[str, Any] = {"draws": draws, "simulators": dict(trained_on.about)}
     if each:
@@ -432,7 +432,7 @@ def _starts(errors: Callable[[Floats], Floats]) -> list[Floats]:
     grid = np.array(list(itertools.product(START_P_I, START_P_I, START_D)))
     chosen: list[Floats] = []
     for gains in grid[np.argsort(errors(grid), kind="stable")]:
-        if all(np.count_nonzero(gains != other) > 1 for other in chosen):
+        if all(np.count_nonzero(gains != previous) > 1 for previous in chosen):
             chosen.append(gains)
     return chosen[:SEARCHES]
 
@@ -451,6 +451,6 @@ def _search(errors: Callable[[Floats], Floats], start: Floats) -> tuple[Floats, 
         "xatol": TOLERANCE,
         "fatol": ERROR_TOLERANCE,
     }
-    found = minimize(error, first, method="Nelder-Mead", options=options).x
-    gains = np.array([float(f"{gain:.{DIGITS - 1}e}") for gain in np.exp(found)])
+    optimum = minimize(error, first, method="Nelder-Mead", options=options).x
+    gains = np.array([float(f"{gain:.{DIGITS - 1}e}") for gain in np.exp(optimum)])
     return gains, error(np.log(gains))

@@ -139,14 +139,14 @@ def check_names(
     Raises:
         InputError: if a name is neither, or there are no simulators of a lung.
     """
-    known = trained_on.names
+    available = trained_on.names
     if names is None:
-        return known
+        return available
     names = [names] if isinstance(names, str) else names
     for name in names:
-        if (all_lungs and name == ALL) or lung(name).id in known:
+        if (all_lungs and name == ALL) or lung(name).id in available:
             continue
-        if known == LUNG_IDS:
+        if available == LUNG_IDS:
             scored_lung(name)
-        raise InputError(f"the simulators have no lung {name}; they have {', '.join(known)}")
+        raise InputError(f"the simulators have no lung {name}; they have {', '.join(available)}")
     return tuple(name if name == ALL else lung(name).id for name in names)

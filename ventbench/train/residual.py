@@ -62,9 +62,6 @@ class ResidualConfig:
     #: plants of each lung that are trained on, the nominal one first; all if None.
     members: int | None = None
     spread: float = 1.0  #: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
-    #: whether each update takes one lung at one PIP, in turn, as in the paper, instead of all of
-    #: them.
-    round_robin: bool = False
 
     def __post_init__(self) -> None:
         """Refuse numbers that cannot work.
@@ -119,8 +116,8 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
         cell: one cell, batch shape ``()``.
     """
 
-    def policy(state: Any, seen: Any, _: Any) -> tuple[Any, Array]:
-        inner, base, correction = controller.parts(state[0], seen)
+    def policy(state: Any, observation: Any, _: Any) -> tuple[Any, Array]:
+        inner, base, correction = controller.parts(state[0], observation)
         return (inner, correction), valve(base + correction)
 
     def step(carry: tuple[env.LoopState, Any], at: tuple[Array, Array]) -> tuple[Any, Any]:
@@ -172,8 +169,8 @@ def objective(
     runs = jax.vmap(run, (None, 0, 0))(controller, plants, cells)
     scored = jnp.isin(jnp.arange(protocol.BREATHS), jnp.array(protocol.SCORED_BREATHS))
     breath = jnp.where(scored, 1.0, first_breath)[:, None]
-    each = jnp.abs(runs.pressure - cells.pip[:, None, None]) + lam * jnp.abs(runs.correction)
-    total = jnp.mean(each * breath * jnp.reshape(weight, (-1, 1, 1)))
+    costs = jnp.abs(runs.pressure - cells.pip[:, None, None]) + lam * jnp.abs(runs.correction)
+    total = jnp.mean(costs * breath * jnp.reshape(weight, (-1, 1, 1)))
     return total / jnp.mean(breath)
 
 
@@ -226,10 +223,7 @@ def _advance(
         layers, state = carry
         member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
         # Lung and PIP of each run.
-        if config.round_robin:
-            cell = jnp.full(config.copies, number % (lungs * len(pips)))
-        else:
-            cell = jnp.repeat(jnp.arange(lungs * len(pips)), config.copies)
+        cell = jnp.repeat(jnp.arange(lungs * len(pips)), config.copies)
         lung, pip = cell // len(pips), cell % len(pips)
         member = jax.random.randint(member_key, lung.shape, 0, members)
         cells = draws.random_scenarios(scenario_key, pips[pip], spread=config.spread, smooth=True)
@@ -375,27 +369,27 @@ def train_residual(
             training with other settings.
         FloatingPointError: if a training diverges.
     """
-    config, progress = config or ResidualConfig(), progress or (lambda what, how_far: None)
+    config, progress = config or ResidualConfig(), progress or (lambda what, state: None)
     trained_on, out = plants_to_train_on(simulator), Path(out)
-    names, known = check_names(networks, trained_on), list(trained_on.names)
+    names, available = check_names(networks, trained_on), list(trained_on.names)
     progress("PID grid", None)
     official = trained_on.nominal
-    lungs = {name: take(official, index) for index, name in enumerate(known)}
-    _, tuned = tune_pid(known if ALL in names else names, gains=gains, simulator=simulator)
-    each: dict[int, dict[str, Residual]] = {seed: {} for seed in seeds}
-    controllers, about = {}, {}
+    lungs = {name: take(official, index) for index, name in enumerate(available)}
+    _, tuned = tune_pid(available if ALL in names else names, gains=gains, simulator=simulator)
+    by_seed: dict[int, dict[str, Residual]] = {seed: {} for seed in seeds}
+    controllers, networks_report = {}, {}
     for name in names:
         best = tuple(tuned["single"]["gains"] if name == ALL else tuned["lungs"][name]["gains"])
-        where = list(range(len(known))) if name == ALL else [known.index(name)]
+        where = list(range(len(available))) if name == ALL else [available.index(name)]
         plants = jax.tree.map(
             lambda leaf, where=where: np.asarray(leaf)[:, where], trained_on.plants
         )
         weights = trained_on.weights[where]
         started, fresh = time.perf_counter(), []
         for seed in seeds:
-            about_it = f"network {name}, seed {seed}" if len(seeds) > 1 else f"network {name}"
+            title = f"network {name}, seed {seed}" if len(seeds) > 1 else f"network {name}"
             with compilation.float32():
-                each[seed][name] = fit(
+                by_seed[seed][name] = fit(
                     plants,
                     best,
                     config=config,
@@ -403,13 +397,13 @@ def train_residual(
                     keep=True,
                     weights=weights,
                     checkpoint=_checkpoint(out, name, seed),
-                    progress=lambda *how_far, about_it=about_it: progress(about_it, how_far),
+                    progress=lambda *state, title=title: progress(title, state),
                 )
                 lungs_of = environment.Lungs(plants, jnp.asarray(weights))
-                fresh.append(float(_fresh(lungs_of, each[seed][name])))
+                fresh.append(float(_fresh(lungs_of, by_seed[seed][name])))
         chosen = seeds[int(np.argmin(fresh))]
-        controllers[name] = each[chosen][name]
-        about[name] = {
+        controllers[name] = by_seed[chosen][name]
+        networks_report[name] = {
             "gains": list(best),
             "seed": chosen,
             "seconds": round(time.perf_counter() - started, 1),
@@ -419,9 +413,9 @@ def train_residual(
         }
     save_weights(out / WEIGHTS, controllers)
     for seed in seeds if len(seeds) > 1 else ():
-        save_weights(out / f"weights-{seed}.npz", each[seed])
+        save_weights(out / f"weights-{seed}.npz", by_seed[seed])
     report = {
-        "networks": about,
+        "networks": networks_report,
         "recipe": dataclasses.asdict(config),
         "seeds": list(seeds),
         "simulators": dict(trained_on.about),

@@ -119,10 +119,13 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     assert calibrate.lost_flow(parts["leak"], LUNG).low < 5.0
     parts["lung"] = measure(bench, "lung", lung=LUNG, now=DAY)
     hal: Any = device.service.hal
-    hal.faults = (Fault(FaultKind.LEAK, device.clock.now(), strength=0.01),)
+    hal.faults = (Fault(FaultKind.LEAK, device.clock.now(), strength=0.006),)
     leaking = calibrate.lost_flow(measure(bench, "leak", lung=LUNG, now=DAY), LUNG)
-    hal.faults = ()
     assert leaking.low > 10.0
+    hal.faults = (Fault(FaultKind.LEAK, device.clock.now(), strength=0.02),)
+    with pytest.raises(InputError, match="mL/s are lost: look for the leak"):
+        measure(bench, "leak", lung=LUNG, now=DAY)
+    hal.faults = ()
     path, own = tmp_path / "calibration.json", device_of(bench.client)
     saved = Calibration(own, parts).save(path)
     kept = load(path, own, now=DAY + datetime.timedelta(days=29))
@@ -146,7 +149,7 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     with pytest.raises(InputError, match=r"31 days old.*calibrate valve"):
         load(path, own, now=DAY + datetime.timedelta(days=31))
     assert load(path, own, stale=True) == saved
-    with pytest.raises(InputError, match="calibrate this one"):
+    with pytest.raises(InputError, match="not of this 00"):
         load(path, own | {"device_id": "00"}, now=DAY)
     content = json.loads(path.read_text())
     content["parts"]["valve"]["reading"][0] += 1.0

@@ -365,6 +365,8 @@ def test_six_lungs_survive_three_crashes_and_two_cables(tmp_path: Path) -> None:
 
     lungs = {name: simulated_lung(name, "physics") for name in LUNG_IDS}
     device = LoopbackDevice(simulated_lung(LUNG, "physics"))
+    for other in lungs.values():  # another lung on the same ventilator
+        other.identity = device.service.hal.identity
     client = Client(device, device.clock)
     client.hello()
     everything = make_plan(["pid"], LUNG_IDS, pips=(10.0,), repeats=2, control_every=0)

@@ -183,7 +183,7 @@ def test_a_death_in_an_inspiration_vents(
         return [line.split(",") for line in log.read_text().splitlines()]
 
     try:
-        client = Client(Link(str(link)), timeout=0.5)
+        client = Client(Link(str(link)), timeout=PATIENCE)
         client.hello()
         inspire(client, lambda: rows()[-1][1:3] == ["10", "0"])
         before = len(rows())

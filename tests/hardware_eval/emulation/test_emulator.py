@@ -120,7 +120,7 @@ def test_faults_and_nonsense_by_the_control_socket(
         client.heartbeat()
     tell(control, "clear")
     _wait_for(lambda: not emulator.line.faults)
-    assert client.hello().name == "bench"
+    assert Client(client.transport, timeout=PATIENCE).hello().name == "bench"
     assert "KIND@START" in capfd.readouterr().err
     with pytest.raises(InputError, match="no emulator listens"):
         tell(tmp_path / "nobody", "clear")

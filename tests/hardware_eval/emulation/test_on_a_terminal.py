@@ -78,7 +78,7 @@ class DeviceOnTerminal(LoopbackDevice):
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[DeviceOnTerminal]:
     device = DeviceOnTerminal(simulated_lung(LUNG))
 
-    def connect(port: str) -> Line:
+    def connect(port: str, confirmed: bool = True) -> Line:
         client = Client(device, device.clock)
         client.hello()
         return Line(client, device.clock)

@@ -34,7 +34,12 @@ from tests.hardware_eval.firmware.core import FIRMWARE, tool
 from ventbench.base.errors import InputError
 
 IMAGES = {"linux": "ventilator-linux", "mps2": "ventilator-mps2.elf"}
-PATIENCE = 60.0
+
+#: Patience with a busy machine, s; a healthy one needs a hundredth of it.
+PATIENCE = 600.0
+
+#: Time after which breaths that were judged are enough, s.
+ENOUGH = 60.0
 
 #: Time from order to order of a program that runs, s.
 STEP = 0.005
@@ -111,7 +116,8 @@ def _inspiring(firmware: Logged, client: Client) -> None:
             client.arm()
             client.heartbeat()
             assert client.command(25.0, 0).mode is Mode.RUNNING
-            _until(lambda: (firmware.state.u_in, firmware.state.u_out) == (25.0, 0))
+            # It may have vented again before anybody looks.
+            _until(lambda: any((x.u_in, x.u_out) == (25.0, 0) for x in list(firmware.orders)))
             return
     pytest.fail("no breath began")
 
@@ -137,7 +143,7 @@ def test_the_watchdog_vents_when_the_host_falls_silent(device: tuple[Logged, Pat
     _until(lambda: firmware.orders[-1].time > 0.0)
     judged, start = 0, time.monotonic()
     # A dozen breaths in a minute; on a busy machine one, however long it takes.
-    while judged < 12 and time.monotonic() - start < (PATIENCE if judged else 10 * PATIENCE):
+    while judged < 12 and time.monotonic() - start < (ENOUGH if judged else PATIENCE):
         _inspiring(firmware, client)
         _until(lambda: firmware.state.u_out == 1)
         orders = list(firmware.orders)

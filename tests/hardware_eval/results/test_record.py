@@ -154,7 +154,7 @@ def test_the_board_shows_it_beside_the_simulated_score(path: Path, tmp_path: Pat
     lung, pips = LUNG_IDS.index(LUNG), [protocol.PIPS.index(pip) for pip in PIPS]
     gap = made.score - simulated.figures.nominal[lung, pips].mean()
     assert f"{made.score:.3f}" in page
-    assert f"gap {gap:+.3f}".replace("-", "−") in page.replace("-", "−")
+    assert f">{gap:+.3f}<".replace("-", "−") in page.replace("-", "−")
     assert "emulator" in page
     assert untouched.read_bytes() == other
     with pytest.raises(InputError, match="already"):

@@ -15,7 +15,7 @@ from ventbench.base.errors import InputError
 from ventbench.plants.stacking import open_loop_breaths
 from ventbench.recordings import join
 from ventbench.task.lungs import RECORDED_LUNGS, lung
-from ventbench.train.rigs.data import SAMPLES, groups_of, inspirations, whole_breaths
+from ventbench.train.rigs.data import SAMPLES, complete_breaths, groups_of, inspirations
 from ventbench.train.rigs.fit import (
     CHUNK,
     EXPIRATORY_WIDTHS,
@@ -95,7 +95,7 @@ def test_finds_known_lungs_again(fitted, around, make_synthetic, known_sessions)
 def test_finds_the_expiratory_valve(true_parameters, around, measured, known_sessions):
     """The second stage changes what its list names, and expirations come nearer."""
     with float64():
-        whole = whole_breaths(measured, known_sessions, RECORDED_LUNGS)
+        whole = complete_breaths(measured, known_sessions, RECORDED_LUNGS)
         known = {name: getattr(around.pooled, name) for name in EXPIRATORY_WIDTHS}
         start = replace(true_parameters, **known)
         refitted = fit_expiration(start, whole, jnp.ones(len(measured)))
@@ -141,7 +141,7 @@ def test_inspirations_are_arranged(measured, reconstructed, known_sessions):
         data = jax.tree.map(np.asarray, inspirations(both, known_sessions, RECORDED_LUNGS))
     n, m = len(measured), len(reconstructed)
     assert data.u_in.shape == data.dt.shape == data.pressure.shape == (n + m, SAMPLES - 1)
-    np.testing.assert_array_equal(data.start_known, [1.0] * n + [0.0] * m)
+    np.testing.assert_array_equal(data.start_measured, [1.0] * n + [0.0] * m)
     np.testing.assert_array_equal(data.start[:n], measured.pressure[:, 0])
     # The command of sample i leads to the pressure of sample i + 1; 29 of 30 samples count.
     np.testing.assert_array_equal(data.u_in[:n, 3], measured.u_in[:, 3])
@@ -166,7 +166,9 @@ def test_a_breath_without_start_or_expiration_tells_nothing_of_the_expiratory_va
     pressure[1, 30:] = np.nan
     pressure[2, 40] = np.nan
     with float64():
-        data = whole_breaths(replace(measured, pressure=pressure), known_sessions, RECORDED_LUNGS)
+        data = complete_breaths(
+            replace(measured, pressure=pressure), known_sessions, RECORDED_LUNGS
+        )
         share = np.asarray(data.share)
     np.testing.assert_allclose(share[:4].sum(axis=1), [0, 0, 2, 2])
     assert share[2, 40] == 0.0

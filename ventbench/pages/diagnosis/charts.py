@@ -134,9 +134,9 @@ class Chart:
 
 def ticks(low: float, high: float, count: int) -> tuple[list[float], list[str]]:
     """Ticks: about ``count`` round numbers from ``low`` to ``high``, and their texts."""
-    wanted = max(high - low, 1e-9) / count
-    scale = 10.0 ** np.floor(np.log10(wanted))
-    step = float(scale * next(x for x in (1, 2, 5, 10) if x * scale >= 0.999 * wanted))
+    spacing = max(high - low, 1e-9) / count
+    scale = 10.0 ** np.floor(np.log10(spacing))
+    step = float(scale * next(x for x in (1, 2, 5, 10) if x * scale >= 0.999 * spacing))
     first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
     values = [step * k for k in range(first, last + 1)]
     places = max(0, -int(np.floor(np.log10(step) + 1e-9)))
@@ -171,7 +171,7 @@ class BreathPanel:
     why: str  #: reason why the breath is shown.
     errors: dict[str, float]  #: root mean square over the inspiration by stage, cmH2O.
     pressure: Chart  #: chart of the pressure.
-    near: Chart  #: the part of it where the refitted simulator errs most, magnified.
+    magnified: Chart  #: the part of it where the refitted simulator errs most, magnified.
     error: Chart  #: chart of recorded minus simulated pressure.
     valve: Chart  #: chart of the command.
 
@@ -207,14 +207,14 @@ def panels(diagnosis: Diagnosis) -> list[BreathPanel]:
     traces = diagnosis.traces
     by_stage = {key: rmse(traces, getattr(traces, key)) for key in STAGES}
     several = len(traces.breaths.by_lung_index) > 1
-    shown = []
+    charts_of_breaths = []
     for i, why in worst(diagnosis):
         name = f"breath {traces.breaths.breath_id[i]}"
         if several:
             name += f", {traces.breaths.lung_ids[i]}"
         errors = {key: float(values[i]) for key, values in by_stage.items()}
-        shown.append(_panel(traces, i, name, why, errors, [*stages(diagnosis)]))
-    return shown
+        charts_of_breaths.append(_panel(traces, i, name, why, errors, [*stages(diagnosis)]))
+    return charts_of_breaths
 
 
 def _panel(
@@ -237,32 +237,32 @@ def _panel(
     low, high = window(time, recorded, simulated["refit"])
     pressure.band(low, high)
     within = (time >= low - 1e-9) & (time <= high + 1e-9)
-    seen = [recorded[within], *(simulated[key][within] for key in looks if key != "before")]
-    near = Chart(
+    pressures = [recorded[within], *(simulated[key][within] for key in looks if key != "before")]
+    magnified = Chart(
         (low, high),
-        limits(*seen),
+        limits(*pressures),
         "",
         "magnified, cmH2O",
         f"{capital(name)} from {low:.2f} to {high:.2f} s, magnified.",
         height=130.0,
     )
-    for chart, part in ((pressure, slice(None)), (near, within)):
+    for chart, part in ((pressure, slice(None)), (magnified, within)):
         chart.line("seen", time[part], recorded[part])
         for key in looks:
             chart.line(key, time[part], simulated[key][part])
-    left = {key: recorded - values for key, values in simulated.items()}
+    errors_of_stage = {key: recorded - values for key, values in simulated.items()}
     error = Chart(
         (0.0, end),
-        limits(*(left[key] for key in looks if key != "before"), least=1.0),
+        limits(*(errors_of_stage[key] for key in looks if key != "before"), least=1.0),
         "",
         "recorded − simulated, cmH2O",
         f"Error of {name}, recorded minus simulated: as given, refitted and corrected.",
         height=110.0,
     )
     for key in looks:
-        error.line(key, time, left[key])
+        error.line(key, time, errors_of_stage[key])
     valve = command(time, breath.u_in[i][use], end, f"Commands of {name}.", 84.0)
-    return BreathPanel(name, why, errors, pressure, near, error, valve)
+    return BreathPanel(name, why, errors, pressure, magnified, error, valve)
 
 
 def window(time: Floats, recorded: Floats, simulated: Floats) -> tuple[float, float]:
@@ -311,7 +311,7 @@ def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
     inside = slice(used[0], used[-1] + 1) if used.size else slice(None)
     mean, half, corrected = refit.mean[inside], refit.half[inside], after.mean[inside]
     half = np.where(np.isfinite(half), half, 0.0)
-    y = limits(mean, corrected, [0.0], _near(mean - half, mean), _near(mean + half, mean))
+    y = limits(mean, corrected, [0.0], _clipped(mean - half, mean), _clipped(mean + half, mean))
     places = [place for place in diagnosis.location if place.axis == axis.name]
     unit = "" if axis.unit == "1" else f", {axis.unit}"
     where = "; ".join(f"{p.low:.6g} to {p.high:.6g}" for p in places) or "none"
@@ -337,25 +337,25 @@ def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
     return chart
 
 
-def _near(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def _clipped(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Ends of intervals, cut where they are so wide that they would hide everything else."""
     reach = 2.0 * np.nanmax(np.abs(mean), initial=0.1)
     return np.clip(end, -reach, reach)
 
 
-def own_signal(name: str, shown: Characteristic) -> Chart:
+def characteristic_chart(name: str, curve: Characteristic) -> Chart:
     """What a mechanism does to its own quantity, without it and with it."""
     chart = Chart(
-        (float(shown.x.min()), float(shown.x.max())),
-        limits(shown.without, shown.acting),
-        shown.x_label,
-        shown.y_label,
-        f"{shown.y_label} over {shown.x_label}, without and with {name}.",
+        (float(curve.x.min()), float(curve.x.max())),
+        limits(curve.without, curve.acting),
+        curve.x_label,
+        curve.y_label,
+        f"{curve.y_label} over {curve.x_label}, without and with {name}.",
         width=360.0,
         height=200.0,
     )
-    chart.line(_WITHOUT, shown.x, shown.without)
-    chart.line(_WITH, shown.x, shown.acting)
+    chart.line(_WITHOUT, curve.x, curve.without)
+    chart.line(_WITH, curve.x, curve.acting)
     return chart
 
 
@@ -374,15 +374,15 @@ def nonparametric_term(shape: NonparametricTerm) -> Chart:
     return chart
 
 
-def request(wanted: BreathRequest) -> list[Chart]:
+def request(breaths: BreathRequest) -> list[Chart]:
     """The first breaths to record next."""
     charts = []
-    for k in range(min(len(wanted.u_in), REQUESTED)):
-        time = np.concatenate([[0.0], np.cumsum(wanted.dt[k][:-1])])
+    for k in range(min(len(breaths.u_in), REQUESTED)):
+        time = np.concatenate([[0.0], np.cumsum(breaths.dt[k][:-1])])
         chart = command(
-            time, wanted.u_in[k], float(time[-1]), f"Commands of breath {k + 1} to record.", 130.0
+            time, breaths.u_in[k], float(time[-1]), f"Commands of breath {k + 1} to record.", 130.0
         )
-        for start, end in _open(time, wanted.u_out[k]):
+        for start, end in _open(time, breaths.u_out[k]):
             chart.band(start, end)
         charts.append(chart)
     return charts

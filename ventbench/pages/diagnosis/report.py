@@ -94,44 +94,44 @@ def html(diagnosis: Diagnosis) -> str:
         if diagnosis.form is not None
         else "An effect outside the library",
         slot_chart=None
-        if (shown := diagnosis.form or diagnosis.nonparametric) is None
-        else charts.nonparametric_term(shown),
+        if (slot_term := diagnosis.form or diagnosis.nonparametric) is None
+        else charts.nonparametric_term(slot_term),
         request=diagnosis.request,
         request_words=report_text.request(diagnosis),
         request_charts=[] if diagnosis.request is None else charts.request(diagnosis.request),
         lungs=[report_text.lung(match) for match in diagnosis.lungs],
         notes=diagnosis.notes,
-        about=_about(diagnosis),
+        about=_facts_of_run(diagnosis),
     )
 
 
 def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """What a reader asks first: the question, the answer in short, and a line beneath it."""
     errors, count = diagnosis.open_loop, len(diagnosis.open_loop.held_out_breaths)
-    told = []
+    answers = []
     if sure := report_text.sureness(diagnosis):
         decided, _, breaths = sure.partition(" on ")
-        each = "each, " if sure.startswith("each at ") else ""
-        told.append(("How sure?", decided.removeprefix("each at "), f"{each}on {breaths}"))
+        prefix = "each, " if sure.startswith("each at ") else ""
+        answers.append(("How sure?", decided.removeprefix("each at "), f"{prefix}on {breaths}"))
         if sure.startswith("uncertain"):
-            told[-1] = ("How sure?", "uncertain", sure.removeprefix("uncertain: "))
+            answers[-1] = ("How sure?", "uncertain", sure.removeprefix("uncertain: "))
     after, out = _number(errors.after.rmse), errors.groups.get("expiration", {})
     if diagnosis.verdict == "nothing_missing":
         also = f"; expiration {_number(out['after'].rmse)}" if "after" in out else ""
-        about = f"in inspiration, root mean square on {count} breaths{also}"
-        told.append(("How far off?", f"{after} cmH2O", about))
+        detail = f"in inspiration, root mean square on {count} breaths{also}"
+        answers.append(("How far off?", f"{after} cmH2O", detail))
     else:
         worth = f"{_number(errors.refit.rmse)} → {after} cmH2O"
-        about = f"error in inspiration on {count} breaths set aside"
+        detail = f"error in inspiration on {count} breaths set aside"
         if {"refit", "after"} <= out.keys():
             ends = (_number(out[stage].rmse) for stage in ("refit", "after"))
-            about += f"; expiration {' → '.join(ends)}"
-        told.append(("What is mending it worth?", worth, about))
+            detail += f"; expiration {' → '.join(ends)}"
+        answers.append(("What is mending it worth?", worth, detail))
     noise = f"beyond the measurement's noise of {_number(errors.noise_floor)}"
     if errors.scatter_error:
         noise += f" and the {_number(errors.scatter_error)} of what differs from breath to breath"
-    told.append(("What stays unexplained?", f"{_number(errors.unexplained)} cmH2O", noise))
-    return told
+    answers.append(("What stays unexplained?", f"{_number(errors.unexplained)} cmH2O", noise))
+    return answers
 
 
 def bars(diagnosis: Diagnosis) -> list[dict[str, Any]]:
@@ -175,26 +175,26 @@ def _cell(distance: OpenLoopError | None) -> dict[str, str]:
 
 def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
     """A missing mechanism with its formula, its parameters and its own signal."""
-    about = mechanism(missing.name).description
-    meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
+    description = mechanism(missing.name).description
+    meanings = {parameter.name: parameter.meaning for parameter in description.parameters}
     breaths = diagnosis.traces.breaths
     largest = float(np.max(breaths.u_in, initial=10.0, where=breaths.valid))
-    shown = characteristic(missing.name, _values(diagnosis, missing), largest_command=largest)
+    curve = characteristic(missing.name, _values(diagnosis, missing), largest_command=largest)
     return {
         "name": missing.name,
-        "heading": number_text.capital(about.title),
+        "heading": number_text.capital(description.title),
         "simulator": {
             key: number_text.quantity_like(value, missing.parameters[key], f"{missing.name}.{key}")
             for key, value in missing.simulator_values.items()
             if key in missing.parameters
         },
-        "equation": typeset(about.equation),
-        "signature": about.signature,
+        "equation": typeset(description.equation),
+        "signature": description.signature,
         "changed": missing.changed,
         "confidence": f"{100 * missing.confidence:.0f} %",
         "nats": f"{missing.nats:.0f}",
         "alternatives": missing.alternatives,
-        "chart": None if shown is None else charts.own_signal(about.title, shown),
+        "chart": None if curve is None else charts.characteristic_chart(description.title, curve),
         "timeline": timeline(diagnosis, missing),
         "affected": missing.affected,
         "parameters": [
@@ -221,9 +221,9 @@ def _values(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, float]
     """Values of a mechanism's parameters by short name, and of the base model's."""
     values: dict[str, float] = {}
     plant: Any = next(iter(diagnosis.plants.values()), None)
-    known = None if plant is None else plant.parameters()
-    if known is not None:
-        for path, value in known.items():
+    parameters = None if plant is None else plant.parameters()
+    if parameters is not None:
+        for path, value in parameters.items():
             owner, _, short = path.rpartition(".")
             if owner in ("", missing.name):
                 values[short] = float(np.mean(np.asarray(value)))
@@ -240,7 +240,7 @@ def _place(diagnosis: Diagnosis, place: ErrorRegion) -> dict[str, str]:
     }
 
 
-def _about(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+def _facts_of_run(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     recorded = diagnosis.traces.breaths
     held = int(np.count_nonzero(diagnosis.traces.held_out))
     sd, correlation = diagnosis.noise
@@ -319,22 +319,22 @@ def entries(diagnosis: Diagnosis) -> list[Entry]:
 
 
 def _entry(number: int, missing: MissingMechanism) -> Entry:
-    about = mechanism(missing.name).description
-    strength = missing.parameters.get(about.strength.name)
+    description = mechanism(missing.name).description
+    strength = missing.parameters.get(description.strength.name)
     value = ""
     if strength is not None:
-        value = number_text.quantity(strength, f"{missing.name}.{about.strength.name}")
-    return Entry(number, about.title, value, "lit", PARTS[about.site])
+        value = number_text.quantity(strength, f"{missing.name}.{description.strength.name}")
+    return Entry(number, description.title, value, "lit", PARTS[description.site])
 
 
 def parts(listed: list[Entry]) -> dict[str, Part]:
     """Every part of the picture, by its place in the physics."""
     result = {}
     for site, name in PARTS.items():
-        here = [entry for entry in listed if entry.part == name]
-        looks = {entry.look for entry in here}
+        entries_of_part = [entry for entry in listed if entry.part == name]
+        looks = {entry.look for entry in entries_of_part}
         look = "lit" if "lit" in looks else "suspect" if looks else ""
-        result[site] = Part(name, look, ", ".join(str(entry.number) for entry in here))
+        result[site] = Part(name, look, ", ".join(str(entry.number) for entry in entries_of_part))
     return result
 
 
@@ -357,9 +357,9 @@ def typeset(equation: str) -> Markup:
             return unit.replace("H2O", "H<sub>2</sub>O").replace("s2", "s<sup>2</sup>")
         if quantity is None:
             return str(escape(_SIGNS.get(sign, sign)))
-        shown = _LETTERS.get(quantity, quantity)
+        text = _LETTERS.get(quantity, quantity)
         derivative = len(quantity) == 2 and quantity[0] == "d"
-        shown = f"<i>{shown}</i>" if len(shown) == 1 or derivative else shown
-        return shown if index is None else f"{shown}<sub>{index}</sub>"
+        text = f"<i>{text}</i>" if len(text) == 1 or derivative else text
+        return text if index is None else f"{text}<sub>{index}</sub>"
 
     return Markup(_SYMBOL.sub(markup, equation))

@@ -15,7 +15,7 @@ from ventbench.base.text import escape_markdown
 from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages.diagnosis.charts import rmse, stages
-from ventbench.pages.rerun_log import beside_text, known, send, written
+from ventbench.pages.rerun_log import beside_text, displayable, send, written
 
 #: Colours of the three simulators, and of the recording, on dark and light ground.
 COLORS = {
@@ -45,7 +45,7 @@ def write(path: Path, diagnosis: Diagnosis) -> Path:
         for lung, index in diagnosis.traces.breaths.by_lung_index.items():
             log_lung(stream, diagnosis, lung, index)
 
-    name = f"diagnosis of {known(diagnosis.simulator)}"
+    name = f"diagnosis of {displayable(diagnosis.simulator)}"
     content = written(name, blueprint(diagnosis), markdown(diagnosis), log)
     files.write_atomically(path, lambda file: file.write(content))
     return path
@@ -53,12 +53,14 @@ def write(path: Path, diagnosis: Diagnosis) -> Path:
 
 def markdown(diagnosis: Diagnosis) -> str:
     """The text panel: the diagnosis in words, and a guide to the views."""
-    verdict, *others = (escape_markdown(known(text)) for text in report_text.sentences(diagnosis))
+    verdict, *sentences = (
+        escape_markdown(displayable(text)) for text in report_text.sentences(diagnosis)
+    )
     places = [
         escape_markdown(number_text.error_region(place, diagnosis.noise[0]))
         for place in diagnosis.location[:5]
     ]
-    lines = [f"## {verdict}", "", *(f"{text}\n" for text in others)]
+    lines = [f"## {verdict}", "", *(f"{text}\n" for text in sentences)]
     if places:
         lines += ["## Where the refitted simulator errs", "", *(f"- {text}" for text in places), ""]
     lines += [
@@ -84,8 +86,8 @@ def log_lung(
     order = breaths.valid.ravel()
 
     def line(part: str, values: Floats, name: str, color: str, width: float) -> None:
-        entity, shown = f"/{lung}/{part}", np.ravel(values).astype(float)[None, order]
-        send(stream, entity, time[order], shown, [name], [color], width, TIMELINE)
+        entity, samples = f"/{lung}/{part}", np.ravel(values).astype(float)[None, order]
+        send(stream, entity, time[order], samples, [name], [color], width, TIMELINE)
 
     line("pressure/recorded", breaths.pressure, "recorded", COLORS["recorded"], 3.0)
     for key, text in stages(diagnosis).items():
@@ -150,5 +152,5 @@ def _worst(diagnosis: Diagnosis) -> tuple[str, rrb.TimeAxis]:
     lung = str(traces.breaths.lung_ids[breath])
     start = span(diagnosis) * int(np.flatnonzero(traces.breaths.by_lung_index[lung] == breath)[0])
     end, edge = start + span(diagnosis), rr.TimeRangeBoundary.absolute
-    shown = rr.TimeRange(start=edge(seconds=start - 0.1), end=edge(seconds=end))
-    return lung, rrb.TimeAxis(view_range=shown)
+    time_range = rr.TimeRange(start=edge(seconds=start - 0.1), end=edge(seconds=end))
+    return lung, rrb.TimeAxis(view_range=time_range)

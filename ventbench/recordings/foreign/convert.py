@@ -23,9 +23,9 @@ from ventbench.base.errors import InputError
 from ventbench.recordings.bad_samples import (
     MEASURED,
     BadSamples,
+    blanked,
     find_bad_samples,
     repeated_rows,
-    without,
 )
 from ventbench.recordings.breaths import Breaths, arranged
 from ventbench.recordings.foreign.cycles import expiratory_valve, find_breaths
@@ -97,13 +97,13 @@ class Imported:
             "warnings": list(self.warnings),
             "left_out": [
                 {
-                    "column": each.column,
-                    "kind": each.kind,
-                    "count": len(each.rows),
-                    "share": each.share,
-                    "rows": (each.rows[:1000] + 1).tolist(),
+                    "column": samples.column,
+                    "kind": samples.kind,
+                    "count": len(samples.rows),
+                    "share": samples.share,
+                    "rows": (samples.rows[:1000] + 1).tolist(),
                 }
-                for each in self.bad
+                for samples in self.bad
             ],
         }
 
@@ -168,39 +168,39 @@ def import_recording(
         table = read_table(table, separator=separator, decimal=decimal)
     table, selected = _selected(table, dict(select or {}))
     layout = layout or recognise(table.columns)
-    known = _layout(layout, table)
-    roles = _roles(table, dict(columns or {}), known, rate)
+    spec = _layout(layout, table)
+    roles = _roles(table, dict(columns or {}), spec, rate)
     by_role = {role: name for name, role in roles.items() if role not in ("group", "unused")}
-    changes = _conversions(table, by_role, dict(units or {}), known)
+    changes = _conversions(table, by_role, dict(units or {}), spec)
     notes, warnings = [*table.notes, *selected], []
-    if known is not None:
-        notes.append(f"Layout {layout}: {known.about}.")
-    spoken = (known.words if known is not None else {}) | dict(words or {})
+    if spec is not None:
+        notes.append(f"Layout {layout}: {spec.about}.")
+    spoken = (spec.words if spec is not None else {}) | dict(words or {})
     raw = {
         role: _numbers(table, name, spoken)
         for role, name in by_role.items()
         if role != "breath" and not (role == "time" and rate is not None)
     }
     for step in (_once, _together):
-        table, raw, said = step(table, raw)
-        notes += said
+        table, raw, sentences = step(table, raw)
+        notes += sentences
     measured = {role: raw[role] for role in (*MEASURED, "u_in") if role in raw}
     bad = find_bad_samples(measured, tuple(missing))
-    raw |= without(measured, bad)
-    said = [_of_file(each, table, by_role) for each in bad]
-    warnings += said
+    raw |= blanked(measured, bad)
+    sentences = [_of_file(bad_samples, table, by_role) for bad_samples in bad]
+    warnings += sentences
     added = dict(offsets or {})
     if unknown := set(added) - set(raw):
         raise InputError(f"--offset {min(unknown)}: no column is {min(unknown)}")
     if "time" in raw:
-        raw["time"], said = _continued(table, raw["time"])
-        notes += said
+        raw["time"], sentences = _continued(table, raw["time"])
+        notes += sentences
     values = {
         role: changes[role].apply(x + added[role] if role in added else x)
         for role, x in raw.items()
         if role in changes
     }
-    other = {role: x for role, x in raw.items() if role not in changes}
+    rest = {role: x for role, x in raw.items() if role not in changes}
     _net_flow(values)
     for role in ("flow", "volume"):
         if role in values and not np.isfinite(values[role]).any():
@@ -211,7 +211,7 @@ def import_recording(
             f"{table.file}, column {by_role['pressure']}: every pressure is blank, so there is "
             "nothing to compare a simulator with"
         )
-    _invert(values, other, invert)
+    _invert(values, rest, invert)
     _check_signs(table, by_role, values, changes)
     keys = [
         _labels(table.columns[name])
@@ -227,12 +227,12 @@ def import_recording(
     if unused:
         notes.append(f"Columns that are not used: {', '.join(unused)}.")
     pieces, how = find_breaths(
-        table.file, time, values, other, keys, groups, known.lead if known else 0.0
+        table.file, time, values, rest, keys, groups, spec.lead if spec else 0.0
     )
     notes.append(how)
-    R, C, how = _lung(lung, other, len(table))
+    R, C, how = _lung(lung, rest, len(table))
     notes.append(how)
-    u_out, how = expiratory_valve(values, other, pieces)
+    u_out, how = expiratory_valve(values, rest, pieces)
     notes.append(how)
     u_in = values.get("u_in")
     if u_in is None:
@@ -253,16 +253,16 @@ def import_recording(
         **{name: values[name] for name in ("flow", "volume") if name in values},
     }
     labelled = {**samples, "R": R, "C": C}
-    pieces, left = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
-    notes += left
+    pieces, dropped = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
+    notes += dropped
     warnings += _suspicious(samples, changes)
     breaths = _breaths(table.file, pieces, time, samples, R, C, notes)
     few = few_breaths(len(breaths))
-    found = check_roles(breaths)
-    if found and found[0].level == "refused":
-        column = by_role.get(found[0].column, found[0].column)
-        raise InputError(f"{table.file}, column {column}: {found[0]}")
-    warnings += [str(finding) for finding in found]
+    issues = check_roles(breaths)
+    if issues and issues[0].level == "refused":
+        column = by_role.get(issues[0].column, issues[0].column)
+        raise InputError(f"{table.file}, column {column}: {issues[0]}")
+    warnings += [str(finding) for finding in issues]
     notes += [few] if few is not None else []
     used = {name: role for name, role in roles.items() if role != "unused"}
     return Imported(breaths, changes, used, tuple(notes), tuple(warnings), bad)
@@ -310,8 +310,8 @@ def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
             )
         keep &= np.array([_same(cell, value) for cell in table.columns[name].tolist()])
     if not keep.any():
-        asked = ", ".join(f"{n}={v}" for n, v in select.items())
-        raise InputError(f"{table.file}: no row has {asked}")
+        conditions = ", ".join(f"{n}={v}" for n, v in select.items())
+        raise InputError(f"{table.file}: no row has {conditions}")
     if keep.all():
         return table, []
     return _rows(table, keep), [f"{int(keep.sum())} of {len(keep)} rows were selected."]
@@ -350,8 +350,8 @@ def _roles(
 ) -> dict[str, str]:
     """Role of each column: as mapped, by the layout, by its header; the first of each role."""
     roles = _mapped(table, mapped)
-    taken = {role for role in roles.values() if role not in ("group", "unused")}
-    alike: dict[str, list[str]] = {}
+    assigned = {role for role in roles.values() if role not in ("group", "unused")}
+    candidates: dict[str, list[str]] = {}
     for name in table.columns:
         if name in roles:
             continue
@@ -363,17 +363,17 @@ def _roles(
             role = f"{role}_{header.side}" if role and header.side else role
         if role in ("group", "unused"):
             roles[name] = role
-        elif role is not None and role not in taken:
-            alike.setdefault(role, []).append(name)
-    one_way = {"flow_in", "flow_out"} & (alike.keys() | taken)
-    if "flow" in alike.keys() | taken or len(one_way) == 1:
-        for role in one_way:
-            alike.pop(role, None)
-    for role, names in alike.items():
-        _check_alike(table, role, names)
+        elif role is not None and role not in assigned:
+            candidates.setdefault(role, []).append(name)
+    single = {"flow_in", "flow_out"} & (candidates.keys() | assigned)
+    if "flow" in candidates.keys() | assigned or len(single) == 1:
+        for role in single:
+            candidates.pop(role, None)
+    for role, names in candidates.items():
+        _check_duplicates(table, role, names)
         roles[names[0]] = role
     for role in set(roles.values()) - {"group", "unused"}:
-        names = [name for name, own in roles.items() if own == role]
+        names = [name for name, assigned_role in roles.items() if assigned_role == role]
         if len(names) > 1:
             raise InputError(f"columns {' and '.join(names)} are both {role}; map one of them")
     _check_needed(table, roles, layout, rate)
@@ -384,15 +384,15 @@ def _mapped(table: Table, mapped: dict[str, str]) -> dict[str, str]:
     """Roles of columns that a user maps, by their names in the table."""
     headers = {text: name for name, text in table.headers.items()}
     roles = {}
-    for given, role in mapped.items():
-        name = given if given in table.columns else headers.get(given, read_header(given).name)
+    for header, role in mapped.items():
+        name = header if header in table.columns else headers.get(header, read_header(header).name)
         if role not in ROLES:
-            raise InputError(f"--map {given}={role}: a column may be {', '.join(ROLES)}")
+            raise InputError(f"--map {header}={role}: a column may be {', '.join(ROLES)}")
         if name not in table.columns:
-            close = get_close_matches(given, table.columns, n=1)
+            close = get_close_matches(header, table.columns, n=1)
             hint = f" Perhaps {close[0]!r}." if close else ""
             raise InputError(
-                f"--map {given}={role}: {table.file} has no column {given!r}; it has "
+                f"--map {header}={role}: {table.file} has no column {header!r}; it has "
                 f"{', '.join(table.columns)}.{hint}"
             )
         roles[name] = role
@@ -413,30 +413,32 @@ def _check_needed(
     """Ask for a column that is needed and not understood, with the option that says it."""
     has = set(roles.values())
     timed = rate or table.rate or any(table.header(name).interval for name in table.columns)
-    for what, wanted in _NEEDED.items():
-        if has & set(wanted) or (wanted == ("time",) and timed):
+    for quantity, accepted in _NEEDED.items():
+        if has & set(accepted) or (accepted == ("time",) and timed):
             continue
         headers = {name: table.header(name) for name in table.columns if name not in roles}
         headers = {n: x for n, x in headers.items() if table.columns[n].dtype.kind in "fiub"}
-        likely = [name for name, header in headers.items() if header.role in wanted]
+        likely = [name for name, header in headers.items() if header.role in accepted]
         open_ = likely or [name for name, x in headers.items() if not (x.role or x.excluded)]
-        if len(wanted) > 1 and (not open_ or layout is not None):
+        if len(accepted) > 1 and (not open_ or layout is not None):
             continue
-        columns = f"{table.file}: no column is {what}; the columns are {', '.join(table.columns)}"
-        role = next((headers[n].role for n in likely), None) or wanted[0]
+        columns = (
+            f"{table.file}: no column is {quantity}; the columns are {', '.join(table.columns)}"
+        )
+        role = next((headers[n].role for n in likely), None) or accepted[0]
         option = f"--map {quote((open_ or ['NAME'])[0])}={role}"
-        if wanted == ("time",):
+        if accepted == ("time",):
             raise InputError(
                 f"{columns}. Say which with {option}, or give the sampling rate with --rate 50"
             )
-        way_out = ""
-        if len(wanted) > 1:
-            others = " ".join(f"--map {quote(name)}=unused" for name in open_)
-            way_out = f"; or, if none of them is, {others}"
-        raise InputError(f"{columns}. Say which with {option}{way_out}")
+        remedy = ""
+        if len(accepted) > 1:
+            exclusions = " ".join(f"--map {quote(name)}=unused" for name in open_)
+            remedy = f"; or, if none of them is, {exclusions}"
+        raise InputError(f"{columns}. Say which with {option}{remedy}")
 
 
-def _check_alike(table: Table, role: str, names: Sequence[str]) -> None:
+def _check_duplicates(table: Table, role: str, names: Sequence[str]) -> None:
     """Refuse to choose among columns of one role that differ."""
     if role not in _MEASURED or role == "time":
         return
@@ -460,11 +462,11 @@ def _conversions(
     for role in units:
         if role not in _MEASURED:
             raise InputError(f"{role} has no unit; units are for {', '.join(_MEASURED)}")
-    known = layout.units if layout is not None else {}
+    layout_units = layout.units if layout is not None else {}
 
     def unit(role: str, name: str) -> str | None:
         header = table.header(name).unit if layout is None else None
-        return units.get(role) or known.get(role) or header or table.units.get(name)
+        return units.get(role) or layout_units.get(role) or header or table.units.get(name)
 
     return {
         role: conversion(
@@ -491,12 +493,15 @@ def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:
             try:
                 numbers[k] = float(word)
             except ValueError:
-                shown = [str(x) for x in dict.fromkeys(values.tolist()) if x][:2]
-                shown.sort(key=lambda x: not re.match("open|on|true|yes|high|1", x, re.IGNORECASE))
-                option = ",".join(f"{x}={1 - n}" for n, x in enumerate(shown))
+                examples = [str(x) for x in dict.fromkeys(values.tolist()) if x][:2]
+                examples.sort(
+                    key=lambda x: not re.match("open|on|true|yes|high|1", x, re.IGNORECASE)
+                )
+                option = ",".join(f"{x}={1 - n}" for n, x in enumerate(examples))
                 raise InputError(
-                    f"{table.file}, column {name}: its cells are no numbers, such as {shown[0]!r}; "
-                    f"say what they stand for, such as --map-values {quote(option)}"
+                    f"{table.file}, column {name}: its cells are no numbers, such as "
+                    f"{examples[0]!r}; say what they stand for, such as "
+                    f"--map-values {quote(option)}"
                 ) from None
     return numbers[which.reshape(-1)]
 
@@ -507,8 +512,8 @@ def _once(table: Table, raw: dict[str, Floats]) -> tuple[Table, dict[str, Floats
     if not repeats.any():
         return table, raw, []
     count, first = int(repeats.sum()), table.place(int(np.argmax(repeats)))
-    said = f"{count} rows that repeat the row before were left out, the first in {first}."
-    return _rows(table, ~repeats), {k: x[~repeats] for k, x in raw.items()}, [said]
+    sentence = f"{count} rows that repeat the row before were left out, the first in {first}."
+    return _rows(table, ~repeats), {k: x[~repeats] for k, x in raw.items()}, [sentence]
 
 
 def _together(table: Table, raw: dict[str, Floats]) -> tuple[Table, dict[str, Floats], list[str]]:
@@ -517,24 +522,24 @@ def _together(table: Table, raw: dict[str, Floats]) -> tuple[Table, dict[str, Fl
     Between, it would be invented, and would lag behind the others where it jumps. Commands are not
     thinned, and without a clock no rows can be missed.
     """
-    known = [np.isfinite(raw[role]) for role in MEASURED if role in raw]
-    shares = [float(x.mean()) for x in known if x.any()]
+    finite = [np.isfinite(raw[role]) for role in MEASURED if role in raw]
+    shares = [float(x.mean()) for x in finite if x.any()]
     if not shares or min(shares) > 1.0 - _SPARSE or "u_in" in raw or "time" not in raw:
         return table, raw, []
-    both = np.logical_and.reduce([x for x in known if x.any()])
+    both = np.logical_and.reduce([x for x in finite if x.any()])
     if both.mean() < 0.9 * min(shares):
         return table, raw, []
     count = len(both) - int(both.sum())
-    said = [f"{count} rows were left out in which only some of the measured columns are known."]
-    return _rows(table, both), {name: x[both] for name, x in raw.items()}, said
+    sentence = [f"{count} rows were left out in which only some of the measured columns are known."]
+    return _rows(table, both), {name: x[both] for name, x in raw.items()}, sentence
 
 
 def _of_file(bad: BadSamples, table: Table, by_role: Mapping[str, str]) -> str:
     """What was left out, by the name and the lines of the file."""
     at = bad.rows[:6].tolist()
     first = [int(row) + 1 if table.lines is None else int(table.lines[row]) for row in at]
-    what = bad.what("rows" if table.lines is None else "lines", first)
-    return what.replace(f"of {bad.column} ", f"of {by_role[bad.column]} ", 1) + "."
+    text = bad.what("rows" if table.lines is None else "lines", first)
+    return text.replace(f"of {bad.column} ", f"of {by_role[bad.column]} ", 1) + "."
 
 
 def _net_flow(values: dict[str, Floats]) -> None:
@@ -561,12 +566,12 @@ def _continued(table: Table, time: Floats) -> tuple[Floats, list[str]]:
         else:
             wraps.append(f"{place} (at {size:.10g})")
             time[at[k + 1] :] += size
-    said = []
+    sentences = []
     if wraps:
-        said.append(f"The clock wraps in {_few(wraps)}; it was continued.")
+        sentences.append(f"The clock wraps in {_few(wraps)}; it was continued.")
     if resets and len(resets) <= max(3, len(time) // 1000):
-        said.append(f"The clock begins anew in {_few(resets)}; no breath goes on over that.")
-    return time, said
+        sentences.append(f"The clock begins anew in {_few(resets)}; no breath goes on over that.")
+    return time, sentences
 
 
 def _few(items: Sequence[str]) -> str:
@@ -576,29 +581,31 @@ def _few(items: Sequence[str]) -> str:
 
 def _bridge(values: dict[str, Floats], time: Floats, by_role: Mapping[str, str]) -> list[str]:
     """Interpolate the blanks of columns that come at a slower rate than the rows, but no jumps."""
-    said = []
+    sentences = []
     for role in (role for role in (*MEASURED, "u_in") if role in values):
-        known = np.isfinite(values[role])
-        if known.mean() > 1.0 - _SPARSE or known.sum() < 2:
+        finite = np.isfinite(values[role])
+        if finite.mean() > 1.0 - _SPARSE or finite.sum() < 2:
             continue
-        at = np.flatnonzero(known)
+        at = np.flatnonzero(finite)
         if (every := float(np.median(np.diff(at)))) < 2:
             continue
-        own, rows = values[role][at], np.arange(at[0], at[-1] + 1)
+        samples, rows = values[role][at], np.arange(at[0], at[-1] + 1)
         before = np.searchsorted(at, rows, side="right") - 1
         after = np.minimum(before + 1, len(at) - 1)
-        near = at[after] - at[before] <= 2.0 * every
-        near &= ~(time[at[after]] - time[at[before]] > _BRIDGED)
+        bridgeable = at[after] - at[before] <= 2.0 * every
+        bridgeable &= ~(time[at[after]] - time[at[before]] > _BRIDGED)
         if role == "u_in":  # a command stays until the next
-            bridged = own[before]
+            bridged = samples[before]
         else:
-            bridged = np.interp(rows, at, own)
-            near &= np.abs(own[after] - own[before]) <= _JUMP * np.ptp(own)
+            bridged = np.interp(rows, at, samples)
+            bridgeable &= np.abs(samples[after] - samples[before]) <= _JUMP * np.ptp(samples)
         values[role] = values[role].copy()
-        values[role][rows] = np.where(known[rows] | near, bridged, np.nan)
+        values[role][rows] = np.where(finite[rows] | bridgeable, bridged, np.nan)
         how = "held" if role == "u_in" else "interpolated except where it jumps"
-        said.append(f"{by_role.get(role, role)} is known in one of {every:g} rows; it was {how}.")
-    return said
+        sentences.append(
+            f"{by_role.get(role, role)} is known in one of {every:g} rows; it was {how}."
+        )
+    return sentences
 
 
 def _labels(values: NDArray[Any]) -> Ints:
@@ -656,30 +663,32 @@ def _plain(rate: float, precision: float) -> str:
     return f"{float(f'{rate:.{digits}g}'):g}"
 
 
-def _lung(given: str | None, other: Mapping[str, Floats], count: int) -> tuple[Floats, Floats, str]:
+def _lung(
+    label_id: str | None, rest: Mapping[str, Floats], count: int
+) -> tuple[Floats, Floats, str]:
     """R and C of each row."""
     from ventbench.task.lungs import lung as parse
 
-    if given is not None:
-        label: Lung = parse(given)
-        over = " in place of R and C of the file" if "R" in other and "C" in other else ""
+    if label_id is not None:
+        label: Lung = parse(label_id)
+        over = " in place of R and C of the file" if "R" in rest and "C" in rest else ""
         how = f"Lung {label.id}, as given{over}."
         return np.full(count, label.R), np.full(count, label.C), how
-    if "R" in other and "C" in other:
-        pairs = np.unique(np.stack([other["R"], other["C"]], axis=1), axis=0)
+    if "R" in rest and "C" in rest:
+        pairs = np.unique(np.stack([rest["R"], rest["C"]], axis=1), axis=0)
         ids = ", ".join(f"R{R:g}C{C:g}" for R, C in pairs[:9].tolist())
-        return other["R"], other["C"], f"Lungs of the file: {ids}."
+        return rest["R"], rest["C"], f"Lungs of the file: {ids}."
     raise InputError(
         "no columns hold R and C of the lung; give --lung R20C50 (a guess is enough: R in "
         "cmH2O/(L/s) and C in mL/cmH2O are fitted again), or map the columns"
     )
 
 
-def _invert(values: dict[str, Floats], other: dict[str, Floats], roles: Iterable[str]) -> None:
+def _invert(values: dict[str, Floats], rest: dict[str, Floats], roles: Iterable[str]) -> None:
     """Change signs; of a valve, what is open."""
     for role in roles:
-        if role == "u_out" and role in other:
-            other[role] = 1.0 - other[role]
+        if role == "u_out" and role in rest:
+            rest[role] = 1.0 - rest[role]
         elif role in values:
             values[role] = 100.0 - values[role] if role == "u_in" else -values[role]
         else:
@@ -723,18 +732,18 @@ def _sound(
     rows, bad, problems = np.concatenate(pieces), dict[int, str](), list[str]()
     owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     for name, values in samples.items():
-        column, own = COLUMNS[name], np.asarray(values, float)[rows]
-        low = own <= column.low if column.positive else own < column.low
-        wrong = np.flatnonzero(low | (own > column.high) | (np.isnan(own) & (not column.blank)))
+        column, cells = COLUMNS[name], np.asarray(values, float)[rows]
+        low = cells <= column.low if column.positive else cells < column.low
+        wrong = np.flatnonzero(low | (cells > column.high) | (np.isnan(cells) & (not column.blank)))
         if len(wrong):
             problems.append(
-                f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(own)} "
+                f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(cells)} "
                 f"values are outside {column.span}, the first in "
-                f"{table.place(int(rows[wrong[0]]))} ({own[wrong[0]]:g}). Check the unit (such as "
-                "--flow-unit L/min) and the map."
+                f"{table.place(int(rows[wrong[0]]))} ({cells[wrong[0]]:g}). Check the unit "
+                "(such as --flow-unit L/min) and the map."
             )
         for at in wrong[np.unique(owner[wrong], return_index=True)[1]]:
-            bad.setdefault(int(owner[at]), f"{name} is {own[at]:g}")
+            bad.setdefault(int(owner[at]), f"{name} is {cells[at]:g}")
     for k, piece in enumerate(pieces):
         at = time[piece][np.isfinite(time[piece])]
         reason = "the time goes back" if np.any(np.diff(at) <= 0) else None
@@ -751,11 +760,11 @@ def _sound(
             + ("; --skip-bad-breaths leaves them out." if some else ".")
         )
         raise InputError("\n".join([*problems[:5], *problems[5:][-1:]]))
-    kept = [piece for k, piece in enumerate(pieces) if k not in bad]
-    said = [f"{table.place(int(pieces[k][0]))} ({why})" for k, why in sorted(bad.items())]
-    more = f" and {len(said) - 10} more" if len(said) > 10 else ""
-    left = f"{len(said)} bad breaths were left out: {', '.join(said[:10])}{more}."
-    return kept, [left] if said else []
+    intact = [piece for k, piece in enumerate(pieces) if k not in bad]
+    reasons = [f"{table.place(int(pieces[k][0]))} ({why})" for k, why in sorted(bad.items())]
+    more = f" and {len(reasons) - 10} more" if len(reasons) > 10 else ""
+    sentence = f"{len(reasons)} bad breaths were left out: {', '.join(reasons[:10])}{more}."
+    return intact, [sentence] if reasons else []
 
 
 def _suspicious(
@@ -791,8 +800,8 @@ def _breaths(
     parts = []
     for piece in pieces:
         at, k = time[piece], np.arange(len(piece))
-        known = np.isfinite(at)
-        at = np.interp(k, k[known], at[known]) if not known.all() else at
+        finite = np.isfinite(at)
+        at = np.interp(k, k[finite], at[finite]) if not finite.all() else at
         parts.append(at - at[0])
     columns = {
         name: values[rows].astype(np.int8 if name == "u_out" else float)

@@ -24,7 +24,7 @@ def find_breaths(
     file: str,
     time: Floats,
     values: Mapping[str, Floats],
-    other: Mapping[str, Floats],
+    rest: Mapping[str, Floats],
     keys: list[Ints],
     groups: list[Ints],
     lead: float,
@@ -35,7 +35,7 @@ def find_breaths(
         file: names the recording in messages.
         time: times, s, shape ``(N,)``; NaN where there is none.
         values: measured columns by role, in the units of the schema, ``(N,)`` each.
-        other: further columns by role, ``(N,)`` each.
+        rest: further columns by role, ``(N,)`` each.
         keys: columns a change of which begins a breath.
         groups: those of them that only tell recordings apart.
         lead: time before the number of a breath changes at which its samples begin, s.
@@ -66,11 +66,11 @@ def find_breaths(
     else:
         gaps = (steps < 0) | (steps > _GAP * max(usual, 1e-9))
         broken[1:] |= gaps[1:]
-        onsets, how = _onsets(file, time, values, other)
+        onsets, how = _onsets(file, time, values, rest)
         starts = broken.copy()
         starts[onsets] = True
     pieces = np.split(rows, np.flatnonzero(starts)[1:])
-    kept, short, timeless = [], 0, 0
+    complete, short, timeless = [], 0, 0
     for k, piece in enumerate(pieces):
         at = time[piece][np.isfinite(time[piece])]
         if len(at) < 2 <= len(piece):
@@ -84,33 +84,33 @@ def find_breaths(
         if edge or not _SHORTEST <= length <= _LONGEST:
             short += 1
             continue
-        kept.append(piece)
-    if not kept:
+        complete.append(piece)
+    if not complete:
         raise InputError(
             f"{file}: no whole breath was found {how}; a breath lasts {_SHORTEST:g} to "
             f"{_LONGEST:g} s. Check the rate and the units, or map a column that numbers breaths "
             "with --map NAME=breath"
         )
-    left = f"; {short} pieces that are no whole breath were left out" if short else ""
+    omitted = f"; {short} pieces that are no whole breath were left out" if short else ""
     if timeless:
-        left += f"; {timeless} without times were left out"
-    return kept, f"{len(kept)} breaths, split {how}{left}."
+        omitted += f"; {timeless} without times were left out"
+    return complete, f"{len(complete)} breaths, split {how}{omitted}."
 
 
 def expiratory_valve(
-    values: Mapping[str, Floats], other: Mapping[str, Floats], pieces: list[Ints]
+    values: Mapping[str, Floats], rest: Mapping[str, Floats], pieces: list[Ints]
 ) -> tuple[NDArray[np.int8], str]:
     """Return u_out of each row, ``(N,)``, and a sentence that says where it is from.
 
     Args:
         values: measured columns by role, in the units of the schema, ``(N,)`` each.
-        other: further columns by role, ``(N,)`` each.
+        rest: further columns by role, ``(N,)`` each.
         pieces: rows of each breath.
     """
-    if "u_out" in other:
-        return (other["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
-    if "target" in other:
-        u_out = (~_is_high(other["target"])).astype(np.int8)
+    if "u_out" in rest:
+        return (rest["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
+    if "target" in rest:
+        u_out = (~_is_high(rest["target"])).astype(np.int8)
         return u_out, "u_out is 1 where the target is low."
     u_out = np.zeros(len(values["pressure"]), np.int8)
     if "flow" in values:
@@ -134,19 +134,19 @@ def expiratory_valve(
 
 
 def _onsets(
-    file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats]
+    file: str, time: Floats, values: Mapping[str, Floats], rest: Mapping[str, Floats]
 ) -> tuple[Ints, str]:
     """Rows at which inspirations begin, and what shows them."""
-    if "u_out" in other:
-        shut = other["u_out"] < 0.5
+    if "u_out" in rest:
+        shut = rest["u_out"] < 0.5
         return np.flatnonzero(shut[1:] & ~shut[:-1]) + 1, "where the expiratory valve closes"
-    if "target" in other:
-        high = _is_high(other["target"])
+    if "target" in rest:
+        high = _is_high(rest["target"])
         return np.flatnonzero(high[1:] & ~high[:-1]) + 1, "where the target rises"
     if "u_in" in values and np.nanmax(values["u_in"]) > 0:
         on = np.nan_to_num(values["u_in"]) > 0
-        away = _after_pause(on, time)
-        return away, "where the inspiratory valve opens"
+        openings = _after_pause(on, time)
+        return openings, "where the inspiratory valve opens"
     if "flow" in values and np.isfinite(values["flow"]).any():
         flow = _bridged(values["flow"])
         size = float(np.quantile(np.abs(flow), 0.99))
@@ -194,5 +194,5 @@ def _is_high(signal: Floats) -> Bools:
 
 def _bridged(values: Floats) -> Floats:
     """Values with their blanks interpolated, shape ``(N,)``."""
-    known = np.isfinite(values)
-    return np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+    finite = np.isfinite(values)
+    return np.interp(np.arange(len(values)), np.flatnonzero(finite), values[finite])

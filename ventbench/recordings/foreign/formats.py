@@ -47,8 +47,8 @@ def read_table(
     if not path.is_file():
         if (path / "metadata.yaml").is_file():
             return _rosbag(file)
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise InputError(f"{file} {what}; name a CSV, Parquet or .mat file")
+        reason = "is a folder" if path.is_dir() else "does not exist"
+        raise InputError(f"{file} {reason}; name a CSV, Parquet or .mat file")
     with open(path, "rb") as stream:
         first = stream.read(128)
     if not first:
@@ -143,10 +143,10 @@ def _variables(file: str, content: dict[str, Any]) -> Table:
         name.rpartition(".")[2] if last[name.rpartition(".")[2]] == 1 else name: v
         for name, v in columns.items()
     }
-    others = [name for name, v in flat.items() if len(v) != length]
+    mismatched = [name for name, v in flat.items() if len(v) != length]
     notes = [f"MATLAB file with {len(columns)} columns of {length} rows."]
-    if others:
-        notes.append(f"Columns of other lengths were left out ({', '.join(others[:5])}).")
+    if mismatched:
+        notes.append(f"Columns of other lengths were left out ({', '.join(mismatched[:5])}).")
     named = {re.sub(r"[^a-z]", "", n.rpartition(".")[2].lower()): v for n, v in scalars.items()}
     rate = next((named[name] for name in RATES if named.get(name, 0.0) > 0.0), None)
     return Table(file, columns, rate=rate, notes=tuple(notes))
@@ -204,9 +204,9 @@ def _channels(
     if not columns or not len(next(iter(columns.values()))):
         raise InputError(f"{file} holds no signal; name the file of the waveforms")
     notes = [f"{kind} with {len(columns)} signals at {rate:g} Hz."]
-    left = [f"{n} ({r:g} Hz)" for n, r in zip(names, rates, strict=True) if r != rate]
-    if left:
-        notes.append(f"Signals of other rates were left out ({', '.join(left)}).")
+    omitted = [f"{n} ({r:g} Hz)" for n, r in zip(names, rates, strict=True) if r != rate]
+    if omitted:
+        notes.append(f"Signals of other rates were left out ({', '.join(omitted)}).")
     return Table(file, columns, spelt, None, float(rate), tuple(notes))
 
 
@@ -269,11 +269,11 @@ def _json(file: str) -> Table | None:
 
 def _rows_within(content: Any) -> dict[str, Sequence[Any]] | None:
     """The longest table in a document: records, named lists, or rows beside their names."""
-    found: list[dict[str, Sequence[Any]]] = []
+    tables: list[dict[str, Sequence[Any]]] = []
     if isinstance(content, list) and len(content) > 1 and all(isinstance(x, dict) for x in content):
         records = [_flat(record) for record in content]
         names = dict.fromkeys(name for record in records[:1000] for name in record)
-        found.append({name: [record.get(name) for record in records] for name in names})
+        tables.append({name: [record.get(name) for record in records] for name in names})
     elif isinstance(content, dict):
         lists = {name: x for name, x in content.items() if isinstance(x, list) and len(x) > 1}
         plain = {k: x for k, x in lists.items() if not isinstance(x[0], dict | list)}
@@ -281,12 +281,12 @@ def _rows_within(content: Any) -> dict[str, Sequence[Any]] | None:
             names = next((x for x in plain.values() if len(x) == len(rows[0])), None)
             if names is not None and all(len(row) == len(names) for row in rows):
                 columns = zip(*rows, strict=True)
-                found.append(dict(zip(map(str, names), columns, strict=True)))
+                tables.append(dict(zip(map(str, names), columns, strict=True)))
         longest = max(map(len, plain.values()), default=0)
-        found.append({name: x for name, x in plain.items() if len(x) == longest})
-        found += filter(None, map(_rows_within, content.values()))
+        tables.append({name: x for name, x in plain.items() if len(x) == longest})
+        tables += filter(None, map(_rows_within, content.values()))
     return max(
-        (x for x in found if len(x) > 1), key=lambda x: len(next(iter(x.values()))), default=None
+        (x for x in tables if len(x) > 1), key=lambda x: len(next(iter(x.values()))), default=None
     )
 
 
@@ -378,14 +378,16 @@ def _of_topics(file: str, topics: dict[str, list[dict[str, Any]]], kind: str) ->
     at: dict[float, dict[str, Any]] = {}
     for topic, messages in used.items():
         for row in messages:
-            own = {k if unique or k == "time" else f"{topic}/{k}": x for k, x in row.items()}
-            at.setdefault(row["time"], {}).update(own)
+            named_columns = {
+                k if unique or k == "time" else f"{topic}/{k}": x for k, x in row.items()
+            }
+            at.setdefault(row["time"], {}).update(named_columns)
     rows = [at[time] for time in sorted(at)]
     columns = dict.fromkeys(key for row in rows for key in row)
-    left = [topic for topic in topics if topic not in used]
+    omitted = [topic for topic in topics if topic not in used]
     table = _of_values(file, {key: [row.get(key) for row in rows] for key in columns}, kind)
     notes = [
         *table.notes,
-        *([f"Topics of fewer messages were left out ({', '.join(left)})."] if left else []),
+        *([f"Topics of fewer messages were left out ({', '.join(omitted)})."] if omitted else []),
     ]
     return replace(table, notes=tuple(notes))

@@ -26,11 +26,11 @@ _HEAD, _COMPRESSED, _NESTED = 512, 15, (1, 2, 3)
 _NUMBER, _CELL = 8, 40
 
 
-def refuse(file: str, size: float, what: str) -> None:
+def refuse(file: str, size: float, part: str) -> None:
     """Refuse a size, bytes, of what a file holds."""
     if size > LARGEST:
         raise InputError(
-            f"{file}: {what} take {size / 1e9:.3g} GB, more than the {LARGEST / 1e9:g} GB that are "
+            f"{file}: {part} take {size / 1e9:.3g} GB, more than the {LARGEST / 1e9:g} GB that are "
             "read; export a part of it"
         )
 
@@ -44,11 +44,11 @@ def check_parquet(file: str) -> None:
     """Check the rows and columns, and the pages, that the footer of a Parquet file claims."""
     from pyarrow import parquet
 
-    about = parquet.read_metadata(file)
-    groups = (about.row_group(k) for k in range(about.num_row_groups))
+    metadata = parquet.read_metadata(file)
+    groups = (metadata.row_group(k) for k in range(metadata.num_row_groups))
     pages = sum(group.total_byte_size for group in groups)
-    values = _NUMBER * about.num_rows * max(about.num_columns, 1)
-    refuse(file, max(pages, values), f"its {about.num_rows} rows")
+    values = _NUMBER * metadata.num_rows * max(metadata.num_columns, 1)
+    refuse(file, max(pages, values), f"its {metadata.num_rows} rows")
 
 
 def check_archive(file: str) -> None:

@@ -167,24 +167,24 @@ def _dialect(
     """The separator and decimal mark with which most cells of most lines are numbers."""
     best, most = None, 0.0
     quoted = any('"' in line for line in lines)
-    for own in (separator,) if separator else _SEPARATORS:
-        split = [cells for cells in (_cells(line, own) for line in lines) if len(cells) > 1]
+    for candidate in (separator,) if separator else _SEPARATORS:
+        split = [cells for cells in (_cells(line, candidate) for line in lines) if len(cells) > 1]
         split = [cells for cells in map(_filled, split) if cells]
         for mark in (decimal,) if decimal else (".", ","):
-            if mark == own and not quoted:
+            if mark == candidate and not quoted:
                 continue
             score = sum(sum(_is_value(cell, mark) for cell in c) / len(c) for c in split)
-            if own == " ":  # words of lines above are apart by blanks too
+            if candidate == " ":  # words of lines above are apart by blanks too
                 score *= 0.85
             # Between equals: "7,736" alone is a decimal comma, and integers have no mark.
             if mark == ",":
                 score += 1e-6 if any("," in cell for cells in split for cell in cells) else -1e-6
             if score > most + 1e-9:
-                best, most = (own, mark), score
+                best, most = (candidate, mark), score
     if best is None:
-        asked = f" separated by {separator!r}" if separator else ""
+        requested = f" separated by {separator!r}" if separator else ""
         raise InputError(
-            f"{file}: no line has two cells{asked} of which one is a number; give --separator"
+            f"{file}: no line has two cells{requested} of which one is a number; give --separator"
         )
     return best
 
@@ -228,15 +228,15 @@ def _table(
     if odd_cells:
         notes.append(f"Cells that are no numbers are blank ({'; '.join(odd_cells)}).")
     for number, line in sorted(stray)[:3]:
-        said = " ".join(_cells(line, separator))[:60]
-        notes.append(f"Line {first + 1 + number} is no row and was left out: {said!r}.")
+        excerpt = " ".join(_cells(line, separator))[:60]
+        notes.append(f"Line {first + 1 + number} is no row and was left out: {excerpt!r}.")
     if len(stray) > 3:
         last = first + 1 + max(number for number, _ in stray)
         notes.append(f"So were {len(stray) - 3} more lines, the last of them {last}.")
-    shown = {"\t": "tab", " ": "blanks"}.get(separator, repr(separator))
+    label = {"\t": "tab", " ": "blanks"}.get(separator, repr(separator))
     numbers = numbers + first + 1
     notes.insert(
-        0, f"{note}separated by {shown}, decimal {mark!r}, first row in line {numbers[0]}."
+        0, f"{note}separated by {label}, decimal {mark!r}, first row in line {numbers[0]}."
     )
     return Table(file, columns, units, numbers, _rate(texts, mark), tuple(notes), names)
 
@@ -282,7 +282,7 @@ def _arrow(
                 include_columns=only,
                 decimal_point=mark,
                 null_values=sorted(
-                    {way for x in _BLANKS for way in (x, x.upper(), x.title(), "NaN")}
+                    {spelling for x in _BLANKS for spelling in (x, x.upper(), x.title(), "NaN")}
                 ),
                 strings_can_be_null=False,
             ),
@@ -296,10 +296,10 @@ def _arrow(
         table, odd = None, []
     stray: list[tuple[int, str]] = []
     if table is None or odd or data.count(b"\n", offset) + 1 != table.num_rows:
-        kept, numbers = [], []
+        regular, numbers = [], []
         for k, line in enumerate(data[offset:].decode().split("\n")):
             if line.count(separator) == usual - 1 and '"' not in line:
-                kept.append(line)
+                regular.append(line)
             elif not line.strip():
                 continue
             elif _width(cells := _cells(line, separator)) > width:
@@ -307,10 +307,10 @@ def _arrow(
                 continue
             else:
                 quoted = ('"' + cell.replace('"', '""') + '"' for cell in cells[:usual])
-                kept.append(separator.join([*quoted, *[""] * (usual - len(cells))]))
+                regular.append(separator.join([*quoted, *[""] * (usual - len(cells))]))
             numbers.append(k)
-        body, lines = "\n".join(kept).encode(), np.array(numbers, np.int64)
-        if not kept:
+        body, lines = "\n".join(regular).encode(), np.array(numbers, np.int64)
+        if not regular:
             return None, lines, stray
         table = read(body, {})[0]
     else:
@@ -351,8 +351,8 @@ def _header(
     if not texts:
         return [str(k + 1) for k in range(width)], [], ["There is no header; columns are 1, 2, ..."]
     units_row: list[str] = []
-    known = sum(map(is_unit, texts[-1]))
-    if len(texts) > 1 and known and 2 * known >= sum(map(bool, texts[-1])):
+    unit_cells = sum(map(is_unit, texts[-1]))
+    if len(texts) > 1 and unit_cells and 2 * unit_cells >= sum(map(bool, texts[-1])):
         units_row = texts.pop()
     # The names are the last line of as many cells as columns; an alarm may stand below them.
     cells = next((text for text in reversed(texts) if sum(map(bool, text)) == width), texts[-1])
@@ -427,12 +427,12 @@ def _columns(
             odd_cells.append((name, odd, texts))
     # A line with a word and hardly a number, between lines of numbers, is no row.
     message = any_odd & (filled <= 1)
-    said = [
+    sentences = [
         f"{name}: {odd.sum()} cells, such as {texts[int(np.argmax(odd))]!r}"
         for name, odd, texts in odd_cells
         if not message[odd].all()
     ]
-    return columns, units, said, message
+    return columns, units, sentences, message
 
 
 def _values(cells: Any, mark: str) -> tuple[Floats, int]:
@@ -475,23 +475,23 @@ def _clock(cells: Any) -> Floats | None:
     half = parts[5].str.lower()
     hours = np.where(half.notna(), hours % 12 + 12 * (half == "pm"), hours)
     out = 3600.0 * hours + 60.0 * minutes + seconds
-    known = np.flatnonzero(np.isfinite(out))
-    back = np.diff(out[known], prepend=out[known[0]]) < -43200.0
-    out[known] += 86400.0 * np.cumsum(back)
+    finite = np.flatnonzero(np.isfinite(out))
+    back = np.diff(out[finite], prepend=out[finite[0]]) < -43200.0
+    out[finite] += 86400.0 * np.cumsum(back)
     return np.round(out, 9)
 
 
 def _delimited_breaths(file: str, lines: list[str], encoding: str) -> Table:
     """Breaths between lines BS and BE, flow and pressure a line, 50 times a second."""
     rows: list[tuple[int, float, float, float]] = []
-    breath, begun, cut = 0, 0, 0
+    breath, first_row, cut = 0, 0, 0
     inside = False
     for number, line in enumerate(lines, 1):
         if re.match(r"\s*BS\b", line):
             if inside:  # the breath before has no end
                 cut += 1
-                del rows[begun:]
-            breath, begun, inside = breath + 1, len(rows), True
+                del rows[first_row:]
+            breath, first_row, inside = breath + 1, len(rows), True
         elif re.match(r"\s*BE\b", line):
             inside = False
         elif inside:
@@ -505,7 +505,7 @@ def _delimited_breaths(file: str, lines: list[str], encoding: str) -> Table:
             rows.append((number, flow, pressure, breath))
     if inside:
         cut += 1
-        del rows[begun:]
+        del rows[first_row:]
     if not rows:
         raise InputError(f"{file}: no breath stands between a line BS and a line BE")
     numbers, flows, pressures, breaths = np.array(rows).T
@@ -526,8 +526,10 @@ def _above_servo_data(file: str, lines: list[str]) -> int:
     if stripped[0] not in ("[REC]", *_NO_WAVEFORMS):
         return 0
     if "[DATA]" not in stripped or stripped[0] != "[REC]":
-        what = _NO_WAVEFORMS.get(stripped[0], "no line [DATA]")
-        raise InputError(f"{file} of a Servo ventilator holds {what}; export a recording ([REC])")
+        content = _NO_WAVEFORMS.get(stripped[0], "no line [DATA]")
+        raise InputError(
+            f"{file} of a Servo ventilator holds {content}; export a recording ([REC])"
+        )
     return stripped.index("[DATA]") + 1
 
 
@@ -544,10 +546,12 @@ def _by_units(table: Table) -> Table:
         if unit and role not in units:
             roles[name], units[role] = role, unit
     columns = {roles.get(name, name): values for name, values in table.columns.items()}
-    told = [x for x in columns.values() if x.dtype.kind == "U" and np.mean(x != "") > 0.5]
-    if told and "flow" in columns:
-        phase = np.array([text[:2].casefold() for text in told[0]])
-        inward = [each for each in set(phase) if np.nansum(columns["flow"][phase == each]) > 0]
+    phases = [x for x in columns.values() if x.dtype.kind == "U" and np.mean(x != "") > 0.5]
+    if phases and "flow" in columns:
+        phase = np.array([text[:2].casefold() for text in phases[0]])
+        inward = [
+            letters for letters in set(phase) if np.nansum(columns["flow"][phase == letters]) > 0
+        ]
         columns["expiration"] = 1.0 - np.isin(phase, inward)
     return replace(table, columns=columns, units=units, headers={})
 

@@ -79,13 +79,13 @@ def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings
         )
     breaths = join(parts)
     blank = breaths.valid & ~np.isfinite(breaths.pressure)
-    whole = np.count_nonzero(blank, axis=1) == 0
+    complete = np.count_nonzero(blank, axis=1) == 0
     usable = (breaths.inspiratory & np.isfinite(breaths.pressure))[:, 1:].any(axis=1)
-    order = np.concatenate([np.flatnonzero(whole & usable), np.flatnonzero(~whole & usable)])
-    breaths, whole = breaths.select(order), whole[order]
+    order = np.concatenate([np.flatnonzero(complete & usable), np.flatnonzero(~complete & usable)])
+    breaths, complete = breaths.select(order), complete[order]
     copy, repeat = repetitions(breaths)
     first = np.flatnonzero(copy == np.arange(len(copy)))
-    breaths, count = breaths.select(first), int(np.count_nonzero(whole[first]))
+    breaths, count = breaths.select(first), int(np.count_nonzero(complete[first]))
     breaths = replace(breaths, breath_id=np.arange(1, len(first) + 1))
     if count < 2 * folds:
         raise InputError(
@@ -153,7 +153,7 @@ class InspirationData:
 
     groups: Groups  #: setting, kind of rig and session.
     start: Array  #: first pressure, cmH2O, ``(n,)``; 0 where unknown.
-    start_known: Array  #: whether it was measured, ``(n,)``.
+    start_measured: Array  #: whether it was measured, ``(n,)``.
     u_in: Array  #: commands, %, ``(n, S - 1)``.
     dt: Array  #: time for which each command is held, s, ``(n, S - 1)``.
     #: pressure at the end of each command, cmH2O, ``(n, S - 1)``; 0 where it has no weight.
@@ -237,13 +237,13 @@ class WholeBreaths:
     share: Array
 
 
-def whole_breaths(breaths: Breaths, sessions: Sessions, labels: Sequence[Lung]) -> WholeBreaths:
+def complete_breaths(breaths: Breaths, sessions: Sessions, labels: Sequence[Lung]) -> WholeBreaths:
     """Arrange whole breaths; a breath without a first pressure or an expiration has no weight."""
-    known = breaths.valid & np.isfinite(breaths.pressure)
-    opened = known & (breaths.u_out == 1)
-    usable = known[:, :1] & opened.any(axis=1, keepdims=True)
-    share = np.zeros(known.shape)
-    for part in (opened, known & (breaths.u_out == 0)):
+    finite = breaths.valid & np.isfinite(breaths.pressure)
+    opened = finite & (breaths.u_out == 1)
+    usable = finite[:, :1] & opened.any(axis=1, keepdims=True)
+    share = np.zeros(finite.shape)
+    for part in (opened, finite & (breaths.u_out == 0)):
         share += usable * part / np.maximum(part.sum(axis=1, keepdims=True), 1)
     arrays = (np.nan_to_num(breaths.pressure), breaths.u_in, breaths.u_out, breaths.dt, share)
     return WholeBreaths(

@@ -280,11 +280,11 @@ def penalty(pooled: Pooled, around: Centre, scales: Scales) -> Array:
         heavy_tailed(apart(name) / getattr(scales, scale)) for name, scale in _HEAVY_TAILED.items()
     ]
     for name in ("R", "K2"):
-        away = apart(name)
-        terms.append(gaussian(away - around.same_resistor @ away, scales.resistor))
-    away = apart("E")
+        deviation = apart(name)
+        terms.append(gaussian(deviation - around.same_resistor @ deviation, scales.resistor))
+    deviation = apart("E")
     terms += [
-        gaussian(away - around.same_spring @ away, scales.spring),
+        gaussian(deviation - around.same_spring @ deviation, scales.spring),
         gaussian(full_flow(pooled) - around.sheet_flow, scales.sheet),
         gaussian(jnp.diff(apart("slopes")), scales.smoothness),
         gaussian(jnp.diff(apart("slopes_rig"), axis=-1), scales.smoothness_rig),
@@ -351,8 +351,8 @@ def breath_errors(fitted: Fitted, data: InspirationData) -> Array:
     plant = plant.replace(  # type: ignore[attr-defined]
         slopes=plant.slopes * jnp.exp(fitted.gain)[:, None]
     )
-    known = data.start_known > 0
-    start = jnp.where(known, data.start, fitted.rig_start[data.groups.session]) + fitted.start
+    measured = data.start_measured > 0
+    start = jnp.where(measured, data.start, fitted.rig_start[data.groups.session]) + fitted.start
     return jnp.where(data.share > 0, simulate(plant, start, data) - data.pressure, 0.0)
 
 
@@ -372,7 +372,7 @@ def loss(
     breath = noise.saturation * jnp.log1p(breath / noise.saturation)
     breath = breath * noise.independent / noise.pressure
     # A breath that counts for nothing still keeps its own latent values at zero.
-    width = jnp.where(data.start_known > 0, noise.start, noise.unknown_start_scale)
+    width = jnp.where(data.start_measured > 0, noise.start, noise.unknown_start_scale)
     latent = heavy_tailed(fitted.gain / noise.gain) + heavy_tailed(fitted.start / width)
     rigs = 0.5 * jnp.sum(((fitted.rig_start - noise.unknown_start) / noise.rig_start) ** 2)
     prior = penalty(fitted.pooled, around, scales) + latent + rigs
@@ -446,11 +446,11 @@ def fit(
     )
     carry: tuple[Fitted, Any] = (fitted, _optimiser(config).init(fitted))  # pyright: ignore[reportArgumentType]
     value = float("inf")
-    for done in range(0, config.iterations, CHUNK):
+    for iteration in range(0, config.iterations, CHUNK):
         carry, values = _advance(carry, data, weight, around, scales, noise, config)
         value = float(values[-1])
         if progress is not None:
-            progress((done + CHUNK) / config.iterations)
+            progress((iteration + CHUNK) / config.iterations)
     return carry[0], value
 
 
@@ -471,7 +471,7 @@ def fit_expiration(pooled: Pooled, data: WholeBreaths, weight: Array) -> Pooled:
 
     Args:
         pooled: pooled parameters from :func:`fit`.
-        data: data from :func:`whole_breaths`.
+        data: data from :func:`complete_breaths`.
         weight: weight of each breath, shape ``(n,)``; 0 leaves it out.
 
     Returns:
@@ -483,25 +483,25 @@ def fit_expiration(pooled: Pooled, data: WholeBreaths, weight: Array) -> Pooled:
     )
     soft, saturation = EXPIRATORY_SOFTNESS, EXPIRATORY_SATURATION
 
-    def loss(moved: dict[str, Array]) -> Array:
-        plant = plants(replace(pooled, **moved), data.groups)
+    def loss(parameters: dict[str, Array]) -> Array:
+        plant = plants(replace(pooled, **parameters), data.groups)
         simulated = open_loop(plant, data.pressure[:, 0], data.u_in, data.u_out, data.dt)
         error = jnp.where(data.share > 0, simulated - data.pressure, 0.0)
         breath = jnp.sum(data.share * (jnp.sqrt(error**2 + soft**2) - soft), axis=1)
         breath = saturation * jnp.log1p(breath / saturation)
         moves = [
-            jnp.sum(((moved[name] - start[name]) / EXPIRATORY_WIDTHS[name]) ** 2)
+            jnp.sum(((parameters[name] - start[name]) / EXPIRATORY_WIDTHS[name]) ** 2)
             for name in EXPIRATORY_WIDTHS
         ]
         prior = 0.5 * EXPIRATORY_PRIOR * sum(moves)
         return (jnp.sum(weight * breath) + prior) / jnp.maximum(jnp.sum(weight), 1.0)
 
     def iterate(carry: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], None]:
-        moved, state = carry
-        updates, state = optimiser.update(jax.grad(loss)(moved), state)
-        return (optax.apply_updates(moved, updates), state), None
+        parameters, state = carry
+        updates, state = optimiser.update(jax.grad(loss)(parameters), state)
+        return (optax.apply_updates(parameters, updates), state), None
 
-    (moved, _), _ = jax.lax.scan(
+    (parameters, _), _ = jax.lax.scan(
         iterate, (start, optimiser.init(start)), None, length=EXPIRATORY_ITERATIONS
     )
-    return replace(pooled, **moved)
+    return replace(pooled, **parameters)

@@ -144,11 +144,11 @@ class LabelTest:
                 f"C by the flow that its resistor tells, {self._range} mL/cmH2O, is more than "
                 f"{most} from the label {self.lung.C:g}"
             )
-        other = self.error_best_other_label
-        if other is not None and other < self.error_own_label:
+        other_error = self.error_best_other_label
+        if other_error is not None and other_error < self.error_own_label:
             out.append(
                 f"its breaths are explained better by {self.best_other_label} (median error "
-                f"{other:.2f} cmH2O) than by its own label ({self.error_own_label:.2f})"
+                f"{other_error:.2f} cmH2O) than by its own label ({self.error_own_label:.2f})"
             )
         return out
 
@@ -232,7 +232,7 @@ def _errors(
 ) -> Array:
     plant = plants(pooled, groups)
     plant = plant.replace(slopes=plant.slopes * jnp.exp(gain))  # type: ignore[attr-defined]
-    start = jnp.where(data.start_known > 0, data.start, start)
+    start = jnp.where(data.start_measured > 0, data.start, start)
     error = jnp.where(data.share > 0, simulate(plant, start, data) - data.pressure, 0.0)
     return jnp.sum(data.share * jnp.abs(error), axis=1)
 
@@ -282,8 +282,8 @@ def label_errors(
             ]
         )
         for index in left_out:
-            own = np.median(error[:, session == index], axis=1)
-            out[index].append(float(np.min(own + _GAIN_COST * np.abs(_GAINS))))
+            medians = np.median(error[:, session == index], axis=1)
+            out[index].append(float(np.min(medians + _GAIN_COST * np.abs(_GAINS))))
     return out
 
 
@@ -312,7 +312,7 @@ def label_tests(
     ids = [lung.id for lung in labels]
     tests = []
     for index, row in enumerate(sessions.table):
-        own = ids.index(row.lung)
+        labelled = ids.index(row.lung)
         (r, c), limits = (
             values[:, index],
             [
@@ -320,12 +320,12 @@ def label_tests(
                 for k in range(2)
             ],
         )
-        apart = np.where(np.arange(len(ids)) == own, np.inf, errors[index])
+        apart = np.where(np.arange(len(ids)) == labelled, np.inf, errors[index])
         best = int(np.argmin(apart)) if len(ids) > 1 else None
         tests.append(
             LabelTest(
                 session=index,
-                lung=labels[own],
+                lung=labels[labelled],
                 measured=int(counts[0][index]),
                 breaths=int(counts[1][index]),
                 R=float(r),
@@ -333,7 +333,7 @@ def label_tests(
                 C=float(c),
                 C_interval=limits[1],
                 laminar_share=laminar_share,
-                error_own_label=float(errors[index][own]),
+                error_own_label=float(errors[index][labelled]),
                 best_other_label=None if best is None else ids[best],
                 error_best_other_label=None if best is None else float(apart[best]),
             )

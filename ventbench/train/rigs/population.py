@@ -144,14 +144,14 @@ def fit_mixed(
         apart = means - units.design @ beta
         second = apart.T @ apart + spread.sum(axis=0)
         # Variances and correlations have priors of their own (Barnard et al., 2000).
-        given = np.isinf(prior.units)
-        counts = np.where(given, 0.0, prior.units)
-        own = (second.diagonal() + counts * prior.scale**2) / (count + counts)
-        own = np.where(given, prior.scale**2, own)
+        fixed = np.isinf(prior.units)
+        counts = np.where(fixed, 0.0, prior.units)
+        variances = (second.diagonal() + counts * prior.scale**2) / (count + counts)
+        variances = np.where(fixed, prior.scale**2, variances)
         root = np.sqrt(second.diagonal())
         correlation = second / np.outer(root, root) * count / (count + prior.uncorrelated)
         np.fill_diagonal(correlation, 1.0)
-        covariance = correlation * np.sqrt(np.outer(own, own))
+        covariance = correlation * np.sqrt(np.outer(variances, variances))
     beta, error, means, _ = _expect(units, prior, covariance)
     return Population(beta, error, covariance, means)
 
@@ -185,9 +185,9 @@ def surprise(units: Units, j: int, population: Population) -> float:
         Share of the predicted units that are nearer to the middle: uniform in 0..1 if all is right.
     """
     values, vectors = np.linalg.eigh(units.information[j])
-    known = values > 1e-6 * values[-1]
-    root = vectors[:, known] * np.sqrt(values[known])
-    estimate = (vectors[:, known] / np.sqrt(values[known])).T @ units.weighted[j]
+    positive = values > 1e-6 * values[-1]
+    root = vectors[:, positive] * np.sqrt(values[positive])
+    estimate = (vectors[:, positive] / np.sqrt(values[positive])).T @ units.weighted[j]
     mean, spread = population.predictive(units.design[j])
     covariance = np.eye(root.shape[1]) + root.T @ spread @ root
     off = estimate - root.T @ mean
@@ -212,7 +212,7 @@ class _Breaths:
 
     @property
     def known(self) -> Bools:
-        return np.asarray(self.data.start_known) > 0
+        return np.asarray(self.data.start_measured) > 0
 
     def at_start(self) -> Floats:
         first = np.where(self.known, np.asarray(self.data.start), self.noise.unknown_start)
@@ -264,10 +264,10 @@ def _with_own(breaths: _Breaths, rigs: Floats, scale: float, steps: int) -> _Bre
     for _ in range(steps):
         residual, weight, slopes = _linearised(breaths, rigs, _by_breath)
         by = np.stack(slopes, -1)
-        prior, own = _own(breaths, scale)
+        prior, posterior = _own(breaths, scale)
         normal = np.einsum("bt,bti,btj->bij", weight, by, by)
         normal[:, [0, 1], [0, 1]] += prior
-        right = np.einsum("bt,bti->bi", weight * residual, by) - prior * own
+        right = np.einsum("bt,bti->bi", weight * residual, by) - prior * posterior
         change = np.linalg.solve(normal, right[..., None])[..., 0]
         gain, start = np.clip(change, -LARGEST, LARGEST).T
         breaths = _Breaths(
@@ -285,13 +285,13 @@ def _units(breaths: _Breaths, rigs: Floats, design: Floats) -> Units:
     """Information of the sessions, the breaths' gains and starts integrated out."""
     residual, weight, (by_rig, *slopes) = _linearised(breaths, rigs, _by_all)
     by = np.stack(slopes, -1)
-    prior, own = _own(breaths, GAIN)
+    prior, posterior = _own(breaths, GAIN)
     weighted = weight[..., None] * by_rig
     inner = np.einsum("bt,bti,btj->bij", weight, by, by)
     inner[:, [0, 1], [0, 1]] += prior
     mixed = weighted.transpose(0, 2, 1) @ by
     solved = mixed @ np.linalg.inv(inner)
-    inner_right = np.einsum("bt,bti->bi", weight * residual, by) - prior * own
+    inner_right = np.einsum("bt,bti->bi", weight * residual, by) - prior * posterior
     right = np.einsum("btp,bt->bp", weighted, residual)
     right -= (solved @ inner_right[..., None])[..., 0]
     information = weighted.transpose(0, 2, 1) @ by_rig - solved @ mixed.transpose(0, 2, 1)
@@ -344,10 +344,10 @@ class FittedPopulation:
         """:func:`surprise` of each session by the others."""
         out = []
         for j in range(len(self.sessions)):
-            others = fit_mixed(
+            refit = fit_mixed(
                 self.units.without(j), self.prior, iterations=30, start=self.population.covariance
             )
-            out.append(surprise(self.units, j, others))
+            out.append(surprise(self.units, j, refit))
         return out
 
     def of_lungs(self, lungs: Sequence[str], unrecorded: float) -> RigPopulation:
@@ -389,12 +389,12 @@ def fit_population(
         progress: called with the share that is done, 0..1.
     """
     session = np.asarray(data.groups.session)
-    kept = np.flatnonzero(np.isin(session, sessions))
+    used = np.flatnonzero(np.isin(session, sessions))
     order = {index: j for j, index in enumerate(sessions)}
-    at = np.array([order[index] for index in session[kept].tolist()])
-    zero = np.zeros(len(kept))
-    chosen = jax.tree.map(lambda x: np.asarray(x)[kept], data)
-    breaths = _Breaths(chosen, at, weight[kept], noise or Noise(), zero, zero)
+    at = np.array([order[index] for index in session[used].tolist()])
+    zero = np.zeros(len(used))
+    chosen = jax.tree.map(lambda x: np.asarray(x)[used], data)
+    breaths = _Breaths(chosen, at, weight[used], noise or Noise(), zero, zero)
     rigs = to_vector(plants)[list(sessions)]
     design = design_of(lungs)
     fit = np.linalg.lstsq(design.reshape(-1, design.shape[2]), rigs.ravel(), rcond=None)
@@ -441,31 +441,31 @@ def train_population(
         OSError: if a file cannot be written.
     """
     folder = Path(simulators)
-    known = frozen.load(folder)
-    settings = known.manifest["recipe"]["rigs"]
+    base = frozen.load(folder)
+    settings = base.manifest["recipe"]["rigs"]
     data = load_rig_recordings(Path(recordings), folds=settings["folds"], seed=settings["seed"])
     weight = np.where(np.arange(len(data.breaths)) < data.measured, 1.0, settings["reconstructed"])
     with compilation.float64():
-        arranged = inspirations(data.breaths, known.sessions, data.labels)
+        arranged = inspirations(data.breaths, base.sessions, data.labels)
     rigs = [
         (session, lung)
-        for lung, own in zip(known.lung_ids, known.rigs, strict=True)
-        for session in sorted(own)
+        for lung, rigs_of_lung in zip(base.lung_ids, base.rigs, strict=True)
+        for session in sorted(rigs_of_lung)
     ]
-    scored = jax.tree.map(lambda leaf: np.asarray(leaf)[0], known.members)
+    scored = jax.tree.map(lambda leaf: np.asarray(leaf)[0], base.members)
     sessions, lungs = [session for session, _ in rigs], [lung for _, lung in rigs]
     fitted = fit_population(scored, arranged, sessions, lungs, weight, progress=progress)
-    _write(fitted, known)
+    _write(fitted, base)
     return fitted
 
 
-def _write(fitted: FittedPopulation, known: frozen.Frozen) -> None:
+def _write(fitted: FittedPopulation, base: frozen.Frozen) -> None:
     """Write the population, its check and its hash into the folder of simulators."""
-    folder = known.folder
-    save_population(fitted.of_lungs(known.lung_ids, UNRECORDED_SLOPE), folder / frozen.POPULATION)
+    folder = base.folder
+    save_population(fitted.of_lungs(base.lung_ids, UNRECORDED_SLOPE), folder / frozen.POPULATION)
     sd = np.sqrt(fitted.population.covariance.diagonal())
     levels = np.linspace(0.0, 1.0, len(GAIN_QUANTILES))
-    about = {
+    manifest = {
         "sessions": list(fitted.sessions),
         "left_out": [round(share, 4) for share in fitted.left_out()],
         "deviations": {name: round(float(x), 4) for name, x in zip(NAMES, sd, strict=True)},
@@ -477,8 +477,8 @@ def _write(fitted: FittedPopulation, known: frozen.Frozen) -> None:
     digest = files.sha256(folder / frozen.POPULATION)
     written = {
         "format": frozen.ROLES_FORMAT,
-        "lungs": known.roles,
-        "population": about,
+        "lungs": base.roles,
+        "population": manifest,
         "files": {frozen.POPULATION: {"sha256": digest}},
     }
     files.write_text(folder / frozen.ROLES, tomli_w.dumps(written))
@@ -492,11 +492,11 @@ def _scatter(gain: Floats, group: Ints) -> tuple[Floats, float, float]:
     """
     off, squares, freedom, products = np.zeros(len(gain)), 0.0, 0, []
     for name in np.unique(group):
-        own = gain[group == name]
-        off[group == name] = own - np.median(own)
-        away = own - own.mean()
-        squares, freedom = squares + float(away @ away), freedom + len(own) - 1
-        products += (away[1:] * away[:-1]).tolist()
+        gains_of_rig = gain[group == name]
+        off[group == name] = gains_of_rig - np.median(gains_of_rig)
+        deviation = gains_of_rig - gains_of_rig.mean()
+        squares, freedom = squares + float(deviation @ deviation), freedom + len(gains_of_rig) - 1
+        products += (deviation[1:] * deviation[:-1]).tolist()
     sd = float(np.sqrt(squares / max(freedom, 1)))
     lag = float(np.mean(products) / sd**2) if products and sd > 0 else 0.0
     return off * (sd / max(float(np.std(off)), 1e-12)), sd, lag

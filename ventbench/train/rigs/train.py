@@ -42,11 +42,11 @@ from ventbench.train.rigs.data import (
     InspirationData,
     RigRecordings,
     WholeBreaths,
+    complete_breaths,
     groups_of,
     groups_of_sessions,
     inspirations,
     load_rig_recordings,
-    whole_breaths,
 )
 from ventbench.train.rigs.fit import (
     LAMINAR_SHARE,
@@ -140,10 +140,10 @@ class _Problem:
             label.id: [i for i, row in enumerate(self.table.table) if row.lung == label.id]
             for label in self.data.labels
         }
-        several = [own for own in by_lung.values() if len(own) > 1]
+        several = [sessions for sessions in by_lung.values() if len(sessions) > 1]
         listed = [len(by_lung[name]) for name in self.listed if len(by_lung[name]) > 1]
         count = max(listed, default=0)
-        return [[i for own in several for i in own[turn::count]] for turn in range(count)]
+        return [[i for sessions in several for i in sessions[turn::count]] for turn in range(count)]
 
 
 def train_rigs(
@@ -189,13 +189,13 @@ def train_rigs(
     # Clocks alone tell sessions apart; no pressure is looked at.
     table = sessions.find(data.breaths)
     scales, noise = Scales(), Noise()
-    about = _provenance(data, listed, config, scales, noise)
-    parts = WorkFolder(out / "parts", about)
+    provenance = _provenance(data, listed, config, scales, noise)
+    parts = WorkFolder(out / "parts", provenance)
     with compilation.float32():  # enough for a fit to noisy recordings, and twice as fast
         problem = _arrange(data, table, listed, config, scales, noise)
         fits = _fits(problem, config, parts, report)
         manifest, members = _assess(problem, listed, fits, out)
-    _write(out, about | manifest, members, data)
+    _write(out, provenance | manifest, members, data)
     parts.delete()
     report("done", 1.0)
     return frozen.load(path=out)
@@ -207,10 +207,10 @@ def _listed(data: RigRecordings, lungs: Sequence[str] | None) -> tuple[str, ...]
     if missing:
         raise InputError(f"lung {missing[0]} was not recorded; recorded are {', '.join(recorded)}")
     # Six lungs of the protocol first, in the order of every table.
-    wanted = recorded if lungs is None else tuple(lung(name).id for name in lungs)
+    requested = recorded if lungs is None else tuple(lung(name).id for name in lungs)
     return (
-        *(name for name in LUNG_IDS if name in wanted),
-        *(name for name in wanted if name not in LUNG_IDS),
+        *(name for name in LUNG_IDS if name in requested),
+        *(name for name in requested if name not in LUNG_IDS),
     )
 
 
@@ -231,7 +231,7 @@ def _arrange(
         listed,
         table,
         inspirations(data.breaths, table, data.labels, samples),
-        whole_breaths(data.measured_breaths, table, data.labels),
+        complete_breaths(data.measured_breaths, table, data.labels),
         weight,
         centre(data.labels, len(table), config.laminar_share),
         scales,
@@ -247,7 +247,7 @@ class _Fits:
     scored: Fitted  #: fit to all breaths.
     members: list[Fitted]  #: fits without each fold.
     resampled: list[Fitted]  #: fits to resampled breaths.
-    without_rigs: list[Fitted]  #: fits without the sessions of each round.
+    excluding_rigs: list[Fitted]  #: fits without the sessions of each round.
     tests: list[LabelTest]  #: tests of the labels of all sessions.
 
 
@@ -263,7 +263,7 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
 
     def run(
         name: str,
-        what: str,
+        stage: str,
         weight: Floats,
         *,
         expiration: bool = False,
@@ -285,14 +285,14 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
                 problem.noise,
                 settings,
                 start,
-                lambda share: report(what, 0.95 * (done + cost * share) / total),
+                lambda share: report(stage, 0.95 * (done + cost * share) / total),
             )
             if expiration:
                 pooled = fit_expiration(fitted.pooled, problem.whole, jnp.asarray(weight[:m]))
                 fitted = dataclasses.replace(fitted, pooled=pooled)
             return fitted
 
-        report(what, 0.95 * done / total)
+        report(stage, 0.95 * done / total)
         result = parts.get(name, compute, stored)
         done += cost
         return result
@@ -306,10 +306,10 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
     resampled = []
     for turn in range(config.resamples):
         weight = problem.weight * rng.exponential(size=n)
-        what = f"resampled breaths, {turn + 1}"
-        resampled.append(run(f"resample-{turn}", what, weight, start=scored))
+        stage = f"resampled breaths, {turn + 1}"
+        resampled.append(run(f"resample-{turn}", stage, weight, start=scored))
 
-    def without_rigs(name: str, doubtful: Sequence[int]) -> list[Fitted]:
+    def excluding_rigs(name: str, doubtful: Sequence[int]) -> list[Fitted]:
         out = []
         for turn, left_out in enumerate(problem.rounds):
             silent = np.isin(problem.session, [*left_out, *doubtful])
@@ -317,9 +317,9 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
             out.append(run(f"{name}-{turn}", f"rigs held out, {name} {turn + 1}", weight))
         return out
 
-    first = without_rigs("rigs", [])
+    first = excluding_rigs("rigs", [])
     doubtful = _worst(_label_tests(problem, scored, resampled, first))
-    second = without_rigs("again", doubtful) if doubtful else first
+    second = excluding_rigs("again", doubtful) if doubtful else first
     tests = _label_tests(problem, scored, resampled, second)
     return _Fits(scored, members, resampled, second, tests)
 
@@ -328,18 +328,18 @@ def _worst(tests: Sequence[LabelTest]) -> list[int]:
     """Of each lung the session that failed with the largest error under its own label."""
     failed: dict[str, LabelTest] = {}
     for test in tests:
-        known = failed.get(test.lung.id)
-        if test.reasons and (known is None or test.error_own_label > known.error_own_label):
+        previous = failed.get(test.lung.id)
+        if test.reasons and (previous is None or test.error_own_label > previous.error_own_label):
             failed[test.lung.id] = test
     return sorted(test.session for test in failed.values())
 
 
 def _label_tests(
-    problem: _Problem, scored: Fitted, resampled: Sequence[Fitted], without_rigs: Sequence[Fitted]
+    problem: _Problem, scored: Fitted, resampled: Sequence[Fitted], excluding_rigs: Sequence[Fitted]
 ) -> list[LabelTest]:
     data, table = problem.data, problem.table
     errors: dict[int, Sequence[float]] = {}
-    for left_out, part in zip(problem.rounds, without_rigs, strict=True):
+    for left_out, part in zip(problem.rounds, excluding_rigs, strict=True):
         errors |= label_errors(
             part.pooled, left_out, problem.inspirations, data.labels, problem.scales
         )
@@ -403,9 +403,9 @@ def _assess(
     measured = data.measured_breaths
     known = seen(data.breaths, _seen_by(data))
     simulators = frozen.Frozen(out, {}, "", table, members, known)
-    own = simulation.open_loop_errors(simulators.cross_fitted, measured)
+    cross_fitted_error = simulation.open_loop_errors(simulators.cross_fitted, measured)
     unseen = np.full(data.measured, np.nan)
-    for left_out, part in zip(problem.rounds, fits.without_rigs, strict=True):
+    for left_out, part in zip(problem.rounds, fits.excluding_rigs, strict=True):
         shared = partial(_shared_plants, part.pooled, table, data.labels)
         which = np.isin(of_measured, left_out)
         unseen[which] = simulation.open_loop_errors(shared, measured)[which]
@@ -418,10 +418,10 @@ def _assess(
             "R": lung(name).R,
             "C": lung(name).C,
             **rigs[name],
-            **_figures("own_rig_", own[scored]),
-            **_figures("reference_rig_", own[reference]),
+            **_figures("own_rig_", cross_fitted_error[scored]),
+            **_figures("reference_rig_", cross_fitted_error[reference]),
             **_figures("unseen_rig_", unseen[scored]),
-            **_figures("held_out_", own[index]),
+            **_figures("held_out_", cross_fitted_error[index]),
             "recorded_commands": _recorded_commands(problem, rigs[name]["rigs"]),
         }
     return {
@@ -475,9 +475,9 @@ def choose_rigs(tests: Sequence[LabelTest], table: Sessions) -> dict[str, Any]:
     if rest:
         kind = table.table[reference.session].rig
         apart = min(rest, key=lambda t: (table.table[t.session].rig == kind, *recorded(t)))
-        others = sorted((t.session for t in rest if t is not apart), key=partial(_digest, table))
+        remaining = sorted((t.session for t in rest if t is not apart), key=partial(_digest, table))
         count = math.ceil(HELD_OUT_SHARE * len(chosen))
-        out["held_out_rigs"] = [apart.session, *others][:count]
+        out["held_out_rigs"] = [apart.session, *remaining][:count]
     return out
 
 
@@ -541,9 +541,9 @@ def _provenance(
 
 
 def _write(out: Path, manifest: dict[str, Any], members: Hybrid, data: RigRecordings) -> None:
-    known = seen(data.breaths, _seen_by(data))
+    unseen = seen(data.breaths, _seen_by(data))
     save_plant(out / frozen.MEMBERS, members)
-    arrays = {**vars(known.prints), "fold": known.fold}
+    arrays = {**vars(unseen.prints), "fold": unseen.fold}
     files.write_atomically(out / frozen.SEEN, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
     names = (frozen.MEMBERS, frozen.SEEN)
     hashes = {"files": {name: {"sha256": files.sha256(out / name)} for name in names}}

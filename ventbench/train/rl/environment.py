@@ -100,8 +100,8 @@ def draw(
     plant = jax.random.randint(plant_key, (count,), 0, which) * vary
     plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[plant, lung], lungs.plants)
     pip = (first + jnp.arange(count) // number) % len(protocol.PIPS)
-    wanted = jnp.asarray(protocol.PIPS, jnp.result_type(float))[pip]
-    cells = random_scenarios(key, wanted, spread=None if vary else 0.0)
+    pips = jnp.asarray(protocol.PIPS, jnp.result_type(float))[pip]
+    cells = random_scenarios(key, pips, spread=None if vary else 0.0)
     return Episodes(plants, cells, lungs.weights[lung, pip])
 
 
@@ -127,10 +127,10 @@ def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
     cells, weight = episodes.cells, episodes.weight
     memory = residual.init_features(cells.pip.shape)
 
-    def policy(state: Any, seen: Any, key: Array) -> tuple[Any, Array]:
-        memory, x, base = residual.features(state[0], seen)
-        asked, kept = act(key, x, base)
-        return (memory, (x, kept)), asked
+    def policy(state: Any, observation: Any, key: Array) -> tuple[Any, Array]:
+        memory, x, base = residual.features(state[0], observation)
+        command, extra = act(key, x, base)
+        return (memory, (x, extra)), command
 
     def run(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Any]:
         breath, keys = now
@@ -138,7 +138,7 @@ def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
 
         def step(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Any, Array]]:
             loop, memory = carry
-            (loop, (memory, (x, kept))), pressure = rollouts.control_step(
+            (loop, (memory, (x, extra))), pressure = rollouts.control_step(
                 varied,
                 cells,
                 policy,
@@ -147,7 +147,7 @@ def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
                 (breath, *now),
             )
             reward = -weight * jnp.abs(pressure - cells.pip) / REWARD_SCALE
-            return (loop, memory), (x, kept, reward)
+            return (loop, memory), (x, extra, reward)
 
         start = env.start_breath(varied, cells)
         (loop, memory), out = jax.lax.scan(step, (start, memory), (jnp.arange(MOVES), keys))
@@ -257,10 +257,10 @@ def load_lungs(simulator: Given = "frozen", *, rigs: Literal["training", "refere
     if rigs not in get_args(Literal["training", "reference"]):
         raise InputError(f"rigs is {rigs!r}; choose training or reference")
     trained_on = plants_to_train_on(simulator)
-    kept = slice(None) if rigs == "training" else slice(1)
+    members = slice(None) if rigs == "training" else slice(1)
     with compilation.float32():
         plants = jax.tree.map(
-            lambda leaf: jnp.asarray(np.asarray(leaf)[kept], jnp.float32), trained_on.plants
+            lambda leaf: jnp.asarray(np.asarray(leaf)[members], jnp.float32), trained_on.plants
         )
         return Lungs(plants, jnp.asarray(trained_on.weights, jnp.float32))
 
@@ -305,10 +305,10 @@ def reset(
 def observe(state: State) -> Array:
     """What a submission sees, scaled, shape ``(OBSERVATION,)``; see :data:`OBSERVATION`."""
     count = jnp.minimum(state.count, STEPS - 1)  # after the end, an observation of the same kind
-    seen = env.observe(state.episode.cell, state.progress.loop, count // BREATH, count % BREATH)
-    after = [seen.previous_u_in / 50.0 - 1.0, seen.time, seen.dt / protocol.DT]
-    pressures = jnp.stack([seen.pressure, seen.target]) / 40.0
-    return jnp.concatenate([pressures, seen.targets_ahead / 40.0, jnp.stack(after)])
+    sample = env.observe(state.episode.cell, state.progress.loop, count // BREATH, count % BREATH)
+    after = [sample.previous_u_in / 50.0 - 1.0, sample.time, sample.dt / protocol.DT]
+    pressures = jnp.stack([sample.pressure, sample.target]) / 40.0
+    return jnp.concatenate([pressures, sample.targets_ahead / 40.0, jnp.stack(after)])
 
 
 def step(state: State, action: Array) -> tuple[State, Array, Array, Array]:

@@ -66,14 +66,14 @@ class PolicyGradient:
     def iterate(self, state: State, plants: environment.Lungs) -> State:
         """One update on lungs."""
         cells_key, roll_key, key = jax.random.split(state.key, 3)
-        drawn = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
+        episodes = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
 
         def loss(parameters: Parameters) -> Array:
             def act(key: Array, x: Array, base: Array) -> tuple[Array, None]:
                 mean: Array = self.network.apply(parameters, x)  # type: ignore[assignment]
                 return base + SCALE * mean[..., 0], None
 
-            return -jnp.mean(environment.roll(drawn, act, roll_key)[2])
+            return -jnp.mean(environment.roll(episodes, act, roll_key)[2])
 
         gradient = jax.grad(loss)(state.parameters)
         updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.parameters)
@@ -176,7 +176,7 @@ class PPO:
     def _collect(self, state: State, plants: environment.Lungs, key: Array) -> PPOBatch:
         parameters = state.parameters
         cells_key, roll_key = jax.random.split(key)
-        drawn = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
+        episodes = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
 
         def act(key: Array, x: Array, base: Array) -> tuple[Array, tuple[Array, Array]]:
             mean = self._mean(parameters, x)
@@ -184,7 +184,7 @@ class PPO:
             action = mean + jnp.exp(log_spread) * jax.random.normal(key, mean.shape)
             return base + SCALE * action, (action, log_probability(action, mean, log_spread))
 
-        x, (action, before), rewards = environment.roll(drawn, act, roll_key)
+        x, (action, before), rewards = environment.roll(episodes, act, roll_key)
         value = self._value(parameters, x)
         advantage = environment.advantages(rewards, value, self.discount, self.trace)
         batch = PPOBatch(x, action, before, advantage, value)
@@ -203,8 +203,8 @@ class PPO:
         advantage = advantage / (jnp.std(advantage) + 1e-6)
         ratio = jnp.exp(now - part.log_probability)
         policy = jnp.mean(clipped_loss(ratio, advantage, self.clip))
-        wanted = part.value + part.advantage
-        critic = jnp.mean((self._value(parameters, part.features) - wanted) ** 2)
+        returns = part.value + part.advantage
+        critic = jnp.mean((self._value(parameters, part.features) - returns) ** 2)
         return policy + 0.5 * critic
 
 
@@ -264,8 +264,8 @@ class DQN:
         network_key, key = jax.random.split(key)
         parameters = residual.init_parameters(self.network, network_key)
         size = self.memory * environment.MOVES
-        seen, zero = jnp.zeros((size, residual.FEATURES)), jnp.zeros((size,))
-        replay = Replay(seen, jnp.zeros((size,), jnp.int32), zero, zero, seen)
+        features, zero = jnp.zeros((size, residual.FEATURES)), jnp.zeros((size,))
+        replay = Replay(features, jnp.zeros((size,), jnp.int32), zero, zero, features)
         iteration = jnp.zeros((), jnp.int32)
         optimiser = self._optimiser.init(parameters)
         return DQNState(parameters, parameters, optimiser, replay, key, iteration)
@@ -281,10 +281,10 @@ class DQN:
             state.replay,
             new,
         )
-        known = jnp.minimum((state.iteration + 1) * count, self.memory * environment.MOVES)
+        filled = jnp.minimum((state.iteration + 1) * count, self.memory * environment.MOVES)
 
         def update(carry: Any, key: Array) -> tuple[Any, None]:
-            rows = jax.random.randint(key, (self.batch,), 0, known)
+            rows = jax.random.randint(key, (self.batch,), 0, filled)
             return self._update(carry, jax.tree.map(lambda x: x[rows], replay)), None
 
         carry = (state.online, state.target, state.optimiser)
@@ -301,7 +301,7 @@ class DQN:
 
     def _collect(self, state: DQNState, plants: environment.Lungs, key: Array) -> Replay:
         cells_key, roll_key = jax.random.split(key)
-        drawn = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
+        episodes = environment.of_iteration(cells_key, plants, self.breaths, state.iteration)
         start, end = self.explore
         progress = jnp.minimum(state.iteration / (self.explored * self.iterations), 1.0)
         share = start + (end - start) * progress
@@ -314,7 +314,7 @@ class DQN:
             choice = jnp.where(explore, random, greedy)
             return base + jnp.asarray(CHOICES, base.dtype)[choice], choice
 
-        x, choice, rewards = environment.roll(drawn, act, roll_key)
+        x, choice, rewards = environment.roll(episodes, act, roll_key)
         following = jnp.arange(environment.MOVES) + 1
         discount = jnp.where(following < environment.MOVES, self.discount, 0.0)
         replay = Replay(
@@ -329,12 +329,12 @@ class DQN:
     def _update(self, carry: Any, part: Replay) -> Any:
         online, target, optimiser = carry
         after = [self._values(p, part.following) for p in (online, target)]
-        wanted = environment.double_q_target(part.reward, part.discount, *after)
+        target_values = environment.double_q_target(part.reward, part.discount, *after)
 
         def loss(parameters: Parameters) -> Array:
             values = self._values(parameters, part.features)
             chosen = jnp.take_along_axis(values, part.choice[:, None], axis=-1)[:, 0]
-            return jnp.mean(optax.huber_loss(chosen, wanted))
+            return jnp.mean(optax.huber_loss(chosen, target_values))
 
         updates, optimiser = self._optimiser.update(jax.grad(loss)(online), optimiser, online)
         online = optax.apply_updates(online, updates)

@@ -85,9 +85,9 @@ def nominal_error(lungs: environment.Lungs, policy: Any) -> Array:
     pips = np.repeat(np.asarray(protocol.PIPS), lungs.count)
     which = jnp.arange(len(pips)) % lungs.count
     cells = nominal_scenario(pips)
-    each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], lungs.nominal)
-    drawn = environment.Episodes(each, cells, jnp.ones(len(pips)))
-    return jnp.mean(environment.errors(drawn, policy))
+    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], lungs.nominal)
+    episodes = environment.Episodes(plants, cells, jnp.ones(len(pips)))
+    return jnp.mean(environment.errors(episodes, policy))
 
 
 def fresh_error(lungs: environment.Lungs, policy: Any) -> Array:
@@ -175,27 +175,27 @@ def train(
             "jax": jax.__version__,
         }
         stored = Checkpoint(file, settings)
-        (runs, curves, seconds, compiling), done = stored.restore(carry)
+        (runs, curves, seconds, compiling), point = stored.restore(carry)
         began = time.perf_counter()
-        if done < points:  # once for nothing, so that no point's time contains the compiling
+        if point < points:  # once for nothing, so that no point's time contains the compiling
             jax.block_until_ready(_advance(method, runs, plants, chunk))
         saved = now = time.perf_counter()
         pause = SAVE_SECONDS
         compiling = compiling + (now - began)
-        while done < points:
+        while point < points:
             runs, errors = _advance(method, runs, plants, chunk)
-            done += 1
-            curves[:, done] = np.asarray(errors)
+            point += 1
+            curves[:, point] = np.asarray(errors)
             before, now = now, time.perf_counter()
-            seconds[done] = seconds[done - 1] + now - before
-            if not np.isfinite(curves[:, done]).all():
-                raise FloatingPointError(f"training diverged before point {done} of {points}")
-            if now - saved > pause or done == points:
-                stored.save((runs, curves, seconds, compiling), done)
+            seconds[point] = seconds[point - 1] + now - before
+            if not np.isfinite(curves[:, point]).all():
+                raise FloatingPointError(f"training diverged before point {point} of {points}")
+            if now - saved > pause or point == points:
+                stored.save((runs, curves, seconds, compiling), point)
                 saved = time.perf_counter()
                 pause = max(SAVE_SECONDS, SAVE_SHARE * (saved - now))
             if progress is not None:
-                progress(done / points, np.asarray(runs.error))
+                progress(point / points, np.asarray(runs.error))
         return TrainedPolicies(
             policies=jax.tree.map(np.asarray, runs.best),
             validation=np.asarray(runs.error),
@@ -345,19 +345,19 @@ def _train(
 ) -> TrainedControllers:
     began = time.perf_counter()
     trained_on, out = plants_to_train_on(simulator), Path(out)
-    known = list(trained_on.names)
+    available = list(trained_on.names)
     names = check_names(networks, trained_on)
-    if networks is None and len(known) > 1:
+    if networks is None and len(available) > 1:
         names = (*names, ALL)
-    groups = _groups(names, len(known))
+    groups = _groups(names, len(available))
     methods = [
         method_for(name, group.lungs, steps) if method is None else _shortened(method, name, steps)
         for group in groups
     ]
     report = progress or (lambda *_: None)
-    about, checkpoints, used = {}, [], {}
+    networks_report, checkpoints, used = {}, [], {}
     policies: dict[str, Any] = {}
-    each: dict[int, dict[str, Any]] = {seed: {} for seed in seeds}
+    by_seed: dict[int, dict[str, Any]] = {seed: {} for seed in seeds}
     for group, settings in zip(groups, methods, strict=True):
         label, kind = ", ".join(group.names), "all" if ALL in group.names else "one"
         checkpoints.append(out / f".{name}-{kind}.npz")
@@ -374,22 +374,22 @@ def _train(
         pids = _pid_errors(plants)
         used[kind] = asdict(settings)
         for index, network in enumerate(group.names):
-            about[network] = _best_run(trained, index, seeds)
-            about[network]["error_pid"] = pids[index * len(seeds)]
+            networks_report[network] = _best_run(trained, index, seeds)
+            networks_report[network]["error_pid"] = pids[index * len(seeds)]
             for run, seed in enumerate(seeds, index * len(seeds)):
-                each[seed][network] = jax.tree.map(lambda x, run=run: x[run], trained.policies)
-            policies[network] = each[about[network]["seed"]][network]
+                by_seed[seed][network] = jax.tree.map(lambda x, run=run: x[run], trained.policies)
+            policies[network] = by_seed[networks_report[network]["seed"]][network]
     result = {
         "method": name,
         "recipes": used,
-        "networks": about,
+        "networks": networks_report,
         "simulators": dict(trained_on.about),
         "jax": jax.__version__,
         "seconds": round(time.perf_counter() - began, 1),
     }
     residual.save_policies(out / "weights.npz", policies)
     for seed in seeds if len(seeds) > 1 else ():
-        residual.save_policies(out / f"weights-{seed}.npz", each[seed])
+        residual.save_policies(out / f"weights-{seed}.npz", by_seed[seed])
     files.write_json(out / "training.json", result)
     for checkpoint in checkpoints:
         checkpoint.unlink(missing_ok=True)
@@ -398,11 +398,11 @@ def _train(
 
 def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> environment.Lungs:
     """Lungs of each run, an axis of R in front: the seeds of a network in a row."""
-    known = list(trained_on.names)
+    available = list(trained_on.names)
     if ALL in group.names:
-        where = np.repeat([list(range(len(known)))], seeds, axis=0)
+        where = np.repeat([list(range(len(available)))], seeds, axis=0)
     else:
-        where = np.repeat([[known.index(name)] for name in group.names], seeds, axis=0)
+        where = np.repeat([[available.index(name)] for name in group.names], seeds, axis=0)
     plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, where], trained_on.plants)
     # (plants, runs, lungs, ...) -> (runs, plants, lungs, ...)
     plants = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), plants)
@@ -414,7 +414,7 @@ def _pid_errors(lungs: environment.Lungs) -> list[float]:
     with compilation.float32():
         lungs = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), lungs)
         pid = PID(*residual.GAINS)
-        errors = jax.jit(jax.vmap(lambda own: nominal_error(own, pid)))(lungs)
+        errors = jax.jit(jax.vmap(lambda run_lungs: nominal_error(run_lungs, pid)))(lungs)
         return [float(error) for error in errors]
 
 

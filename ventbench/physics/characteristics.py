@@ -85,6 +85,8 @@ def characteristic(
                 return _tapped(shown, own)
 
             def shows(own: Values, pressure: Array, state: Array, length: Array) -> Pair:
+                if shown.begins == "stage":  # of the two of a substep
+                    _, state = shown.reading(own, pressure, 0.0 * pressure, state, 0.5 * length)
                 return shown.reading(own, pressure, 0.0 * pressure, state, length)
 
             label = "reading of the sensor, cmH2O"

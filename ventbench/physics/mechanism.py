@@ -364,9 +364,11 @@ class Mechanism:
     rank: int = 0
     #: True if it has a continuous state, which starts at :meth:`initial_state`.
     stateful: bool = False
-    #: True if its state follows its input however fast that moves, as of play: each stage of the
-    #: integrator then starts it where the substep began, not on the line that stages lie on.
-    rate_independent: bool = False
+    #: Where a stage of the integrator takes its state from: ``"line"``, on which stages lie;
+    #: ``"substep"``, where that began, of what follows its input however fast that moves, as of
+    #: play; ``"stage"``, where the one before ended, of steps that are exact. But for the first, a
+    #: reading is given the time since the substep began.
+    begins: Literal["line", "substep", "stage"] = "line"
     #: True if it keeps a memory from sample to sample, which starts as the resting command.
     has_memory: bool = False
     #: Steps of the integrator in a substep that a fit needs where the mechanism acts. One that

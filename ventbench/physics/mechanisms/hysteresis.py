@@ -67,7 +67,7 @@ class LungHysteresis(Mechanism):
         special_case_of=("recoil_memory",),
     )
     stateful = True
-    rate_independent = True
+    begins = "substep"
     rank = 1  # behind what bends the lung, whose slope this one adds to
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
@@ -115,7 +115,7 @@ class SensorHysteresis(Mechanism):
         special_case_of=("sensor_memory",),
     )
     stateful = True
-    rate_independent = True
+    begins = "substep"
     rank = 2
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:

@@ -215,6 +215,11 @@ class ClockSkew(Mechanism):
         return values["skew"] * time
 
 
+#: Time, s, of a line that has no inertia, and where a damping counts as critical: both limits are
+#: those of the formulas nearby.
+_NO_INERTIA, _CRITICAL = 1e-9, 1e-9
+
+
 class PressureLine(Mechanism):
     """A sampling line that rings: gas that moves as a plug against the sensor's volume."""
 
@@ -249,23 +254,38 @@ class PressureLine(Mechanism):
         special_case_of=("sensor_memory",),
     )
     stateful = True
+    begins = "stage"
     rank = 1
-    divisions = 4
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
-        """Pressure at the sensor, cmH2O, and ``time`` times its rate of change."""
+        """Reading, cmH2O, and ``time`` times its rate of change, where the substep began.
+
+        Beside them pressure, cmH2O, in the first stage of the substep, and its time, s, if it was.
+        """
         at_rest = pressure + 0.0 * flow
-        return jnp.stack([at_rest, 0.0 * at_rest])
+        return jnp.stack([at_rest, 0.0 * at_rest, at_rest, 0.0 * at_rest])
 
     def reading(
         self, values: Values, pressure: Array, flow: Array, state: Array, length: Array
     ) -> Pair:
-        """Implicit step; a line without inertia shows the pressure at once."""
+        """Exact step where the pressure ramps as in both stages; without inertia, it shows that.
+
+        The reading follows the ramp ``2 damping time`` late, and rings around that. Ringing faster
+        than the step needs no smaller one.
+        """
         time, damping = values["time"], values["damping"]
-        whole = time**2 + 2.0 * damping * time * length + length**2
-        after = state[0] + length * (time * state[1] + length * (pressure - state[0])) / whole
-        speed = (time**2 * state[1] + time * length * (pressure - state[0])) / whole
-        return after, jnp.stack([after, speed])
+        second = state[3] > 0.0
+        ramp = jnp.where(second, (pressure - state[2]) / (length - state[3]), 0.0)
+        late = 2.0 * damping * time
+        angle = length / jnp.maximum(time, _NO_INERTIA)
+        speed = jnp.sqrt(jnp.maximum(1.0 - damping**2, _CRITICAL))
+        fades = jnp.exp(-damping * angle)
+        cosine, sine = fades * jnp.cos(speed * angle), fades * jnp.sin(speed * angle) / speed
+        off, rate = state[0] - (pressure - (length + late) * ramp), state[1] - time * ramp
+        after = pressure - late * ramp + (cosine + damping * sine) * off + sine * rate
+        rate = (cosine - damping * sine) * rate - sine * off + time * ramp
+        first = jnp.stack([state[0], state[1], pressure, length + 0.0 * pressure])
+        return after, jnp.where(second, jnp.stack([after, rate, pressure, 0.0 * rate]), first)
 
 
 class TapConstriction(Mechanism):

@@ -258,7 +258,7 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         return before if i < 0 else values[i]
 
     y = np.array([v0, 0.0, 0.0, 0.0, p0, 0.0, p0, 0.0, p0, 0.0, p0, 0.0, 1.0])
-    rig.began = v0
+    rig.began = y[0]
     width, loop, last = rig.get("sensor_hysteresis", "width"), -np.ones(3), p0
     rows = [(start, 0.0, 0.0)]
     for a, b in pairwise(edges):

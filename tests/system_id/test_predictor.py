@@ -110,6 +110,22 @@ def test_of_dead_times_are_those_of_milliseconds(predictor, values, path, first)
     assert np.sqrt(np.mean((slope - moved) ** 2)) < 0.2 * np.sqrt(np.mean(moved**2))
 
 
+def test_are_zero_where_the_point_beside_cannot_be_simulated(predictor, data, values, monkeypatch):
+    def predict_all(points):
+        seen = np.zeros((len(points), *data.measured.shape))
+        seen[1, 2, :, 7:] = np.inf, np.nan, *[-np.inf] * (seen.shape[3] - 9)
+        return seen
+
+    monkeypatch.setattr(predictor, "predict_all", predict_all)
+    assert np.array_equal(predictor.derivatives(values, (0, 1))[1], np.zeros_like(seen_of(data, 2)))
+    monkeypatch.setattr(predictor, "predict_all", lambda points: predict_all(points)[::-1])
+    assert not np.isfinite(predictor.derivatives(values, (0,))[1]).all(), "nor at the point itself"
+
+
+def seen_of(data, count):
+    return np.zeros((len(data), count, *data.measured.shape[1:]))
+
+
 def test_look_within_the_bounds_alone(predictor, data, monkeypatch):
     asked = []
 

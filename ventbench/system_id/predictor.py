@@ -224,6 +224,7 @@ class Predictor:
         Pressures are continuous in all free parameters; a parameter in which they are not, such as
         the bias of a rounding, is tried value by value. An effect that may have either sign can
         have a kink where it is off: there, the derivative is the mean of both one-sided slopes.
+        It is zero where the model can simulate a breath, but not at the point beside it.
         """
         moves = np.stack([self._move(values[:, column], column) for column in columns])
         off = [k for k, column in enumerate(columns) if self._is_off(values[:, column], column)]
@@ -236,6 +237,7 @@ class Predictor:
         seen, ahead, behind = np.split(self.predict_all(points), split)
         changes = ahead - seen
         changes[off] = 0.5 * (ahead[off] - behind)
+        changes[~np.isfinite(changes) & np.isfinite(seen)] = 0.0
         return seen[0], np.moveaxis(changes / moves[:, :, None, None], 0, 1)
 
     def _divisions(self, points: Floats) -> Ints:

@@ -17,6 +17,7 @@ from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, make_evalua
 from ventbench.diagnosis.evidence import COMMANDS, EVENTS, search
 from ventbench.diagnosis.hypothesis import Hypothesis, all_parameter_paths
 from ventbench.diagnosis.identification import IdentifiedModel
+from ventbench.diagnosis.in_time import Paths, ask_for_little
 from ventbench.diagnosis.intermittent import Intermittent, find
 from ventbench.pages.diagnosis import report
 from ventbench.physics import paths
@@ -144,6 +145,28 @@ def test_commands_that_were_lost_are_found_and_followed():
     assert lost.sum() > 10
     assert np.mean(np.abs(told - true)[lost] < 1.0) > 0.9
     assert np.mean(np.abs(told - true)[~lost] < 4.0) > 0.98
+
+
+def test_a_valve_that_sticks_or_has_play_has_lost_no_command():
+    """It does not follow what asks for little; chance does not ask, and small losses are unseen."""
+    rng = np.random.default_rng(4)
+    u_in = rng.uniform(0.0, 25.0, (BREATHS, 40))
+    u_in[:, 1::2] = u_in[:, :-1:2] + rng.normal(0.0, 3.0, u_in[:, 1::2].shape)  # many small moves
+    chance = rng.uniform(size=u_in.shape)
+
+    def reached(stays: Any) -> Paths:
+        valve, way = np.zeros(BREATHS), []
+        for k in range(u_in.shape[1]):
+            valve = np.where(stays(u_in[:, k] - valve, chance[:, k]), valve, u_in[:, k])
+            way.append(valve)
+        kept = np.stack(way, axis=1) != u_in
+        return Paths(np.zeros(BREATHS), np.stack(way, axis=1), kept.sum(axis=1), np.ones(BREATHS))
+
+    assert ask_for_little(reached(lambda away, chance: np.abs(away) < 4.0), u_in) < 1e-9
+    for share in (0.05, 0.3, 0.6):
+        assert ask_for_little(reached(lambda away, chance, s=share: chance < s), u_in) > 0.01
+        seen = reached(lambda away, chance, s=share: (chance < s) & (np.abs(away) > 2.0))
+        assert ask_for_little(seen, u_in) > 0.01
 
 
 def test_the_affected_breaths_stand_in_the_first_sentence_the_json_and_the_page(tmp_path):

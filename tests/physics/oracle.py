@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 def valve_positions(u_in, m):
     """What reaches the valve's orifice, as the command of a linear valve, %."""
-    out, stands, asked = [], 0.0, 0.0
+    out, stands, asked, rests = [], 0.0, 0.0, 0.0
     for u in u_in:
         if "command_rounding" in m:
             u = float(np.floor(u))
@@ -36,6 +36,9 @@ def valve_positions(u_in, m):
                 stands = u + play
             yielding = give * soft + (1 - give) * stands
             u = stands = smooth * slow + (1 - smooth) * yielding
+        if "valve_stiction" in m:
+            band, away = m["valve_stiction"]["band"], u - rests
+            u = rests = rests + away * np.clip(0.5 + (abs(away) - band) / (0.2 * band), 0.0, 1.0)
         if dead["driver"] < 1 and "valve_dead_band" in m:
             u = remainder(u, (1 - dead["driver"]) * dead["width"], dead["crack"])
         if "valve_curve" in m:
@@ -58,8 +61,19 @@ def recoil(volume, C, m):
     return np.log((1 + share * x) / (1 - x)) / (1 + share) / k if k else linear
 
 
+#: Time, s, in which a limited valve follows what it can.
+AT_ONCE = 1e-4
+
+#: Radii of the stops of a hysteresis, cmH2O.
+RADII = np.array([1.0, 3.0, 9.0])
+
+
 class Breath:
-    """Right-hand side; states: volume, valve, supply, stress, airway, flow, sensor, second lag."""
+    """Right-hand side.
+
+    States: volume, valve, supply, stress, airway, flow, sensor, second lags of valve and sensor,
+    limited valve, reading of a line and its slope, share of a plug.
+    """
 
     def __init__(self, R, C, m, R_ex, peep):
         self.R, self.C, self.m, self.R_ex, self.peep = R, C, m, R_ex, peep
@@ -74,6 +88,15 @@ class Breath:
         self.lag, self.second = self.get("valve_lag", "tau"), self.get("valve_lag", "second")
         self.slow, self.filter = self.get("sensor_lag", "tau"), self.get("sensor_lag", "second")
         self.opening, self.opened_at = 0.0, 0.0  # lag of the expiratory valve, and when it opens
+        stroke = self.get("valve_rate", "stroke")
+        self.rate = 2.28 / stroke if stroke else np.inf
+        self.line = self.get("pressure_line", "time")
+        self.damping = m.get("pressure_line", {}).get("damping", 0.3)
+        self.loop = self.get("lung_hysteresis", "height")
+        self.stops, self.began = -np.ones(3), 0.0  # at the start of a stretch
+        self.plug = self.get("airway_opening", "resistance")
+        self.opens = m.get("airway_opening", {}).get("opening", 13.0)
+        self.tap = self.get("tap_constriction", "drop")
         self.ratio, self.relax = self.get("viscoelasticity", "ratio"), 1.0
         if self.ratio:
             self.relax = m["viscoelasticity"]["time"]
@@ -100,8 +123,9 @@ class Breath:
 
     def balance(self, t, y, wanted, opened):
         """Flow of the valve against the airway and against none, into the lung, out; pressures."""
-        volume, valve, supply, stress, airway, flow, _, behind, _ = y
+        volume, valve, supply, stress, airway, flow, _, behind, _, limited, *_ = y
         q = behind if self.second else valve if self.lag else wanted
+        q = limited if np.isfinite(self.rate) else q
         d, linear = self.get("supply_droop", "drop"), self.get("supply_droop", "linear")
         levelling = 1 / (1 + d / (1 - d) * supply / 0.5)
         q = q * ((1 - linear) * levelling + linear * max(1 - d * supply / 0.5, 0.02))
@@ -112,21 +136,24 @@ class Breath:
 
         inside = recoil(volume, self.C, self.m)
         inside += stress - self.muscle(t)
+        if self.loop:
+            inside += self.loop * (1 + np.mean(self.stops_at(volume))) / 2
+        R = self.R + self.plug * y[12]
 
         def into(p):
             if self.mass:
                 return flow
             x = p - inside
             if not self.K2:
-                return x / self.R
+                return x / R
             if self.power == 2:
-                root = np.sqrt(self.R**2 + 4 * self.K2 * abs(x))
-                return np.sign(x) * (root - self.R) / 2 / self.K2
+                root = np.sqrt(R**2 + 4 * self.K2 * abs(x))
+                return np.sign(x) * (root - R) / 2 / self.K2
             size = abs(x)
             return np.sign(x) * brentq(
-                lambda q: self.R * q + self.K2 * q**self.power - size,
+                lambda q: R * q + self.K2 * q**self.power - size,
                 0.0,
-                size / self.R + 1e-9,
+                size / R + 1e-9,
                 xtol=1e-13,
             )
 
@@ -141,12 +168,15 @@ class Breath:
             airway = brentq(
                 lambda p: fed(p) - self.lost(p) - out(p) - into(p), -2000, 3000, xtol=1e-11
             )
-        return fed(airway), q, into(airway), out(airway), airway, inside
+        return fed(airway), q, into(airway), out(airway), airway, inside, R
 
     def slope(self, t, y, wanted, opened):
-        _, valve, supply, stress, _, _, sensor, behind, filtered = y
-        q, drawn, flow, out, p, inside = self.balance(t, y, wanted, opened)
-        drop = self.R * flow + self.K2 * flow * abs(flow) ** (self.power - 1)
+        _, valve, supply, stress, _, _, sensor, behind, filtered, limited, line, speed, *_ = y
+        q, drawn, flow, out, p, inside, R = self.balance(t, y, wanted, opened)
+        asked = behind if self.second else valve if self.lag else wanted
+        seen = p - self.tap * flow**2
+        shown = filtered if self.filter else sensor if self.slow else seen
+        drop = R * flow + self.K2 * flow * abs(flow) ** (self.power - 1)
         return [
             flow,
             (wanted - valve) / self.lag if self.lag else 0.0,
@@ -154,10 +184,27 @@ class Breath:
             self.ratio / (self.C / 1000) * flow - stress / self.relax,
             (q - flow - out - self.lost(p)) / self.tank if self.tank else 0.0,
             (p - inside - drop) / self.mass if self.mass else 0.0,
-            (p - sensor) / self.slow if self.slow else 0.0,
+            (seen - sensor) / self.slow if self.slow else 0.0,
             (valve - behind) / self.second if self.second else 0.0,
             (sensor - filtered) / self.filter if self.filter else 0.0,
+            np.clip((asked - limited) / AT_ONCE, -self.rate, self.rate)
+            if np.isfinite(self.rate)
+            else 0.0,
+            speed if self.line else 0.0,
+            (shown - line) / self.line**2 - 2 * self.damping * speed / self.line
+            if self.line
+            else 0.0,
+            -y[12] * np.clip(0.5 + (p - self.opens) / 0.5, 0.0, 1.0) / 0.03 if self.plug else 0.0,
         ]
+
+    def stops_at(self, volume):
+        """Stops of the lung's hysteresis, in a stretch in which the volume goes one way."""
+        return np.clip(self.stops + (volume - self.began) / (self.C / 1000) / RADII, -1.0, 1.0)
+
+    def reading(self, y, flow, p):
+        """What the sensor shows, but for its hysteresis."""
+        seen = p - self.tap * flow**2
+        return y[10] if self.line else y[8] if self.filter else y[6] if self.slow else seen
 
 
 def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, position=0.0):
@@ -190,6 +237,7 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
     times = np.concatenate([[0.0], np.cumsum(dt[:-1])])
     asked = [gain / 1000 * u for u in valve_positions(u_in, m)]
     late, late_out = rig.get("valve_delay", "delay"), rig.get("exhalation_valve_delay", "opening")
+    late_shut = rig.get("exhalation_valve_closing", "closing")
     rig.opening = late_out * rig.get("exhalation_valve_delay", "slow")
     late_out -= rig.opening
     behind, skew = rig.get("clock_offset", "offset"), rig.get("clock_skew", "skew")
@@ -199,7 +247,7 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         return (t + behind) / (1 - skew)
 
     opens = arrives(times[1:][np.diff(u_out) > 0] + late_out)
-    edges = set(times).union(*(arrives(times + x) for x in (0.0, late, late_out)))
+    edges = set(times).union(*(arrives(times + x) for x in (0.0, late, late_out, late_shut)))
     if "patient_effort" in m:
         e = m["patient_effort"]
         edges |= {e["onset"] + share * e["duration"] for share in (0.0, 2 / 3, 1.0)}
@@ -209,7 +257,9 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         i = int(np.searchsorted(times, t, side="right")) - 1
         return before if i < 0 else values[i]
 
-    y = np.array([v0, 0.0, 0.0, 0.0, p0, 0.0, p0, 0.0, p0])
+    y = np.array([v0, 0.0, 0.0, 0.0, p0, 0.0, p0, 0.0, p0, 0.0, p0, 0.0, 1.0])
+    rig.began = y[0]
+    width, loop, last = rig.get("sensor_hysteresis", "width"), -np.ones(3), p0
     rows = [(start, 0.0, 0.0)]
     for a, b in pairwise(edges):
         if b - a < 1e-12:
@@ -217,15 +267,23 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         middle = (a + b) / 2
         told = middle * (1 - skew) - behind
         wanted = held(asked, 0.0, told - late)
-        opened = held(u_out, 0.0, told - late_out) and held(u_out, 0.0, told)
+        asks = held(u_out, 1.0, told)
+        opened = asks and held(u_out, 0.0, told - late_out)
+        opened = opened or (not asks and late_shut and held(u_out, 1.0, told - late_shut))
         if opened and rig.opening:
             rig.opened_at = max(opens[opens < middle])
+        fine = {"t_eval": np.linspace(a, b, 41)} if width else {}
         found = solve_ivp(
-            rig.slope, (a, b), y, "LSODA", rtol=1e-8, atol=1e-10, args=(wanted, opened)
+            rig.slope, (a, b), y, "LSODA", rtol=1e-8, atol=1e-10, args=(wanted, opened), **fine
         )
         y = found.y[:, -1]
+        rig.stops, rig.began = rig.stops_at(y[0]), y[0]
+        for t, each in zip(found.t, found.y.T, strict=True) if width else ():
+            _, _, flow, _, p, _, _ = rig.balance(t, each, wanted, opened)
+            last, change = rig.reading(each, flow, p), rig.reading(each, flow, p) - last
+            loop = np.clip(loop + change / RADII, -1.0, 1.0)
         if np.any(np.abs(times - b) < 1e-12):
-            _, _, flow, _, p, _ = rig.balance(b, y, wanted, opened)
-            reading = y[8] if rig.filter else y[6] if rig.slow else p
+            _, _, flow, _, p, _, _ = rig.balance(b, y, wanted, opened)
+            reading = rig.reading(y, flow, p) - width * (1 + np.mean(loop)) / 2
             rows.append((shown(reading), 1000 * flow, 1000 * (y[0] - v0)))
     return np.array(rows).T

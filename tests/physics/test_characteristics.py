@@ -38,6 +38,13 @@ def test_they_are_the_formulas() -> None:
     later = lag.x > 0  # ms
     exact = 20.0 - 15.0 * np.exp(-lag.x[later] / 40.0)
     np.testing.assert_allclose(lag.acting[later], exact, atol=0.15)
+    for ms in (0.2, 20.0):  # exact, be the step longer than the period or not
+        line = characteristic("pressure_line", {"time": 1e-3 * ms, "damping": 0.3})
+        assert line is not None
+        later = line.x > 0
+        t, speed = line.x[later] / ms, np.sqrt(1.0 - 0.3**2)
+        rings = np.exp(-0.3 * t) * (np.cos(speed * t) + 0.3 / speed * np.sin(speed * t))
+        np.testing.assert_allclose(line.acting[later], 20.0 - 15.0 * rings, atol=1e-9)
     late = characteristic("valve_delay", {"delay": 0.03})
     assert late is not None
     assert late.x[np.argmax(late.acting > 0)] == pytest.approx(30.0, abs=0.5)

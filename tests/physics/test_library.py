@@ -115,24 +115,27 @@ def test_smooth_play_is_that_of_bouc_and_wen():
 
 
 def test_special_cases_differ_between_the_terms_of_a_component():
-    assert special_cases("sensor_memory") == ("sensor_lag",)
+    assert special_cases("sensor_memory") == (
+        "pressure_line",
+        "sensor_hysteresis",
+        "sensor_lag",
+    )
     assert special_cases("drift_shape") == ("sensor_drift",)
     assert special_cases("sensor_shape") == ("sensor_curve",)
-    assert special_cases("volume_resistance") == ()
+    assert special_cases("volume_resistance") == ("airway_opening",)
     assert special_cases("flow_shape") == ("turbulent_resistance",)
     assert set(special_cases("command_memory")) == {
         "valve_delay",
         "valve_lag",
         "supply_droop",
         "valve_hysteresis",
+        "valve_rate",
     }
 
 
 @pytest.mark.parametrize("name", library())
 def test_neutral_is_off_exactly_and_strong_is_not(name, breaths, predicted):
     shapes = {p.name: p.strong for p in mechanism(name).description.parameters[1:]}
-    if name == "exhalation_valve_delay":
-        shapes = {"closing": 0.0}  # a second delay, an effect of its own
     strength = mechanism(name).description.strength
     # Beside others, of which none may be moved by it.
     others = {
@@ -159,7 +162,7 @@ def test_absent_is_neutral(breaths, predicted):
 
 
 def test_names_are_checked():
-    with pytest.raises(InputError, match="choose of circuit_compliance"):
+    with pytest.raises(InputError, match="choose of airway_opening"):
         mechanism("gremlins")
     with pytest.raises(InputError, match=r"no parameter 'leak\.size'; leak has conductance"):
         parameter("leak.size")

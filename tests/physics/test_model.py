@@ -81,7 +81,10 @@ def test_stable_at_any_parameter_in_range(data):
     gas = values["gain"] * 100 * dt * T / values["C"]
     flow = values["gain"] * 0.1
     # Gas with mass in a stiff circuit rings; softening and the sensor's gain are in range too.
-    assert np.abs(p).max() < 50.0 * (gas + flow * (values["R"] + 80 * flow + 200) + 100.0)
+    most = 50.0 * (gas + flow * (values["R"] + 80 * flow + 200) + 100.0)
+    # What a tap adds as the lung empties through its own resistance.
+    most += abs(values["tap_constriction.drop"]) * (most / values["R"]) ** 2
+    assert np.abs(p).max() < most
 
 
 @pytest.mark.slow
@@ -101,8 +104,13 @@ def test_gradients_are_finite_and_not_zero():
             by = dict(zip(plant.names, slope(plant).values, strict=True))
             assert all(np.isfinite(x) for x in by.values())
             dead = {name for name, x in by.items() if abs(x) < 1e-12}
-            strengths = {f"{m}.{item.description.strength.name}" for m, item in library().items()}
-            assert not dead & (strengths | {"R", "C", "gain", "R_ex", "PEEP"}), level
+            strengths = {
+                f"{m}.{item.description.strength.name}"
+                for m, item in library().items()
+                # One without a slope where it is off must be scanned.
+                if level == "mild" or not item.description.strength.scan
+            }
+            assert dead & (strengths | {"R", "C", "gain", "R_ex", "PEEP"}) == set(), level
 
 
 def test_single_precision_agrees():

@@ -20,6 +20,12 @@ TOLERANCE = {
     "exhalation_valve_delay": (0.04, 0.008),
     # Its slope has a step where it opens.
     "relief_leak": (0.008, 0.003),
+    # It begins to open within a step.
+    "airway_opening": (0.008, 0.003),
+    "sensor_hysteresis": (0.04, 0.008),
+    "pressure_line": (0.01, 0.002),
+    "valve_rate": (0.01, 0.002),
+    "exhalation_valve_closing": (0.04, 0.008),
     "clock_offset": (0.04, 0.008),
     "clock_skew": (0.04, 0.008),
     "inertance": (0.01, 0.002),
@@ -111,6 +117,12 @@ def test_all_together(predicted):
         m |= cases.strengths(name, "mild")
     breaths = cases.recording(2, m)
     assert_close(predicted(breaths, m), breaths.pressure, (0.15, 0.02))
+
+
+def test_a_valve_that_opens_and_closes_late(predicted):
+    m = cases.strengths("exhalation_valve_closing") | cases.strengths("exhalation_valve_delay")
+    breaths = cases.recording(2, m)
+    assert_close(predicted(breaths, m), breaths.pressure, (0.1, 0.03))
 
 
 def test_flow_and_volume():

@@ -37,7 +37,7 @@ ACTING = {
     "supply_droop.drop": 0.1,
 }
 
-LATE = ("valve_delay.delay", "exhalation_valve_delay.opening", "exhalation_valve_delay.closing")
+LATE = ("valve_delay.delay", "exhalation_valve_delay.opening", "exhalation_valve_closing.closing")
 
 #: Dead times, s; what closes late by a millisecond or two changes less than the integrator errs.
 AT = [(path, first) for path in LATE for first in (0.0, 0.041) if (path, first) != (LATE[2], 0.0)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,11 @@ def _wider(value: float, low: float, high: float, share: float) -> tuple[float, 
     return float(value - down), float(value + up)
 
 
+#: Intervals that are kept: whether a strength is definite asks for them, then the report.
+_INTERVALS = 64
+
+
+@lru_cache(maxsize=_INTERVALS)
 def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
     """Interval of a parameter; where it reaches the neutral value, that of the profile likelihood.
 

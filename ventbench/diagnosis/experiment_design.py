@@ -228,7 +228,7 @@ def _best_on_lung(
     if not kinds:
         return None
     data = _data(kinds, problem.data, recorded_rows)
-    predictor = Predictor(data, problem.predictor.names, problem.predictor.substeps)
+    predictor = problem.predictor.of(data)
     expected = [
         forecast(hypothesis, data, predictor, recorded_rows, start, noise) for hypothesis in every
     ]
@@ -277,8 +277,7 @@ def _safe(
         data = _data(kinds, recorded, recorded_rows)
         safe = np.ones(len(data), bool)
         for hypothesis in hypotheses:
-            known = hypothesis.problem.predictor
-            predictor = Predictor(data, known.names, known.substeps)
+            predictor = hypothesis.problem.predictor.of(data)
             pressure = predictor.predict(values_of(hypothesis, data, recorded_rows, start))[:, 0]
             inside = (pressure >= low) & (pressure <= high)  # False where it is not finite
             safe &= inside.all(axis=1)

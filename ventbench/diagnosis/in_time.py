@@ -14,7 +14,10 @@ Commands may be lost, which leaves the valve at the one before, or come late by 
 then act only if none that was sent after them has arrived. At each sample the valve thus either
 follows or keeps what it has, and readings up to the next sample depend on no later command: a
 search from sample to sample that keeps the likeliest paths (a beam) has their exact likelihoods.
-The sum over the paths that are kept is a lower bound of the likelihood with all of them.
+The sum over the paths that are kept is a lower bound of the likelihood with all of them. A command
+is lost whatever it asks for: where those that the valve did not follow ask for less of a move than
+the others, the valve sticks, or has play, and nothing was lost. (They may ask for more, as small
+ones are lost without a trace.)
 """
 
 from __future__ import annotations
@@ -298,7 +301,7 @@ def _commands(
         ways = [follow(problem, x, partition, share, lag) for lag in lags]
         way = max(ways, key=lambda each: float(each.nats.sum()))
         kept, sent = float(way.kept.sum()), float(way.sent.sum())
-        if not kept:
+        if not kept or ask_for_little(way, data.u_in) <= EXCHANGEABLE:
             break
         share = min(kept / sent, 0.5)  # a valve that waits counts at every sample
         names = partition.predictor.names
@@ -308,6 +311,25 @@ def _commands(
         odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2 + np.log(len(lags))
         terms.append(Term(name, [1.0], odds=float(odds), latent=[column]))
     return terms
+
+
+def ask_for_little(way: Paths, u_in: Floats) -> float:
+    """Probability that commands which are lost at random ask for as little of a move (rank sum).
+
+    Args:
+        way: what reached the valve.
+        u_in: commands that were sent, %, ``(n, T)``.
+    """
+    valve = np.pad(way.u_in[:, :-1], ((0, 0), (1, 0)))
+    asked, lost = np.abs(u_in - valve), way.u_in != u_in
+    new = asked > _SAME
+    new[:, -1] = False  # nobody sees what it does
+    asked, lost = asked[new], lost[new]
+    ranks = np.unique(asked, return_inverse=True)[1]
+    ranks = ranks - ranks.mean()
+    n, k = len(lost), int(lost.sum())
+    sd = np.sqrt(k * (n - k) * np.mean(ranks**2) / max(n - 1, 1))
+    return float(special.ndtr(ranks[lost].sum() / max(sd, 1e-12)))
 
 
 def input_responses(partition: Partition, values: Floats, place: str) -> Floats:

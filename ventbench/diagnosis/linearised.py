@@ -119,8 +119,10 @@ def points(name: str) -> list[dict[str, float]]:
     sizes: tuple[float, ...] = (strength.mild, strength.strong)
     if any(p.change_point for p in others):
         sizes = (strength.mild,)
-    elif strength.kinked:
+    elif strength.kinked and strength.unit == "s":  # beyond a sample, it acts in proportion
         sizes = tuple(strength.strong * x for x in (0.15, 0.35, 0.6, 1.0))
+    elif strength.kinked and strength.scan:  # what one threshold does says nothing of another
+        sizes = tuple(x for x in strength.scan if x != strength.neutral)
     elif strength.low <= -strength.mild:
         sizes += (-strength.mild,)
 

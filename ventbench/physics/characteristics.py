@@ -75,13 +75,22 @@ def characteristic(
             return _command(shown, own, largest_command)
         if shown.has("dead_time"):
             return _late(float(jnp.asarray(shown.dead_time(own, jnp.asarray(1.0)))), end)
-        if shown.stateful and shown.description.site == "expiratory valve":
+        opens = shown.stateful and shown.description.site == "expiratory valve"
+        if opens or shown.has("outlet_dead_time"):
             return _late_outlet(shown, own, base, end)
         if shown.has("inflow"):
             return _response(shown, own, shown.inflow, end, 0.0, _FLOW, "flow of the valve, L/s")
         if shown.has("reading"):
+            if not shown.stateful:
+                return _tapped(shown, own)
+
+            def shows(own: Values, pressure: Array, state: Array, length: Array) -> Pair:
+                if shown.begins == "stage":  # of the two of a substep
+                    _, state = shown.reading(own, pressure, 0.0 * pressure, state, 0.5 * length)
+                return shown.reading(own, pressure, 0.0 * pressure, state, length)
+
             label = "reading of the sensor, cmH2O"
-            return _response(shown, own, shown.reading, end, _LOW, _HIGH, label)
+            return _response(shown, own, shows, end, _LOW, _HIGH, label)
         if shown.has("sensor_output"):
             return _sensor(shown, own)
         if shown.has("network"):
@@ -198,6 +207,15 @@ def _in_time(x: Floats, without: Floats, acting: Floats, y_label: str) -> Charac
     if x[-1] > 0.6:
         return Characteristic(x, without, acting, "time since the step, s", y_label)
     return Characteristic(x * 1e3, without, acting, "time since the step, ms", y_label)
+
+
+def _tapped(shown: Mechanism, own: Values) -> Characteristic:
+    """Reading at one pressure over the flow that passes the tap."""
+    flow = jnp.linspace(-_AIRWAY_FLOW, _AIRWAY_FLOW, _STATIC)
+    pressure = jnp.full_like(flow, _HIGH)
+    after, _ = shown.reading(own, pressure, flow, 0.0 * flow, jnp.asarray(1e-3))
+    labels = ("flow into the lung, L/s", f"reading at {_HIGH:.0f} cmH2O")
+    return Characteristic(_floats(flow), _floats(pressure), _floats(after), *labels)
 
 
 def _sensor(shown: Mechanism, own: Values) -> Characteristic:
@@ -335,7 +353,7 @@ def _network(
 def _hold(
     shown: Mechanism, own: Values, base: Mapping[str, float], end: float
 ) -> Characteristic | None:
-    """Recoil of a lung that is inflated by 10 cmH2O in 0.1 s and then held."""
+    """Pressure that a lung takes which is inflated by 10 cmH2O in 0.1 s and then held."""
     length, inflating = end / _STEPS, 0.1
     count = max(1, round(inflating / length))
     flow = np.zeros(_STEPS)
@@ -352,8 +370,10 @@ def _hold(
         )
         after = shown.network(own, network, view)
         linear.append(float(network.recoil + network.elastance * length * now))
-        acting.append(float(after.recoil + after.elastance * length * now))
+        resistance = after.resistance - network.resistance
+        acting.append(float(after.recoil + (after.elastance * length + resistance) * now))
         state = shown.next_state(own, state, jnp.asarray(now), view)
         volume += now * length
     x = np.linspace(0.0, end, _STEPS + 1)
-    return _in_time(x, np.array(linear), np.array(acting), "recoil of the lung, cmH2O")
+    of = "recoil of the lung" if shown.description.site == "alveolus" else "pressure it takes"
+    return _in_time(x, np.array(linear), np.array(acting), f"{of}, cmH2O")

@@ -26,6 +26,10 @@ _LONG = 0.9
 #: Length of the substep before a sample, s.
 LAST_SUBSTEP = 0.001
 
+#: Least distance of edges that get a cut each, as a share of a sample: 3 us change no sample, but
+#: gas with mass loses digits in steps that are much shorter.
+_APART = 1e-4
+
 
 def resolution(dt: float) -> tuple[int, int]:
     """Numbers of substeps and of past samples that samples of ``dt`` seconds need."""
@@ -106,12 +110,16 @@ def substep_lengths(
     room, zero = dt - short, jnp.zeros_like(dt)
     cuts = [room * (k / (count - 1)) for k in range(1, count - 1)]
     free = [jnp.ones_like(dt, bool) for _ in cuts]
+    least_apart, edges = _APART * dt, [zero, room]  # both are ends of substeps in any case
     for delay in dead_times[: count - 2]:
         edge, found = zero, jnp.zeros_like(dt, bool)
         for begin in _begins(past):
             arrives = delay + begin + zero
             inside = (arrives > 0.0) & (arrives < room) & ~found
             edge, found = jnp.where(inside, arrives, edge), found | inside
+        for other in edges:
+            found = found & (jnp.abs(edge - other) > least_apart)
+        edges.append(edge)
         away = [
             jnp.where(is_free, jnp.abs(cut - edge), jnp.inf)
             for cut, is_free in zip(cuts, free, strict=True)

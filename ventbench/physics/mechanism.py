@@ -45,8 +45,8 @@ class Parameter:
     #: values that a search must also try, as it may end in the wrong minimum; of the strength of an
     #: event of some breaths, all that it tries.
     scan: tuple[float, ...] = ()
-    #: True for a dead time: the likelihood is flat between two samples and falls off steeply where
-    #: an edge passes one, so that its interval is a profile's.
+    #: True for a dead time or a threshold: the likelihood is flat between two samples, or commands,
+    #: and falls off steeply where an edge passes one, so that its interval is a profile's.
     kinked: bool = False
     #: standard deviation before any data, in coordinates, around ``neutral``; given for what must
     #: stay there where no data bear on it, be it a strength.
@@ -364,6 +364,11 @@ class Mechanism:
     rank: int = 0
     #: True if it has a continuous state, which starts at :meth:`initial_state`.
     stateful: bool = False
+    #: Where a stage of the integrator takes its state from: ``"line"``, on which stages lie;
+    #: ``"substep"``, where that began, of what follows its input however fast that moves, as of
+    #: play; ``"stage"``, where the one before ended, of steps that are exact. But for the first, a
+    #: reading is given the time since the substep began.
+    begins: Literal["line", "substep", "stage"] = "line"
     #: True if it keeps a memory from sample to sample, which starts as the resting command.
     has_memory: bool = False
     #: Steps of the integrator in a substep that a fit needs where the mechanism acts. One that
@@ -415,8 +420,13 @@ class Mechanism:
         """Own state after a step with this flow into the lung, L/s."""
         return state
 
-    def reading(self, values: Values, pressure: Array, state: Array, length: Array) -> Pair:
-        """Pressure after the sensor's dynamics, cmH2O, and the own state after the step."""
+    def reading(
+        self, values: Values, pressure: Array, flow: Array, state: Array, length: Array
+    ) -> Pair:
+        """Pressure behind a part of the sensor, cmH2O, and the own state after the step.
+
+        ``flow`` goes into the lung, L/s; ``length`` is that of the step, s.
+        """
         return pressure, state
 
     def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:

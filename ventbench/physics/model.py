@@ -284,7 +284,12 @@ def _at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousStat
 
     # A loop, as unrolled it would be most of what is to be compiled.
     volume, _ = jax.lax.scan(closer, volume, None, length=6)
-    return now.replace(volume=volume)  # type: ignore[attr-defined]
+    now = now.replace(volume=volume)  # type: ignore[attr-defined]
+    view = _view(assembly, now, now, zero, zero - 1e3, zero + 1e6, pressure)
+    for name, mechanism in assembly.mechanisms.items():
+        if mechanism.begins == "substep":  # what it remembers is that it has come to rest here
+            internal[name] = mechanism.next_state(assembly.values[name], internal[name], zero, view)
+    return now.replace(internal=internal)  # type: ignore[attr-defined]
 
 
 def _substep(
@@ -339,11 +344,13 @@ def _implicit(
         return jax.tree.map(lambda a, b: a + ahead * (b - a), before, after)
 
     def state(name: str) -> Array:  # hooks call it, so that inactive mechanisms compute nothing
-        return (
-            between(now.internal[name], guess.internal[name])
-            if name in now.internal
-            else 0.0 * now.volume
-        )
+        if name not in now.internal:
+            return 0.0 * now.volume
+        before = now.internal[name]
+        begins = assembly.mechanisms[name].begins
+        if begins == "line":
+            return between(before, guess.internal[name])
+        return before if begins == "substep" else guess.internal[name]
 
     start = between(now.replace(internal={}), guess.replace(internal={}))  # type: ignore[attr-defined]
     internal, flow = dict(guess.internal), commanded_flow
@@ -355,12 +362,13 @@ def _implicit(
     view = _view(assembly, start, guess, opened, time, length, peep)
     network = _network(assembly, start, flow, view, state)
     pressure, flow = network.solve(start.pressure, start.flow, length)
-    reading = pressure
+    reading, view = pressure, view.replace(pressure=pressure)  # type: ignore[attr-defined]
     for name, mechanism in assembly.mechanisms.items():
         if mechanism.has("reading") or mechanism.has("next_state"):
             before = (reading, internal.get(name, reading))
             first = None if mechanism.has("inflow") else partial(state, name)
-            reading, new_state = assembly.change(name, _after, before, first, flow, view)
+            passed = length if mechanism.begins == "line" else (1.0 + ahead) * length
+            reading, new_state = assembly.change(name, _after, before, first, flow, view, passed)
             internal |= {name: new_state} if mechanism.stateful else {}
     return ContinuousState(start.volume + flow * length, flow, pressure, reading, internal)
 
@@ -437,11 +445,12 @@ def _after(
     state: Callable[[], Array] | None,
     flow: Array,
     view: View,
+    passed: Array,
 ) -> Pair:
     reading, new_state = before
     if mechanism.stateful and state is not None:
         new_state = state()
-    reading, new_state = mechanism.reading(own, reading, new_state, view.length)
+    reading, new_state = mechanism.reading(own, reading, flow, new_state, passed)
     view = view.replace(state=new_state)  # type: ignore[attr-defined]
     return reading, mechanism.next_state(
         own, new_state, flow, view

@@ -276,7 +276,7 @@ class Hybrid:
             "valve_lag.tau": self.valve_lag,
             "circuit_compliance.compliance": 1e3 * self.circuit_compliance,
             "sensor_lag.tau": self.sensor_lag,
-            "exhalation_valve_delay.closing": self.closing_delay,
+            "exhalation_valve_closing.closing": self.closing_delay,
             "relief_valve.conductance": RELIEF_CONDUCTANCE * ones,
             "relief_valve.opening": RELIEF * ones,
             **{f"valve_shape.c{k}": valve(u) / gain - u for k, u in enumerate(_VALVE_SHAPE, 1)},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -164,17 +165,33 @@ class Noise:
         Shapes ``(c, 1)`` and twice ``(n, c, T)``.
         """
         channels = weight.shape[1]
-        sigma, ar, slow = (
-            np.asarray(x[:channels], float)[:, None] for x in (self.sigma, self.ar, self.slow)
-        )
-        gain, spread = np.empty_like(weight), np.empty_like(weight)
-        variance = slow[:, 0] + np.zeros(weight.shape[:-1])  # of the discrepancy, as expected
-        for k in range(weight.shape[-1]):
-            spread[..., k] = variance + 1.0 - slow[:, 0]
-            gain[..., k] = weight[..., k] * variance / spread[..., k]
-            left = variance * (1.0 - gain[..., k])
-            variance = slow[:, 0] + ar[:, 0] ** 2 * (left - slow[:, 0])
-        return ar, gain, sigma * np.sqrt(spread)
+        own = (x[:channels] for x in (self.sigma, self.ar, self.slow))
+        return _kalman(*own, weight.shape, weight.astype(float).tobytes())
+
+
+#: Filters that are kept: fits ask for the same one at each of their steps.
+_FILTERS = 32
+
+
+@lru_cache(maxsize=_FILTERS)
+def _kalman(
+    sigma: tuple[float, ...],
+    ar: tuple[float, ...],
+    slow: tuple[float, ...],
+    shape: tuple[int, int, int],
+    weight: bytes,
+) -> tuple[Floats, Floats, Floats]:
+    """What :meth:`Noise._filter` returns, for the weights of a shape."""
+    seen = np.frombuffer(weight).reshape(shape)
+    scale, share, slow_share = (np.asarray(x, float)[:, None] for x in (sigma, ar, slow))
+    gain, spread = np.empty(shape), np.empty(shape)
+    variance = slow_share[:, 0] + np.zeros(shape[:-1])  # of the discrepancy, as expected
+    for k in range(shape[-1]):
+        spread[..., k] = variance + 1.0 - slow_share[:, 0]
+        gain[..., k] = seen[..., k] * variance / spread[..., k]
+        left = variance * (1.0 - gain[..., k])
+        variance = slow_share[:, 0] + share[:, 0] ** 2 * (left - slow_share[:, 0])
+    return share, gain, scale * np.sqrt(spread)
 
 
 def robust_noise(residual: Floats, weight: Floats) -> Noise:

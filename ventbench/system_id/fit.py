@@ -247,9 +247,10 @@ def t_quantile(freedom: float) -> float:
 #: of the last stride it is found.
 _BRACKETING, _REFITS, _RESOLVED = 14, 8, 0.01
 
-#: First stride for a kinked parameter, as a share of its range: at a steep wall of the likelihood
-#: the curvature says nothing.
-_STRIDE = 0.01
+#: First stride, as a share of the way to the end by the covariance, a little more than that, so
+#: that it brackets the end; and for a kinked parameter, as a share of its range: at a steep wall of
+#: the likelihood the curvature says nothing.
+_FIRST, _STRIDE = 1.1, 0.01
 
 #: Points of the grid over a plateau, nats below which the plateau ends, and depth of a dip, in
 #: nats, that the noise of a single sample may cause.
@@ -274,6 +275,8 @@ def profile_interval(fit: Fit, path: str, group: int = 0) -> tuple[float, float]
     sd = float(np.sqrt(fit.covariance[unknown, unknown]))
     if parameter.kinked:
         sd = max(sd, _STRIDE * (parameter.high - parameter.low))
+    else:
+        sd *= _FIRST * t_quantile(fit.freedom)
     ends = [_end(fit, unknown, sd * side, allowed) for side in (-1.0, 1.0)]
     low, high = (float(np.clip(parameter.physical(x), parameter.low, parameter.high)) for x in ends)
     return low, high
@@ -387,8 +390,19 @@ def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
 
 
 def _pinned(fit: Fit, x: Floats, unknown: int, value: float) -> tuple[float, Floats]:
-    """Lowest cost with one unknown held, and its point, searched from ``x``."""
-    low, high = fit.problem.unknowns.bounds()
-    low[unknown] = high[unknown] = value
-    end = minimise(fit.problem.cost, fit.problem.normal, x, low, high, tolerance=0.02, iterations=8)
+    """Lowest cost with one unknown held, and its point, searched from ``x``.
+
+    The others start where the parabola at the minimum has them, unless a wall of the likelihood
+    makes that worse than ``x``.
+    """
+    problem, hessian = fit.problem, fit.minimum.hessian
+    low, high = problem.unknowns.bounds()
+    others = np.arange(len(x)) != unknown
+    ahead, x = np.zeros_like(x), x.copy()
+    ahead[others] = -solve(hessian[np.ix_(others, others)], hessian[others, unknown])
+    there = np.clip(x + ahead * (value - x[unknown]), low, high)
+    x[unknown] = there[unknown] = low[unknown] = high[unknown] = value
+    start = np.stack([x, there])
+    x = start[int(np.argmin(problem.costs(start)))]
+    end = minimise(problem.cost, problem.normal, x, low, high, tolerance=0.02, iterations=8)
     return end.cost, end.x

@@ -161,6 +161,13 @@ class Predictor:
             (column, *stiff) for column, name in enumerate(names) if (stiff := _small_steps(name))
         ]
 
+    def of(self, data: Data) -> Predictor:
+        """The same for other breaths, by the functions that are compiled where they suffice."""
+        other = Predictor(data, self.names, self.substeps, (self._size,))
+        other.memory = max(self.memory, other.memory)
+        other._static["memory"] = other.memory
+        return other
+
     @property
     def with_large_steps(self) -> Predictor:
         """The same with one step of the integrator in each substep, whatever acts."""

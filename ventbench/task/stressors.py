@@ -195,7 +195,7 @@ STRESSORS: tuple[Stressor, ...] = (
         "exhalation_valve_late",
         "circuit",
         "expiratory valve closes late",
-        "exhalation_valve_delay.closing",
+        "exhalation_valve_closing.closing",
         0.05,
         0.10,
         "Solenoid and diaphragm: 0 to 100 ms; 24 to 54 ms are in the scored rigs.",
@@ -450,6 +450,14 @@ NOT_STRESSED: dict[str, str] = {
     "trapped_gas": "For version 2 of the table; runs start at rest.",
     "relief_leak": "For version 2 of the table; `leak` loses as much.",
     "sensor_curve": "For version 2 of the table; `sensor_high` and `sensor_low` have its size.",
+    "valve_rate": "For version 2 of the table; `valve_lag` is as late.",
+    "valve_stiction": "For version 2 of the table; `valve_play` loses as much.",
+    "pressure_line": "For version 2 of the table; `sensor_lag` is as late.",
+    "tap_constriction": "For version 2 of the table; `sensor_high` and `sensor_low` have its size.",
+    "lung_hysteresis": "For version 2 of the table; `viscoelasticity` is alike within a breath.",
+    "sensor_hysteresis": "For version 2 of the table; `sensor_high` has its size.",
+    "airway_opening": "For version 2 of the table; `secretions` are as narrow.",
+    "exhalation_valve_delay": "For version 2 of the table; it acts in expiration alone.",
     "supply_pressure": "For version 2 of the table; `supply_droop` loses flow late as well.",
 }
 

@@ -51,7 +51,9 @@ class SensorLag(Mechanism):
         """Pressure behind each lag, cmH2O."""
         return jnp.stack([pressure + 0.0 * flow] * 2)
 
-    def reading(self, values: Values, pressure: Array, state: Array, length: Array) -> Pair:
+    def reading(
+        self, values: Values, pressure: Array, flow: Array, state: Array, length: Array
+    ) -> Pair:
         """Implicit step towards the pressure; a lag of 0 s is there at once."""
         first = (values["tau"] * state[0] + length * pressure) / (values["tau"] + length)
         # So written, a second lag of 0 s changes no bit.
@@ -211,3 +213,104 @@ class ClockSkew(Mechanism):
     def outlet_dead_time(self, values: Values, u_out: Array, time: Array) -> Array:
         """The delay of a command at a time in the breath, s."""
         return values["skew"] * time
+
+
+#: Time, s, of a line that has no inertia, and where a damping counts as critical: both limits are
+#: those of the formulas nearby.
+_NO_INERTIA, _CRITICAL = 1e-9, 1e-9
+
+
+class PressureLine(Mechanism):
+    """A sampling line that rings: gas that moves as a plug against the sensor's volume."""
+
+    description = Description(
+        name="pressure_line",
+        title="resonance of the sensor's line",
+        site="sensor",
+        equation="time^2 d2y/dt2 + 2 damping time dy/dt + y = p",
+        parameters=(
+            Parameter("time", "s", "period of the ringing / 2 pi", 0.0, 0.06, 0.0, 0.012, 0.03),
+            Parameter(
+                "damping",
+                "1",
+                "share of the critical damping",
+                0.05,
+                1.0,
+                0.3,
+                0.3,
+                0.3,
+                shape=True,
+                grid=(0.15, 0.3, 0.6),
+                uncertain=True,
+            ),
+        ),
+        source="Lines of manometers and catheters are of second order (Gardner, Anesthesiology 54, "
+        "1981, 227): 3 to 30 Hz, damping 0.1 to 0.7.",
+        signature="Readings overshoot and ring after every edge of pressure, in inspiration and "
+        "expiration alike; flow and volume do not.",
+        confusable=("sensor_lag", "inertance"),
+        least=0.004,
+        least_reason="40 Hz: more than a recording of 30 samples a second shows",
+        special_case_of=("sensor_memory",),
+    )
+    stateful = True
+    begins = "stage"
+    rank = 1
+
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
+        """Reading, cmH2O, and ``time`` times its rate of change, where the substep began.
+
+        Beside them pressure, cmH2O, in the first stage of the substep, and its time, s, if it was.
+        """
+        at_rest = pressure + 0.0 * flow
+        return jnp.stack([at_rest, 0.0 * at_rest, at_rest, 0.0 * at_rest])
+
+    def reading(
+        self, values: Values, pressure: Array, flow: Array, state: Array, length: Array
+    ) -> Pair:
+        """Exact step where the pressure ramps as in both stages; without inertia, it shows that.
+
+        The reading follows the ramp ``2 damping time`` late, and rings around that. Ringing faster
+        than the step needs no smaller one.
+        """
+        time, damping = values["time"], values["damping"]
+        second = state[3] > 0.0
+        ramp = jnp.where(second, (pressure - state[2]) / (length - state[3]), 0.0)
+        late = 2.0 * damping * time
+        angle = length / jnp.maximum(time, _NO_INERTIA)
+        speed = jnp.sqrt(jnp.maximum(1.0 - damping**2, _CRITICAL))
+        fades = jnp.exp(-damping * angle)
+        cosine, sine = fades * jnp.cos(speed * angle), fades * jnp.sin(speed * angle) / speed
+        off, rate = state[0] - (pressure - (length + late) * ramp), state[1] - time * ramp
+        after = pressure - late * ramp + (cosine + damping * sine) * off + sine * rate
+        rate = (cosine - damping * sine) * rate - sine * off + time * ramp
+        first = jnp.stack([state[0], state[1], pressure, length + 0.0 * pressure])
+        return after, jnp.where(second, jnp.stack([after, rate, pressure, 0.0 * rate]), first)
+
+
+class TapConstriction(Mechanism):
+    """A pressure tap in a constriction, where gas in motion presses less."""
+
+    description = Description(
+        name="tap_constriction",
+        title="pressure tap in a constriction",
+        site="sensor",
+        equation="y = p - drop Q^2",
+        parameters=(
+            Parameter("drop", "cmH2O s2/L2", "reading lost at 1 L/s", -40.0, 40.0, 0.0, 4.0, 12.0),
+        ),
+        source="Bernoulli: rho v^2 / 2 at a tap of 4 to 12 mm bore is 0.7 to 50 cmH2O at 1 L/s; "
+        "negative where the wall tap faces the stream.",
+        signature="Readings are low by the square of flow, in inspiration and at the start of "
+        "expiration alike, where a resistance errs with opposite signs.",
+        confusable=("turbulent_resistance", "valve_curve"),
+        least=0.5,
+        least_reason="the stream in a bore of 13 mm, which every adapter has",
+    )
+    rank = -1
+
+    def reading(
+        self, values: Values, pressure: Array, flow: Array, state: Array, length: Array
+    ) -> Pair:
+        """Pressure at the tap."""
+        return pressure - values["drop"] * flow**2, state

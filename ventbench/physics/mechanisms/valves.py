@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import (
+    VALVE_GAIN,
     Description,
     Mechanism,
     Network,
@@ -345,15 +346,14 @@ class ValveCurve(Mechanism):
 
 
 class ExhalationValveDelay(Mechanism):
-    """Command of the expiratory valve, shifted in time, and an opening that takes its time.
+    """An expiratory valve that opens late, and takes its time.
 
-    The strength is the mean delay of the opening, of which a share is a first-order lag. The valve
-    closes promptly, but for a dead time of its own.
+    The strength is the mean delay of the opening, of which a share is a first-order lag.
     """
 
     description = Description(
         name="exhalation_valve_delay",
-        title="delay of the expiratory valve",
+        title="late opening of the expiratory valve",
         site="expiratory valve",
         equation="opening slow do/dt = u_out(t - opening (1 - slow)) - o",
         parameters=(
@@ -367,18 +367,6 @@ class ExhalationValveDelay(Mechanism):
                 0.05,
                 0.1,
                 scan=tuple(0.01 * k for k in range(16)),
-                kinked=True,
-            ),
-            Parameter(
-                "closing",
-                "s",
-                "dead time of closing",
-                0.0,
-                0.15,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
                 kinked=True,
             ),
             Parameter(
@@ -396,10 +384,10 @@ class ExhalationValveDelay(Mechanism):
                 share=True,
             ),
         ),
-        source="Solenoid and diaphragm of the expiratory valve: 0 to 100 ms, of opening and "
-        "closing apart. A diaphragm on a vented pilot opens as its pilot empties.",
+        source="Solenoid and diaphragm of the expiratory valve: 0 to 100 ms. A diaphragm on a "
+        "vented pilot opens as its pilot empties.",
         signature="Pressure stays up after the command to open, or falls slowly at first, whatever "
-        "the lung; inspiration is not affected, unless closing is late too.",
+        "the lung; inspiration is not affected.",
         confusable=("inertance", "sensor_lag"),
         least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
@@ -408,9 +396,8 @@ class ExhalationValveDelay(Mechanism):
     stateful = True
 
     def outlet_dead_time(self, values: Values, u_out: Array, time: Array) -> Array:
-        """Delay of the last command, s."""
-        opening = values["opening"] * (1.0 - values["slow"])
-        return u_out * opening + (1.0 - u_out) * values["closing"]
+        """Delay of a command to open, s."""
+        return u_out * values["opening"] * (1.0 - values["slow"])
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """Open."""
@@ -427,3 +414,134 @@ class ExhalationValveDelay(Mechanism):
         before = jnp.clip(state, 0.0, 1.0)  # where it closes, a stage starts beyond
         after = (tau * before + view.length * view.opened) / (tau + view.length)
         return jnp.minimum(after, view.opened)
+
+
+class ExhalationValveClosing(Mechanism):
+    """An expiratory valve that closes late."""
+
+    description = Description(
+        name="exhalation_valve_closing",
+        title="late closing of the expiratory valve",
+        site="expiratory valve",
+        equation="o(t) = u_out(t - closing) while u_out = 0",
+        parameters=(
+            Parameter(
+                "closing",
+                "s",
+                "dead time of closing",
+                0.0,
+                0.15,
+                0.0,
+                0.04,
+                0.08,
+                scan=tuple(0.01 * k for k in range(16)),
+                kinked=True,
+            ),
+        ),
+        source="A diaphragm closes when its pilot has filled, apart from its opening: 0 to 100 ms. "
+        "Public recordings of the PVP ask for 58 ms (57 to 59) beside an opening of 70 to 81 ms.",
+        signature="Gas escapes and pressure stays low during the first samples of inspiration, "
+        "whatever the lung; expiration is not affected.",
+        confusable=("valve_delay", "valve_lag", "circuit_compliance"),
+        least=0.008,
+        least_reason="a quarter of a sample: less is the clock's, not the valve's",
+        special_case_of=("outlet_memory",),
+    )
+
+    def outlet_dead_time(self, values: Values, u_out: Array, time: Array) -> Array:
+        """Delay of a command to close, s."""
+        return (1.0 - u_out) * values["closing"]
+
+
+#: Flow, L/s, that the stroke's time is of.
+_FULL_FLOW = 1e-3 * VALVE_GAIN * 100.0
+
+
+class ValveRate(Mechanism):
+    """A valve whose stroke takes its time, however far it is to go."""
+
+    description = Description(
+        name="valve_rate",
+        title="limited rate of the inspiratory valve",
+        site="inspiratory valve",
+        equation="|dq/dt| <= 2.28 L/s / stroke",
+        parameters=(
+            Parameter(
+                "stroke",
+                "s",
+                "time from shut to fully open",
+                0.0,
+                3.0,
+                0.0,
+                0.3,
+                0.8,
+                scan=(0.1, 0.2, 0.4, 0.8, 1.6),
+            ),
+        ),
+        source="Stepper motors and motor-driven valves: 0.1 to 2 s a stroke.",
+        signature="Large edges of the command arrive as ramps, small ones at once; unlike a lag, "
+        "whose time does not depend on the size of the edge.",
+        confusable=("valve_lag", "valve_delay", "circuit_compliance"),
+        least=0.05,
+        least_reason="less is through with the edges of usual breaths within a sample",
+        special_case_of=("command_memory", "supply_memory"),
+    )
+    stateful = True
+
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
+        """The resting flow, L/s."""
+        return flow + 0.0 * pressure
+
+    def inflow(self, values: Values, flow: Array, state: Array, length: Array) -> Pair:
+        """The flow as far as the valve gets in the step."""
+        reach = length * _FULL_FLOW / jnp.maximum(values["stroke"], 1e-9)
+        after = state + jnp.clip(flow - state, -reach, reach)
+        return after, after
+
+
+class ValveStiction(Mechanism):
+    """A valve that sticks until the command is far enough away, then jumps to it."""
+
+    description = Description(
+        name="valve_stiction",
+        title="stiction of the inspiratory valve",
+        site="inspiratory valve",
+        equation="u_effective = u if |u - u_effective before| > band, else as before",
+        parameters=(
+            Parameter(
+                "band",
+                "%",
+                "distance of the command at which the valve lets go",
+                0.0,
+                15.0,
+                0.0,
+                2.0,
+                5.0,
+                # A command that no longer lets go changes all that come after it: the likelihood
+                # is jagged within tenths of a percent.
+                scan=tuple(0.2 * k for k in range(2, 51)),
+                kinked=True,
+            ),
+        ),
+        source="Stick-slip of sliding seals, one-parameter model of Stenman, Gustafsson and "
+        "Forsman (Int. J. Adapt. Control 17, 2003, 625); control valves in need of repair stick "
+        "over 1 to 10 % of the stroke.",
+        signature="Flow stands still while the command creeps, then jumps: errors of either sign "
+        "that end in a step, in every breath at other samples.",
+        confusable=("valve_hysteresis", "command_rounding"),
+        least=0.5,
+        least_reason="the resolution of drivers",
+        special_case_of=("command_plays",),
+    )
+
+    rank = 1
+    has_memory = True
+
+    def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
+        """Position of the valve, %, twice."""
+        band = values["band"]
+        away = u_in - memory
+        # A short slope instead of a step, by which a fit finds the band.
+        free = jnp.clip(0.5 + (jnp.abs(away) - band) / (_LETS_GO * band + _THIN), 0.0, 1.0)
+        position = memory + free * away
+        return position, position

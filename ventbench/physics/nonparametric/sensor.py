@@ -93,7 +93,9 @@ class SensorMemory(FilterBank):
         """Pressure that the sensor shows in all filters, cmH2O."""
         return self.lasting(pressure + 0.0 * flow)
 
-    def reading(self, values: Values, pressure: Array, state: Array, length: Array) -> Pair:
+    def reading(
+        self, values: Values, pressure: Array, flow: Array, state: Array, length: Array
+    ) -> Pair:
         """Implicit step of all filters."""
         after = self.step(state, pressure, length)
         return pressure + self.weighed(values, after - pressure), after

@@ -13,7 +13,7 @@ often the self-test is wrong (``hardware_selftests.py`` has the other faults).
 
     python benchmarks/hardware_guards.py [--lungs 4] [--entry pid_best ...] [--guard lateness ...]
 
-Prints the four tables of ``hardware_eval/README.md``, and what the population's rigs do, on which
+Prints the tables of ``hardware_eval/README.md``, and what the population's rigs do, on which
 the bounds of the fallback rest.
 """
 

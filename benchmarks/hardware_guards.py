@@ -1,33 +1,40 @@
-"""How often the fallback and the host's checks are wrong, on three families of right lungs.
+"""How often the guards of a bench are wrong: fallback, checks of the host, lateness, self-test.
 
-The frozen rigs, rigs of the population, and lungs of an independent generator breathe side by side,
-in virtual time. First every bundled entry runs on each at each PIP without a fallback: a run is
-harmless if it passes the safety gate and never reaches the device's limit. Then it runs with one.
-What the fallback takes of a harmless run, and a check that trips in one, is a false alarm. Entries
-that run away, of which most runs fail the gate, say what the fallback misses: runs that fail the
-gate although it may take over. What reaches the limit is vented by the device and counted apart.
+Right lungs of three families breathe side by side, in virtual time: the frozen rigs, rigs of the
+population, and lungs of an independent generator. First every bundled entry runs on each at each
+PIP without a fallback: a run is harmless if it passes the safety gate and never reaches the
+device's limit. Then it runs with one. What the fallback takes of a harmless run, and a check that
+trips in one, is a false alarm.
 
-    python benchmarks/hardware_guards.py [--rigs 4] [--entry pid_best ...]
+Where the paper's PI does no harm, controllers that run away say what the fallback misses: runs that
+fail the gate, or that the device vents at its limit, although it may take over. Hosts and entries
+that are late by chance say how often a session blames the wrong one. Right and wrong lungs say how
+often the self-test is wrong (``hardware_selftests.py`` has the other faults).
 
-Prints both tables, and what the population's rigs do, on which the
-bounds of the fallback rest.
+    python benchmarks/hardware_guards.py [--lungs 4] [--entry pid_best ...] [--guard lateness ...]
+
+Prints the tables of ``hardware_eval/README.md``, and what the population's rigs do, on which
+the bounds of the fallback rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import Enum
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 import typer
-from hardware_selftests import QUANTUM, Generated, Lungs, Plants, generated, interval
+from hardware_selftests import QUANTUM, Generated, Lungs, Plants, generated, interval, of_label
 
 from hardware_eval.bench import fallback, safety
-from hardware_eval.bench.controllers import PIDController
+from hardware_eval.bench.controllers import Count, Lateness, PIDController
 from hardware_eval.bench.loop import LATE_SHARE
 from hardware_eval.bench.plan import CONTROL_GAINS
+from hardware_eval.bench.session import MAX_HELD_UP
 from hardware_eval.emulation.cases import Base
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.entries.cells import InProcessRunner
@@ -43,6 +50,30 @@ SEED = b"guards of a bench, right lungs 1"
 
 #: Noise of the sensor, cmH2O.
 NOISE = 0.1
+
+
+class Guard(Enum):
+    """What is measured; the host's checks with the fallback."""
+
+    FALLBACK = "fallback"
+    LATENESS = "lateness"
+    SELFTEST = "selftest"
+
+
+#: Answers of a run.
+ASKED = protocol.BREATHS * protocol.INSPIRATION_STEPS
+
+#: Shares of late answers of entry and host, and whether the entry is to blame.
+LATE = (
+    (0.002, 0.002, False),
+    (0.01, 0.01, False),
+    (0.03, 0.03, False),
+    (0.2, 0.2, False),
+    (0.02, 0.0, True),
+    (0.05, 0.0, True),
+    (0.2, 0.01, True),
+    (1.0, 0.2, True),
+)
 
 #: Commands of the bias flow before an inspiration, %.
 BIAS = float(waveform.expiratory_command(protocol.BREATH_STEPS - 1))
@@ -105,14 +136,15 @@ def breathe(lungs: Lungs, labels: Ints, pips: Floats, act: Act, guarded: bool) -
 
 
 class Runaways:
-    """PIDs that go wrong at a random moment: the valve is open, opens on, or the gain tenfold."""
+    """PIs that go wrong at a random moment: the valve is open, opens on, or the gain tenfold.
 
-    def __init__(self, labels: Ints) -> None:
+    Sound ones never do.
+    """
+
+    def __init__(self, labels: Ints, *, sound: bool = False) -> None:
         random = np.random.default_rng(list(SEED))
         self._pids = [PIDController((*CONTROL_GAINS[LUNGS[k].id], 0.0)) for k in labels]
-        self._moment = random.integers(
-            0, protocol.BREATHS * protocol.INSPIRATION_STEPS, len(labels)
-        )
+        self._moment = random.integers(0, ASKED, len(labels)) + ASKED * sound
         self._kind, self._step = random.integers(0, 3, len(labels)), -1
 
     def __call__(self, rows: Floats) -> Floats:
@@ -185,45 +217,79 @@ def responses(lungs: Lungs, n: int) -> Floats:
 
 
 def percent(count: int, of: int) -> str:
-    """A share with its interval of 95 %."""
+    """A share with its interval of 95 %, if there is one."""
+    if not of:
+        return "-"
     low, high = (100.0 * x for x in interval(count, of))
     return f"{100.0 * count / of:.2f} ({low:.2f} to {high:.2f})"
 
 
-def main(rigs: int = 4, entry: list[str] | None = None) -> None:
-    """How often the fallback and the host's checks are wrong, on three families of right lungs.
+def false_alarms(
+    family: str, name: str, labels: Ints, pips: Floats, make: Callable[[], Lungs]
+) -> str:
+    """Row of an entry on lungs of a family."""
+    free = breathe(make(), labels, pips, controllers(name, labels), False)
+    held = breathe(make(), labels, pips, controllers(name, labels), True)
+    harmless = ~(free.unsafe | free.vented)
+    count = int(harmless.sum())
+    failed = int((harmless & (held.outside > LATE_SHARE * ASKED)).sum())
+    taken, tripped = (int(x[harmless].sum()) for x in (held.taken, free.tripped))
+    return (
+        f"| {family} | {name} | {count} of {len(labels)} | {percent(taken, count * ASKED)} | "
+        f"{percent(failed, count)} | {tripped} |"
+    )
 
-    --rigs: of each lung and family.
-    --entry: bundled; repeatable; all if not.
-    """
-    names = entry or bundled()
-    asked = protocol.BREATHS * protocol.INSPIRATION_STEPS
+
+def misses(family: str, labels: Ints, pips: Floats, make: Callable[[], Lungs]) -> str:
+    """Row of runaways on lungs of a family."""
+    sound = breathe(make(), labels, pips, Runaways(labels, sound=True), False)
+    free = breathe(make(), labels, pips, Runaways(labels), False)
+    held = breathe(make(), labels, pips, Runaways(labels), True)
+    harmful = ~(sound.unsafe | sound.vented) & (free.unsafe | free.vented)
+    vented = int((harmful & held.vented).sum())
+    missed = int((harmful & held.unsafe & ~held.vented).sum())
+    count = int(harmful.sum())
+    return f"| {family} | {count} of {len(labels)} | {vented} | {percent(missed, count)} |"
+
+
+def is_blamed(entry: float, host: float, random: np.random.Generator, runs: int = 60) -> bool:
+    """Whether a session of one lung fails an entry; both are late in such shares of answers."""
+    lateness = Lateness()
+    for _ in range(runs):
+        for _ in range(MAX_HELD_UP):
+            own, empty = (Count(int(random.binomial(ASKED, p)), ASKED) for p in (entry, host))
+            of_host = lateness.is_of_host("entry", own, empty)
+            if own.late <= LATE_SHARE * ASKED:
+                break
+            if not of_host:
+                return True
+        else:
+            return False  # the session gives up, and says that the host is too busy
+    return False
+
+
+def refused(family: str, kind: str, lungs: int) -> tuple[int, int]:
+    """Lungs of a kind that the self-test refuses, and how many there were."""
+    sheets = [x for lung in LUNGS for x in of_label(lung.id, kind, family, lungs, False, 0)]
+    return sum(bool(x["bad"]) for x in sheets), len(sheets)
+
+
+def of_fallback(lungs: int, entry: list[str] | None) -> None:
+    """Print false alarms of the fallback and of the host's checks, and what the fallback misses."""
+    mounted = []
+    for family, (rig_labels, make) in families(lungs).items():
+        rig, place = (x.ravel() for x in np.indices((len(rig_labels), len(protocol.PIPS))))
+        pips = np.array(protocol.PIPS)[place]
+        mounted.append((family, rig_labels[rig], pips, partial(make, rig)))
     print("| lungs | entry | harmless runs | steps taken, % | runs failed, % | checks tripped |")
     print("|---|---|---|---|---|---|")
-    missed = []
-    for family, (rig_labels, make) in families(rigs).items():
-        rig, place = (x.ravel() for x in np.indices((len(rig_labels), len(protocol.PIPS))))
-        labels, pips = rig_labels[rig], np.array(protocol.PIPS)[place]
-        for name in names:
-            free = breathe(make(rig), labels, pips, controllers(name, labels), False)
-            harmless = ~(free.unsafe | free.vented)
-            held = breathe(make(rig), labels, pips, controllers(name, labels), True)
-            count = int(harmless.sum())
-            failed = harmless & (held.outside > LATE_SHARE * asked)
-            print(
-                f"| {family} | {name} | {count} of {len(rig)} | "
-                f"{percent(int(held.taken[harmless].sum()), count * asked)} | "
-                f"{percent(int(failed.sum()), count)} | {int(free.tripped[harmless].sum())} |",
-                flush=True,
-            )
-        free = breathe(make(rig), labels, pips, Runaways(labels), False)
-        held = breathe(make(rig), labels, pips, Runaways(labels), True)
-        missed.append(
-            f"| {family} | {len(rig)} | {free.unsafe.sum()} | {free.vented.sum()} | "
-            f"{percent(int(held.unsafe.sum()), int(free.unsafe.sum()))} | {held.vented.sum()} |"
-        )
-    print("\n| lungs | runaways | unsafe alone | vented alone | missed, % | vented by the device |")
-    print("|---|---|---|---|---|---|", *missed, sep="\n")
+    for family, labels, pips, make_all in mounted:
+        for name in entry or bundled():
+            print(false_alarms(family, name, labels, pips, make_all), flush=True)
+    print("\n| lungs | runaways that do harm | vented by the device | missed, % |")
+    print("|---|---|---|---|")
+    for each in mounted:
+        print(misses(*each), flush=True)
     labels, make = families(64)["population"]
     resistive = np.flatnonzero([LUNGS[k].R >= 20.0 for k in labels])  # others show little of it
     shares = responses(make(resistive), len(resistive))
@@ -231,6 +297,50 @@ def main(rigs: int = 4, entry: list[str] | None = None) -> None:
     for step, own in enumerate(shares, 1):
         low, middle, high = np.quantile(own, (0.01, 0.5, 0.99))
         print(f"  {step}: {middle:.2f} ({low:.2f} to {high:.2f}: 98 % of them)")
+
+
+def of_lateness(sessions: int) -> None:
+    """Print how often sessions of 60 runs blame the wrong one for late answers."""
+    print("| entry late, % | host late, % | to blame | sessions that blame wrongly, % |")
+    print("|---|---|---|---|")
+    random = np.random.default_rng(list(SEED))
+    for own, host, guilty in LATE:
+        wrong = sum(is_blamed(own, host, random) is not guilty for _ in range(sessions))
+        who = "entry" if guilty else "host"
+        print(f"| {100 * own:g} | {100 * host:g} | {who} | {percent(wrong, sessions)} |")
+
+
+def of_selftest(lungs: int) -> None:
+    """Print right lungs that the self-test refuses, and wrong ones that it does not."""
+    print("| lungs | right lungs refused, % | wrong lungs missed, % |\n|---|---|---|")
+    for family in ("frozen", "population", "generator"):
+        right, of = refused(family, "right", lungs)
+        wrong, others = refused(family, "another lung", lungs)
+        print(
+            f"| {family} | {percent(right, of)} | {percent(others - wrong, others)} |", flush=True
+        )
+
+
+def main(
+    lungs: int = 4,
+    entry: list[str] | None = None,
+    guard: list[Guard] | None = None,
+    sessions: int = 1000,
+) -> None:
+    """How often the guards of a bench are wrong: fallback, host's checks, lateness, self-test.
+
+    --lungs: of each label and family.
+    --entry: bundled; repeatable; all if not.
+    --guard: repeatable; all if not.
+    --sessions: with answers that are late.
+    """
+    guards = guard or list(Guard)
+    if Guard.FALLBACK in guards:
+        of_fallback(lungs, entry)
+    if Guard.LATENESS in guards:
+        of_lateness(sessions)
+    if Guard.SELFTEST in guards:
+        of_selftest(lungs)
 
 
 if __name__ == "__main__":

@@ -126,6 +126,18 @@ def test_the_bytes_of_a_command_are_those_of_the_specification() -> None:
     assert encode(Packet(0x01020304, 7, Command(12.34, 1, 99))) == b"\0" + coded + b"\0"
 
 
+def test_the_bytes_of_a_devices_answers_are_those_of_the_specification() -> None:
+    head = struct.pack("<II", 5, 6)
+    welcome = Welcome(1, (1, 2, 3), Capability.FLOW, 0.08, 60.0, b"12345678", bytes(32), "x")
+    body = struct.pack("<BBBBHHH8s32sB", 1, 1, 2, 3, 2, 80, 6000, b"12345678", bytes(32), 1) + b"x"
+    assert decode(b"\x81" + head + body) == Packet(5, 6, welcome)
+    reading = Reading(6, 1.5, -0.25, 30.0, 12.34, 1, Mode.VENTED, Flag.SENSOR_NOISY)
+    body = struct.pack("<QhhHBBH", 1_500_000, -25, 30, 1234, 1, 3, 256)
+    assert decode(b"\x82" + head + body) == Packet(5, 6, reading)
+    refusal = Refusal(6, Reason.STALE, Mode.RUNNING, Flag.SATURATED)
+    assert decode(b"\x83" + head + struct.pack("<BBH", 5, 2, 64)) == Packet(5, 6, refusal)
+
+
 def test_the_specification_names_every_number() -> None:
     text = (Path(messages.__file__).parents[1] / "PROTOCOL.md").read_text("utf-8")
     for kind in Kind:

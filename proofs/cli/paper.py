@@ -42,6 +42,10 @@ Store = Annotated[
 def paper(
     recordings: RecordingsDir = None,
     workers: Workers = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write a page with the figures as pictures."),
+    ] = None,
     store: Store = None,
     json: JsonFile = None,
 ) -> None:
@@ -51,9 +55,13 @@ def paper(
     read from stored results. With --recordings the errors by horizon are measured again; `study
     --store` renews the others.
 
-    Example: `python -m proofs paper --json paper.json`
+    Example: `python -m proofs paper --out paper.html --json paper.json`
     """
+    from proofs.paper.page import page
     from proofs.paper.paper import reproduce_paper
+
+    if out is not None:
+        require("matplotlib")
 
     with bar("paper") as progress:
         result, stored = reproduce_paper(
@@ -61,6 +69,8 @@ def paper(
             workers=workers,
             progress=lambda what, share: progress(share, text=what),
         )
+    if out is not None:
+        files.write_text(out, page(result))
     emit(result.to_json(), json)
     typer.echo(result.to_markdown(), err=str(json) == "-")
     _keep(store, **stored)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from proofs.paper import published
-from proofs.paper.report import Cell, Section, Table, Verdict, below, every
+from proofs.paper.report import Cell, Chart, Section, Table, Verdict, bars, below, every
 from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
@@ -68,6 +68,11 @@ def best_gains(grid: pid_search.PIDGrid) -> Section:
         )
     top = sum(value < NEAR / 100.0 for value in excess)
     low, high = _interval(100.0 * np.array(excess))
+    errors = {"the paper's best P, I": 2, "best P, I here": 4, "best P, I, D here": 6}
+    series = {
+        name: (list(grid.lungs), [x if isinstance(x := row[k], float) else None for row in rows])
+        for name, k in errors.items()
+    }
     return Section(
         "pid",
         "Best PIDs",
@@ -96,6 +101,7 @@ def best_gains(grid: pid_search.PIDGrid) -> Section:
                 tuple(rows),
             ),
         ),
+        (Chart("Gains on the simulators", "lung", "mean error, cmH2O", series),),
     )
 
 
@@ -177,6 +183,9 @@ def example(official: frozen.Frozen, grid: pid_search.PIDGrid, residual: Floats)
                 float(metric.swings(breath, EXAMPLE_PIP)),
             )
         )
+    after = [round(k * protocol.DT, 3) for k in range(protocol.INSPIRATION_STEPS)]
+    curves = {name: (after, breath.tolist()) for name, breath in breaths.items()}
+    curves["target"] = (after, [EXAMPLE_PIP] * len(after))
     ours, others = rows[-1], rows[:-1]
     faster = all(not ours[3] > row[3] for row in others if np.isfinite(row[3]))
     nearer = all(ours[2] < row[2] for row in others)
@@ -201,6 +210,7 @@ def example(official: frozen.Frozen, grid: pid_search.PIDGrid, residual: Floats)
                 2,
             ),
         ),
+        (Chart("Third breath", "time in the breath, s", "airway pressure, cmH2O", curves),),
     )
 
 
@@ -255,6 +265,7 @@ def performance(
         "computed: submissions/residual_mlp and the grid, nominal runs, on simulators; rigs of a "
         "round: its records",
         tables,
+        tuple(bars(table, "mean error, cmH2O", heads[:2]) for table in tables),
     )
 
 
@@ -274,6 +285,12 @@ def robustness(grid: pid_search.PIDGrid, own: Floats, residual: Floats) -> Secti
     wins = sum(row[2] < row[1] for row in rows)
     changes = _changes(pid, residual)
     ends, more = _interval(changes), _interval(changes - _changes(each, own))
+    table = Table(
+        "Mean |pressure - PIP|, cmH2O; neither is told the lung",
+        ("lung", "best single PID", "one network", "change, %"),
+        rows,
+        2,
+    )
     return Section(
         "robustness",
         "One controller for all lungs",
@@ -288,14 +305,8 @@ def robustness(grid: pid_search.PIDGrid, own: Floats, residual: Floats) -> Secti
         f"also has {residual.mean():.3f} cmH2O where the best PIDs of each lung have "
         f"{each.mean():.3f}.",
         "computed: submissions/residual_mlp_all and the grid, nominal runs",
-        (
-            Table(
-                "Mean |pressure - PIP|, cmH2O; neither is told the lung",
-                ("lung", "best single PID", "one network", "change, %"),
-                rows,
-                2,
-            ),
-        ),
+        (table,),
+        (bars(table, "mean error, cmH2O", table.columns[1:3]),),
     )
 
 
@@ -341,6 +352,7 @@ def reinforcement(errors: Mapping[str, Floats]) -> Section:
     rows.append(("mean", *(float(errors[name].mean()) for name in names)))
     ours, ppo, dqn = (float(x) for x in rows[-1][1:])
     ends = [_interval(_changes(errors[name], errors["residual"])) for name in names[1:]]
+    table = Table("Mean |pressure - PIP|, cmH2O", ("lung", *names), tuple(rows))
     return Section(
         "reinforcement",
         "Against PPO and DQN",
@@ -356,7 +368,8 @@ def reinforcement(errors: Mapping[str, Floats]) -> Section:
         "handful of trials "
         f"each (the paper: {published.TRIALS['PPO']} and {published.TRIALS['DQN']}).",
         "computed: submissions residual_mlp, ppo, dqn, performance track, nominal runs",
-        (Table("Mean |pressure - PIP|, cmH2O", ("lung", *names), tuple(rows)),),
+        (table,),
+        (bars(table, "mean error, cmH2O", names),),
     )
 
 
@@ -393,6 +406,22 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
     low, high = (100.0 * (short[end] / best - 1.0) for end in ("low95", "high95"))
     late = [methods[name]["episodes_to_2_percent"] for name in ("ppo", "dqn")]
     slow: Verdict = "agrees" if all(n is None or n >= MANY for n in late) else "differs"
+    table = Table(
+        f"{samples['lung']}: score without noise, cmH2O (interquartile mean, 95 %), and breaths",
+        (
+            "method",
+            "final",
+            "from",
+            "to",
+            "breaths",
+            "score at 100 breaths",
+            "breaths to the best PID",
+            "breaths to within 2 %",
+            "seconds, two cores",
+            "compiling, s",
+        ),
+        rows,
+    )
     return Section(
         "samples",
         "Breaths of experience",
@@ -405,25 +434,8 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
         "inspiration; in the paper a pass over all PIPs.",
         f"`{samples['about']['command']}`, stored, simulators version "
         f"{samples['about']['simulators']}; {samples['seeds']} seeds",
-        (
-            Table(
-                f"{samples['lung']}: score without noise, cmH2O (interquartile mean, 95 %), and "
-                "breaths",
-                (
-                    "method",
-                    "final",
-                    "from",
-                    "to",
-                    "breaths",
-                    "score at 100 breaths",
-                    "breaths to the best PID",
-                    "breaths to within 2 %",
-                    "seconds, two cores",
-                    "compiling, s",
-                ),
-                rows,
-            ),
-        ),
+        (table,),
+        (bars(table, "score, cmH2O", ("score at 100 breaths", "final")),),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -39,14 +39,36 @@ class Table:
 
     def to_markdown(self) -> str:
         """The table as it is shown."""
-        rows = [[self._text(cell) for cell in row] for row in self.rows]
+        rows = [[self.text(cell) for cell in row] for row in self.rows]
         texts = [self.columns, ["---"] * len(self.columns), *rows]
         return "\n".join(f"| {' | '.join(row)} |" for row in texts)
 
-    def _text(self, cell: Cell) -> str:
+    def text(self, cell: Cell) -> str:
+        """A cell as it is shown."""
         if cell is None:
             return "-"
         return cell if isinstance(cell, str) else f"{cell:.{self.digits}f}"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure of the paper as it comes out here."""
+
+    caption: str  #: what it shows.
+    x: str  #: label of the abscissa, with its unit; of bars, what has a group.
+    y: str  #: label of the ordinate, with its unit.
+    #: abscissae, or names of the groups of bars, and ordinates by name; None where there is none.
+    series: Mapping[str, tuple[Sequence[float | str], Sequence[float | None]]]
+
+
+def bars(table: Table, y: str, columns: Sequence[str]) -> Chart:
+    """A chart of columns of a table, a group of bars a row."""
+    groups = [str(row[0]) for row in table.rows]
+    series = {}
+    for name in columns:
+        cells = [row[table.columns.index(name)] for row in table.rows]
+        series[name] = (groups, [None if isinstance(cell, str) else cell for cell in cells])
+    return Chart(table.caption, table.columns[0], y, series)
 
 
 @dataclass(frozen=True)
@@ -61,6 +83,7 @@ class Section:
     finding: str  #: what came out here, in a sentence or two.
     source: str  #: how the figures here were made.
     tables: tuple[Table, ...] = ()  #: tables.
+    charts: tuple[Chart, ...] = ()  #: the paper's figures.
 
 
 @dataclass(frozen=True)

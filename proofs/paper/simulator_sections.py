@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proofs.paper import published
-from proofs.paper.report import Cell, Section, Table, Verdict, below, every
+from proofs.paper.report import Cell, Chart, Section, Table, Verdict, bars, below, every
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.plants import frozen
@@ -124,6 +124,9 @@ def simulators(official: frozen.Frozen, horizon: Mapping[str, Any]) -> Section:
         "R-C lung",
         "two balloons",
     )
+    table = Table(
+        "Open-loop mean absolute error on held-out breaths, cmH2O", columns, tuple(rows), 2
+    )
     return Section(
         "simulators",
         "Errors of the simulators",
@@ -132,11 +135,8 @@ def simulators(official: frozen.Frozen, horizon: Mapping[str, Any]) -> Section:
         "in part" if network < physics else "differs",
         finding,
         "held-out errors of the official simulators; the others from recordings, stored",
-        (
-            Table(
-                "Open-loop mean absolute error on held-out breaths, cmH2O", columns, tuple(rows), 2
-            ),
-        ),
+        (table,),
+        (bars(table, "error, cmH2O", (columns[1], columns[2], *columns[6:])),),
     )
 
 
@@ -148,6 +148,10 @@ def by_horizon(horizon: Mapping[str, Any]) -> Section:
         curve = about["hybrid"]["by_step"]
         at = [curve[k - 1] if k <= len(curve) else None for k in HORIZONS]
         rows.append((name, about["hybrid"]["distance"], *at))
+    steps = {
+        name: (list(range(1, len(about["hybrid"]["by_step"]) + 1)), about["hybrid"]["by_step"])
+        for name, about in lungs.items()
+    }
     growth = {
         name: about["hybrid"]["by_step"][HORIZONS[-1] - 1] / np.mean(about["hybrid"]["by_step"])
         for name, about in lungs.items()
@@ -171,6 +175,7 @@ def by_horizon(horizon: Mapping[str, Any]) -> Section:
                 2,
             ),
         ),
+        (Chart("Hybrid, held-out breaths", "steps without feedback", "error, cmH2O", steps),),
     )
 
 
@@ -198,6 +203,19 @@ def architectures(networks: Mapping[str, Any]) -> Section:
             row = ours.get(value)
             figures = [row[key] if row else None for key in ("R5C10", "mean", "low95", "high95")]
             rows.append((f"{setting} {value}", values.get(value), *figures))
+    table = Table(
+        "Open-loop error on held-out breaths, cmH2O",
+        (
+            "setting",
+            "paper, R5C10",
+            "here, R5C10",
+            "mean of six lungs",
+            "change of it, 95 % from",
+            "to",
+        ),
+        tuple(rows),
+        2,
+    )
     return Section(
         "architectures",
         "Shapes of the networks",
@@ -209,21 +227,8 @@ def architectures(networks: Mapping[str, Any]) -> Section:
         f"one: {', '.join(clear) or 'none'}.",
         f"`{networks['about']['command']}`, stored; one setting changed at a time from "
         + ", ".join(f"{name} {value}" for name, value in base.items()),
-        (
-            Table(
-                "Open-loop error on held-out breaths, cmH2O",
-                (
-                    "setting",
-                    "paper, R5C10",
-                    "here, R5C10",
-                    "mean of six lungs",
-                    "change of it, 95 % from",
-                    "to",
-                ),
-                tuple(rows),
-                2,
-            ),
-        ),
+        (table,),
+        (bars(table, "error, cmH2O", table.columns[1:4]),),
     )
 
 
@@ -289,4 +294,17 @@ def exploration(official: frozen.Frozen) -> Section:
         f"95 %); the highest pressure is {peak:.1f} cmH2O.",
         f"computed: {BREATHS} breaths of {SHOWN}, with the paper's ranges of that lung",
         (Table(f"Exploration of {SHOWN}", ("quantity", "value"), rows),),
+        (
+            Chart("Commands", "time, s", "inspiratory valve, %", _some(breaths.time, u_in)),
+            Chart("Their pressures", "time, s", "pressure, cmH2O", _some(breaths.time, pressure)),
+        ),
     )
+
+
+def _some(time: Floats, values: Floats) -> dict[str, tuple[list[float], list[float | None]]]:
+    """Curves of the first breaths; None outside of inspirations."""
+    curves = {}
+    for k in range(8):
+        shown = np.isfinite(values[k])
+        curves[f"breath {k + 1}"] = (time[k][shown].tolist(), values[k][shown].tolist())
+    return curves

@@ -367,6 +367,11 @@ def test_what_vetoes_nothing_is_told_first():
         "the others: Nothing is missing"
     )
     assert report_text.headline(saturated).startswith("Readings saturate at 31.0 cmH2O. Nothing")
+    spoiled = dataclasses.replace(saturated, left_out="3 % of the readings of flow are none")
+    assert report_text.verdict(spoiled).startswith(
+        "3 % of the readings of flow are none; by the others: The pressure sensor saturates"
+    )
+    assert report_text.headline(spoiled).startswith("3 % of the readings of flow are none. Read")
     place = ErrorRegion("volume", 0.0, 50.0, "mL", 0.8, 0.03, 0.9)
     weak = dataclasses.replace(made.nothing(12), remaining=(place,))
     assert report_text.verdict(weak) == (

@@ -74,6 +74,22 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
 
 
+def without_json() -> Iterator[str]:
+    """Yield the commands of all programs that take no ``--json``."""
+    from hardware_eval.cli import app as hardware
+
+    waiting: list[tuple[str, Any]] = [
+        (name, typer.main.get_command(program))
+        for name, program in (PROGRAMS | {"ventbench-hardware": hardware}).items()
+    ]
+    while waiting:
+        path, command = waiting.pop()
+        inner = getattr(command, "commands", {})
+        waiting += [(f"{path} {name}", each) for name, each in inner.items()]
+        if not inner and not any("--json" in option.opts for option in command.params):
+            yield path
+
+
 def python_pages() -> list[ParameterSet]:
     """Return each page with Python blocks; pages with long fits are slow."""
     pages = []
@@ -252,6 +268,17 @@ def test_the_sites_table_of_commands_has_all_and_their_examples_parse() -> None:
     ours = [line for line in parts if line.startswith(("ventbench ", f"{PROOFS} "))]
     assert len(ours) > 30
     assert not {line: problem for line in ours if (problem := parse(line))}
+
+
+def test_every_command_that_prints_results_has_them_as_json_or_the_page_says_not() -> None:
+    text = (ROOT / "docs" / "commands.md").read_text("utf-8").split("<!-- commands -->")[0]
+    sentence = re.split(r"\.\s", text.partition("These print only where what they made is:")[2])[0]
+    named, program = set[str](), ""
+    for name in re.findall(r"`([^`]+)`", sentence):
+        matched = re.match(rf"(ventbench-hardware|ventbench|{PROOFS}) ", name)
+        program = matched[1] if matched else program
+        named.add(name if matched else f"{program} {name}")
+    assert named == set(without_json())
 
 
 def test_the_page_of_submissions_names_all_that_a_controller_sees() -> None:

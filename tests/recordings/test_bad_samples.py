@@ -9,9 +9,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from ventbench.base.errors import InputError
 from ventbench.mechanics import identify
-from ventbench.recordings import check, load, make_breaths, write
+from ventbench.recordings import check, load, make_breaths, require_roles, write
 from ventbench.recordings.bad_samples import blanked, clean, find_bad_samples
+from ventbench.recordings.breaths import join
 
 RATE, PERIOD = 50.0, 3.0
 
@@ -143,3 +145,19 @@ def test_every_door_leaves_the_same_samples_out(tmp_path):
         for truth, found in ((20.0, lung.R), (50.0, lung.C)):
             assert found.ci95[0] < truth < found.ci95[1]
     assert dataclasses.replace(read, notes=()).pressure.shape == spoiled.pressure.shape
+
+
+def test_a_notable_share_is_said_first_and_a_large_one_is_refused():
+    columns = signals()
+    at = np.random.default_rng(3).permutation(1800)
+    columns["flow"][at[:40]] = -1650.0
+    breaths = clean(recording(columns))
+    assert breaths.left_out == {"flow": pytest.approx(40 / 1800)}
+    said = "2.2 % of the readings of flow are none and are left out"
+    assert identify(breaths)[0].notes[0] == f"{said}."
+    assert join([breaths, recording(signals(1))]).left_out["flow"] == pytest.approx(20 / 1800)
+    columns["flow"][at[:400]] = -1650.0
+    spoiled = clean(recording(columns), [-1650.0])
+    for door in (identify, require_roles):
+        with pytest.raises(InputError, match=r"22 % of the readings of flow .* is unusable"):
+            door(spoiled)

@@ -58,7 +58,7 @@ def text(path: Path, above: str, *columns: np.ndarray, separator: str = "\t") ->
 
 
 TIME, PRESSURE, FLOW = MADE["time"], MADE["pressure"], MADE["flow"]
-WORDS = np.where(MADE["out"], "OPEN", "CLOSED").tolist()
+WORDS = np.where(MADE["out"], "OPEN", "HELD").tolist()
 NAMED = {
     "t_ms": (1000 * TIME).tolist(),
     "paw": PRESSURE.tolist(),
@@ -103,12 +103,12 @@ def test_json_without_a_table_is_refused(tmp_path):
 def test_words_of_a_valve_are_mapped_or_asked_for(tmp_path):
     path = tmp_path / "log.json"
     path.write_text(json.dumps(NAMED | {"exp valve": WORDS}))
-    with pytest.raises(InputError, match="--map-values OPEN=1,CLOSED=0"):
+    with pytest.raises(InputError, match="--map-values OPEN=1,HELD=0"):
         import_recording(path, lung="R20C50")
-    imported = import_recording(path, lung="R20C50", words={"open": 1, "closed": 0})
+    imported = import_recording(path, lung="R20C50", words={"open": 1, "held": 0})
     same(imported, CYCLES - 1)  # the first begins with the recording, perhaps later than its valve
     np.testing.assert_array_equal(imported.breaths.u_out[0], TIME[:150] >= 1.0)
-    asked = ["import", str(path), "--lung", "R20C50", "--map-values", "open=1,closed=0"]
+    asked = ["import", str(path), "--lung", "R20C50", "--map-values", "open=1,held=0"]
     assert CliRunner().invoke(app, asked).exit_code == 0
 
 

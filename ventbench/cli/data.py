@@ -109,8 +109,8 @@ def import_(
     file: Annotated[
         Path,
         typer.Argument(
-            help="Text with any separator, JSON, .xlsx, Parquet, MATLAB .mat (-v7), EDF, WFDB, "
-            "MCAP, or a bag of ROS."
+            help="Text with any separator, JSON, .xlsx, Parquet, NumPy .npy or .npz, MATLAB .mat "
+            "(-v7), EDF, WFDB, MCAP, or a bag of ROS."
         ),
     ],
     out: Annotated[

@@ -51,6 +51,7 @@ from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.python_simulators import PythonSimulators
 from ventbench.plants.simulators import Simulators
+from ventbench.recordings.bad_samples import notable
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 from ventbench.recordings.roles import require_roles
@@ -416,6 +417,7 @@ def _conclude(
         chosen=correction.chosen,
         changes=adequacy.changes,
         saturated=experiment.saturated,
+        left_out=notable(breaths),
         gain_scatter=conclusion.gain_sd,
         posterior=told_posterior(conclusion.posterior),
         detection_limits=limits,

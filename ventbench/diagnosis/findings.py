@@ -233,6 +233,8 @@ class Findings:
     #: reading at which the pressure sensor saturates, cmH2O, and share of the readings that do,
     #: which are left out; None if it does not.
     saturated: tuple[float, float] | None = None
+    #: that a share of the readings are none and are left out, where it is notable; else None.
+    left_out: str | None = None
     #: the likeliest sets of terms by the search alone, with their probabilities: mechanisms, basis
     #: terms (something unknown at their place) and effects in time. Held-out breaths have no say.
     posterior: tuple[tuple[tuple[str, ...], float], ...] = ()

@@ -73,6 +73,9 @@ def answer(findings: Findings) -> str:
 
 def headline(findings: Findings) -> str:
     """What is missing and what mending it is worth, in one short sentence."""
+    if findings.left_out is not None:
+        others = headline(dataclasses.replace(findings, left_out=None))
+        return f"{findings.left_out}. {others}"
     if findings.saturated is not None:
         others = headline(dataclasses.replace(findings, saturated=None))
         return f"Readings saturate at {rounded(findings.saturated[0], 1)} cmH2O. {others}"
@@ -98,6 +101,9 @@ def headline(findings: Findings) -> str:
 
 def verdict(findings: Findings) -> str:
     """What is missing, and how sure that is; without a full stop."""
+    if findings.left_out is not None:
+        others = verdict(dataclasses.replace(findings, left_out=None))
+        return f"{findings.left_out}; by the others: {others}"
     if findings.saturated is not None:
         reading, share = findings.saturated
         saturates = (

@@ -197,6 +197,7 @@ class Diagnosis(Findings):
             "saturated": None
             if self.saturated is None
             else {"reading": self.saturated[0], "share": self.saturated[1]},
+            "left_out": self.left_out,
             "gain_scatter": self.gain_scatter,
             "posterior": [{"terms": t, "probability": p} for t, p in self.posterior],
             "detection_limits": {

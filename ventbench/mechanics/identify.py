@@ -46,7 +46,7 @@ from ventbench.mechanics.term_selection import (
     delay,
     select_terms,
 )
-from ventbench.recordings.bad_samples import clean, isolated
+from ventbench.recordings.bad_samples import clean, isolated, notable
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.roles import check_roles, find_saturation
 from ventbench.system_id.fit import t_quantile
@@ -195,9 +195,11 @@ def identify(
         progress: called after each lung with how many breaths are done, and of how many.
 
     Raises:
-        InputError: if neither is recorded, or too little of a lung to tell R from C.
+        InputError: if neither is recorded, or too little of a lung to tell R from C, or more than
+            a fifth of the readings are none.
     """
     breaths, lungs, completed = clean(breaths), [], 0
+    notable(breaths)
     for name, part in breaths.by_lung().items():
         lungs.append(_identify_lung(name, part))
         completed += len(part)
@@ -392,8 +394,9 @@ def _with_equivalent_lag(delayed_by: Term | None, lung: LungFit) -> tuple[Term, 
 def _notes(
     breaths: Breaths, segments: tuple[Segment, ...], table: CrossProducts, noise: float
 ) -> list[str]:
-    issues = check_roles(breaths)
-    notes = [str(finding) for finding in issues]
+    issues, first = check_roles(breaths), notable(breaths)
+    notes = [] if first is None else [f"{first}."]
+    notes += [str(finding) for finding in issues]
     if len(table) < FEWEST_BREATHS:
         notes.append(
             f"Fewer than {FEWEST_BREATHS} breaths: R and C alone, nothing else could be tested."

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints, runs
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
 #: Columns that are measured.
@@ -40,8 +41,9 @@ _CHANCE = 1e-3
 #: Share of equal steps between changes from which a sensor is slower than the rows.
 _REGULAR = 0.8
 
-#: Share of the readings of a column that may be left out before the recording is unusable.
-UNUSABLE = 0.2
+#: Share of the readings of a column that may be left out before an answer says so first, and before
+#: the recording is unusable.
+_NOTABLE, UNUSABLE = 0.01, 0.2
 
 #: Places of bad samples that are shown.
 _SHOWN = 5
@@ -138,6 +140,28 @@ def blanked(columns: Mapping[str, Floats], bad: Iterable[BadSamples]) -> dict[st
     return out
 
 
+def left_out(bad: Iterable[BadSamples]) -> dict[str, float]:
+    """Share of the readings of each column that are none; those of a slow sensor do not count."""
+    shares: dict[str, float] = {}
+    for samples in bad:
+        if samples.kind != "slow":
+            shares[samples.column] = shares.get(samples.column, 0.0) + samples.share
+    return shares
+
+
+def notable(breaths: Breaths) -> str | None:
+    """What an answer says first: the share that was left out, without a full stop; None if few.
+
+    Raises:
+        InputError: if it is so large that the recording is unusable.
+    """
+    column, share = max(breaths.left_out.items(), key=lambda pair: pair[1], default=("", 0.0))
+    text = f"{100.0 * share:.2g} % of the readings of {column} are none and are left out"
+    if share > UNUSABLE:
+        raise InputError(f"column {column}: {text}. That is too much: the recording is unusable.")
+    return text if share > _NOTABLE else None
+
+
 def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
     """Breaths without bad samples, which its notes list first; the same object if there is none."""
     names = [name for name in (*MEASURED, "u_in") if getattr(breaths, name) is not None]
@@ -150,7 +174,10 @@ def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
         changes[name] = np.full(breaths.valid.shape, np.nan)
         changes[name][breaths.valid] = cleaned[name]
     notes = (*(samples.what().capitalize() + "." for samples in bad), *breaths.notes)
-    return replace(breaths, notes=notes, **changes)
+    shares = left_out(bad)
+    for name, share in breaths.left_out.items():
+        shares[name] = shares.get(name, 0.0) + share
+    return replace(breaths, notes=notes, left_out=shares, **changes)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import gzip
 import html
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
@@ -51,6 +51,8 @@ class Breaths:
     #: SHA-256 of the file, hex, or None if the breaths are not those of a whole file.
     sha256: str | None = None
     notes: tuple[str, ...] = ()  #: what a reader of the file should know, a sentence each.
+    #: share of the readings of a column that are none and were left out, by column.
+    left_out: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Make the arrays read-only."""
@@ -179,7 +181,7 @@ class Breaths:
         return {name: self.select(index) for name, index in self.by_lung_index.items()}
 
     def _arrays(self) -> dict[str, np.ndarray]:
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
@@ -323,11 +325,16 @@ def join(parts: Sequence[Breaths]) -> Breaths:
         if all(getattr(part, name) is not None for part in parts)
     ]
     rest: dict[str, Any] = {name: together(name, samples=False) for name in labels}
+    sizes = np.array([part.valid.sum() for part in parts])
+    shares = {name: 0.0 for part in parts for name in part.left_out}
+    for name in shares:
+        shares[name] = float(np.average([p.left_out.get(name, 0.0) for p in parts], weights=sizes))
     return arranged(
         np.concatenate([part.valid.sum(axis=1) for part in parts]),
         together("time", samples=True),
         {name: together(name, samples=True) for name in signals},
         notes=tuple(note for part in parts for note in part.notes),
+        left_out=shares,
         **rest,
     )
 

@@ -39,6 +39,23 @@ _CMH2O = Fraction(_DATA["units"]["pressure"]["cmH2O"])
 
 
 @dataclass(frozen=True)
+class States:
+    """Two words in cells for a valve that is open or not."""
+
+    one: str  #: for open; of a phase, for expiration.
+    zero: str  #: for closed; of a phase, for inspiration.
+    phase: bool  #: whether they are phases of the breath.
+
+
+#: By the pair of words in lower case.
+STATES: dict[frozenset[str], States] = {
+    frozenset(pair.split()): States(*pair.split(), phase=kind == "expiration")
+    for kind, pairs in _DATA["states"].items()
+    for pair in pairs
+}
+
+
+@dataclass(frozen=True)
 class Conversion:
     """An exact change of units."""
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.recordings.bad_samples import UNUSABLE, clean
+from ventbench.recordings.bad_samples import UNUSABLE, clean, left_out
 from ventbench.recordings.breaths import Breaths, arranged, join
 from ventbench.recordings.roles import few_breaths, findings
 from ventbench.recordings.scan import Progress, Scanned, scan
@@ -299,11 +299,7 @@ def role_problems(source: Source, scanned: Scanned) -> dict[str, tuple[Recording
         )
         for level in ("refused", "suspicious")
     }
-    unusable = {
-        column
-        for column in {samples.column for samples in scanned.bad}
-        if sum(x.share for x in scanned.bad if x.column == column and x.kind != "slow") > UNUSABLE
-    }
+    unusable = {column for column, share in left_out(scanned.bad).items() if share > UNUSABLE}
     for samples in scanned.bad:
         level = "refused" if samples.column in unusable else "suspicious"
         advice = (
@@ -547,6 +543,7 @@ def _assemble(scanned: Scanned, file: str) -> Breaths:
         C=scanned.C,
         time_inferred=scanned.time_blank,
         source=file,
+        left_out=left_out(scanned.bad),
     )
 
 

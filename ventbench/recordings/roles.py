@@ -15,7 +15,7 @@ import numpy as np
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.linear import solve
-from ventbench.recordings.bad_samples import MEASURED
+from ventbench.recordings.bad_samples import MEASURED, notable
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.headers import UNITS
 
@@ -519,11 +519,12 @@ def find_saturation(breaths: Breaths) -> tuple[Saturation, ...]:
 
 
 def require_roles(breaths: Breaths) -> None:
-    """Refuse breaths whose columns are not what they are called.
+    """Refuse breaths whose columns are not what they are called, or too bad to be used.
 
     Raises:
         InputError: with what is wrong and the option that mends it.
     """
+    notable(breaths)
     refused = [f for f in check_roles(breaths) if f.level == "refused"]
     if refused:
         raise InputError("\n".join(f"column {f.column}: {f}" for f in refused))

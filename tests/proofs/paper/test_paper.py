@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from proofs.__main__ import app
 from proofs.paper import controller_sections, paper, published, simulator_sections
-from proofs.paper.report import Reproduction, Section, Table, below, every
+from proofs.paper.page import page, svg
+from proofs.paper.report import Chart, Reproduction, Section, Table, bars, below, every
 from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.task import protocol
@@ -219,3 +220,29 @@ def test_errors_by_horizon_can_be_measured_again(stored, public_recordings):
             np.testing.assert_allclose(
                 again["lungs"][name][kind]["by_step"], about[kind]["by_step"], atol=2e-3
             )
+
+
+def test_the_papers_figures_are_pictures_beside_the_numbers(stored):
+    sections = (
+        simulator_sections.by_horizon(stored["horizon"]),
+        simulator_sections.architectures(stored["networks"]),
+        controller_sections.sample_efficiency(stored["samples"]),
+    )
+    assert {"figure 5, table 5", "table 4"} <= {s.place for s in sections if s.charts}
+    shown = page(Reproduction({"ventbench": "x"}, sections))
+    assert shown.count("<svg") == shown.count("<figure>") == 3
+    assert "<code>--recordings DIR</code>" in shown
+    assert shown.count("<tr>") == len(sections) + 1 + sum(
+        1 + len(s.tables[0].rows) for s in sections
+    )
+    assert shown == page(Reproduction({"ventbench": "x"}, sections))
+
+
+def test_a_group_of_bars_has_one_for_each_number_of_its_row():
+    table = Table("Errors", ("lung", "paper", "here"), (("R5C10", 0.5, None), ("R5C20", 0.7, 1.0)))
+    chart = bars(table, "error, cmH2O", ("paper", "here"))
+    assert chart.series["here"] == (["R5C10", "R5C20"], [None, 1.0])
+    line = Chart("One", "time, s", "pressure, cmH2O", {"target": ([0.0, 1.0], [5.0, 5.0])})
+    for drawn in (svg(chart), svg(line)):
+        assert drawn.startswith("<svg")
+        assert drawn.rstrip().endswith("</svg>")

@@ -25,14 +25,17 @@ from ventbench.recordings.bad_samples import (
     BadSamples,
     blanked,
     find_bad_samples,
+    left_out,
+    notable,
     repeated_rows,
 )
 from ventbench.recordings.breaths import Breaths, arranged
 from ventbench.recordings.foreign.cycles import expiratory_valve, find_breaths
 from ventbench.recordings.foreign.formats import read_table
 from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, Layout, recognise
+from ventbench.recordings.foreign.shapes import epoch_unit, one_row_a_sample
 from ventbench.recordings.foreign.tables import Table
-from ventbench.recordings.headers import Conversion, conversion, in_file_unit, read_header
+from ventbench.recordings.headers import STATES, Conversion, conversion, in_file_unit, read_header
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung
@@ -129,9 +132,9 @@ def import_recording(
     """Read a recording of another laboratory.
 
     Args:
-        path: text with any separator (also gzipped), JSON, a spreadsheet, Parquet, MATLAB, EDF,
-            BDF, the header (.hea) of a WFDB record, MCAP, or a bag of ROS; or what has been read of
-            one.
+        path: text with any separator (also gzipped), JSON, a spreadsheet, Parquet, NumPy, MATLAB,
+            EDF, BDF, the header (.hea) of a WFDB record, MCAP, or a bag of ROS; or what has been
+            read of one. Its table has a row a sample, a row a measurement, or lists of samples.
         columns: role of each column, ``{"Paw": "pressure"}``; the roles are ``time``,
             ``pressure``, ``flow`` (or ``flow_in`` and ``flow_out``, one-way flows), ``volume``,
             ``u_in``, ``u_out``, ``R``, ``C``, ``breath``, ``group`` (a breath ends where it
@@ -148,7 +151,8 @@ def import_recording(
         select: values that columns must have, ``{"run": "a", "test": "1"}``; other rows are left
             out.
         missing: values that stand for a missing one, such as -99.
-        words: numbers that words in cells stand for, ``{"open": 1, "closed": 0}``.
+        words: numbers that words in cells stand for, ``{"high": 1, "low": 0}``; pairs such as open
+            and closed are understood.
         skip_bad_breaths: leave out breaths that the schema cannot hold, and name them.
         separator: separator of the cells; found out if None.
         decimal: ``"."`` or ``","``; found out if None.
@@ -167,15 +171,21 @@ def import_recording(
     if not isinstance(table, Table):
         table = read_table(table, separator=separator, decimal=decimal)
     table, selected = _selected(table, dict(select or {}))
+    mapped, units = dict(columns or {}), dict(units or {})
+    table = one_row_a_sample(table, mapped, units.get("time"), rate)
     layout = layout or recognise(table.columns)
     spec = _layout(layout, table)
-    roles = _roles(table, dict(columns or {}), spec, rate)
+    roles = _roles(table, mapped, spec, rate)
+    spoken = (spec.words if spec is not None else {}) | dict(words or {})
+    table, roles, states = _states(table, roles, spoken)
     by_role = {role: name for name, role in roles.items() if role not in ("group", "unused")}
-    changes = _conversions(table, by_role, dict(units or {}), spec)
-    notes, warnings = [*table.notes, *selected], []
+    changes = _conversions(table, by_role, units, spec)
+    notes, warnings = [*table.notes, *selected, *states], []
     if spec is not None:
         notes.append(f"Layout {layout}: {spec.about}.")
-    spoken = (spec.words if spec is not None else {}) | dict(words or {})
+    clock = by_role.get("time")
+    if clock is not None and (unit := epoch_unit(table.columns[clock])) not in (None, "s"):
+        notes.append(f"{clock} counts {unit} since 1970, by the size of its values.")
     raw = {
         role: _numbers(table, name, spoken)
         for role, name in by_role.items()
@@ -257,6 +267,8 @@ def import_recording(
     notes += dropped
     warnings += _suspicious(samples, changes)
     breaths = _breaths(table.file, pieces, time, samples, R, C, notes)
+    breaths = replace(breaths, left_out=left_out(bad))
+    notable(breaths)
     few = few_breaths(len(breaths))
     issues = check_roles(breaths)
     if issues and issues[0].level == "refused":
@@ -466,7 +478,8 @@ def _conversions(
 
     def unit(role: str, name: str) -> str | None:
         header = table.header(name).unit if layout is None else None
-        return units.get(role) or layout_units.get(role) or header or table.units.get(name)
+        unit = units.get(role) or layout_units.get(role) or header or table.units.get(name)
+        return unit or (epoch_unit(table.columns[name]) if role == "time" else None)
 
     return {
         role: conversion(
@@ -476,6 +489,35 @@ def _conversions(
         for role, name in by_role.items()
         if role in _MEASURED or role in ("flow_in", "flow_out")
     }
+
+
+def _states(
+    table: Table, roles: dict[str, str], spoken: Mapping[str, float]
+) -> tuple[Table, dict[str, str], list[str]]:
+    """Numbers in place of a pair of words such as open and closed in the columns of valves.
+
+    A column of inspiration and expiration is that of the expiratory valve if there is no other.
+    """
+    columns, units, roles, sentences = dict(table.columns), dict(table.units), dict(roles), []
+    for name, values in table.columns.items():
+        role = roles.get(name)
+        if values.dtype.kind != "U" or role not in (None, "u_in", "u_out"):
+            continue
+        words = {word.casefold(): word for word in np.unique(values).tolist() if word}
+        state = STATES.get(frozenset(words))
+        if state is None or words.keys() <= {word.casefold() for word in spoken}:
+            continue
+        if role is None:
+            if not state.phase or "u_out" in roles.values():
+                continue
+            roles[name] = "u_out"
+        one, zero = (words[word] for word in (state.one, state.zero))
+        if role == "u_in":
+            one, zero = (zero, one) if state.phase else (one, zero)
+            units[name] = "1"
+        columns[name] = np.where(values == "", np.nan, np.where(values == one, 1.0, 0.0))
+        sentences.append(f"{name}: {one} is 1 (open) and {zero} is 0; else give --map-values.")
+    return replace(table, columns=columns, units=units), roles, sentences
 
 
 def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:

@@ -1,7 +1,7 @@
 """Tables of numbers from files of every kind: recognised by their first bytes, read by a library.
 
-Parquet (pyarrow), JSON, MATLAB (scipy), EDF and BDF (pyedflib), WFDB (wfdb), MCAP (mcap) and bags
-of ROS (rosbags). Nothing is resampled.
+Parquet (pyarrow), JSON, NumPy, MATLAB (scipy), EDF and BDF (pyedflib), WFDB (wfdb), MCAP (mcap)
+and bags of ROS (rosbags). Nothing is resampled.
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 import re
 import warnings
+import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,9 @@ from ventbench.recordings.foreign import sizes
 from ventbench.recordings.foreign.tables import (
     RATES,
     Table,
+    clock_seconds,
     decoded,
+    listed,
     named,
     read_spreadsheet,
     read_text,
@@ -37,8 +40,8 @@ def read_table(
 ) -> Table:
     """Read a table; the separator and the decimal mark of text are found out if None.
 
-    The file is text (also gzipped), a spreadsheet (.xlsx), Parquet, MATLAB, EDF, BDF, or the header
-    (.hea) of a WFDB record.
+    The file is text (also gzipped), a spreadsheet (.xlsx), Parquet, NumPy, MATLAB, EDF, BDF, or the
+    header (.hea) of a WFDB record.
 
     Raises:
         InputError: if the file cannot be read, or holds no table of numbers.
@@ -55,30 +58,37 @@ def read_table(
         raise InputError(f"{file} is empty")
     if first.startswith(b"\x1f\x8b"):
         first = decoded(file)[0][:128]
-    if first.startswith(b"PAR1"):
-        return _parquet(file)
-    if first.startswith(b"MATLAB 5.0"):
-        return _matlab(file)
+    for beginnings, read in _readers().items():
+        if first.startswith(beginnings):
+            return read(file)
     if first.startswith((b"MATLAB 7.3", b"\x89HDF")):
         raise InputError(
             f"{file} is HDF5 (MATLAB 7.3, a log of PyTables?); save it with `save(..., '-v7')` in "
             "MATLAB, or export the table as CSV"
         )
-    if first.startswith((b"0       ", b"\xffBIOSEMI")):
-        return _edf(file)
     if path.suffix == ".hea":
         return _wfdb(file)
-    if first.startswith(b"\x89MCAP"):
-        return _mcap(file)
-    if first.startswith((b"#ROSBAG", b"SQLite format 3")):
-        return _rosbag(file)
     if first.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"["):
         content = _json(file)
         if content is not None:
             return content
     if first.startswith(b"PK\x03\x04"):
+        if b".npy" in first:
+            return _numpy(file)
         return read_spreadsheet(file)
     return read_text(file, separator, decimal)
+
+
+def _readers() -> dict[tuple[bytes, ...], Callable[[str], Table]]:
+    """What reads a file, by its first bytes."""
+    return {
+        (b"PAR1",): _parquet,
+        (b"MATLAB 5.0",): _matlab,
+        (b"\x93NUMPY",): _numpy,
+        (b"0       ", b"\xffBIOSEMI"): _edf,
+        (b"\x89MCAP",): _mcap,
+        (b"#ROSBAG", b"SQLite format 3"): _rosbag,
+    }
 
 
 def _parquet(file: str) -> Table:
@@ -99,6 +109,8 @@ def _parquet(file: str) -> Table:
             columns[name] = values.to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
         elif kind in "iufb":
             columns[name] = values.to_numpy(float)
+        elif (lists := listed(values)) is not None:
+            columns[name] = lists
         else:
             columns[name] = values.astype(str).to_numpy(str)
     if not columns or len(frame) == 0:
@@ -116,11 +128,38 @@ def _matlab(file: str) -> Table:
         raise
     except (ValueError, NotImplementedError, OSError, TypeError, zlib.error) as error:
         raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
-    return _variables(file, content)
+    return _variables(file, content, "MATLAB file")
 
 
-def _variables(file: str, content: dict[str, Any]) -> Table:
-    """The columns among a MATLAB file's variables."""
+def _numpy(file: str) -> Table:
+    """The arrays of a ``.npz`` by name, the fields of a structured one, or columns by number."""
+    try:
+        sizes.check_numpy(file)
+        loaded = np.load(file, allow_pickle=False)
+        arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+    except InputError:
+        raise
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"{file} cannot be read ({reason}); save arrays of numbers by np.save or np.savez"
+        ) from None
+
+    def content(array: NDArray[Any]) -> Any:
+        if array.dtype.names:
+            return {name: content(array[name]) for name in array.dtype.names}
+        return (
+            array.astype("datetime64[ns]").astype(float) * 1e-9
+            if array.dtype.kind == "M"
+            else array
+        )
+
+    variables = {name: content(array) for name, array in arrays.items()}
+    return _variables(file, variables, "NumPy file")
+
+
+def _variables(file: str, content: dict[str, Any], kind: str) -> Table:
+    """The columns among the variables of a file."""
     flat: dict[str, NDArray[Any]] = {}
     scalars: dict[str, float] = {}
     for name, value in content.items():
@@ -144,7 +183,7 @@ def _variables(file: str, content: dict[str, Any]) -> Table:
         for name, v in columns.items()
     }
     mismatched = [name for name, v in flat.items() if len(v) != length]
-    notes = [f"MATLAB file with {len(columns)} columns of {length} rows."]
+    notes = [f"{kind} with {len(columns)} columns of {length} rows."]
     if mismatched:
         notes.append(f"Columns of other lengths were left out ({', '.join(mismatched[:5])}).")
     named = {re.sub(r"[^a-z]", "", n.rpartition(".")[2].lower()): v for n, v in scalars.items()}
@@ -158,7 +197,7 @@ def _flatten(
     """Collect the columns and single numbers of a MATLAB variable."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            _flatten(f"{name}.{key}", inner, flat, scalars)
+            _flatten(f"{name}.{key}".lstrip("."), inner, flat, scalars)
         return
     if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
         for key in value[0]:  # an array of records
@@ -175,7 +214,7 @@ def _flatten(
     elif array.ndim == 2:
         rows = array if array.shape[0] >= array.shape[1] else array.T
         for k in range(rows.shape[1]):
-            flat[f"{name}.{k + 1}"] = rows[:, k]
+            flat[f"{name}.{k + 1}".lstrip(".")] = rows[:, k]
 
 
 def _channels(
@@ -302,16 +341,25 @@ def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def _of_values(file: str, columns: dict[str, Sequence[Any]], kind: str) -> Table:
     """Columns of any values: numbers where they are, words elsewhere."""
-    names = named(list(columns))
+    from pandas import Series
+
+    names, units = named(list(columns)), dict[str, str]()
     arrays: dict[str, NDArray[Any]] = {}
     for name, header in names.items():
         values = ["" if value is None else value for value in columns[header]]
         try:
-            arrays[name] = np.array([np.nan if value == "" else value for value in values], float)
+            array = np.array([np.nan if value == "" else value for value in values], float)
+            if array.ndim > 1:
+                raise ValueError
+            arrays[name] = array
         except (TypeError, ValueError):
-            arrays[name] = np.array(list(map(str, values)))
+            lists = listed(values)
+            words = Series(list(map(str, values)))
+            clock = clock_seconds(words) if lists is None else None
+            units |= {name: "s"} if clock is not None else {}
+            arrays[name] = next(x for x in (lists, clock, words.to_numpy(str)) if x is not None)
     note = f"{kind} with {len(arrays)} columns of {len(next(iter(arrays.values())))} rows."
-    return Table(file, arrays, notes=(note,), headers=names)
+    return Table(file, arrays, units, notes=(note,), headers=names)
 
 
 def _mcap(file: str) -> Table:

@@ -12,6 +12,7 @@ import os
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 from ventbench.base.errors import InputError
 
@@ -62,6 +63,37 @@ def check_archive(file: str) -> None:
 def check_cells(file: str, cells: float) -> None:
     """Check the number of a spreadsheet's cells."""
     refuse(file, _CELL * cells, f"{cells:.3g} cells")
+
+
+def check_text(file: str, cells: Any) -> None:
+    """Check a column of words, each of which takes as much as the longest."""
+    refuse(file, 4.0 * len(cells) * float(cells.str.len().max()), "the words of one column")
+
+
+def check_numpy(file: str) -> None:
+    """Check the shapes of the arrays of a ``.npy`` or ``.npz`` file, by their headers."""
+    import zipfile
+
+    import numpy as np
+
+    def size(stream: Any) -> int:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0
+        shape, _, kind = (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(
+            stream
+        )
+        return math.prod(shape) * max(kind.itemsize, _NUMBER)
+
+    if not zipfile.is_zipfile(file):
+        with open(file, "rb") as stream:
+            refuse(file, size(stream), "its array")
+        return
+    total = 0
+    with zipfile.ZipFile(file) as archive:
+        for member in archive.namelist():
+            with archive.open(member) as stream:
+                total += size(stream)
+    refuse(file, total, "its arrays")
 
 
 def check_matlab(file: str) -> None:

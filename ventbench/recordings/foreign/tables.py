@@ -37,10 +37,20 @@ _BLANKS = ("", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a", "inf", "-i
 #: Numbers by decimal mark, also with thousands apart: "1,061.3" or "1.061,3".
 _NUMBER = {
     mark: re.compile(
-        rf"[+-]?(?:\d+{m}?\d*|{m}\d+|\d{{1,3}}(?:[{other} '’\u00a0\u202f]\d{{3}})+(?:{m}\d*)?)"
+        rf"[+-]?(?:\d+{m}?\d*|{m}\d+"
+        rf"|\d{{1,3}}(?:[{other} '’\u00a0\u202f]\d{{3}}){{1,4}}(?:{m}\d*)?)"
         r"(?:[eE][+-]?\d+)?"
     )
     for mark, m, other in ((".", r"\.", ","), (",", ",", r"\."))
+}
+
+#: A list of samples in one cell, also as JSON writes it, and least number of them.
+_LIST = {
+    mark: re.compile(rf"[\[({{]?\s*{number}(?:{separators}{number}){{7,}}\s*[\])}}]?")
+    for mark, number, separators in (
+        (".", r"(?:[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|nan|null)", r"(?:\s*[,;|]\s*|\s+)"),
+        (",", r"(?:[+-]?(?:\d+,?\d*|,\d+)(?:[eE][+-]?\d+)?|nan|null)", r"(?:\s*[;|]\s*|\s+)"),
+    )
 }
 
 #: A time of day or a stopwatch, with or without a date; before milliseconds also a colon.
@@ -50,8 +60,9 @@ _CLOCK = re.compile(
 )
 
 #: Names of a sampling rate, Hz, and of an interval, s, above a table or beside it.
-RATES = ("fs", "rate", "samplingrate", "samplerate", "freq", "frequency", "samplingfrequency")
-_INTERVALS = ("interval", "samplinginterval", "sampleinterval", "dt", "deltax")
+FREQUENCIES = ("fs", "samplingrate", "samplerate", "samplingfrequency")
+RATES = (*FREQUENCIES, "rate", "freq", "frequency")
+INTERVALS = ("interval", "samplinginterval", "sampleinterval", "dt", "deltax")
 
 #: First cells of lines that hold names, and units, of the columns right of them.
 _TITLES, _UNIT_TITLES = (
@@ -71,8 +82,8 @@ class Table:
     """Columns of equal length."""
 
     file: str  #: path as the caller wrote it.
-    #: values by name, float64 with NaN for blank, ``(m,)``; text only where no cell is a number.
-    #: Times of day are seconds.
+    #: values by name, float64 with NaN for blank, ``(m,)``; text only where no cell is a number,
+    #: objects where cells are lists of samples. Times of day are seconds.
     columns: dict[str, NDArray[Any]]
     units: dict[str, str] = field(default_factory=dict)  #: units beside the names, by name.
     lines: Ints | None = None  #: line of each row in a text file, ``(m,)``, else None.
@@ -114,7 +125,8 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     data, encoding = decoded(file)
     if not data:
         raise InputError(f"{file} holds no text")
-    above = [line.decode() for line in data[: 1 << 20].split(b"\n", _LOOKED_AT)[:_LOOKED_AT]]
+    looked_at = data[: 1 << 20].decode(errors="replace")
+    above = looked_at.split("\n", _LOOKED_AT)[:_LOOKED_AT]
     if re.match(r"\s*BS\b", next((x for x in above if re.match(r"\s*B[SE]\b", x)), "")):
         return _delimited_breaths(file, data.decode().split("\n"), encoding)
     stated = re.fullmatch(r"\"?sep=(.)\"?", above[0])
@@ -122,6 +134,7 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
         separator, above[0] = separator or stated[1], ""
     if of_servo := _above_servo_data(file, above):
         separator, above[:of_servo] = separator or "\t", [""] * of_servo
+    above = _titled(above)
     separator, decimal = _dialect(file, [x for x in above if x.strip()], separator, decimal)
     table = _table(file, data, above, separator, decimal, f"Text ({encoding}), cells ")
     return _by_units(table) if of_servo else table
@@ -158,6 +171,7 @@ def _cells(line: str, separator: str) -> list[str]:
         return line.split()
     if '"' not in line:
         return [cell.strip() for cell in line.split(separator)]
+    csv.field_size_limit(max(csv.field_size_limit(), len(line)))  # a cell may list many samples
     return [cell.strip() for cell in next(csv.reader([line.strip()], delimiter=separator), [])]
 
 
@@ -194,7 +208,11 @@ def _filled(cells: list[str]) -> list[str]:
 
 
 def _is_value(cell: str, mark: str) -> bool:
-    return bool(_NUMBER[mark].fullmatch(cell) or (":" in cell and _CLOCK.fullmatch(cell)))
+    return bool(
+        _NUMBER[mark].fullmatch(cell)
+        or (":" in cell and _CLOCK.fullmatch(cell))
+        or _LIST[mark].fullmatch(cell)
+    )
 
 
 def _table(
@@ -212,14 +230,18 @@ def _table(
     names = named(headers)
     first = rows[begins][0]
     offset = sum(len(line) + 1 for line in data.split(b"\n", first)[:first])
-    cells, numbers, stray = _arrow(data, offset, len(names), separator, mark)
-    if len(stray) > max(_STRAY_LINES, _STRAY * len(numbers)):
+    last, named_by = rows[begins - 1] if begins else (0, [])
+    words = _filled(named_by) and not any(_is_value(cell, mark) for cell in named_by)
+    header = above[last].strip() if words else ""
+    cells, numbers, stray = _arrow(data, offset, len(names), separator, mark, header)
+    odd = [x for x in stray if not x[1].startswith("#") and x[1].strip() != header]
+    if len(odd) > max(_STRAY_LINES, _STRAY * len(numbers)):
         raise InputError(
-            f"{file}, line {first + 1 + stray[0][0]}: {len(stray)} of {len(numbers) + len(stray)} "
-            f"lines are no rows of at most {len(names)} numbers, such as {stray[0][1][:60]!r}; "
+            f"{file}, line {first + 1 + odd[0][0]}: {len(odd)} of {len(numbers) + len(odd)} "
+            f"lines are no rows of at most {len(names)} numbers, such as {odd[0][1][:60]!r}; "
             "remove them, or give --separator"
         )
-    columns, units, odd_cells, message = _columns(list(names), units, cells, mark, notes)
+    columns, units, odd_cells, message = _columns(file, list(names), units, cells, mark, notes)
     if message.any():
         lines = data[offset:].split(b"\n")
         stray += [(k, lines[k].decode()) for k in numbers[message].tolist()]
@@ -252,9 +274,12 @@ def _first_numbers(rows: list[list[str]], mark: str) -> int | None:
 
 
 def _arrow(
-    data: bytes, offset: int, width: int, separator: str, mark: str
+    data: bytes, offset: int, width: int, separator: str, mark: str, header: str
 ) -> tuple[Any, Ints, list[tuple[int, str]]]:
-    """Rows as an Arrow table of numbers or text, their lines from 0, and lines that are no rows."""
+    """Rows as an Arrow table of numbers or text, their lines from 0, and lines that are no rows.
+
+    Comments and repeats of the header are none.
+    """
     from pyarrow import ArrowInvalid, BufferReader, py_buffer, string, types
     from pyarrow import csv as arrow
 
@@ -290,7 +315,10 @@ def _arrow(
         return table, odd
 
     body: bytes | memoryview = memoryview(data)[offset:]
+    again = header.encode()
     try:
+        if data.find(b"\n#", offset) >= 0 or (again and data.find(b"\n" + again, offset) >= 0):
+            raise ArrowInvalid
         table, odd = read(body, {})
     except ArrowInvalid:
         table, odd = None, []
@@ -298,10 +326,13 @@ def _arrow(
     if table is None or odd or data.count(b"\n", offset) + 1 != table.num_rows:
         regular, numbers = [], []
         for k, line in enumerate(data[offset:].decode().split("\n")):
+            if not line.strip():
+                continue
+            if line.startswith("#") or line.strip() == header:
+                stray.append((k, line))
+                continue
             if line.count(separator) == usual - 1 and '"' not in line:
                 regular.append(line)
-            elif not line.strip():
-                continue
             elif _width(cells := _cells(line, separator)) > width:
                 stray.append((k, line))
                 continue
@@ -348,6 +379,9 @@ def _header(
         return [*first, *titles], [""] * len(first) + units, ["Names stand in a line of titles."]
     while texts and (sum(map(bool, texts[-1])) < min(2, width) or _mostly_numbers(texts[-1])):
         texts.pop()
+    comments = [bool(cells) and cells[0].startswith("#") for cells in above[: len(texts)]]
+    if texts and not comments[-1]:
+        texts = [x for x, is_comment in zip(texts, comments, strict=True) if not is_comment]
     if not texts:
         return [str(k + 1) for k in range(width)], [], ["There is no header; columns are 1, 2, ..."]
     units_row: list[str] = []
@@ -376,6 +410,9 @@ def _mostly_numbers(cells: list[str]) -> bool:
 def _rate(above: list[list[str]], mark: str) -> float | None:
     """Sampling rate, Hz, that a line above the table states."""
     for cells in above:
+        text = " ".join(cells).replace(mark, ".")
+        if (each := re.search(r"([\d.]+)\s*(m?)s(?:ec)?/sample", text)) is not None:
+            return (1000.0 if each[2] else 1.0) / float(each[1])
         line = re.split(r"[\s,;:=|]+", " ".join(cells).replace(mark, ".").strip(" #%\"'"))
         for k in range(1, len(line)):
             name = re.sub(r"[^a-z]|hz", "", "".join(line[:k]).lower())
@@ -384,13 +421,13 @@ def _rate(above: list[list[str]], mark: str) -> float | None:
             unit = "".join(line[k + 1 : k + 2]).lower()
             if name in RATES:
                 return float(line[k]) * (1000.0 if unit == "khz" else 1.0)
-            if name in _INTERVALS and unit in ("s", "ms"):
+            if name in INTERVALS and unit in ("s", "ms"):
                 return (1.0 if unit == "s" else 1000.0) / float(line[k])
     return None
 
 
 def _columns(
-    names: list[str], units_row: list[str], cells: Any, mark: str, notes: list[str]
+    file: str, names: list[str], units_row: list[str], cells: Any, mark: str, notes: list[str]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, str], list[str], Bools]:
     """Values and units by name; odd cells in words; rows of a word with hardly a number."""
     import pyarrow as pa
@@ -411,8 +448,13 @@ def _columns(
         values, grouped = _values(texts, mark)
         odd = np.isnan(values) & ~texts.str.lower().isin(_BLANKS).to_numpy()
         if odd.any() and not np.isfinite(values).any():
-            clock = _clock(texts)
+            lists = listed(texts, mark)
+            if lists is not None:
+                columns[name], filled = lists, filled + (texts != "").to_numpy()
+                continue
+            clock = clock_seconds(texts)
             if clock is None:
+                sizes.check_text(file, texts)
                 columns[name] = texts.to_numpy(str)
                 continue
             values, units[name] = clock, "s"
@@ -455,7 +497,25 @@ def _values(cells: Any, mark: str) -> tuple[Floats, int]:
     return values, int(apart.sum())
 
 
-def _clock(cells: Any) -> Floats | None:
+def listed(cells: Sequence[Any], mark: str = ".") -> NDArray[Any] | None:
+    """Lists of samples in cells, objects of float64 ``(n,)``; None if one is none."""
+    lists = np.empty(len(cells), object)
+    for k, cell in enumerate(cells):
+        if isinstance(cell, str):
+            if cell and not _LIST[mark].fullmatch(cell):
+                return None
+            cell = re.split(r"[\s;|]+" if mark == "," else r"[\s,;|]+", cell.strip("[](){} \t"))
+            cell = [x.replace(",", ".").replace("null", "nan") for x in cell if x]
+        try:
+            lists[k] = np.array(() if cell is None else cell, float)
+        except (TypeError, ValueError):
+            return None
+        if lists[k].ndim != 1:
+            return None
+    return lists
+
+
+def clock_seconds(cells: Any) -> Floats | None:
     """Seconds of times of day, on over midnight; None if hardly any cell is one."""
     parts = cells.str.extract(rf"^{_CLOCK.pattern}$")
     hours, minutes = (parts[k].astype(float).to_numpy(float, na_value=np.nan) for k in (0, 1))
@@ -531,6 +591,30 @@ def _above_servo_data(file: str, lines: list[str]) -> int:
             f"{file} of a Servo ventilator holds {content}; export a recording ([REC])"
         )
     return stripped.index("[DATA]") + 1
+
+
+def _titled(lines: list[str]) -> list[str]:
+    """The first lines, with one of names and units in place of those of BIOPAC AcqKnowledge.
+
+    Below ``2 channels`` stand the name and the unit of each, a line each, then ``min,CH1,CH2`` and
+    the number of samples of each.
+    """
+    for k, line in enumerate(lines[:20]):
+        if (stated := re.fullmatch(r"\W*(\d+) channels?\W*", line, re.IGNORECASE)) is None:
+            continue
+        end = k + 1 + 2 * int(stated[1])
+        head = re.fullmatch(r"(?:(?!CH\d)(\w+)\W)?CH\d+(\W)?.*", "".join(lines[end : end + 1]))
+        if head is None:
+            continue
+        separator = head[2] or "\t"
+        texts = [re.sub(rf"[{separator}\"]+", " ", x).strip() for x in lines[k + 1 : end]]
+        titles = [f"{x} [{unit}]" for x, unit in zip(texts[::2], texts[1::2], strict=True)]
+        titles = [f"time [{head[1]}]", *titles] if head[1] else titles
+        counted = re.fullmatch(rf"[\d\s{separator}]+", "".join(lines[end + 1 : end + 2]))
+        below = end + 1 + (counted is not None)
+        blank = [""] * (below - k - 1)
+        return [*lines[:k], *blank, separator.join(titles), *lines[below:]]
+    return lines
 
 
 def _by_units(table: Table) -> Table:

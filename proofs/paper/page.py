@@ -1,0 +1,121 @@
+"""The comparison with the paper as one page: its figures as pictures beside the numbers."""
+
+from __future__ import annotations
+
+import html
+import io
+import re
+from typing import Any
+
+import numpy as np
+
+from proofs.paper.report import Chart, Reproduction, Section, Table
+from ventbench.base.errors import require
+from ventbench.palette import GREY, INK, LINE, QUIET, RUNS, SOFT
+
+_HEAD = f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>The paper, reproduced</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; color: {INK}; max-width: 60rem; margin: 2rem auto;
+  padding: 0 1rem; }}
+h2 {{ margin-top: 3rem; border-top: 1px solid {LINE}; padding-top: 1rem; }}
+.place, figcaption {{ color: {QUIET}; font-size: 0.875rem; }}
+figure {{ margin: 1rem 0; }}
+figure svg {{ max-width: 100%; height: auto; }}
+.wide {{ overflow-x: auto; }}
+table {{ border-collapse: collapse; font-size: 0.875rem; font-variant-numeric: tabular-nums; }}
+th, td {{ padding: 0.25rem 0.75rem; text-align: right; border-bottom: 1px solid {LINE}; }}
+th {{ background: {SOFT}; }}
+th:first-child, td:first-child, .claims td, .claims th {{ text-align: left; }}
+</style></head><body>
+"""
+
+
+def page(reproduction: Reproduction) -> str:
+    """The page as HTML, which needs no other file.
+
+    Raises:
+        InputError: if matplotlib is missing.
+    """
+    about = ", ".join(f"{name} {value}" for name, value in reproduction.about.items())
+    claims = tuple((s.place, s.claim, s.verdict, s.finding) for s in reproduction.sections)
+    summary = Table("", ("paper", "claim", "here", "figures here"), claims)
+    parts = [
+        _HEAD,
+        f'<h1>The paper, reproduced</h1><p class="place">{html.escape(about)}</p>',
+        _table(summary, "claims"),
+        *map(_section, reproduction.sections),
+        "</body></html>\n",
+    ]
+    return "\n".join(parts)
+
+
+def _section(section: Section) -> str:
+    texts = [
+        f"<h2>{_text(section.title)}</h2>",
+        f'<p class="place">{_text(f"{section.place}; {section.source}")}</p>',
+        f"<p>Paper: {_text(section.claim)}</p>",
+        f"<p>Here (<b>{section.verdict}</b>): {_text(section.finding)}</p>",
+    ]
+    for chart in section.charts:
+        caption = f"<figcaption>{_text(chart.caption)}</figcaption>"
+        texts.append(f"<figure>{svg(chart)}{caption}</figure>")
+    texts += [f"<p>{_text(table.caption)}:</p>{_table(table)}" for table in section.tables]
+    return "\n".join(texts)
+
+
+def _text(text: str) -> str:
+    """Text as HTML, with code between backquotes."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+
+
+def _table(table: Table, kind: str = "") -> str:
+    def row(cells: tuple[Any, ...], tag: str) -> str:
+        texts = (_text(table.text(cell)) for cell in cells)
+        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
+
+    rows = "".join(row(cells, "td") for cells in table.rows)
+    head = row(table.columns, "th")
+    return f'<div class="wide"><table class="{kind}"><thead>{head}</thead>{rows}</table></div>'
+
+
+def svg(chart: Chart) -> str:
+    """A chart as SVG: curves, or groups of bars where the abscissae are names.
+
+    Raises:
+        InputError: if matplotlib is missing.
+    """
+    require("matplotlib")
+    import matplotlib as mpl
+    from matplotlib import rcsetup
+    from matplotlib.figure import Figure
+
+    style: dict[Any, Any] = {
+        "svg.hashsalt": chart.caption,  # equal figures give equal bytes
+        "axes.prop_cycle": rcsetup.cycler(color=[*RUNS, GREY]),
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "font.size": 10,
+    }
+    with mpl.rc_context(style):
+        figure = Figure(figsize=(8.0, 3.4), layout="constrained")
+        axes = figure.add_subplot()
+        for k, (name, (x, values)) in enumerate(chart.series.items()):
+            y = np.array([np.nan if value is None else value for value in values], float)
+            if isinstance(x[0], str):
+                width = 0.8 / len(chart.series)
+                at = np.arange(len(x)) + width * (k - 0.5 * (len(chart.series) - 1))
+                axes.bar(at, y, width, label=name)
+                axes.set_xticks(range(len(x)), [*map(str, x)], rotation=0 if len(x) < 9 else 90)
+            else:
+                dashes = "--" if name == "target" else "-"
+                axes.plot(np.asarray(x, float), y, dashes, label=name, linewidth=1.5)
+        axes.set_xlabel(chart.x)
+        axes.set_ylabel(chart.y)
+        if len(chart.series) > 1:
+            figure.legend(loc="outside right upper", frameon=False)
+        output = io.StringIO()
+        figure.savefig(output, format="svg", metadata={"Date": None, "Creator": None})
+    text = output.getvalue()
+    return text[text.index("<svg") :]

@@ -1,0 +1,204 @@
+"""Tables of other shapes as one row a sample: a row a measurement, or a list of samples a cell.
+
+A long ("tidy") table names what was measured in one column and holds the value in another, as
+databases of time series export it; a packed one has a row a breath or a message.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ventbench.base.arrays import Floats
+from ventbench.base.errors import InputError
+from ventbench.recordings.foreign.tables import FREQUENCIES, INTERVALS, Table, named
+from ventbench.recordings.headers import Conversion, conversion, is_unit
+
+#: Names of the values of a long table, and most things that it measures.
+_VALUES, _MOST = ("value", "values", "reading", "measurement", "val", "amplitude"), 100
+
+#: Seconds since 1970 that a recording may be of: 2001 to 2100.
+_RECORDED = (1e9, 4.1e9)
+
+#: Share of the steps between starts that must agree, and how well, to tell an interval.
+_AGREEING, _ALIKE = 0.8, 0.02
+
+
+def one_row_a_sample(
+    table: Table, mapped: Mapping[str, str], time_unit: str | None, rate: float | None
+) -> Table:
+    """Bring a long or a packed table into the usual shape; any other comes back as it is.
+
+    Args:
+        table: the table.
+        mapped: role of each column that the user maps; of a long table also of what it measures.
+        time_unit: unit of the time, where the user names it.
+        rate: sampling rate, Hz, where the user names it.
+
+    Raises:
+        InputError: if lists of one row differ in length, or nothing tells the time within them.
+    """
+    return _unpacked(_pivoted(table, mapped), mapped, time_unit, rate)
+
+
+def epoch_unit(values: Floats) -> str | None:
+    """Unit in which a clock counts since 1970, by its size; None if it does not."""
+    finite = np.asarray(values)[np.isfinite(values)]
+    for unit in ("s", "ms", "us", "ns"):
+        seconds = conversion("time", unit).apply(finite)
+        if len(finite) and _RECORDED[0] <= seconds.min() <= seconds.max() <= _RECORDED[1]:
+            return unit
+    return None
+
+
+def time_change(table: Table, name: str, unit: str | None) -> Conversion:
+    """Change of units of a clock: as given, by its header, beside it, or since 1970."""
+    unit = unit or table.header(name).unit or table.units.get(name)
+    return conversion("time", unit or epoch_unit(table.columns[name]))
+
+
+def _role(table: Table, name: str, mapped: Mapping[str, str]) -> str | None:
+    header = table.header(name)
+    written = table.headers.get(name, name)
+    return mapped.get(name) or mapped.get(written) or (header.role if header.certain else None)
+
+
+def _clock(table: Table, mapped: Mapping[str, str]) -> str | None:
+    """The column of numbers that is the time."""
+    numeric = (name for name, x in table.columns.items() if x.dtype.kind in "fiu")
+    return next((name for name in numeric if _role(table, name, mapped) == "time"), None)
+
+
+def _pivoted(table: Table, mapped: Mapping[str, str]) -> Table:
+    """A column each of what a long table measures; a row each time, in the order of time."""
+    import pandas as pd
+
+    numeric = [name for name, x in table.columns.items() if x.dtype.kind in "fiu"]
+    if any(_role(table, name, mapped) == "pressure" for name in numeric):
+        return table
+    values = next((n for n in numeric if n.strip("_ ").casefold() in _VALUES), None)
+    words = {
+        name: [str(x) for x in pd.unique(x) if x]
+        for name, x in table.columns.items()
+        if x.dtype.kind == "U"
+    }
+    kinds = {name: x for name, x in words.items() if 1 <= len(x) <= _MOST and not _units(x)}
+    if values is None or not kinds:
+        return table
+
+    def understood(name: str) -> tuple[int, int]:
+        titles = Table("", {}, headers=named(kinds[name]))
+        return sum(_role(titles, n, mapped) is not None for n in titles.headers), len(kinds[name])
+
+    kind, time = max(kinds, key=understood), _clock(table, mapped)
+    if understood(kind) < (0, 2):
+        return table
+    code = pd.factorize(table.columns[kind])[0]
+    clock = np.arange(len(table)) if time is None else table.columns[time]
+    again = pd.Series(code).groupby([code, clock] if time is not None else [code]).cumcount()
+    place = pd.MultiIndex.from_arrays([clock if time is not None else again, again])
+    row = pd.factorize(place)[0]
+    first = np.unique(row, return_index=True)[1]
+    steps = [np.diff(clock[code == k]) for k in range(code.max() + 1)]
+    if time is not None and all((x >= 0).all() for x in steps):
+        order = np.argsort(clock[first], kind="stable")
+        row, first = np.argsort(order)[row], first[order]
+    unit_column = next((name for name, x in words.items() if _units(x)), None)
+    headers, columns, units = named(kinds[kind]), {}, {}
+    for name, written in headers.items():
+        of_kind = table.columns[kind] == written
+        columns[name] = np.full(len(first), np.nan)
+        columns[name][row[of_kind]] = table.columns[values][of_kind]
+        if unit_column is not None:
+            units[name] = str(table.columns[unit_column][of_kind][0])
+    for name, x in table.columns.items():
+        kept = name not in (kind, values, unit_column) and len(pd.unique(x)) > 1
+        if kept and name not in columns and (x == x[first][row]).all():
+            columns[name] = x[first]
+            headers[name] = table.headers.get(name, name)
+            units |= {name: table.units[name]} if name in table.units else {}
+    notes = f"A row a measurement: {kind} names it, {values} is its value ({', '.join(headers)})."
+    lines = None if table.lines is None else table.lines[first]
+    return replace(
+        table,
+        columns=columns,
+        units=units,
+        lines=lines,
+        notes=(*table.notes, notes),
+        headers=headers,
+    )
+
+
+def _units(words: list[str]) -> bool:
+    return bool(words) and all(map(is_unit, words))
+
+
+def _unpacked(
+    table: Table, mapped: Mapping[str, str], time_unit: str | None, rate: float | None
+) -> Table:
+    """A row each sample of the lists that stand in cells; their times go on from those of rows."""
+    packed = {
+        name: x
+        for name, x in table.columns.items()
+        if x.dtype.kind == "O" and _role(table, name, mapped) != "unused"
+    }
+    if not packed:
+        return table
+    sizes = {name: np.array([len(cell) for cell in x]) for name, x in packed.items()}
+    lengths = np.maximum.reduce(list(sizes.values()))
+    for name, size in sizes.items():
+        if len(odd := np.flatnonzero((size != lengths) & (size > 0))):
+            raise InputError(
+                f"{table.file}, {table.place(int(odd[0]))}: column {name} lists {size[odd[0]]} "
+                f"samples, another one {lengths[odd[0]]}; leave one out with --map {name}=unused"
+            )
+    rows = np.repeat(np.arange(len(lengths)), lengths)
+    within = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    columns = {name: x[rows] for name, x in table.columns.items() if x.dtype.kind != "O"}
+    for name, x in packed.items():
+        blank = (np.full(n, np.nan) for n in np.where(sizes[name] == 0, lengths, 0))
+        columns[name] = np.concatenate(
+            [part for pair in zip(x, blank, strict=True) for part in pair]
+        )
+    note = f"{len(lengths)} rows of lists, of {np.median(lengths):g} samples (median)."
+    lines = None if table.lines is None else table.lines[rows]
+    unrolled = replace(table, columns=columns, lines=lines, notes=(*table.notes, note))
+    if rate is not None or any(_role(table, name, mapped) == "time" for name in packed):
+        return unrolled
+    time = _clock(table, mapped)
+    factor = 1.0 if time is None else float(time_change(table, time, time_unit).factor)
+    starts = None if time is None else factor * np.asarray(table.columns[time], float)
+    interval = _interval(table, starts, lengths)
+    if interval is None:
+        raise InputError(
+            f"{table.file}: lists of samples stand in the cells of {', '.join(packed)}, and no "
+            "column tells their rate; give it with --rate 50"
+        )
+    if starts is None:
+        starts = np.cumsum(interval * lengths) - interval * lengths
+    columns[time or "time"] = (starts[rows] + interval[rows] * within) / factor
+    return unrolled
+
+
+def _interval(table: Table, starts: Floats | None, lengths: Floats) -> Floats | None:
+    """Time between samples in each row, s: as a column says, the file, or the starts of rows."""
+    for name, x in table.columns.items():
+        key = re.sub(r"[^a-z]", "", table.headers.get(name, name).lower())
+        if x.dtype.kind not in "fiu" or not (x > 0).all():
+            continue
+        if key.replace("hz", "") in FREQUENCIES or (key.endswith("hz") and "rate" in key):
+            return 1.0 / np.asarray(x, float)
+        for unit, size in (("ms", 1e-3), ("us", 1e-6), ("s", 1.0), ("", 1.0)):
+            if key.endswith(unit) and key.removesuffix(unit) in INTERVALS:
+                return size * np.asarray(x, float)
+    if table.rate:
+        return np.full(len(lengths), 1.0 / table.rate)
+    if starts is None or len(starts) < 3:
+        return None
+    each = np.diff(starts) / lengths[:-1]
+    usual = float(np.median(each))
+    alike = np.abs(each - usual) <= _ALIKE * abs(usual)
+    return np.full(len(lengths), usual) if usual > 0 and alike.mean() >= _AGREEING else None

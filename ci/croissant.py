@@ -54,7 +54,7 @@ def metadata() -> dict[str, Any]:
     import mlcroissant as mlc  # pyright: ignore[reportMissingImports]
 
     simulators = tomllib.loads((ROOT / "data/simulators/manifest.toml").read_text("utf-8"))
-    objects = [
+    objects: list[Any] = [
         mlc.FileObject(
             id=name,
             name=name,

@@ -113,7 +113,7 @@ def test_of_dead_times_are_those_of_milliseconds(predictor, values, path, first)
 def test_are_zero_where_the_point_beside_cannot_be_simulated(predictor, data, values, monkeypatch):
     def predict_all(points):
         seen = np.zeros((len(points), *data.measured.shape))
-        seen[1, 2, :, 7:] = np.inf, np.nan, *[-np.inf] * (seen.shape[3] - 9)
+        seen[1, 2, :, 7:], seen[1, 2, :, 8] = np.inf, np.nan
         return seen
 
     monkeypatch.setattr(predictor, "predict_all", predict_all)

@@ -272,44 +272,24 @@ def test_every_slow_test_exists() -> None:
         assert f"def {name.rpartition('::')[2]}(" in (ROOT / file).read_text("utf-8"), line
 
 
-#: What a walk through the manual replaces: the laboratory's machine, its person, and its hours.
-AT_THE_BENCH = {
-    r"^.*(ventbench-hardware calibrate|--only).*\n": "",  # a person with instruments
-    r"/dev/ttyACM0": "virtual:R20C50",
-    r"(ventbench-hardware (?:run mine|collect)[^#\n]*)": r"\1 --yes ",
-    r"--breaths 600": "--breaths 12",
-    r"(ventbench-hardware run mine)": r"\1 --pips 10 --repeats 1",
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("manual", "replaced", "blocks"),
-    [("README.md", {}, 5), ("hardware_eval/README.md", AT_THE_BENCH, 6)],
-    ids=["readme", "bench manual"],
-)
-def test_a_manual_runs_from_top_to_bottom(
-    manual: str, replaced: dict[str, str], blocks: int, wheel: Path, tmp_path: Path
-) -> None:
+def test_the_readme_runs_from_top_to_bottom(wheel: Path, tmp_path: Path) -> None:
     """Every block, in order, in one empty folder, from the wheel; its packages are here already."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "wheel")
     folder = tmp_path / "folder"
     folder.mkdir()
-    text = (ROOT / manual).read_text("utf-8")
+    text = (ROOT / "README.md").read_text("utf-8")
     ran = 0
     for language, block in re.findall(r"^```(sh|python)\n(.*?)^```", text, re.M | re.S):
         if "make " in block:  # how a contributor runs the tests, this one among them
             continue
-        source = block
-        for pattern, instead in {r"^pip install .*": "", **replaced}.items():
-            source = re.sub(pattern, instead, source, flags=re.M)
-        command = [sys.executable, "-c", source]
-        if language == "sh":  # what a block leaves running ends with it
-            ended = "trap 'kill $(jobs -p) 2>/dev/null || true; wait' EXIT"
-            command = ["bash", "-euo", "pipefail", "-c", f"{ended}\n{source}"]
+        source = re.sub(r"^pip install .*", "", block, flags=re.M)
+        command = (
+            [sys.executable, "-c"] if language == "python" else ["bash", "-euo", "pipefail", "-c"]
+        )
         done = subprocess.run(
-            command,
+            [*command, source],
             cwd=folder,
             env={
                 **os.environ,
@@ -321,4 +301,4 @@ def test_a_manual_runs_from_top_to_bottom(
         )
         assert done.returncode == 0, f"{block}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
         ran += 1
-    assert ran == blocks
+    assert ran == 5

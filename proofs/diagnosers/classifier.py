@@ -3,9 +3,9 @@
 Amortised inference in the sense of K. Cranmer, J. Brehmer, G. Louppe (PNAS 117 (2020) 30055): a
 recording becomes a row of summaries of what a line through pressure, flow and volume leaves, by
 phase and breath, and small networks give each term of the vocabulary a probability of its own.
-``benchmarks/train_classifier.py`` trains them on draws that are no challenge's; terms that joined the
-vocabulary later have none. It knows the
-generators, which no other diagnoser does; sizes of effects, R and C it does not tell.
+``benchmarks/train_classifier.py`` trains them on draws that are no challenge's; terms that joined
+the vocabulary later have none. It knows the generators, which no other diagnoser does; sizes of
+effects, R and C it does not tell.
 """
 
 from __future__ import annotations

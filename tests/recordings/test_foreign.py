@@ -81,6 +81,14 @@ def test_units_are_exact_both_ways():
         conversion("flow", "furlong")
 
 
+@pytest.mark.parametrize("name", ["lab.npy", "lab.npz"])
+def test_arrays_are_sent_to_the_import(tmp_path, name):
+    path = tmp_path / name
+    (np.save if name.endswith("y") else np.savez)(path, np.zeros((50, 3)))
+    with pytest.raises(InputError, match=r"this is a NumPy file.*data import"):
+        load(path)
+
+
 def test_matlab_struct_with_its_rate(tmp_path):
     made, path = waveforms(), tmp_path / "lab.mat"
     savemat(path, {"data": {"Paw": made["pressure"], "Flow": made["flow"]}, "fs": RATE})

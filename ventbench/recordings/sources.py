@@ -384,9 +384,11 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
         raise fail(name, "this is not a Parquet file", advice)
     if first.startswith(b"\x1f\x8b"):
         return "csv.gz"
-    spreadsheet = first == b"PK\x03\x04" and name.endswith(".xlsx")
-    if spreadsheet or first in (b"MATL", b"\x89HDF"):
-        format_name = {b"MATL": "MATLAB", b"\x89HDF": "HDF5 (MATLAB 7.3)"}.get(first, "spreadsheet")
+    marks = {b"MATL": "MATLAB", b"\x89HDF": "HDF5 (MATLAB 7.3)", b"\x93NUM": "NumPy"}
+    format_name = marks.get(first)
+    if first == b"PK\x03\x04":
+        format_name = {".xlsx": "spreadsheet", ".npz": "NumPy"}.get(Path(name).suffix)
+    if format_name:
         advice = "Bring it into the schema with `ventbench data import`."
         raise fail(name, f"this is a {format_name} file", advice)
     if first.startswith(b"PK\x03\x04"):

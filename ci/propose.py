@@ -9,16 +9,15 @@ from __future__ import annotations
 import os
 import re
 import sys
-from functools import partial
 from pathlib import Path
 
 from ci import workflow
 from ci.git import AUTHOR, Git
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, gate, record, rounds, store
-from ventbench.board.record import Record
-from ventbench.board.replay import ReplayPlants, require_replay
+from ventbench.board import canonical, gate, official_runs, rounds
+from ventbench.board.replay import ReplayPlants
+from ventbench.board.rounds import Round
 
 TITLE = "Round"
 
@@ -31,44 +30,24 @@ def add(
     name: str,
     simulators: ReplayPlants,
     secret: str | None = None,
-) -> list[Record]:
-    """Add the records of a scored round to a leaderboard, each replayed.
+) -> Round:
+    """Close a round by what its other jobs left: bounds of one, and of each entry its own job.
 
     Args:
-        scored: the leaderboard that the other job had at its end; only bounds, result and what the
-            result names are taken from it.
-        leaderboard: to add them to, where the round is drawn.
+        scored: what they left, a folder each; of bounds and entries, nothing else is taken.
+        leaderboard: to add the records to, each replayed, where the round is drawn.
         name: of the round.
         simulators: the frozen ones.
         secret: key that signs them; without one they have no rank.
 
     Raises:
-        InputError: if a record is not what it must be, or the key is not one of the leaderboard's.
+        InputError: if there are no bounds, or the key is not one of the leaderboard's.
     """
     own = rounds.load(leaderboard, name)
     if own.state != "drawn":
         raise InputError(f"round {name} is {own.state}; records need it to be drawn")
-    contents = {
-        file: _content(scored / canonical.ROUNDS / name / file)
-        for file in (rounds.BOUNDS, rounds.RESULT)
-    }
-    for file, content in contents.items():
-        files.write_atomically(own.folder / file, lambda f, content=content: f.write(content))
-    result = rounds.load(leaderboard, name).result
-    assert result is not None
-    added: list[Record] = []
-    for sha256 in result.records.values():
-        path = scored / canonical.RECORDS / f"{sha256}{record.SUFFIX}"
-        _content(path)
-        new = store.add(leaderboard, path, partial(require_replay, simulators))
-        if not isinstance(new, Record) or new.header.draws.sha256 != own.commitment:
-            raise InputError(f"{path.name} is no record of round {name}")
-        if secret:
-            gate.sign(leaderboard, store.path_of(leaderboard, new.sha256), secret)
-        added.append(new)
-    if secret:
-        gate.sign(leaderboard, own.folder / rounds.RESULT, secret)
-    return added
+    files.write_bytes(own.folder / rounds.BOUNDS, _content(scored / "bounds" / rounds.BOUNDS))
+    return official_runs.close(leaderboard, name, scored, load=lambda: simulators, secret=secret)
 
 
 def _content(path: Path) -> bytes:
@@ -110,8 +89,10 @@ def main() -> int:
     if scored := os.environ.get("SCORED"):
         # Read here, where no code of a submission runs.
         secret = os.environ.get(gate.SECRET) or None
-        added = add(Path(scored), checkout / "leaderboard", name, frozen.load(), secret)
-        lines += [f"{score.name} ({score.track}): record {score.sha256}" for score in added]
+        result = add(Path(scored), checkout / "leaderboard", name, frozen.load(), secret).result
+        assert result is not None
+        lines += [f"{run}: record {sha256}" for run, sha256 in result.records.items()]
+        lines += [f"{run}: {why}" for run, why in result.failed.items()]
         lines.append("signed" if secret else f"not signed, not ranked: {gate.SECRET} unset")
     state = rounds.load(checkout / "leaderboard", name).state
     branch = commit(checkout, name, state)

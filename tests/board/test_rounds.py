@@ -290,35 +290,70 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
         assert same == pytest.approx(record.figures.ranked_values.mean(), abs=1e-9)
         assert abs(other - same) > 1
         assert done.result.failed[f"{key}, seed 2"] == "a cell failed"
-    _proposed(fresh, checkout, simulators)
+    _proposed(fresh.parent / "work", done, checkout, simulators)
 
 
-def _proposed(scored: Path, leaderboard: Path, simulators) -> None:
-    """The job that may write takes from the other one what replays, and commits it."""
-    forged = shutil.copytree(leaderboard, scored.parent / "forged")
-    other = shutil.copytree(scored, scored.parent / "other")
-    path, _ = sorted((other / "records").glob("*.json"))
-    values = json.loads(path.read_bytes())
-    values["simulators"] = {"manifest_sha256": "9" * 64}
-    content = canonical.canonical(values)
-    (path.parent / f"{canonical.digest(content)}.json").write_bytes(content)
-    result = json.loads((other / "rounds/r2/result.json").read_bytes())
-    result["records"] = dict.fromkeys(result["records"], canonical.digest(content))
-    (other / "rounds/r2/result.json").write_bytes(canonical.canonical(result))
-    with pytest.raises(InputError, match="those of this ventbench are not those of the record"):
-        propose.add(other, forged, "r2", simulators)
+def _proposed(work: Path, done: rounds.Round, leaderboard: Path, simulators) -> None:
+    """The job that may write takes from each other job what is its own, and commits it."""
+    (work / "bounds").mkdir(exist_ok=True)
+    shutil.copy(done.folder / rounds.BOUNDS, work / "bounds")
+
+    def added(board: Path, left: Path) -> rounds.Result:
+        result = propose.add(left, board, "r2", simulators).result
+        assert result is not None
+        return result
+
+    forged = shutil.copytree(leaderboard, work.parent / "forged")
+    other = shutil.copytree(work, work.parent / "other")
+    path = other / "entry-pid_robust/result.json"
+    left = json.loads(path.read_bytes())
+    for key, sha256 in left["records"].items():
+        values = json.loads((path.parent / f"{sha256}.json").read_bytes())
+        values["simulators"] = {"manifest_sha256": "9" * 64}
+        content = canonical.canonical(values)
+        left["records"][key] = canonical.digest(content)
+        (path.parent / f"{canonical.digest(content)}.json").write_bytes(content)
+    path.write_bytes(canonical.canonical(left))
+    shutil.rmtree(other / "entry-one")
+    result = added(forged, other)
     assert not store.load(forged).scores
-    added = propose.add(scored, leaderboard, "r2", simulators)
-    assert {(x.name, x.track) for x in added} == {
-        ("pid_robust", "performance"),
-        ("pid_robust", "robustness"),
-    }
+    for key, why in result.failed.items():
+        expected = "those of this ventbench are not" if "pid_robust" in key else "No such file"
+        assert expected in why
+    assert added(leaderboard, work) == done.result
     git = Git(leaderboard.parent)
     git.output("init", "--quiet", "--template=")
     assert propose.commit(leaderboard.parent, "r2", "scored") == "round/r2-scored"
     assert git.text("log", "-1", "--format=%s") == "Round r2 is scored"
     with pytest.raises(InputError, match="no name of a round"):
         propose.commit(leaderboard.parent, "../r2", "scored")
+
+
+def test_a_job_cannot_leave_the_record_of_another_entry(leaderboard: Path, simulators) -> None:
+    """Nor one of other draws, or of other bounds, or one that is no record."""
+    folder = leaderboard / "rounds" / ROUND
+    result = json.loads((folder / rounds.RESULT).read_bytes())
+    (folder / rounds.RESULT).unlink()
+    (folder / "result.sig").unlink()
+    scored = store.load(leaderboard).scores
+    of = {x.name: x.sha256 for x in scored}
+    for entry, key, sha256, bounds in (
+        ("softer", "softer (performance)", of["harder"], result["bounds"]),
+        ("harder", "harder (performance)", of["harder"], "0" * 64),
+        ("pid_best", "softer (performance)", of["softer"], result["bounds"]),
+        ("robust", "robust (robustness)", of["robust"], result["bounds"]),
+    ):
+        left = {"bounds": bounds, "records": {key: sha256}, "failed": {}, "seeds": {}}
+        path = leaderboard.parent / f"work/entry-{entry}" / rounds.RESULT
+        path.parent.mkdir(parents=True)
+        path.write_bytes(canonical.canonical(left))
+    done = official_runs.close(leaderboard, ROUND, path.parents[1], load=lambda: simulators).result
+    assert done is not None
+    assert done.records == {"robust (robustness)": of["robust"]}
+    assert "is not the record of softer" in done.failed["softer (performance)"]
+    assert "is of other draws or bounds" in done.failed["harder (performance)"]
+    assert done.failed["pid_best (performance)"] == "its job left no record"
+    assert "No such file" in done.failed["new (performance)"]
 
 
 def _cached(folder: Path) -> Path:
@@ -387,63 +422,6 @@ def test_a_bad_request_leaves_itself_out(fresh: Path) -> None:
     left = own.frozen.left_out
     assert left.keys() == {"one", "O\ufffdne/..", "3", "without a name", "absent"}
     assert "there is no folder" in left["absent"]
-
-
-def test_outsiders_return_in_the_next_round_by_the_documented_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two rounds from one checkout: outsiders, one that cannot be opened, one over its limit."""
-    inside = tmp_path / "submissions"
-    monkeypatch.setattr(rounds, "bundled", lambda: sorted(x.name for x in inside.iterdir()))
-    board, chain = tmp_path / "leaderboard", tmp_path / "chain.json"
-    chain.write_bytes(msgspec.json.encode(referee.chain(SECRET)))
-    listed: list[Any] = []
-
-    def command(*arguments: str) -> None:
-        ended = CliRunner().invoke(app, ["round", *arguments, "--folder", str(board)])
-        assert ended.exit_code == 0, ended.output
-
-    def merged(name: str, account: str) -> None:
-        entry_folder(tmp_path / "submissions" / name, "pid_robust", name)
-        asked = FROZEN + timedelta(seconds=len(listed))
-        listed.append({"name": name, "account": account, "asked": asked.isoformat()})
-
-    def froze(name: str) -> dict[str, str]:
-        (tmp_path / "requests.json").write_text(json.dumps(listed))
-        where = ("--submissions", f"{tmp_path}/submissions")
-        command("freeze", name, *where, "--requests", f"{tmp_path}/requests.json")
-        made = rounds.load(board, name).frozen
-        assert made is not None
-        accounts = {entry.name: entry.account for entry in made.entries}
-        return accounts | {x: f"left out: {why}" for x, why in made.left_out.items()}
-
-    def opened_at(name: str, closes: str) -> None:
-        command("open", name, "--closes", closes, "--limit", "2", "--rehearsal", str(chain))
-
-    entry_folder(tmp_path / "submissions/pid_robust", "pid_robust", "pid_robust")
-    opened_at("a", "2020-01-01")
-    merged("one", "eve")
-    merged("two", "mallory")
-    merged("lacking", "mallory")
-    (tmp_path / "submissions/lacking/controller.py").unlink()
-    first = froze("a")
-    assert "controller.py is missing" in first.pop("lacking")
-    assert first == {"pid_robust": "", "one": "eve", "two": "mallory"}
-
-    opened_at("b", "2020-02-01")
-    shutil.rmtree(tmp_path / "submissions/lacking")
-    merged("lacking", "mallory")
-    merged("third", "mallory")
-    merged("new", "carol")
-    second = froze("b")
-    assert "mallory has 2 entries already" in second.pop("third")
-    assert second == {
-        "pid_robust": "",
-        "one": "eve",
-        "two": "mallory",
-        "lacking": "mallory",
-        "new": "carol",
-    }
 
 
 def test_code_that_changed_after_the_freeze_is_not_scored(fresh: Path, simulators) -> None:

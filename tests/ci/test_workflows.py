@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from ci import advisory
+from ventbench.task import protocol
 
 FOLDER = Path(__file__).resolve().parents[2] / ".github" / "workflows"
 FILES = sorted(FOLDER.glob("*.yml")) if FOLDER.is_dir() else []
@@ -29,6 +30,9 @@ TRUSTED = {
     "github.event.pull_request.head.sha",
     "runner.temp",
     "matrix.python",
+    "matrix.entry",  # names of frozen entries, which are letters, digits and _
+    "steps.plan.outputs.entries",
+    "fromJSON(needs.bounds.outputs.entries)",
 }
 #: Texts of a maintainer, and outputs of our own scripts: as environment variables only.
 ONLY_ENV = {
@@ -156,12 +160,48 @@ def test_the_advisory_job_can_only_read():
     assert job["permissions"] == {"contents": "read"}
 
 
+def commands(job: dict[str, Any]) -> str:
+    return "\n".join(step.get("run", "") for step in job["steps"])
+
+
+def runs_strangers(job: dict[str, Any]) -> bool:
+    """Whether code of submissions runs in a job."""
+    return bool(re.search(r"round score|ventbench score|--rerun|ci\.advisory", commands(job)))
+
+
+def test_bounds_come_from_a_machine_that_has_run_no_stranger():
+    every = [job for path in FILES for job in read(path)["jobs"].values()]
+    assert sum(map(runs_strangers, every)) == 2, "control: entries of a round, and of a change"
+    (bounds,) = [job for job in every if "round bounds" in commands(job)]
+    assert not runs_strangers(bounds)
+    assert "needs" not in bounds
+    jobs = read(FOLDER / "round.yml")["jobs"]
+    assert jobs["bounds"] == bounds
+    assert jobs["entries"]["needs"] == "bounds"
+    (given,) = [step for step in jobs["entries"]["steps"] if "download-artifact" in str(step)]
+    assert given["with"]["name"] == "bounds"
+
+
+def test_each_entry_of_a_round_has_a_job_of_its_own():
+    jobs = read(FOLDER / "round.yml")["jobs"]
+    job, last = jobs["entries"], jobs["propose"]
+    assert list(job["strategy"]["matrix"]) == ["entry"]
+    assert job["strategy"]["fail-fast"] is False
+    assert re.findall("round score.*", commands(job)) == ['round score "$NAME" --only "$ENTRY"']
+    assert 60 * job["timeout-minutes"] > 2 * protocol.ENTRY_S
+    (left,) = [step for step in job["steps"] if "upload-artifact" in str(step)]
+    assert left["with"]["name"] == "entry-${{ matrix.entry }}"
+    assert last["needs"] == ["bounds", "entries"]
+    assert last["if"] == "!cancelled() && needs.bounds.result == 'success'"
+    (taken,) = [step for step in last["steps"] if "download-artifact" in str(step)]
+    assert "merge-multiple" not in taken["with"], "no job writes into what another one left"
+
+
 def test_where_a_submission_runs_nothing_can_be_written():
     jobs = read(FOLDER / "round.yml")["jobs"]
-    assert jobs["score"]["permissions"] == {"contents": "read"}
-    assert "GH_TOKEN" not in str(jobs["score"])
-    assert "round score" not in str(jobs["propose"])
-    assert jobs["propose"]["needs"] == "score"
+    assert jobs["entries"]["permissions"] == {"contents": "read"}
+    assert "GH_TOKEN" not in str(jobs["entries"])
+    assert not runs_strangers(jobs["propose"])
 
 
 def test_the_key_that_signs_is_where_no_submission_runs():
@@ -181,8 +221,8 @@ def test_the_key_that_signs_is_where_no_submission_runs():
 
 def test_a_submission_meets_no_secret():
     jobs = read(FOLDER / "round.yml")["jobs"]
-    assert "secrets." not in str(jobs["score"])
-    assert "environment" not in jobs["score"]
+    assert "secrets." not in str(jobs["entries"])
+    assert "environment" not in jobs["entries"]
 
 
 def test_pages_come_from_a_job_that_may_only_read():

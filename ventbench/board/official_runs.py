@@ -1,9 +1,10 @@
 """Official runs in the sandbox: every frozen entry of a round, and second runs of records.
 
-**Rounds.** Bounds of the draws come first, then every entry on them, then the records. Everything
-that is finished is kept in a folder, so that the same command continues. Jobs are small: workers of
-a cluster need to see the same files. An entry that cannot be run has no record, and the result says
-why.
+**Rounds.** Bounds of the draws come first, where no submission has run; then every entry on them,
+each in a job with a folder of its own; then :func:`close` takes records and failures out of these
+folders, as data that a stranger may have written. What is finished is kept, so that the same
+command continues. Jobs are small: workers of a cluster need to see the same files. An entry that
+cannot be run, or whose job left nothing, has no record, and the result says why.
 
 **Second runs** prove that commands come from the code whose hashes a record names, and what it says
 of the stress track. No file of an earlier run is trusted; several processes can share the work.
@@ -28,12 +29,11 @@ from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.base.resume import WorkFolder, kept_results
-from ventbench.board import canonical, create, gate, rounds, schema, store
+from ventbench.board import canonical, create, gate, record, rounds, schema, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.record import Record
 from ventbench.board.replay import Load, ReplayPlants, protocol_of, require_replay
-from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
+from ventbench.board.rounds import BOUNDS, RESULT, Entered, Result, Round
 from ventbench.entries import reference as references
 from ventbench.entries.cells import Runner
 from ventbench.entries.folder import (
@@ -310,6 +310,42 @@ def bounds_of(
     )
 
 
+def bound(
+    leaderboard: Path,
+    name: str,
+    pool: Executor,
+    work: Path,
+    *,
+    load: Load = frozen.load,
+    starts: tuple[int, ...] = attainable.STARTS,
+    progress: references.Progress | None = None,
+) -> Round:
+    """Write the bounds of a round's draws, unless they are there; runs no submission.
+
+    Args:
+        leaderboard: its folder.
+        name: of the round.
+        pool: executor of the draws.
+        work: folder for what is finished.
+        load: gives the simulators.
+        starts: see :data:`ventbench.task.attainable.STARTS`.
+        progress: called with the number of cells done, and of all.
+
+    Raises:
+        InputError: if the round cannot be scored, or its bounds are of other draws.
+        OSError: if a file cannot be read or written.
+    """
+    own, simulators = _drawn(leaderboard, name), load()
+    if different := rounds.protocol_differences(own, simulators.about()):
+        raise InputError(f"round {name} has another protocol: {', '.join(different)}")
+    if not (path := own.folder / BOUNDS).exists():
+        made = bounds_of(own, simulators, pool, work / "bounds", starts=starts, progress=progress)
+        made.save(path)
+    rigs = rigs_of(simulators)
+    references.reference_of(rigs.about, own.draws(rigs).about(), own.bounds())
+    return own
+
+
 def score(
     leaderboard: Path,
     name: str,
@@ -341,62 +377,47 @@ def score(
         progress: called with what is going on, how much of it is done, and of how much.
 
     Raises:
-        InputError: if the round cannot be scored, code is missing, or a record is refused.
+        InputError: if the round cannot be scored, code is missing, or what is kept is of another
+            round.
         OSError: if a file cannot be read or written.
     """
-    own, simulators = rounds.load(leaderboard, name), load()
     tell = progress or (lambda what, done, count: None)
-    runs, places = plan(own), list(places)
-    if different := rounds.protocol_differences(own, simulators.about()):
-        raise InputError(f"round {name} has another protocol: {', '.join(different)}")
-    code = code_of(own, places)
-    done = WorkFolder(work, {"round": own.frozen_sha256, "draws": own.commitment})
-    computed = bounds_of(
-        own,
-        simulators,
-        pool,
-        work / "bounds",
-        starts=starts,
-        progress=lambda ready, count: tell("bounds of the draws", ready, count),
-    )
-    bounds = computed.save(own.folder / BOUNDS)
-    entries = own.frozen.entries if own.frozen else []
+    code = code_of(_drawn(leaderboard, name), list(places))
+    told = functools.partial(tell, "bounds of the draws")
+    own = bound(leaderboard, name, pool, work, load=load, starts=starts, progress=told)
+    bounds = files.sha256(own.folder / BOUNDS)
+    chosen = sorted(set(code) & set(only or code))
     jobs = {
-        entry.name: (leaderboard.resolve(), name, code[entry.name], work.resolve(), load, runner)
-        for entry in entries
-        if not only or entry.name in only
+        entry: (leaderboard.resolve(), name, code[entry], work.resolve(), load, runner)
+        for entry in chosen
+        if not (kept := _job(work, entry) / RESULT).exists() or not _left(kept, bounds)
     }
-    tell("entries and their seeds", 0, len(jobs))
-    made: dict[str, dict[str, Any]] = {}
-    for job, scored in kept_results(done, pool, _score_entry, jobs):
-        made[job] = scored
-        tell("entries and their seeds", len(made), len(jobs))
-    if only:
-        return own
-    records: dict[str, str] = {}
-    failed: dict[str, str] = {}
-    by_seed: dict[str, list[float]] = {}
-    for at, (entry, track) in enumerate(runs):
-        key = f"{entry} ({track})"
-        for run, outcome in made[entry][track].items():
-            if "failed" in outcome:
-                failed[key + run] = outcome["failed"][: schema.MAX_TEXT]
-            elif run:
-                by_seed.setdefault(key, []).append(outcome["score"])
-            else:
-                path = Path(outcome["record"])
-                kept = leaderboard / canonical.RECORDS / path.name
-                if not kept.exists():
-                    store.add(leaderboard, path, functools.partial(require_replay, simulators))
-                if secret:
-                    gate.sign(leaderboard, kept, secret)
-                records[key] = path.stem
-        tell("records", at + 1, len(runs))
-    content = canonical.canonical(msgspec.to_builtins(Result(bounds, records, failed, by_seed)))
-    files.write_bytes(own.folder / RESULT, content)
-    if secret:
-        gate.sign(leaderboard, own.folder / RESULT, secret)
-    return rounds.load(leaderboard, name)
+    count = len(chosen) - len(jobs)
+    tell("entries and their seeds", count, len(chosen))
+    for done, _ in enumerate(results(pool, _score_entry, jobs), count + 1):
+        tell("entries and their seeds", done, len(chosen))
+    return own if only else close(leaderboard, name, work, load=load, secret=secret, progress=tell)
+
+
+def _drawn(leaderboard: Path, name: str) -> Round:
+    own = rounds.load(leaderboard, name)
+    plan(own)
+    return own
+
+
+def _job(work: Path, entry: str) -> Path:
+    """Folder that the job of an entry leaves."""
+    return work / f"entry-{entry}"
+
+
+def _left(path: Path, bounds: str) -> Result:
+    """Read the result that the job of an entry has left; InputError if it is of other bounds."""
+    if path.is_symlink():
+        raise InputError(f"{path} is a link")
+    left = schema.read_canonical(rounds.RESULT_DECODER, path)
+    if left.bounds != bounds:
+        raise InputError(f"{path} is of other draws or bounds; remove the folder")
+    return left
 
 
 def _score_entry(
@@ -406,23 +427,20 @@ def _score_entry(
     work: Path,
     load: Load,
     runner: Callable[[], Runner],
-) -> dict[str, Any]:
+) -> None:
     """Score an entry on its tracks, and with the weights of each of its seeds, all by one runner.
 
-    Returns:
-        By track and run (empty, or ``", seed N"``) the path of its record's draft, the ranked score
-        of a seed, or why it failed.
+    Leaves its records, and its part of the result, in a folder of its own.
     """
     own, simulators = rounds.load(leaderboard, name), load()
     rigs = rigs_of(simulators)
     entry = next(x for x in own.frozen.entries if x.name == code.name) if own.frozen else None
     assert entry is not None
     drawn, bounds, apart = own.draws(rigs), own.bounds(), runner()
-    made: dict[str, Any] = {}
+    left, folder = Result(files.sha256(own.folder / BOUNDS), {}), _job(work, entry.name)
     with TemporaryDirectory() as place:
         for track, seed in itertools.product(entry.tracks, ["", *(x.name for x in seeds(code))]):
-            run = f", seed {seed}" if seed else ""
-            outcomes = made.setdefault(track, {})
+            key = f"{entry.name} ({track})"
             try:
                 at = Path(place) / f"{track}{seed}"
                 submission = frozen_copy(code, entry.sha256, at)
@@ -438,18 +456,100 @@ def _score_entry(
                     runner=apart,
                 )
                 if seed:
-                    outcomes[run] = _of_seed(result)
+                    left.seeds.setdefault(key, []).append(_of_seed(result))
                     continue
                 about: Mapping[str, Any] = {"round": name, "frozen": own.frozen_sha256}
                 draft = create.create(result, simulators, source=about)
-                outcomes[run] = {"record": str(draft.save(work / "drafts"))}
+                left.records[key] = draft.save(folder).stem
             except (InputError, FloatingPointError, OSError) as error:
-                outcomes[run] = {"failed": str(error)}
-    return made
+                why = str(error)[: schema.MAX_TEXT]
+                left.failed[f"{key}, seed {seed}" if seed else key] = why
+    files.write_bytes(folder / RESULT, canonical.canonical(msgspec.to_builtins(left)))
 
 
-def _of_seed(result: Score) -> dict[str, Any]:
+def _of_seed(result: Score) -> float:
     """Ranked score of a seed."""
     assert result.normalised is not None
     value = float(result.normalised[:, 1:][:, result.ranked].mean())
-    return {"failed": "a cell failed"} if math.isnan(value) else {"score": value}
+    if math.isnan(value):
+        raise InputError("a cell failed")
+    return value
+
+
+def close(
+    leaderboard: Path,
+    name: str,
+    work: Path,
+    *,
+    load: Load = frozen.load,
+    secret: str | None = None,
+    progress: Progress | None = None,
+) -> Round:
+    """Write records and result of a round from what the jobs of its entries left; runs none.
+
+    A job that left nothing, or what it must not, loses its entry and no other one.
+
+    Args:
+        leaderboard: its folder, with the bounds of the round.
+        name: of the round.
+        work: folder of the jobs, one folder each.
+        load: gives the simulators.
+        secret: key that signs the records; without one they have no rank.
+        progress: called with what is going on, how much of it is done, and of how much.
+
+    Raises:
+        InputError: if the round is not drawn, or the key is none of the leaderboard's.
+        OSError: if a file cannot be written.
+    """
+    own, simulators = _drawn(leaderboard, name), load()
+    assert own.frozen is not None
+    result = Result(files.sha256(own.folder / BOUNDS), {})
+    for done, entry in enumerate(own.frozen.entries):
+        for track in entry.tracks:
+            key, folder = f"{entry.name} ({track})", _job(work, entry.name)
+            try:
+                left = _left(folder / RESULT, result.bounds)
+                if (sha256 := left.records.get(key)) is None:
+                    raise InputError(left.failed.get(key, "its job left no record"))
+                path = _take(leaderboard, folder, sha256, own, entry, track, simulators)
+            except (InputError, OSError) as error:
+                result.failed[key] = str(error)[: schema.MAX_TEXT]
+                continue
+            if secret:
+                gate.sign(leaderboard, path, secret)
+            result.records[key] = sha256
+            result.seeds.update({x: y for x, y in left.seeds.items() if x == key})
+            of_seeds = {x: y for x, y in left.failed.items() if x.startswith(f"{key}, seed ")}
+            result.failed.update(of_seeds)
+        if progress is not None:
+            progress("records", done + 1, len(own.frozen.entries))
+    files.write_bytes(own.folder / RESULT, canonical.canonical(msgspec.to_builtins(result)))
+    if secret:
+        gate.sign(leaderboard, own.folder / RESULT, secret)
+    return rounds.load(leaderboard, name)
+
+
+def _take(
+    leaderboard: Path,
+    folder: Path,
+    sha256: str,
+    own: Round,
+    entry: Entered,
+    track: str,
+    simulators: ReplayPlants,
+) -> Path:
+    """Add the record that a job left, unless it is there; InputError if it is of anything else."""
+    path = store.path_of(leaderboard, sha256)
+    left = path if path.exists() else folder / path.name
+    found = record.load(left)
+    if not isinstance(found, Record) or (
+        found.sha256,
+        found.name,
+        found.track,
+        found.header.submission.sha256,
+        found.header.draws.sha256,
+    ) != (sha256, entry.name, track, entry.sha256, own.commitment):
+        raise InputError(f"{left.name} is not the record of {entry.name} ({track}) in this round")
+    if left != path:
+        store.add(leaderboard, left, functools.partial(require_replay, simulators))
+    return path

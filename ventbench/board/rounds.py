@@ -105,13 +105,18 @@ class Frozen(schema.Table, frozen=True):
 class Result(schema.Table, frozen=True):
     """Content of ``result.json``: by entry and track a record, or why there is none.
 
-    ``seeds`` are the ranked scores of an entry with the files of each of its seeds.
+    The job of each entry leaves its part. ``seeds`` are the ranked scores of an entry with the
+    files of each of its seeds.
     """
 
     bounds: schema.Sha256
     records: dict[str, schema.Sha256]
     failed: dict[str, str] = msgspec.field(default_factory=dict)
     seeds: dict[str, list[float]] = msgspec.field(default_factory=dict)
+
+
+#: Of results: of a round, and of the job of an entry.
+RESULT_DECODER = msgspec.json.Decoder(Result)
 
 
 class Notes(schema.Table, frozen=True):
@@ -219,7 +224,7 @@ def load(leaderboard: Path, name: str) -> Round:
         return made
     value = schema.read_canonical(beacon.DECODER, folder / BEACON)
     beacon.check(value, opened.chain, made.number, str(folder / BEACON))
-    result = schema.read_canonical(_RESULT, folder / RESULT) if RESULT in there else None
+    result = schema.read_canonical(RESULT_DECODER, folder / RESULT) if RESULT in there else None
     return Round(folder, opened, frozen, value, result, made.frozen_sha256)
 
 
@@ -451,5 +456,4 @@ def _toml(path: Path, kind: type[schema.TableT]) -> schema.TableT:
     return table
 
 
-_RESULT = msgspec.json.Decoder(Result)
 _REQUESTS = msgspec.json.Decoder(list[Any])

@@ -11,7 +11,7 @@ import typer
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.cli.board import FOLDER, Folder, at_hand, tables_of
-from ventbench.cli.options import JsonFile, Scheduler, Sources, Workers, bars, emit
+from ventbench.cli.options import JsonFile, Scheduler, Sources, Workers, bar, bars, emit
 
 if TYPE_CHECKING:
     from ventbench.board.rounds import Round
@@ -131,6 +131,34 @@ def draw(
     _print_round(rounds.draw(folder, name, content), json)
 
 
+#: Folder of a round's bounds and entries.
+Out = Annotated[
+    Path, typer.Option(metavar="DIR", help="What is finished; the same command continues.")
+]
+
+
+@app.command()
+def bounds(
+    name: Name,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    out: Out = Path("runs/round"),
+    folder: Folder = FOLDER,
+) -> None:
+    """Compute the bounds of the draws, on a machine where no submission has run.
+
+    `ventbench round score` takes them; it computes those that are not there, before any entry.
+
+    Example: `ventbench round bounds 2027-1 --workers 2`
+    """
+    from ventbench.base.executor import executor
+    from ventbench.board import official_runs, rounds
+
+    with bar("bounds of the draws") as progress, executor(workers, scheduler) as pool:
+        own = official_runs.bound(folder, name, pool, out / name, progress=progress)
+    typer.echo(own.folder / rounds.BOUNDS)
+
+
 @app.command()
 def score(
     name: Name,
@@ -148,15 +176,14 @@ def score(
             "kept in --out, and the same command without it closes the round.",
         ),
     ] = None,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="What is finished; the same command continues.")
-    ] = Path("runs/round"),
+    out: Out = Path("runs/round"),
     folder: Folder = FOLDER,
     json: JsonFile = None,
 ) -> None:
     """Score every frozen entry in the full sandbox, and write the records.
 
-    Bounds of the draws come first. With a key in VENTBENCH_SIGNING_KEY the records are signed.
+    Bounds of the draws come first, unless they are there. With a key in VENTBENCH_SIGNING_KEY the
+    records are signed.
 
     Example: `ventbench round score 2027-1 --workers 2`
     """

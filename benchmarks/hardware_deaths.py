@@ -35,7 +35,6 @@ import numpy as np
 import typer
 
 from hardware_eval import realtime
-from hardware_eval.emulation.emulator import tell
 from hardware_eval.wire.client import Client, Link, LinkError
 from hardware_eval.wire.messages import Mode
 from ventbench.base import files
@@ -98,44 +97,33 @@ class EmulatedDevice:
 
     Args:
         folder: for its link and its logs.
-        extra: further options of ``emulate``.
+        extra: further options of the emulator.
     """
 
     def __init__(self, folder: Path, extra: list[str]) -> None:
         folder.mkdir()
-        self.link, self.control = folder / "lung", folder / "control"
+        self.link = folder / "lung"
         self.valves, self.program = folder / "valves.csv", folder / "program.csv"
         self._command = [
             sys.executable,
             "-m",
-            "hardware_eval",
-            "emulate",
-            "--plant",
-            "single_compartment",
+            "tests.hardware_eval.electronics",
             "--link",
             str(self.link),
-            "--control",
-            str(self.control),
-            "--electronics",
+            "--valves",
             str(self.valves),
-            "--log",
+            "--program",
             str(self.program),
             *extra,
         ]
         self._start()
 
     def _start(self) -> None:
-        self._process = subprocess.Popen(
-            self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        self._process.stdout.readline()
-        told = self._process.stderr.readline()
-        while "electronics" not in told:  # before it stands what the system refused
-            assert told, "the emulator did not start"
-            told = self._process.stderr.readline()
-        self._ids = {name: int(number) for name, number in re.findall(r"(\w+) (\d+)[,)]", told)}
+        told = self._process.stdout.readline()
+        assert told, "the emulator did not start"
+        self._ids = {name: int(number) for name, number in re.findall(r"(\w+) (\d+)", told)}
 
     def die(self, death: str) -> None:
         """Bring a death about."""
@@ -150,7 +138,7 @@ class EmulatedDevice:
                 os.kill(self._ids["deadman"], signal.SIGSTOP)
                 os.kill(self._ids["device"], signal.SIGSTOP)
             case "bus":
-                tell(self.control, "bus_blocked@0-0.3")
+                os.kill(self._ids["electronics"], signal.SIGUSR2)
             case "supply":
                 os.kill(self._ids["electronics"], signal.SIGUSR1)
 

@@ -23,12 +23,11 @@ from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, run_once
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
-from hardware_eval.emulation import electronics
-from hardware_eval.emulation.electronics import FaultKind
 from hardware_eval.emulation.emulator import LoopbackDevice
-from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError
 from hardware_eval.wire.messages import Reading
+from tests.hardware_eval import faults
+from tests.hardware_eval.faults import FaultKind, faulty_lung
 from ventbench.task import protocol
 
 #: Time at rest before each run, s.
@@ -163,7 +162,7 @@ def trial(device: LoopbackDevice, lung: str, fault: Fault, moment: float) -> tup
     client.hello()
     begins = device.clock.now() + REST + moment
     if fault.lung is not None:
-        hal.faults = (electronics.Fault(fault.lung[0], begins, strength=fault.lung[1]),)
+        hal.faults = (faults.Fault(fault.lung[0], begins, strength=fault.lung[1]),)
 
     def dies(wanted: float) -> float:
         DeadClient.dead = True
@@ -221,7 +220,7 @@ def main(trials: int = 10, lung: str = "R20C20", only: str = "") -> None:
     --only: only faults whose names hold this.
     """
     random = np.random.default_rng(0)
-    device = LoopbackDevice(simulated_lung(lung, noise=0.1, quantum=0.0703))
+    device = LoopbackDevice(faulty_lung(lung, noise=0.1, quantum=0.0703))
     for fault in (fault for fault in FAULTS if only in fault.name):
         done: dict[str, list[float]] = {}
         for _ in range(trials):
@@ -243,7 +242,7 @@ def _selftest(device: LoopbackDevice, lung: str, fault: Fault) -> str:
     """What the self-test says of the fault, if it is there from the start."""
     hal: Any = device.service.hal
     assert fault.lung is not None
-    hal.faults = (electronics.Fault(fault.lung[0], device.clock.now(), strength=fault.lung[1]),)
+    hal.faults = (faults.Fault(fault.lung[0], device.clock.now(), strength=fault.lung[1]),)
     client = Client(device, device.clock)
     client.hello()
     try:

@@ -18,15 +18,9 @@ import numpy as np
 
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
-from hardware_eval.emulation.electronics import parse
 from hardware_eval.emulation.emulator import LoopbackDevice, tell
 from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
-
-#: What the emulator is told for a perturbation; see :mod:`hardware_eval.emulation.emulator`. A
-#: leak as if the expiratory valve stood open by a twentieth; a tube pinched to three times the
-#: resistance.
-EMULATED = {"leak": "leak@0-60:0.05", "pinch": "pinched@0-60:3"}
 
 #: What the operator does by hand.
 _BY_HAND = {
@@ -165,11 +159,11 @@ class ConsoleOperator(Operator):
         """Have a leak opened or the tube pinched, by hand or by the emulator."""
         if self._device is not None:
             hal: Any = self._device.service.hal
-            hal.faults = (parse(EMULATED[perturbation], self._device.clock.now()),) if on else ()
+            hal.disturb(perturbation if on else "")
             return
         if self._control is not None:
             with contextlib.suppress(InputError):  # a session goes on though nobody disturbs it
-                tell(self._control, EMULATED[perturbation] if on else "clear")
+                tell(self._control, perturbation if on else "clear")
             return
         print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
 

@@ -159,7 +159,7 @@ class Guard:
         due = self._clock() + PERIOD
         try:
             while not stop():
-                data = self._wait(min(due, self.wanted()))
+                data = self._wait(due)
                 now = self._clock()
                 if now >= due:
                     self.lateness = max(self.lateness, now - due)
@@ -167,10 +167,6 @@ class Guard:
                 self.turn(now, data)
         finally:
             self.service.vent(self._clock())
-
-    def wanted(self) -> float:
-        """Time of an earlier turn than the period's, s; infinite for none."""
-        return float("inf")
 
     def turn(self, now: float, data: bytes) -> None:
         """Step the program and answer."""

@@ -2,8 +2,7 @@
 
 In this process it lives on a virtual clock, without a wire (:class:`LoopbackDevice`). On a real
 pseudo-terminal, which is a serial port for any program, ``ventbench-hardware emulate`` runs it in
-real time. The cable can be pulled, and faults can begin, while it runs: by lines of text on a
-socket (``--control``), see :class:`Emulator`.
+real time. The tube can be disturbed while it runs: by lines of text on a socket (``--control``).
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import socket
 import sys
 import time
 import tty
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -25,25 +23,12 @@ from pathlib import Path
 from typing import Any
 
 from hardware_eval import realtime
-from hardware_eval.device.deadman import MONOSTABLE
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
-from hardware_eval.emulation.electronics import (
-    EmulatedHal,
-    Fault,
-    FaultKind,
-    Line,
-    LineFaultKind,
-    parse,
-)
 from hardware_eval.emulation.firmware import Firmware
 from hardware_eval.realtime import VirtualClock
 from hardware_eval.wire.client import DisconnectedError
-from hardware_eval.wire.messages import Flag
 from ventbench.base.errors import InputError
-
-#: Changes of the valves that are remembered.
-_REMEMBERED = 100_000
 
 #: Bytes that are read at once.
 _CHUNK = 4096
@@ -66,7 +51,6 @@ class LoopbackDevice:
         start: time at which the device started, s.
         service: program and hardware of the device.
         latency: time that bytes take each way, s; may be changed while it runs.
-        line: what the line does to bytes; its faults may be changed while it runs.
         actuations: every change of the valves.
         plugged: whether the cable is in; :meth:`unplug` and :meth:`plug` change it.
     """
@@ -75,7 +59,7 @@ class LoopbackDevice:
         self, hal: Hal, settings: DeviceSettings | None = None, latency: float = 0.001
     ) -> None:
         """Start the device on a clock of its own."""
-        self.line, self.clock = Line(), VirtualClock()
+        self.clock = VirtualClock()
         self.start = self.clock.now()
         self.latency = latency
         self.service = DeviceService(hal, settings or DeviceSettings(), self.start)
@@ -91,9 +75,7 @@ class LoopbackDevice:
         """Send bytes to the device; DisconnectedError if the cable is out."""
         self._require_cable()
         arrival = self.clock.now() + self.latency
-        data = self.line.to_device(self.clock.now() - self.start, data)
-        if data:
-            heapq.heappush(self._incoming, (arrival, next(self._order), data))
+        heapq.heappush(self._incoming, (arrival, next(self._order), data))
 
     def read(self, timeout: float) -> bytes:
         """Wait for bytes from the device; empty if none come within ``timeout``, s."""
@@ -108,6 +90,10 @@ class LoopbackDevice:
             coming = [self._next, deadline]
             coming += [queue[0][0] for queue in (self._incoming, self._outgoing) if queue]
             self.clock.sleep_until(max(min(coming), now + 1e-6))
+
+    def answer(self, now: float, data: bytes) -> None:
+        """Put bytes of the device on the way to the host."""
+        heapq.heappush(self._outgoing, (now + self.latency, next(self._order), data))
 
     def close(self) -> None:
         """Nothing to release; the device goes on."""
@@ -147,9 +133,7 @@ class LoopbackDevice:
                 self._next += PERIOD
             answers = self.service.step(now, data)
             if answers and self.plugged:
-                due, answers = self.line.to_host(now - self.start, answers)
-                due += self.start + self.latency
-                heapq.heappush(self._outgoing, (due, next(self._order), answers))
+                self.answer(now, answers)
             state, last = self.service.state, self.actuations[-1]
             if (state.u_in, state.u_out) != (last.u_in, last.u_out):
                 self.actuations.append(Actuation(now, state.u_in, state.u_out))
@@ -158,15 +142,12 @@ class LoopbackDevice:
 class Emulator(Guard):
     """A device on a pseudo-terminal, stepped in real time.
 
-    Lines of text on the control socket: a fault as in ``--fault`` with times from now on
-    (``leak@0-3:0.1``), ``clear`` to end all faults, ``unplug SECONDS`` to pull the cable.
+    Lines of text on the control socket: ``leak`` or ``pinch`` to disturb the tube, ``clear`` to
+    mend it.
 
     Attributes:
         terminal: path that a host opens; of another name after the cable was pulled, unless there
             is a link.
-        actuations: the last changes of the valves; their times are those of ``time.monotonic``,
-            which all processes of a machine share.
-        line: what the line does to bytes.
     """
 
     def __init__(
@@ -175,8 +156,6 @@ class Emulator(Guard):
         *,
         link: Path | None = None,
         control: Path | None = None,
-        line_faults: Sequence[Fault] = (),
-        log: Path | None = None,
         begun: float | None = None,
     ) -> None:
         """Open the terminal.
@@ -185,21 +164,12 @@ class Emulator(Guard):
             service: program of the device, with simulated hardware.
             link: symbolic link to make to the terminal, so that its name stays.
             control: path of the control socket to make.
-            line_faults: what goes wrong on the line.
-            log: file to which each change of the valves is written as it happens: time of
-                ``time.monotonic``, s, u_in, %, u_out, flags.
             begun: zero of the program's clock on ``time.monotonic``, s, if it is not now.
 
         Raises:
             InputError: if the link or the socket cannot be made.
         """
-        now = time.monotonic()
-        begun = now if begun is None else begun
-        self.actuations = deque([Actuation(now, 0.0, 1)], maxlen=_REMEMBERED)
-        self.line = Line(line_faults)
-        self._outgoing: list[tuple[float, int, bytes]] = []
-        self._order = count()
-        self._log = log.open("w", buffering=1) if log else None
+        begun = time.monotonic() if begun is None else begun
         self._link, self._control_path = link, control
         self._slave = -1
         if link is not None and link.exists() and not link.is_symlink():
@@ -225,29 +195,10 @@ class Emulator(Guard):
             self._control.close()
             self._control_path.unlink(missing_ok=True)
             self._control = None
-        if self._log:
-            self._log.close()
-            self._log = None
-
-    def wanted(self) -> float:
-        """Time at which an answer is due that a fault delays, s."""
-        return self._outgoing[0][0] if self._outgoing else float("inf")
 
     def turn(self, now: float, data: bytes) -> None:
-        """Step the program; answer as the line's faults allow, and do what the control says."""
-        answers = self.service.step(now, self.line.to_device(now, data) if data else b"")
-        state, last = self._device.state, self.actuations[-1]
-        if (state.u_in, state.u_out) != (last.u_in, last.u_out):
-            done = Actuation(time.monotonic(), state.u_in, state.u_out)
-            self.actuations.append(done)
-            if self._log:
-                causes = Flag(state.causes).name
-                self._log.write(f"{done.time:.6f},{done.u_in:g},{done.u_out},{causes}\n")
-        if answers:
-            due, answers = self.line.to_host(now, answers)
-            heapq.heappush(self._outgoing, (due, next(self._order), answers))
-        while self._outgoing and self._outgoing[0][0] <= now:
-            self.port.send(heapq.heappop(self._outgoing)[2])
+        """Step the program and answer, and do what the control says."""
+        super().turn(now, data)
         if self._control is not None:
             with contextlib.suppress(BlockingIOError):
                 self._obey(self._control.recv(_CHUNK).decode(errors="replace"))
@@ -255,26 +206,11 @@ class Emulator(Guard):
     def _obey(self, text: str) -> None:
         """Do what lines of the control socket say; a wrong one is named on stderr."""
         hal: Any = self._device.hal
-        for line in text.splitlines():
-            word, _, argument = line.strip().partition(" ")
+        for word in text.split():
             try:
-                if word == "clear":
-                    hal.faults, self.line.faults = (), ()
-                elif word == "unplug":
-                    self.port.hang_up(float(argument or 1.0))
-                    self._outgoing.clear()
-                elif word:
-                    self.add_fault(parse(line, self._clock()))
-            except ValueError as error:
+                hal.disturb("" if word == "clear" else word)
+            except InputError as error:
                 print(f"control: {error}", file=sys.stderr, flush=True)
-
-    def add_fault(self, fault: Fault) -> None:
-        """Add a fault of the lung or of the line; times on the device's clock."""
-        if isinstance(fault.kind, FaultKind):
-            hal: Any = self._device.hal
-            hal.faults = (*hal.faults, fault)
-        else:
-            self.line.faults = (*self.line.faults, fault)
 
     def _open(self) -> int:
         master, self._slave = os.openpty()  # ours keeps it open between hosts
@@ -332,8 +268,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         "ventbench-hardware emulate",
         description="Emulate a ventilator with a lung on a pseudo-terminal.",
-        epilog="Example: ventbench-hardware emulate --lung R20C50 --link ./lung --fault "
-        "leak@10-13:0.1",
+        epilog="Example: ventbench-hardware emulate --lung R20C50 --link ./lung",
     )
     add = parser.add_argument
     add("--lung", default="R20C50", help="lung on the ventilator")
@@ -347,15 +282,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--seal", type=Path, help="where the sealed answer of --conceal goes (JSON)")
     add("--link", type=Path, help="symbolic link to make to the terminal")
     add("--control", type=Path, help="control socket to make")
-    add("--log", type=Path, help="CSV of every order of the program to the valves")
-    add("--electronics", type=Path, help="CSV of everything that the valves do, and why")
-    add(
-        "--normally-closed",
-        action="store_true",
-        help="the expiratory valve is closed without current, as PVP's own",
-    )
-    add("--no-monostable", action="store_true", help="no monostable on the heartbeat pin")
-    add("--fault", action="append", default=[], help="KIND@START[-END][:STRENGTH], repeatedly")
     add("--noise", type=float, default=0.0, help="sensor noise, cmH2O (SD)")
     add("--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O")
     add("--highest", type=float, default=math.inf, help="end of the sensor's range, cmH2O")
@@ -380,40 +306,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _emulate(given: argparse.Namespace) -> int:
-    faults = [parse(text) for text in given.fault]
-    line_faults = [fault for fault in faults if isinstance(fault.kind, LineFaultKind)]
+    from hardware_eval.emulation.simulated import emulated_lung
+
     limit = given.pressure_limit
+    if given.firmware is not None and limit is not None:
+        raise InputError("--pressure-limit: with --firmware, the limit is the firmware's own")
     settings = DeviceSettings() if limit is None else DeviceSettings(limit)
-    about = {name: getattr(given, name) for name in ("lung", "plant", "words", "seal")}
     sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
     print("compiling the lung; the terminal appears when it answers", file=sys.stderr, flush=True)
-    begun = time.monotonic()
-    asked = {
-        **about,
-        **sensor,
-        "faults": [x for x in faults if isinstance(x.kind, FaultKind)],
-        "log": given.electronics,
-        "normally_open": not given.normally_closed,
-        "monostable": float("inf") if given.no_monostable else MONOSTABLE,
-    }
-    hal: EmulatedHal | Firmware
-    if given.firmware is None:
-        hal = EmulatedHal(asked, lambda: time.monotonic() - begun, begun)
-    elif limit is None:
-        hal = Firmware(given.firmware, asked, begun)
-    else:
-        raise InputError("--pressure-limit: with --firmware, the limit is the firmware's own")
+    hal = emulated_lung(given.lung, given.plant, given.words, given.seal, **sensor)
+    begun, image = time.monotonic(), None
+    if given.firmware is not None:
+        image = Firmware(given.firmware, hal, begun)
     try:
-        if isinstance(hal, Firmware):
-            service = hal
-        else:
-            service = DeviceService(hal, settings, time.monotonic() - begun)
         emulator = Emulator(
-            service,
+            image or DeviceService(hal, settings, 0.0),
             link=given.link,
             control=given.control,
-            line_faults=line_faults,
-            log=given.log,
             begun=begun,
         )
         reason = realtime.prefer()
@@ -421,13 +330,13 @@ def _emulate(given: argparse.Namespace) -> int:
             emulator.close()
             raise InputError(f"--realtime: {reason}; run as root, or without it")
         ended = realtime.told_to_end()
-        if isinstance(hal, Firmware):
-            hal.start(lambda: emulator.port.inbox.put(b""))
+        if image is not None:
+            image.start(lambda: emulator.port.inbox.put(b""))
         print(emulator.terminal, flush=True)
-        processes = ", ".join(f"{name} {number}" for name, number in hal.processes.items())
-        print(f"ready: {hal.told} ({processes}); Ctrl-C ends it", file=sys.stderr, flush=True)
-        emulator.run(lambda: ended() or hal.lost)
+        print(f"ready: {hal.told}; Ctrl-C ends it", file=sys.stderr, flush=True)
+        emulator.run(lambda: ended() or (image is not None and image.lost))
         print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
     finally:
-        hal.close()
-    return int(hal.lost)
+        if image is not None:
+            image.close()
+    return int(image is not None and image.lost)

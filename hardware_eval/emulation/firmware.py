@@ -1,4 +1,4 @@
-"""A firmware image as an emulated device: its UART, and the bus to the emulated electronics.
+"""A firmware image as an emulated device: its UART, and the bus to its sensors and valves.
 
 An ``.elf`` runs under QEMU on an emulated MPS2 board with a Cortex-M3; any other file is a program
 of this computer. Both are made by ``make`` in ``hardware_eval/firmware``; its ``main.c`` specifies
@@ -14,17 +14,15 @@ import socket
 import struct
 import subprocess
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from cobs import cobs
 
-from hardware_eval.device.program import Sample
-from hardware_eval.emulation import electronics
-from hardware_eval.emulation.electronics import Fault
+from hardware_eval.device.program import Hal
 from hardware_eval.wire.messages import (
     FLOW_STEPS,
     PRESSURE_STEPS,
@@ -36,9 +34,6 @@ from hardware_eval.wire.messages import (
     with_crc,
 )
 from ventbench.base.errors import InputError
-
-#: Pause after which the thread of the sensors looks whether it is to end, s.
-_LOOK = 0.1
 
 _EMULATOR = "qemu-system-arm"
 
@@ -64,33 +59,26 @@ class Firmware:
     """An image that runs, in place of the program and of its hardware.
 
     Attributes:
+        hal: sensors and valves.
         state: last order.
         lost: whether it has ended.
-        told: what the electronics are.
     """
 
-    def __init__(self, image: Path, given: dict[str, Any], begun: float) -> None:
-        """Start the electronics for an image; ``given`` and ``begun`` as of `EmulatedHal`.
+    def __init__(self, image: Path, hal: Hal, begun: float) -> None:
+        """Prepare an image; sensors and valves have a clock of ``time.monotonic`` since ``begun``.
 
         Raises:
-            InputError: if the image or its emulator is not there, or the lung cannot be as asked.
+            InputError: if the image or its emulator is not there.
         """
         self._command = _command(image)
+        self.hal, self._begun = hal, begun
         self.state, self.lost = Order(), False
-        self._faults: tuple[Fault, ...] = tuple(given["faults"])
         self._answers: deque[bytes] = deque()
         self._image: subprocess.Popen[bytes] | None = None
-        self._ended, self._asking = threading.Event(), threading.Lock()
+        self._ended = threading.Event()
         self._threads: list[threading.Thread] = []
         self._uart, self._bus = socket.socketpair(), socket.socketpair()
-        self._electronics, self._sensors, self._pins = electronics.switch_on(
-            {**given, "begun": begun}
-        )
-        try:
-            identity, self.told = electronics.introduced(self._sensors)
-        except InputError:
-            self.close()
-            raise
+        identity = hal.identity
         endless = identity.highest > 327.0
         self._identity = _IDENTITY.pack(
             b"I",
@@ -118,15 +106,15 @@ class Firmware:
         )
         for line in (self._uart, self._bus):
             line[1].close()
-        for work in (lambda: self._listen(wake), self._order, self._measure):
+        for work in (lambda: self._listen(wake), self._order):
             self._threads.append(threading.Thread(target=work, daemon=True))
             self._threads[-1].start()
 
     @property
-    def processes(self) -> dict[str, int]:
-        """Process ids: what a test kills, and what must live on."""
-        image = {} if self._image is None else {"device": self._image.pid}
-        return {**image, "electronics": self._electronics.pid}
+    def process(self) -> int:
+        """Process id of the image."""
+        assert self._image is not None
+        return self._image.pid
 
     def step(self, now: float, data: bytes = b"") -> bytes:
         """Send bytes to the image; returns what it has answered since."""
@@ -140,33 +128,16 @@ class Firmware:
     def vent(self, now: float) -> None:
         """The image hangs up; see :meth:`close`."""
 
-    @property
-    def hal(self) -> Firmware:
-        """Where faults are put."""
-        return self
-
-    @property
-    def faults(self) -> tuple[Fault, ...]:
-        """What goes wrong with the lung."""
-        return self._faults
-
-    @faults.setter
-    def faults(self, faults: Sequence[Fault]) -> None:
-        self._faults = tuple(faults)
-        with self._asking:
-            self._sensors.send(self._faults)
-
     def close(self) -> None:
-        """End the image and the electronics."""
+        """End the image."""
         self._ended.set()
         if self._image is not None:
             self._image.kill()  # SIGTERM makes QEMU complain
             self._image.wait()
         for thread in self._threads:
             thread.join()
-        for line in (*self._uart, *self._bus, self._sensors, self._pins):
+        for line in (*self._uart, *self._bus):
             line.close()
-        self._electronics.wait()
 
     def _send(self, content: bytes) -> None:
         with contextlib.suppress(OSError):
@@ -180,34 +151,25 @@ class Firmware:
         self.lost = not self._ended.is_set()
 
     def _order(self) -> None:
-        """Give each order to the pins, and ask the sensors."""
-        rest = b""
+        """Give each order to the valves, and a sample to the image."""
+        rest, count = b"", 0
         with contextlib.suppress(OSError):
             while data := self._bus[0].recv(4096):
                 *frames, rest = (rest + data).split(b"\0")
                 for frame in frames:
                     order = _content(frame)
                     if order is not None and len(order) == _ORDER.size:
-                        kind, time, u_in, u_out = _ORDER.unpack(order)
+                        kind, time_us, u_in, u_out = _ORDER.unpack(order)
                         if kind == b"?":
                             self._send(self._identity)
-                        self.state = Order(time / 1e6, u_in / U_IN_STEPS, u_out)
-                        self._pins.sendall(electronics.LINES.pack(self.state.u_in, u_out))
-                        with self._asking:
-                            self._sensors.send("sample")
+                        self.state = Order(time_us / 1e6, u_in / U_IN_STEPS, u_out)
+                        now, count = time.monotonic() - self._begun, (count + 1) & 0xFFFFFFFF
+                        self.hal.actuate(now, self.state.u_in, u_out)
+                        sample = self.hal.sample(now)
+                        pressure = fixed_point(sample.pressure, PRESSURE_STEPS)
+                        flow = fixed_point(sample.flow, FLOW_STEPS)
+                        self._send(_SAMPLE.pack(b"S", pressure, flow, sample.saturated, count))
         self.lost = not self._ended.is_set()
-
-    def _measure(self) -> None:
-        """Give samples to the image."""
-        count = 0
-        with contextlib.suppress(OSError, EOFError):
-            while not self._ended.is_set():
-                if self._sensors.poll(_LOOK):
-                    sample: Sample = self._sensors.recv()
-                    count = (count + 1) & 0xFFFFFFFF
-                    pressure = fixed_point(sample.pressure, PRESSURE_STEPS)
-                    flow = fixed_point(sample.flow, FLOW_STEPS)
-                    self._send(_SAMPLE.pack(b"S", pressure, flow, sample.saturated, count))
 
 
 def _content(frame: bytes) -> bytes | None:

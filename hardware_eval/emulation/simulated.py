@@ -1,4 +1,4 @@
-"""A simulated lung as hardware: any ventbench plant, in real or virtual time, with faults.
+"""A simulated lung as hardware: any ventbench plant, in real or virtual time.
 
 The plant advances from one change of the command to the next, as in scoring; a sample in between
 is what the plant shows by then. A loop of 30 ms so reads what a scored run reads.
@@ -6,21 +6,14 @@ is what the plant shows by then. A loop of 30 ms so reads what a scored run read
 A lung may have *concealed* physics, which any words determine: one strong effect of the library,
 its strength and its lung, added to a simulator. The answer is published encrypted, with its hash,
 when the lung is made; the words open it.
-
-Run as a program, it is the process of the emulated electronics with such a lung.
 """
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import math
-import socket
-import sys
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +34,6 @@ from hardware_eval.emulation.cases import (
     random_generator,
     unseal,
 )
-from hardware_eval.emulation.electronics import Fault, FaultKind, active, serve
 from hardware_eval.wire.messages import Capability
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -59,11 +51,9 @@ LONGEST_HOLD = 0.040
 #: Shorter holds than this, s, are replaced by the command that follows.
 SHORTEST_HOLD = 1e-4
 
-#: Time in which the sensor of a disconnected tube falls to ambient pressure, s.
-_AMBIENT_LAG = 0.05
-
-#: Factor of the airway's resistance when it is occluded.
-_OCCLUSION = 100.0
+#: What a disturbed tube does: a leak as if the expiratory valve stood open by so much, and a factor
+#: of the airway's resistance.
+TUBES = {"": (0.0, 1.0), "leak": (0.05, 1.0), "pinch": (0.0, 3.0)}
 
 _SEAL = "ventbench-concealed-1"
 
@@ -83,7 +73,6 @@ class SimulatedHal:
         plant: Plant,
         *,
         name: str = "simulated lung",
-        faults: Sequence[Fault] = (),
         noise: float = 0.0,
         quantum: float = 0.0,
         highest: float = math.inf,
@@ -94,7 +83,6 @@ class SimulatedHal:
         Args:
             plant: the lung on its ventilator, without a batch shape.
             name: what the device is called.
-            faults: what goes wrong, and when.
             noise: standard deviation of the sensor's noise, cmH2O.
             quantum: step of the sensor's converter, cmH2O; 0 for none.
             highest: end of the sensor's range, cmH2O.
@@ -135,60 +123,36 @@ class SimulatedHal:
         inputs = np.array([0.0, 1.0, LONGEST_HOLD, 1.0, 0.0], np.float32)
         self._advance = jax.jit(advance).lower(vector, inputs).compile()
         jax.block_until_ready(self._advance(vector, inputs))
-        self._rest = vector
-        self._reset(faults, seed)
-
-    def at_rest(self, faults: Sequence[Fault] = (), seed: int = 0) -> SimulatedHal:
-        """Return the same lung at rest, with other faults; nothing is compiled again."""
-        fresh = copy.copy(self)
-        fresh._reset(faults, seed)
-        return fresh
-
-    def _reset(self, faults: Sequence[Fault], seed: int) -> None:
-        self.faults = tuple(faults)
+        self._state = vector
         self._random = np.random.default_rng(seed)
-        self._state = self._rest
         self._since: float | None = None
-        self._command = (0.0, 1)
-        self._restart = 0.0
-        self._stuck_reading = math.nan
-        self._stuck_valve = math.nan
-        self._ambient_from: tuple[float, float] | None = None
-        self._last = Sample(0.0, protocol.PEEP)
+        self._command, self._restart, self._tube = (0.0, 1), 0.0, TUBES[""]
+
+    def disturb(self, tube: str) -> None:
+        """Disturb the tube as one of :data:`TUBES` says; nothing mends it."""
+        if tube not in TUBES:
+            raise InputError(f"a tube has no {tube!r}; choose of {', '.join(filter(None, TUBES))}")
+        self._tube = TUBES[tube]
+
+    def shown(self, now: float) -> tuple[float, float]:
+        """Pressure, cmH2O, and flow, mL/s, by now, as a perfect sensor tells them."""
+        pressure, flow = np.asarray(self._by(now)[1])
+        return float(pressure), float(flow)
+
+    def forced(self, now: float) -> tuple[float, float, float]:
+        """What acts on the plant: u_in, %, the expiratory valve's opening, a factor of R."""
+        (u_in, u_out), (leak, r_scale) = self._command, self._tube
+        return u_in, max(float(u_out), leak), r_scale
 
     def sample(self, now: float) -> Sample:
         """Pressure and flow by now; see :class:`~hardware_eval.device.program.Hal`."""
-        kinds = active(self.faults, now)
-        if FaultKind.BUS_BLOCKED in kinds:
-            return self._last
-        _, shown = self._by(now, kinds)
-        pressure, flow = (float(x) for x in np.asarray(shown))
-        if FaultKind.DISCONNECTED in kinds:
-            begun, before = self._ambient_from or (now, self._last.pressure)
-            self._ambient_from = begun, before
-            pressure, flow = before * math.exp(-(now - begun) / _AMBIENT_LAG), 0.0
-        else:
-            self._ambient_from = None
+        pressure, flow = self.shown(now)
         if self._noise:
             pressure += self._noise * float(self._random.standard_normal())
-        pressure += kinds.get(FaultKind.SENSOR_OFFSET, 0.0)
-        if FaultKind.SENSOR_NOISY in kinds:
-            pressure += kinds[FaultKind.SENSOR_NOISY] * float(self._random.standard_normal())
         if self._quantum:
             pressure = round(pressure / self._quantum) * self._quantum
         pressure = min(pressure, self._highest)
-        if FaultKind.SENSOR_STUCK in kinds:
-            if math.isnan(self._stuck_reading):
-                self._stuck_reading = self._last.pressure
-            pressure = self._stuck_reading
-        else:
-            self._stuck_reading = math.nan
-        lost = FaultKind.SENSOR_LOST in kinds
-        if FaultKind.SENSOR_DROPOUTS in kinds:
-            lost |= bool(self._random.uniform() < kinds[FaultKind.SENSOR_DROPOUTS])
-        pressure = math.nan if lost else pressure
-        self._last = Sample(now, pressure, flow, saturated=pressure >= self._highest)
-        return self._last
+        return Sample(now, pressure, flow, saturated=pressure >= self._highest)
 
     def actuate(self, now: float, u_in: float, u_out: int) -> None:
         """Hold a command from now on; see :class:`~hardware_eval.device.program.Hal`."""
@@ -199,31 +163,15 @@ class SimulatedHal:
         if not (changed or held >= LONGEST_HOLD):
             return
         if held >= SHORTEST_HOLD:
-            kinds = active(self.faults, now)
-            self._state, _ = self._by(now, kinds)
+            self._state, _ = self._by(now)
             self._since, self._restart = now, 0.0
         if self._command[1] == 1 and u_out == 0:
             self._restart = 1.0
         self._command = (u_in, u_out)
 
-    def _by(self, now: float, kinds: dict[object, float]) -> tuple[jax.Array, jax.Array]:
+    def _by(self, now: float) -> tuple[jax.Array, jax.Array]:
         """State and readings at ``now`` if the present command is held until then."""
-        u_in, u_out = self._command
-        share, r_scale = float(u_out), kinds.get(FaultKind.PINCHED, 1.0)
-        if FaultKind.VALVE_STUCK in kinds:
-            if math.isnan(self._stuck_valve):
-                self._stuck_valve = u_in
-            u_in = self._stuck_valve
-        else:
-            self._stuck_valve = math.nan
-        u_in *= kinds.get(FaultKind.VALVE_WEAK, 1.0)
-        if FaultKind.EXPIRATORY_STUCK in kinds:
-            share = 0.0
-        share = max(share, kinds.get(FaultKind.LEAK, 0.0))
-        if FaultKind.DISCONNECTED in kinds:
-            u_in, share = 0.0, 1.0
-        if FaultKind.OCCLUDED in kinds:
-            r_scale = _OCCLUSION
+        u_in, share, r_scale = self.forced(now)
         held = max(now - (now if self._since is None else self._since), SHORTEST_HOLD)
         # A gap of seconds, as after a suspended machine, goes in steps that the plant can take.
         while held > 2.0 * LONGEST_HOLD:
@@ -353,17 +301,3 @@ def emulated_lung(
     if seal:
         concealed.write(seal)
     return hal
-
-
-def _main() -> None:
-    with Connection(int(sys.argv[1])) as bus, socket.socket(fileno=int(sys.argv[2])) as wire:
-        given = bus.recv()
-        about = {name: given.pop(name) for name in ("begun", "normally_open", "monostable", "log")}
-        try:
-            serve(bus, wire, lambda: emulated_lung(**given), **about)
-        except (InputError, OSError) as error:  # of the lung, of --log or --seal
-            bus.send(str(error))
-
-
-if __name__ == "__main__":
-    _main()

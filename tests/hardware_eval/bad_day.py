@@ -17,10 +17,10 @@ from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.safety import DEFAULT, VALVE_GAIN
 from hardware_eval.bench.session import run_plan
 from hardware_eval.device.program import DeviceService, DeviceSettings, Sample
-from hardware_eval.emulation.electronics import Fault, LineFaultKind
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import Client
 from tests.hardware_eval import stand_in
+from tests.hardware_eval.faults import Fault, FaultyDevice, LineFaultKind
 from ventbench.task import protocol
 
 #: How long common boards take until their program answers, s.
@@ -112,7 +112,7 @@ def bad_day(path: Path, seed: int, repeats: int = 3) -> Day:
     late; readings are lost; and a controller's answer is late.
     """
     draw, lung = Random(seed), Lung()
-    device = LoopbackDevice(lung)
+    device = FaultyDevice(lung)
     board = Board(device)
     client = Client(board, board.clock)
     client.hello()

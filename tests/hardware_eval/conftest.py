@@ -10,10 +10,9 @@ import pytest
 
 from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
-from hardware_eval.emulation.emulator import LoopbackDevice
-from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
+from tests.hardware_eval.faults import FaultyDevice, faulty_lung
 
 LUNG = "R5C20"
 
@@ -35,21 +34,22 @@ def scored_only(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def shared_device() -> LoopbackDevice:
-    return LoopbackDevice(simulated_lung(LUNG, "physics"))
+def shared_device() -> FaultyDevice:
+    return FaultyDevice(faulty_lung(LUNG, "physics"))
 
 
 @pytest.fixture
-def device(shared_device: LoopbackDevice) -> Iterator[LoopbackDevice]:
+def device(shared_device: FaultyDevice) -> Iterator[FaultyDevice]:
     hal: Any = shared_device.service.hal
     yield shared_device
     hal.faults = shared_device.line.faults = ()
+    hal.disturb("")
     shared_device.plug()
     shared_device.clock.advance(6.0)  # the watchdog vents, and the lung empties
 
 
 @pytest.fixture
-def line(device: LoopbackDevice) -> Line:
+def line(device: FaultyDevice) -> Line:
     client = Client(device, device.clock)
     client.hello()
     return Line(client, device.clock)

@@ -23,11 +23,11 @@ from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import Finding, selftest
 from hardware_eval.device.program import DeviceSettings
-from hardware_eval.emulation.electronics import Fault, FaultKind
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
 from tests.hardware_eval import stand_in
+from tests.hardware_eval.faults import Fault, FaultKind
 from ventbench.base.errors import InputError
 
 LUNG = "R5C20"

@@ -19,9 +19,9 @@ from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
 from hardware_eval.bench.raw_log import RawLog, breaths, lines
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.session import run_plan
-from hardware_eval.emulation.electronics import Fault, FaultKind, LineFaultKind
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import LinkError
+from tests.hardware_eval.faults import Fault, FaultKind, FaultyDevice, LineFaultKind
 from ventbench import rollout
 from ventbench.controllers.pid import PID
 from ventbench.task import protocol
@@ -54,12 +54,12 @@ class Scripted:
         pass
 
 
-def vented(device: LoopbackDevice) -> bool:
+def vented(device: FaultyDevice) -> bool:
     last = device.actuations[-1]
     return (last.u_in, last.u_out) == (0.0, 1)
 
 
-def test_a_run_scores_as_in_simulation(bench: Bench, device: LoopbackDevice) -> None:
+def test_a_run_scores_as_in_simulation(bench: Bench, device: FaultyDevice) -> None:
     simulated = rollout(PID(*GAINS), simulator="physics", lungs=[LUNG], pips=[20.0])
     controller = Scripted()
     result = run_once(bench, run(), controller)
@@ -97,7 +97,7 @@ def test_an_entry_that_is_late_more_often_than_one_in_a_hundred_fails(bench: Ben
 
 
 def silent(
-    device: LoopbackDevice,
+    device: FaultyDevice,
     after: float,
     steps: float,
     kind: FaultKind | LineFaultKind = LineFaultKind.SILENT,
@@ -119,7 +119,7 @@ def test_a_step_without_an_answer_or_a_reading_costs_no_run(
     early: float,
     step: int,
     bench: Bench,
-    device: LoopbackDevice,
+    device: FaultyDevice,
 ) -> None:
     whole = run_once(bench, run(), Scripted())
     silent(device, (protocol.BREATH_STEPS + step) * protocol.DT - early, 0.9, kind)
@@ -134,7 +134,7 @@ def test_a_step_without_an_answer_or_a_reading_costs_no_run(
     assert result.error == pytest.approx(whole.error, abs=0.1)
 
 
-def test_a_run_of_too_few_readings_runs_again(bench: Bench, device: LoopbackDevice) -> None:
+def test_a_run_of_too_few_readings_runs_again(bench: Bench, device: FaultyDevice) -> None:
     begins = device.clock.now() - device.start + 2.0 + protocol.DT - 0.002
     steps = protocol.BREATH_STEPS + np.arange(2, 34, 4)
     device.line.faults = tuple(
@@ -147,7 +147,7 @@ def test_a_run_of_too_few_readings_runs_again(bench: Bench, device: LoopbackDevi
 
 
 def test_a_silent_line_ends_the_run_and_blames_neither_lung_nor_entry(
-    bench: Bench, device: LoopbackDevice
+    bench: Bench, device: FaultyDevice
 ) -> None:
     silent(device, 0.5, 5.0)
     result = run_once(bench, run(), Scripted())
@@ -156,7 +156,7 @@ def test_a_silent_line_ends_the_run_and_blames_neither_lung_nor_entry(
     assert max(result.breaths[0].late) < protocol.DT  # the loop did not wait for it
 
 
-def test_a_controller_that_fails_ends_its_run(bench: Bench, device: LoopbackDevice) -> None:
+def test_a_controller_that_fails_ends_its_run(bench: Bench, device: FaultyDevice) -> None:
     def fail(step: int, u_in: float) -> float:
         if step == 7:
             raise ControllerFailedError("it raised ValueError")
@@ -189,9 +189,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", sorted(FAULTS))
-def test_a_fault_of_the_bench_stops_the_run(
-    name: str, bench: Bench, device: LoopbackDevice
-) -> None:
+def test_a_fault_of_the_bench_stops_the_run(name: str, bench: Bench, device: FaultyDevice) -> None:
     fault, checks = FAULTS[name]
     hal: Any = device.service.hal
     # The lung rests for 2 s before the run.
@@ -203,7 +201,7 @@ def test_a_fault_of_the_bench_stops_the_run(
     assert vented(device)
 
 
-def test_a_cable_pulled_leaves_the_lung_vented(bench: Bench, device: LoopbackDevice) -> None:
+def test_a_cable_pulled_leaves_the_lung_vented(bench: Bench, device: FaultyDevice) -> None:
     def pull(step: int, u_in: float) -> float:
         if step == 10:
             device.unplug()
@@ -227,13 +225,13 @@ class StopsAt(Operator):
 
 
 @pytest.mark.parametrize("step", [0, 20, 140])
-def test_the_emergency_stop_vents_at_once(step: int, bench: Bench, device: LoopbackDevice) -> None:
+def test_the_emergency_stop_vents_at_once(step: int, bench: Bench, device: FaultyDevice) -> None:
     with pytest.raises(EmergencyStop):
         run_once(replace(bench, operator=StopsAt(step)), run(), Scripted())
     assert vented(device)
 
 
-def test_ctrl_c_anywhere_leaves_the_lung_vented(bench: Bench, device: LoopbackDevice) -> None:
+def test_ctrl_c_anywhere_leaves_the_lung_vented(bench: Bench, device: FaultyDevice) -> None:
     def interrupt(step: int, u_in: float) -> float:
         if step == 50:
             raise KeyboardInterrupt
@@ -275,7 +273,7 @@ def work(bench: Bench, plan: Plan, path: Path, make: Callable[[PlannedRun], Any]
 
 
 def test_a_plan_survives_crashes_and_cables(
-    bench: Bench, plan: Plan, device: LoopbackDevice, tmp_path: Path
+    bench: Bench, plan: Plan, device: FaultyDevice, tmp_path: Path
 ) -> None:
     path = tmp_path / "raw.jsonl"
     crashes = {30, 180, 250}  # steps of inspirations over all sessions

@@ -63,7 +63,7 @@ def test_only_an_order_to_vent_wakes_it_and_orders_may_come_in_pieces() -> None:
 def pins() -> Iterator[tuple[socket.socket, socket.socket, int]]:
     """Orders into a deadman, the pins that it moves, and its process."""
     here, there = socket.socketpair()
-    opens = "hardware_eval.emulation.electronics:Pins"
+    opens = "tests.hardware_eval.electronics:Pins"
     process, orders = deadman.start(opens, str(there.fileno()), [there.fileno()])
     there.close()
     assert here.recv(5) == order(*VENTED)

@@ -8,14 +8,12 @@ import os
 import random
 import re
 import signal
-import socket
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from multiprocessing import Pipe
 from pathlib import Path
 
 import pytest
@@ -23,13 +21,11 @@ import pytest
 from hardware_eval.device import deadman
 from hardware_eval.device.deadman import MONOSTABLE
 from hardware_eval.device.program import Sample
-from hardware_eval.emulation import electronics, simulated
-from hardware_eval.emulation.electronics import Electronics
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import Client, Link, LinkError, RefusedError
 from hardware_eval.wire.messages import Mode
+from tests.hardware_eval.electronics import Electronics
 from tests.hardware_eval.stand_in import Bench
-from ventbench.base.errors import InputError
 
 #: Patience with a busy machine, s.
 PATIENCE = 600.0
@@ -45,19 +41,6 @@ def test_what_the_valves_do_when_nobody_orders_anything(normally_open: bool) -> 
     unpowered = Electronics(normally_open, MONOSTABLE, (50.0, 0), beat=1.0, powered=False)
     # Closed without current, nothing can open it.
     assert unpowered.valves(1.0) == (0.0, int(normally_open), "supply")
-
-
-def test_a_log_that_cannot_be_written_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (here, there), (pins, wire) = Pipe(), socket.socketpair()
-    log = tmp_path / "nowhere" / "log.csv"
-    here.send({"begun": 0.0, "normally_open": True, "monostable": MONOSTABLE, "log": log})
-    monkeypatch.setattr("sys.argv", ["", *(str(os.dup(x.fileno())) for x in (there, wire))])
-    with pins, wire, there, here:
-        simulated._main()
-        with pytest.raises(InputError, match=r"nowhere/log\.csv"):
-            electronics.introduced(here)
 
 
 class Layers(Bench):
@@ -160,24 +143,20 @@ def test_a_death_in_an_inspiration_vents(
         [
             sys.executable,
             "-m",
-            "hardware_eval",
-            "emulate",
-            "--plant",
-            "single_compartment",
+            "tests.hardware_eval.electronics",
             "--link",
             str(link),
-            "--electronics",
+            "--valves",
             str(log),
+            "--program",
+            str(tmp_path / "program.csv"),
             *normally,
         ],
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
         text=True,
     )
     assert emulator.stdout is not None
-    assert emulator.stderr is not None
-    assert emulator.stdout.readline()
-    ids = dict(re.findall(r"(\w+) (\d+)[,)]", emulator.stderr.readline()))
+    ids = dict(re.findall(r"(\w+) (\d+)", emulator.stdout.readline()))
 
     def rows() -> list[list[str]]:
         return [line.split(",") for line in log.read_text().splitlines()]

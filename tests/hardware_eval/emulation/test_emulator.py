@@ -31,6 +31,7 @@ from hardware_eval.wire.client import (
     RefusedError,
 )
 from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
+from tests.hardware_eval.electronics import LoggedEmulator
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 
@@ -38,13 +39,24 @@ from ventbench.base.errors import InputError
 PATIENCE = 600.0
 
 
+class Disturbed(Bench):
+    """A lung whose tube is only remembered."""
+
+    tube = ""
+
+    def disturb(self, tube: str) -> None:
+        if tube == "fire":
+            raise InputError("no such tube")
+        self.tube = tube
+
+
 @pytest.fixture
-def emulator(tmp_path: Path) -> Iterator[Emulator]:
-    running = Emulator(
-        DeviceService(Bench(), DeviceSettings(), 0.0),
+def emulator(tmp_path: Path) -> Iterator[LoggedEmulator]:
+    running = LoggedEmulator(
+        DeviceService(Disturbed(), DeviceSettings(), 0.0),
+        tmp_path / "valves.csv",
         link=tmp_path / "lung",
         control=tmp_path / "control",
-        log=tmp_path / "valves.csv",
     )
     stop = threading.Event()
     thread = threading.Thread(target=running.run, args=(stop.is_set,))
@@ -61,9 +73,8 @@ def _wait_for(done: Callable[[], object]) -> None:
         time.sleep(0.002)
 
 
-def _vented(emulator: Emulator) -> bool:
-    last = emulator.actuations[-1]
-    return (last.u_in, last.u_out) == (0.0, 1)
+def _vented(emulator: LoggedEmulator) -> bool:
+    return emulator.ordered == (0.0, 1)
 
 
 def _run(client: Client) -> None:
@@ -78,7 +89,7 @@ def _run(client: Client) -> None:
     pytest.fail("the device never ran")
 
 
-def test_a_session_on_a_pseudo_terminal(emulator: Emulator, tmp_path: Path) -> None:
+def test_a_session_on_a_pseudo_terminal(emulator: LoggedEmulator, tmp_path: Path) -> None:
     client = Client(Link(emulator.terminal), timeout=PATIENCE)
     assert client.hello().name == "bench"
     _run(client)
@@ -94,11 +105,11 @@ def test_a_session_on_a_pseudo_terminal(emulator: Emulator, tmp_path: Path) -> N
     assert "COMMANDS_STOPPED" in causes.split("|")  # and that a busy machine was late
 
 
-def test_a_cable_is_pulled_and_comes_back(emulator: Emulator, tmp_path: Path) -> None:
+def test_a_cable_is_pulled_and_comes_back(emulator: LoggedEmulator) -> None:
     client = Client(Link(emulator.terminal), timeout=PATIENCE)
     client.hello()
     _run(client)
-    tell(tmp_path / "control", "unplug 0.3")
+    emulator.port.hang_up(0.3)
     with pytest.raises(DisconnectedError):
         _wait_for(lambda: client.heartbeat().mode is None)
     _wait_for(lambda: _vented(emulator))
@@ -108,26 +119,21 @@ def test_a_cable_is_pulled_and_comes_back(emulator: Emulator, tmp_path: Path) ->
     client.close()
 
 
-def test_faults_and_nonsense_by_the_control_socket(
-    emulator: Emulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+def test_the_control_socket_disturbs_the_tube_and_names_nonsense(
+    emulator: LoggedEmulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    control = tmp_path / "control"
-    tell(control, "fire@0")
-    tell(control, "silent@0:1")
-    client = Client(Link(emulator.terminal), timeout=0.05)
-    _wait_for(lambda: emulator.line.faults)
-    with pytest.raises(NoAnswerError, match="is it on"):
-        client.heartbeat()
-    tell(control, "clear")
-    _wait_for(lambda: not emulator.line.faults)
-    assert Client(client.transport, timeout=PATIENCE).hello().name == "bench"
-    assert "KIND@START" in capfd.readouterr().err
+    control, service = tmp_path / "control", emulator.service
+    assert isinstance(service, DeviceService)
+    for said, tube in (("leak", "leak"), ("fire pinch", "pinch"), ("clear", "")):
+        tell(control, said)
+        _wait_for(lambda tube=tube: service.hal.tube == tube)  # type: ignore[attr-defined]
+    assert "control: no such tube" in capfd.readouterr().err
     with pytest.raises(InputError, match="no emulator listens"):
         tell(tmp_path / "nobody", "clear")
 
 
 def test_a_line_that_cannot_be_opened_is_told_and_tried_again(
-    emulator: Emulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    emulator: LoggedEmulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     told = ""
 
@@ -147,7 +153,7 @@ def test_a_line_that_cannot_be_opened_is_told_and_tried_again(
 
 
 def test_errors_of_ports(
-    emulator: Emulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    emulator: LoggedEmulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(PortMissingError, match="is the cable in"):
         Link(str(tmp_path / "none"))
@@ -170,7 +176,7 @@ def test_errors_of_ports(
         Link(emulator.terminal)
 
 
-def test_patience_with_a_lost_port_ends(emulator: Emulator, tmp_path: Path) -> None:
+def test_patience_with_a_lost_port_ends(emulator: LoggedEmulator, tmp_path: Path) -> None:
     link = Link(emulator.terminal, patience=0.05)
     (tmp_path / "lung").unlink()
     with pytest.raises(PortMissingError, match=r"tried for 0\.05 s"):
@@ -194,8 +200,6 @@ def test_a_socket_and_a_loop_are_links_too() -> None:
 
 
 def test_wrong_arguments_say_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert emulator_module.main(["--fault", "fire@1"]) == 2
-    assert "KIND@START" in capsys.readouterr().err
     assert emulator_module.main(["--pressure-limit", "200"]) == 2
     assert "outside 0..100" in capsys.readouterr().err
     for lung, sensor, said in (

@@ -8,11 +8,11 @@ from typing import Any
 import flax.struct
 import pytest
 
-from hardware_eval.emulation.electronics import Fault, FaultKind, LineFaultKind, parse
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.wire.client import Client, DisconnectedError, NoAnswerError
 from hardware_eval.wire.messages import Capability, Flag, Mode
+from tests.hardware_eval.faults import Fault, FaultKind, FaultyDevice, FaultyLung, LineFaultKind
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
@@ -26,12 +26,12 @@ STEPS = 34
 
 
 @pytest.fixture(scope="module")
-def hal_of_a_textbook_lung() -> SimulatedHal:
-    return SimulatedHal(single_compartment(lung("R20C50")))
+def hal_of_a_textbook_lung() -> FaultyLung:
+    return FaultyLung(single_compartment(lung("R20C50")))
 
 
 def _inspire(
-    hal: SimulatedHal, *faults: Fault, u_in: float = 10.0, steps: int = STEPS
+    hal: FaultyLung, *faults: Fault, u_in: float = 10.0, steps: int = STEPS
 ) -> list[float]:
     """Pressures at the steps of an inspiration with a constant command, cmH2O."""
     fresh = hal.at_rest(faults)
@@ -42,14 +42,14 @@ def _inspire(
     return pressures
 
 
-def test_without_faults_the_lung_is_the_plant(hal_of_a_textbook_lung: SimulatedHal) -> None:
+def test_without_faults_the_lung_is_the_plant(hal_of_a_textbook_lung: FaultyLung) -> None:
     """Textbook: p = PEEP + q t / C + R q."""
     flow = 0.228  # L/s: 10 % of 22.8 mL/s per %
     expected = [protocol.PEEP + flow * 0.03 * (k + 1) / 0.05 + 20.0 * flow for k in range(STEPS)]
     assert _inspire(hal_of_a_textbook_lung) == pytest.approx(expected, abs=1e-3)
 
 
-def test_samples_between_commands_change_nothing(hal_of_a_textbook_lung: SimulatedHal) -> None:
+def test_samples_between_commands_change_nothing(hal_of_a_textbook_lung: FaultyLung) -> None:
     fresh = hal_of_a_textbook_lung.at_rest()
     pressures = []
     for k in range(STEPS):
@@ -63,7 +63,7 @@ def test_samples_between_commands_change_nothing(hal_of_a_textbook_lung: Simulat
         assert other.sample(0.03 * (k + 1)).pressure == pytest.approx(pressures[k], abs=1e-3)
 
 
-def test_faults_change_the_pressure_as_they_say(hal_of_a_textbook_lung: SimulatedHal) -> None:
+def test_faults_change_the_pressure_as_they_say(hal_of_a_textbook_lung: FaultyLung) -> None:
     hal = hal_of_a_textbook_lung
     healthy = _inspire(hal)
 
@@ -110,7 +110,7 @@ def test_a_plant_without_flow_says_so() -> None:
     assert not hal.identity.capabilities & Capability.FLOW
 
 
-def test_a_stuck_valve_keeps_its_position(hal_of_a_textbook_lung: SimulatedHal) -> None:
+def test_a_stuck_valve_keeps_its_position(hal_of_a_textbook_lung: FaultyLung) -> None:
     fresh = hal_of_a_textbook_lung.at_rest((Fault(FaultKind.VALVE_STUCK, 0.1),))
     for k in range(10):
         fresh.actuate(0.03 * k, 10.0, 0)
@@ -119,7 +119,7 @@ def test_a_stuck_valve_keeps_its_position(hal_of_a_textbook_lung: SimulatedHal) 
     assert fresh.sample(0.33).pressure > before + 0.1
 
 
-def test_the_device_vents_an_occluded_lung(hal_of_a_textbook_lung: SimulatedHal) -> None:
+def test_the_device_vents_an_occluded_lung(hal_of_a_textbook_lung: FaultyLung) -> None:
     hal = hal_of_a_textbook_lung.at_rest((Fault(FaultKind.OCCLUDED, 0.3),))
     device = LoopbackDevice(hal)
     client = Client(device, device.clock)
@@ -172,7 +172,7 @@ def test_a_frozen_lung_breathes_and_shows_its_flow() -> None:
     ],
 )
 def test_faults_of_the_line(kind: LineFaultKind, strength: float, times_out: bool) -> None:
-    device = LoopbackDevice(Bench())
+    device = FaultyDevice(Bench())
     line = device.line
     client = Client(device, device.clock)
     client.hello()
@@ -209,10 +209,16 @@ def test_a_pulled_cable_vents_and_the_client_comes_back() -> None:
     assert client.arm().mode is Mode.RUNNING
 
 
-def test_faults_as_text() -> None:
-    assert parse("leak@10-13:0.1") == Fault(FaultKind.LEAK, 10.0, 13.0, 0.1)
-    assert parse("late@0:0.02", now=5.0) == Fault(LineFaultKind.LATE, 5.0, math.inf, 0.02)
-    assert parse("sensor_offset@1:-2") == Fault(FaultKind.SENSOR_OFFSET, 1.0, strength=-2.0)
-    for wrong in ("leak", "fire@1", "leak@3-2", "leak@1..2", "leak@x"):
-        with pytest.raises(InputError, match="KIND@START"):
-            parse(wrong)
+def test_a_disturbed_tube_leaks_or_resists_until_it_is_mended() -> None:
+    hal = SimulatedHal(single_compartment(lung("R20C50")))
+    pressures = []
+    for k, tube in enumerate(("", "leak", "pinch", "")):
+        hal.disturb(tube)
+        hal.actuate(k, 10.0, 0)
+        pressures.append(hal.shown(k + 0.03)[0])
+        hal.actuate(k + 0.03, 0.0, 1)
+    healthy, leaking, pinched, mended = pressures
+    assert leaking < healthy < pinched
+    assert mended == pytest.approx(healthy, abs=0.5)
+    with pytest.raises(InputError, match="choose of leak, pinch"):
+        hal.disturb("fire")

@@ -30,7 +30,9 @@ from hardware_eval.emulation.firmware import Firmware, Order
 from hardware_eval.wire.client import Client, Link, NoAnswerError, RefusedError
 from hardware_eval.wire.conformance import conformance
 from hardware_eval.wire.messages import Flag, Mode
+from tests.hardware_eval.electronics import WiredHal
 from tests.hardware_eval.firmware.core import FIRMWARE, tool
+from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 
 IMAGES = {"linux": "ventilator-linux", "mps2": "ventilator-mps2.elf"}
@@ -74,15 +76,14 @@ def device(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Log
 def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
     if image.suffix == ".elf":
         tool("qemu-system-arm")
-    log = tmp_path / "electronics.csv"
-    about = {"lung": LUNG, "plant": "single_compartment", "words": None, "seal": None}
-    given = {**about, "faults": [], "log": log, "normally_open": True, "monostable": 0.09}
-    firmware = Logged(image, given, time.monotonic())
+    begun = time.monotonic()
+    wired = WiredHal(LUNG, tmp_path / "electronics.csv", begun)
+    firmware = Logged(image, wired, begun)
     emulator = Emulator(firmware, link=tmp_path / "lung")
     firmware.start(lambda: emulator.port.inbox.put(b""))
     # Should it get into a loop, or outlive this test, it does not take the processor with it.
     longest = realtime.LONGEST_RUN_S * 1_000_000
-    device = firmware.processes["device"]
+    device = firmware.process
     resource.prlimit(device, resource.RLIMIT_RTTIME, (longest, longest))
     for task in Path(f"/proc/{device}/task").iterdir():
         with contextlib.suppress(OSError):  # where it is granted
@@ -98,6 +99,7 @@ def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
         stop.set()
         thread.join()
         firmware.close()
+        wired.close()
 
 
 def _until(done: Callable[[], object]) -> None:
@@ -133,7 +135,7 @@ def test_an_image_needs_neither_heap_nor_floating_point(tmp_path: Path) -> None:
 
 def test_an_image_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no such file; make it with `make`"):
-        Firmware(tmp_path / "none.elf", {"faults": []}, 0.0)
+        Firmware(tmp_path / "none.elf", Bench(), 0.0)
 
 
 @pytest.mark.slow
@@ -208,7 +210,7 @@ def test_electronics_vent_when_the_image_stands_still(device: tuple[Logged, Path
     client = Client(Link(str(folder / "lung")), timeout=10.0)
     _until(lambda: firmware.orders[-1].time > 0.0)
     _inspiring(firmware, client)
-    image = firmware.processes["device"]
+    image = firmware.process
     os.kill(image, signal.SIGSTOP)
     log = folder / "electronics.csv"
     _until(lambda: log.read_text().splitlines()[-1].endswith("0,1,monostable"))

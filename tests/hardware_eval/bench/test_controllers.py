@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from hardware_eval import realtime
 from hardware_eval.bench.controllers import (
@@ -39,14 +40,20 @@ def blamed(entry: float, host: float, seed: int, attempts: int = 10) -> bool:
     return False
 
 
+#: Sessions that are drawn, and most of them that may blame the wrong one: what a share of 0.5 %,
+#: which ``benchmarks/hardware_guards.py`` measures at most, exceeds once in a thousand times.
+SESSIONS = 300
+WRONG = int(stats.binom.ppf(0.999, SESSIONS, 0.005))
+
+
 @pytest.mark.parametrize("host", [0.002, 0.01, 0.03, 0.2])
 def test_a_busy_host_is_not_blamed_on_the_entry(host: float) -> None:
-    assert np.mean([blamed(host, host, seed) for seed in range(100)]) <= 0.05
+    assert sum(blamed(host, host, seed) for seed in range(SESSIONS)) <= WRONG
 
 
 @pytest.mark.parametrize(("entry", "host"), [(0.05, 0.0), (0.2, 0.01), (1.0, 0.2)])
 def test_a_slow_entry_is_blamed_on_any_host(entry: float, host: float) -> None:
-    assert np.mean([blamed(entry, host, seed) for seed in range(100)]) >= 0.95
+    assert sum(not blamed(entry, host, seed) for seed in range(SESSIONS)) <= WRONG
 
 
 class Gate:

@@ -23,11 +23,10 @@ from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, run_once
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
-from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError
 from hardware_eval.wire.messages import Reading
 from tests.hardware_eval import faults
-from tests.hardware_eval.faults import FaultKind, faulty_lung
+from tests.hardware_eval.faults import FaultKind, FaultyDevice, faulty_lung
 from ventbench.task import protocol
 
 #: Time at rest before each run, s.
@@ -55,7 +54,7 @@ class Troubled:
     longest_answer, beside = 0.0, Count()
 
     def __init__(
-        self, device: LoopbackDevice, lung: str, moment: float, trouble: Callable[[float], Any]
+        self, device: FaultyDevice, lung: str, moment: float, trouble: Callable[[float], Any]
     ) -> None:
         self._pid = PIDController((*CONTROL_GAINS[lung], 0.0))
         self._device, self._moment, self._trouble = device, moment, trouble
@@ -90,7 +89,7 @@ class DeadClient(Client):
 class StopKey(Operator):
     """Presses the emergency stop at a moment."""
 
-    def __init__(self, device: LoopbackDevice, moment: float) -> None:
+    def __init__(self, device: FaultyDevice, moment: float) -> None:
         self._device, self._moment = device, moment
 
     def stop(self) -> bool:
@@ -115,7 +114,7 @@ class Fault:
     name: str
     lung: tuple[FaultKind, float] | None = None
     controller: Callable[[float], Any] | None = None
-    device: Callable[[LoopbackDevice], None] | None = None
+    device: Callable[[FaultyDevice], None] | None = None
     key: bool = False
     dies: bool = False
     inspiration: bool = False
@@ -150,12 +149,12 @@ FAULTS = (
     Fault("Ctrl-C", controller=interrupts, inspiration=True),
     Fault("emergency stop key", key=True),
     Fault("host killed (kill -9)", dies=True, inspiration=True),
-    Fault("cable pulled", device=LoopbackDevice.unplug),
+    Fault("cable pulled", device=FaultyDevice.unplug),
     Fault("host asleep or stopped", dies=True, inspiration=True),
 )
 
 
-def trial(device: LoopbackDevice, lung: str, fault: Fault, moment: float) -> tuple[str, float]:
+def trial(device: FaultyDevice, lung: str, fault: Fault, moment: float) -> tuple[str, float]:
     """What the bench did, and after how many ms the lung was vented (NaN: it was not)."""
     hal: Any = device.service.hal
     client = Client(device, device.clock)
@@ -206,7 +205,7 @@ def trial(device: LoopbackDevice, lung: str, fault: Fault, moment: float) -> tup
     return done, 1e3 * max(vented[-1] - began, 0.0)
 
 
-def clear(device: LoopbackDevice) -> None:
+def clear(device: FaultyDevice) -> None:
     """Mend the device, and let the lung empty."""
     hal: Any = device.service.hal
     hal.faults = ()
@@ -220,7 +219,7 @@ def main(trials: int = 10, lung: str = "R20C20", only: str = "") -> None:
     --only: only faults whose names hold this.
     """
     random = np.random.default_rng(0)
-    device = LoopbackDevice(faulty_lung(lung, noise=0.1, quantum=0.0703))
+    device = FaultyDevice(faulty_lung(lung, noise=0.1, quantum=0.0703))
     for fault in (fault for fault in FAULTS if only in fault.name):
         done: dict[str, list[float]] = {}
         for _ in range(trials):
@@ -238,7 +237,7 @@ def main(trials: int = 10, lung: str = "R20C20", only: str = "") -> None:
         print(f"| {fault.name} | {what} | {span} | {found} |", flush=True)
 
 
-def _selftest(device: LoopbackDevice, lung: str, fault: Fault) -> str:
+def _selftest(device: FaultyDevice, lung: str, fault: Fault) -> str:
     """What the self-test says of the fault, if it is there from the start."""
     hal: Any = device.service.hal
     assert fault.lung is not None

@@ -97,12 +97,7 @@ def run(
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
     from hardware_eval.bench.console import Blind, RerunView, show_bars
-    from hardware_eval.bench.fallback import DEFAULT as FALLBACK
-    from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.plan import make_plan, read_procedure
-    from hardware_eval.bench.safety import SafetySettings
-    from hardware_eval.bench.selftest import Sheet, chosen_parts
-    from hardware_eval.bench.selftest import selftest as run_selftest
     from hardware_eval.results import evaluate as ev
 
     how = read_procedure(plan)
@@ -120,18 +115,8 @@ def run(
         perturbations=how.perturb,
         seed=seed if how.seed is None else how.seed,
     )
-    settings = SafetySettings(largest_u_in=how.largest_u_in, largest_rise=how.largest_rise)
     shows = [show_bars, *([RerunView(how.rerun).breath] if how.rerun else [])]
-    left_out = chosen_parts(how.skip)
     control, calibration = (None if x is None else Path(x) for x in (how.control, how.calibration))
-
-    def before_lung(bench: Bench, mounted: str) -> Sheet | None:
-        if not how.selftest:
-            return None
-        sheet = run_selftest(bench, mounted, **baseline_of(calibrated), skip=left_out)
-        files.write_json(out / f"selftest-{mounted}.json", sheet.as_dict())
-        print(sheet, flush=True)
-        return sheet
 
     with bench_on(port, yes=yes, control=control, kept=out) as (line, _, person):
         calibrated = calibration_of(line, calibration)
@@ -142,16 +127,11 @@ def run(
             out,
             masked if how.blind else person,
             plan=planned,
+            how=how,
             shows=[masked.hiding(show) for show in shows] if how.blind else shows,
             sandbox=not in_process,
-            dry=how.dry_run,
-            before_lung=before_lung,
-            settings=settings,
             operator_name=operator,
-            notes=how.notes,
-            rest=how.rest,
             calibration=calibrated,
-            fallback=FALLBACK if how.fallback else None,
         )
     reason = masked.hidden(done.reason) if how.blind else done.reason
     emit(

@@ -35,7 +35,7 @@ from jax import Array
 
 from hardware_eval.bench.drive import collect
 from hardware_eval.bench.loop import Bench, Operator
-from hardware_eval.bench.plan import make_plan
+from hardware_eval.bench.plan import Procedure, make_plan
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.emulation.emulator import LoopbackDevice
@@ -70,8 +70,8 @@ SIMULATOR = "physics"
 #: Noise of the emulated sensor, cmH2O, and the step of its converter (PVP's).
 NOISE, QUANTUM = 0.1, 0.0703
 
-#: Rest before a run, s.
-_REST = 2.0
+#: How the entries run.
+_HOW = Procedure(fallback=False, dry_run=False, selftest=False, rest=2.0, notes="emulated lung")
 
 #: Steps that the starts of the search for commands open the valve for: a short and a long rise.
 STARTS = (2, 8)
@@ -334,7 +334,7 @@ def demo(
     measured = evaluated(line, entry, "first")
     against = _against(simulated, measured, "simulation")
     step("The same controller on the lung", f"{_said(measured)}{against}")
-    bench = Bench(line.client, line.clock, DEFAULT, Operator(), rest=_REST)
+    bench = Bench(line.client, line.clock, DEFAULT, Operator(), rest=_HOW.rest)
     explored = collect(bench, lung, breaths, out / "explored").breaths
     step("The lung is explored", f"{len(explored)} breaths")
     diagnosis = diagnose(explored, simulator=tested, lung=lung)
@@ -416,11 +416,9 @@ def errors_on(
         out,
         Operator(),
         plan=plan,
+        how=_HOW,
         sandbox=sandbox,
-        dry=False,
         operator_name="ventbench-hardware demo",
-        notes="emulated lung",
-        rest=_REST,
     )
     if not done.complete:
         raise InputError(f"{entry.name} did not finish its plan: {done.reason}")

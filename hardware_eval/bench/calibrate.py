@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from hardware_eval.bench import dated
@@ -31,8 +32,7 @@ from hardware_eval.bench.identity import (
     white_noise,
 )
 from hardware_eval.bench.loop import Bench
-from hardware_eval.bench.safety import VALVE_GAIN
-from hardware_eval.bench.selftest import hold, programs
+from hardware_eval.bench.selftest import LIMITS, hold, programs
 from hardware_eval.wire.client import Correction
 from hardware_eval.wire.messages import Capability
 from ventbench.base.arrays import Floats
@@ -51,27 +51,6 @@ PARTS = {
     "flow": ("mL/s", "mL/s"),
     "leak": ("s", "cmH2O"),
     "lung": ("", ""),
-}
-
-#: What a sound bench reads of each part: least and largest, and what else it is.
-EXPECTED: dict[str, dict[str, tuple[float, float, str]]] = {
-    "zero": {"intercept": (-2.0, 2.0, "the sensor is not open to air, or its offset is wrong")},
-    "span": {
-        "slope": (0.9, 1.1, "the sensor is dead, swapped, or its slope is another part's"),
-        "intercept": (-2.0, 2.0, "its offset is wrong"),
-        "residual": (0.0, 0.02, "the readings lie on no line: it saturates, or was not steady"),
-    },
-    "peep": {"intercept": (-1.5, 1.5, "the PEEP valve is set otherwise, or the sensor is off")},
-    "valve": {
-        "slope": (0.4 * VALVE_GAIN, 2.0 * VALVE_GAIN, "the valve sticks, or the supply is off"),
-        "residual": (0.0, 0.1, "the flow lies on no line over the opening"),
-    },
-    "flow": {
-        "slope": (0.8, 1.25, "the sensor is dead, reversed, or of another unit"),
-        "intercept": (-30.0, 30.0, "its zero is off"),
-        "residual": (0.0, 0.03, "the readings lie on no line: it saturates, or was not steady"),
-    },
-    "leak": {"slope": (-2.0, 20.0, "mL/s are lost: look for the leak before it is calibrated")},
 }
 
 #: Parts that correct readings; the others were measured with what these correct.
@@ -174,16 +153,17 @@ class Part:
     def problem(self) -> str:
         """Why no bench reads so, as a sentence; empty if one may."""
         line = self.fit
-        values = {"intercept": line.intercept.value, "slope": line.slope.value}
+        values = {"slope": line.slope.value, "intercept": line.intercept.value}
         values["residual"] = line.residual / max(np.ptp(self.reading), 1.0)
         if self.kind == "peep":
             values["intercept"] -= self.reference[0]
         if self.kind == "leak":
             values["slope"] = lost_flow(self, self.lung).value
-        for name, (low, high, why) in EXPECTED.get(self.kind, {}).items():
-            if not low <= values[name] <= high:
-                unit = PARTS[self.kind][1]
-                return f"{name} {values[name]:.4g}, expected {low:g} to {high:g} ({unit}): {why}"
+        for name, value in values.items():
+            limit = LIMITS.get(f"{self.kind} {name}")
+            if limit is not None and not limit.low <= value <= limit.high:
+                expected = f"{limit.low:g} to {limit.high:g} ({limit.unit})"
+                return f"{name} {value:.4g}, expected {expected}: {limit.reason}"
         return ""
 
     def __str__(self) -> str:
@@ -469,21 +449,8 @@ def load(
     """
     content = dated.load(path, FORMAT, device, "ventbench-hardware calibrate PART --port PORT")
     try:
-        parts = {
-            kind: Part(
-                kind,
-                x["date"],
-                tuple(x["reference"]),
-                tuple(x["reading"]),
-                tuple(x["error"]),
-                tuple(x["above"]),
-                x["by_hand"],
-                x["lung"],
-                x["note"],
-            )
-            for kind, x in content["parts"].items()
-        }
-    except (KeyError, TypeError, AttributeError) as error:
+        parts = msgspec.convert(content["parts"], dict[str, Part])
+    except (KeyError, msgspec.ValidationError) as error:
         raise InputError(f"{path} is no calibration ({error}); make one by `calibrate`") from None
     for kind, part in () if stale else parts.items():
         dated.check_age(part.date, f"{path}: {kind}", f"ventbench-hardware calibrate {kind}", now)

@@ -2,17 +2,20 @@
 
 Every breath of it is closed-loop or small, and watched by the same checks as a session, so that a
 wrongly set lung cannot be hurt by the test that finds it. What is measured is compared with limits
-that stand in :data:`LIMITS` with their reasons; the sheet says go or no-go.
+that stand in ``limits.toml`` with their reasons; the sheet says go or no-go.
 """
 
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from hardware_eval.bench.drive import Commands, Driven, drive
@@ -43,124 +46,10 @@ class Limit:
     reason: str  #: why.
 
 
-LIMITS: dict[str, Limit] = {
-    "room": Limit(
-        -2.0,
-        2.0,
-        "cmH2O",
-        "A sensor that is open to the room; ten times what the zero of the PVP's part may drift.",
-    ),
-    "reference": Limit(
-        0.93,
-        1.07,
-        "of applied",
-        "A sensor's slope is within 5 % of its data sheet; a water column is read to 2 %.",
-    ),
-    "clicked": Limit(
-        1.0, 1.0, "as ordered", "A person names the valve that clicked, and is not told which."
-    ),
-    "rise": Limit(
-        5.0, 20.0, "cmH2O", "A lung that is filled by 5 % for 3 s at most, towards 10 cmH2O more."
-    ),
-    "vented": Limit(
-        -0.3, 0.35, "of the rise", "What the slowest lung has left after 3 s of a working vent."
-    ),
-    "sensor_zero": Limit(
-        1.0,
-        protocol.PEEP + 1.5,
-        "cmH2O",
-        "A vented lung rests near PEEP; rigs of real sessions read 1.1 to 4.9, as a "
-        "sensor lags behind falling commands. Calibrated PEEP is held within 0.5, the open sensor "
-        "within 2.",
-    ),
-    "peep": Limit(-0.5, 0.5, "cmH2O", "A vented lung rests where it did when PEEP was calibrated."),
-    "sensor_noise": Limit(
-        0.0,
-        0.5,
-        "cmH2O",
-        "Standard deviation at rest; the recordings have 0.1 to 0.3.",
-    ),
-    "leak": Limit(
-        -1.0,
-        1.0,
-        "mL/s",
-        "What a lung loses that is filled towards 20 cmH2O and closed. Counts where neither this "
-        "nor the creep of rubber bellows explains the pressures, by 2.6 standard errors.",
-    ),
-    "valve_sweep": Limit(
-        1.0,
-        1.0,
-        "of steps up",
-        "Each larger opening must give a quarter of the nominal valve's further rise at least, "
-        "within 2.6 standard errors of the noise at rest, and the largest one a rise beyond them; "
-        "else the valve sticks or is unplugged.",
-    ),
-    "valve_gain": Limit(
-        0.4,
-        2.0,
-        "of nominal",
-        "Flow of the valve against 22.8 mL/s per %: measured, or what makes C the label's.",
-    ),
-    "resistance": Limit(
-        0.0,
-        3.0,
-        "of label",
-        "More is an occluded or pinched tube.",
-    ),
-    "lung": Limit(
-        0.0,
-        1.15,
-        "of the best lung's error",
-        "Open-loop error of the label's frozen simulator against that of the lung that fits best; "
-        "decides where R and C do not.",
-    ),
-    "identity": Limit(
-        1.0,
-        1.0,
-        "label held",
-        "R and C by pressure and flow, measured or of a calibrated valve, with 95 % intervals: the "
-        "label holds within the tolerance of test lungs. Simulators have no say in it.",
-    ),
-    "sensor_span": Limit(
-        0.99,
-        1.01,
-        "of calibrated",
-        "R and 1/C of the calibrated lung against those of its calibration: both are off as the "
-        "pressure's span is, or the flow's. A lung repeats within 1 %; counts beyond 2.6 standard "
-        "errors of the noise at rest.",
-    ),
-    "on_time": Limit(
-        0.98,
-        1.0,
-        "of steps",
-        "Share of steps that begin within 2 ms of their deadline.",
-    ),
-    "latest_step": Limit(
-        0.0,
-        0.010,
-        "s",
-        "The latest step; a third of the control step.",
-    ),
-    "round_trip": Limit(
-        0.0,
-        0.010,
-        "s",
-        "Median time from a message to its answer; two of them fit into a step.",
-    ),
-    "interruptions": Limit(
-        0.0,
-        math.inf,
-        "parts repeated",
-        "A part that a busy host or a slow line ends, or of which a step is too late, says nothing "
-        "of the lung and is repeated; ten times in a row are a no-go.",
-    ),
-    "safety": Limit(
-        0.0,
-        0.0,
-        "trips",
-        "No safety check may trip in a test this gentle.",
-    ),
-}
+#: Limits of bring-up, self-test and calibration by what is measured.
+LIMITS = msgspec.convert(
+    tomllib.loads(Path(__file__).with_name("limits.toml").read_text("utf-8")), dict[str, Limit]
+)
 
 
 @dataclass(frozen=True)

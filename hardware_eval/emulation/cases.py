@@ -6,10 +6,13 @@ An answer is published encrypted, with its hash; the secret that made it opens i
 from __future__ import annotations
 
 import hashlib
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from ventbench.base.errors import InputError
@@ -128,56 +131,10 @@ class EffectFamily:
     inside: bool = True  #: whether the library has a mechanism of this name.
 
 
-_LIBRARY_ONLY = ("library",)
-
-EFFECTS: dict[str, EffectFamily] = {
-    "valve_delay": EffectFamily("delay", 0.04, 0.08, _LIBRARY_ONLY),
-    "valve_lag": EffectFamily("tau", 0.04, 0.1, ("library", "two lags")),
-    "valve_dead_band": EffectFamily("width", 1.5, 3.5, _LIBRARY_ONLY),
-    "valve_curve": EffectFamily(
-        "loss", 0.2, 0.5, ("library", "tanh", "exponential", "power law", "convex")
-    ),
-    "valve_hysteresis": EffectFamily("width", 2.0, 5.0, ("library", "soft play")),
-    "command_rounding": EffectFamily("amount", 1.0, 1.0, ("library", "nearest")),
-    "supply_droop": EffectFamily(
-        "drop", 0.1, 0.3, ("library", "subtractive"), (("recovery", (0.7, 1.5)),)
-    ),
-    "leak": EffectFamily("conductance", 8.0, 20.0, ("library", "linear", "exponent 0.65")),
-    "circuit_compliance": EffectFamily("compliance", 1.2, 3.0, _LIBRARY_ONLY),
-    "inertance": EffectFamily("inertance", 0.04, 0.1, _LIBRARY_ONLY),
-    "turbulent_resistance": EffectFamily("quadratic", 4.0, 10.0, ("library", "exponent 1.75")),
-    "nonlinear_compliance": EffectFamily(
-        "stiffening", 1 / 40, 1 / 24, ("library", "sigmoid", "quadratic")
-    ),
-    "viscoelasticity": EffectFamily("ratio", 0.25, 0.7, _LIBRARY_ONLY, (("time", (0.5, 1.8)),)),
-    "sensor_lag": EffectFamily("tau", 0.05, 0.12, _LIBRARY_ONLY),
-    "sensor_drift": EffectFamily("drift", 1.2, 3.0, ("library", "warming"), signs=(1.0, -1.0)),
-    "exhalation_valve_delay": EffectFamily("opening", 0.05, 0.1, _LIBRARY_ONLY),
-    "patient_effort": EffectFamily(
-        "amplitude",
-        2.0,
-        5.0,
-        ("library", "raised cosine", "trapezoid"),
-        (("duration", (0.5, 1.0)),),
-    ),
-    "volume_resistance": EffectFamily(
-        "change", 0.5, 0.65, ("R(V)",), signs=(1.0, -1.0), inside=False
-    ),
-    "cardiogenic": EffectFamily(
-        "amplitude", 0.7, 1.3, ("oscillation",), (("frequency", (1.0, 1.6)),), inside=False
-    ),
-    "pulsating_supply": EffectFamily(
-        "amplitude", 0.115, 0.175, ("oscillation",), (("frequency", (3.0, 7.0)),), inside=False
-    ),
-    "direction_resistance": EffectFamily("ratio", 1.7, 2.0, ("R(direction)",), inside=False),
-    "second_compartment": EffectFamily(
-        "share", 0.2, 0.4, ("two compartments",), (("time", (0.5, 1.5)),), inside=False
-    ),
-    "sensor_nonlinearity": EffectFamily(
-        "bend", 0.9, 1.3, ("quadratic",), signs=(1.0, -1.0), inside=False
-    ),
-    "expiratory_valve_orifice": EffectFamily("amount", 1.0, 1.0, ("orifice",), inside=False),
-}
+EFFECTS = msgspec.convert(
+    tomllib.loads(Path(__file__).with_name("effects.toml").read_text("utf-8")),
+    dict[str, EffectFamily],
+)
 
 #: Mechanisms of the library, in alphabetical order.
 LIBRARY: tuple[str, ...] = tuple(sorted(name for name, e in EFFECTS.items() if e.inside))

@@ -17,7 +17,6 @@ import sys
 import time
 import tty
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -27,20 +26,10 @@ from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
 from hardware_eval.emulation.firmware import Firmware
 from hardware_eval.realtime import VirtualClock
-from hardware_eval.wire.client import DisconnectedError
 from ventbench.base.errors import InputError
 
 #: Bytes that are read at once.
 _CHUNK = 4096
-
-
-@dataclass(frozen=True, slots=True)
-class Actuation:
-    """A change of the valves: device time, s; inspiratory valve, %; expiratory valve, 0 or 1."""
-
-    time: float
-    u_in: float
-    u_out: int
 
 
 class LoopbackDevice:
@@ -51,8 +40,6 @@ class LoopbackDevice:
         start: time at which the device started, s.
         service: program and hardware of the device.
         latency: time that bytes take each way, s; may be changed while it runs.
-        actuations: every change of the valves.
-        plugged: whether the cable is in; :meth:`unplug` and :meth:`plug` change it.
     """
 
     def __init__(
@@ -63,8 +50,6 @@ class LoopbackDevice:
         self.start = self.clock.now()
         self.latency = latency
         self.service = DeviceService(hal, settings or DeviceSettings(), self.start)
-        self.actuations = [Actuation(self.start, 0.0, 1)]
-        self.plugged = True
         self._next = self.start + PERIOD
         self._order = count()
         self._incoming: list[tuple[float, int, bytes]] = []
@@ -72,8 +57,7 @@ class LoopbackDevice:
         self.clock.carry(self._run_until)
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the device; DisconnectedError if the cable is out."""
-        self._require_cable()
+        """Send bytes to the device."""
         arrival = self.clock.now() + self.latency
         heapq.heappush(self._incoming, (arrival, next(self._order), data))
 
@@ -81,7 +65,6 @@ class LoopbackDevice:
         """Wait for bytes from the device; empty if none come within ``timeout``, s."""
         deadline = self.clock.now() + timeout
         while True:
-            self._require_cable()
             now, ready = self.clock.now(), b""
             while self._outgoing and self._outgoing[0][0] <= now:
                 ready += heapq.heappop(self._outgoing)[2]
@@ -91,6 +74,11 @@ class LoopbackDevice:
             coming += [queue[0][0] for queue in (self._incoming, self._outgoing) if queue]
             self.clock.sleep_until(max(min(coming), now + 1e-6))
 
+    def turn(self, now: float, data: bytes) -> None:
+        """Step the device's program, and answer."""
+        if answers := self.service.step(now, data):
+            self.answer(now, answers)
+
     def answer(self, now: float, data: bytes) -> None:
         """Put bytes of the device on the way to the host."""
         heapq.heappush(self._outgoing, (now + self.latency, next(self._order), data))
@@ -99,26 +87,11 @@ class LoopbackDevice:
         """Nothing to release; the device goes on."""
 
     def reopen(self) -> None:
-        """Connect again; DisconnectedError if the cable is still out."""
-        self._require_cable()
+        """Nothing to connect."""
 
     def raise_lines(self) -> bool:
         """There are none."""
         return False
-
-    def unplug(self) -> None:
-        """Pull the cable; what is on the way is lost."""
-        self.plugged = False
-        self._incoming.clear()
-        self._outgoing.clear()
-
-    def plug(self) -> None:
-        """Put the cable back."""
-        self.plugged = True
-
-    def _require_cable(self) -> None:
-        if not self.plugged:
-            raise DisconnectedError("the cable to the device is out")
 
     def _run_until(self, instant: float) -> None:
         while True:
@@ -131,12 +104,7 @@ class LoopbackDevice:
                 data += heapq.heappop(self._incoming)[2]
             if self._next <= now:
                 self._next += PERIOD
-            answers = self.service.step(now, data)
-            if answers and self.plugged:
-                self.answer(now, answers)
-            state, last = self.service.state, self.actuations[-1]
-            if (state.u_in, state.u_out) != (last.u_in, last.u_out):
-                self.actuations.append(Actuation(now, state.u_in, state.u_out))
+            self.turn(now, data)
 
 
 class Emulator(Guard):

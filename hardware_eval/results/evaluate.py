@@ -23,17 +23,19 @@ from hardware_eval.bench.controllers import (
     LiveController,
     SubmissionController,
 )
-from hardware_eval.bench.fallback import FallbackSettings
-from hardware_eval.bench.loop import REST_S, Bench, Operator, Show
-from hardware_eval.bench.plan import UNDISTURBED, Plan, PlannedRun
+from hardware_eval.bench.fallback import DEFAULT as FALLBACK
+from hardware_eval.bench.identity import Baseline
+from hardware_eval.bench.loop import Bench, Operator, Show
+from hardware_eval.bench.plan import UNDISTURBED, Plan, PlannedRun, Procedure
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
-from hardware_eval.bench.safety import DEFAULT, SafetySettings
-from hardware_eval.bench.selftest import Sheet
+from hardware_eval.bench.safety import SafetySettings
+from hardware_eval.bench.selftest import Sheet, chosen_parts, selftest
 from hardware_eval.realtime import ENTRY_PRIORITY, Clock, RealClock
 from hardware_eval.results import acceptance, page
 from hardware_eval.results import record as records
 from hardware_eval.wire.client import ANSWER_TIMEOUT, Client, Link
 from hardware_eval.wire.messages import Capability
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.board import record
 from ventbench.board.record import HardwareRecord
@@ -265,16 +267,11 @@ def evaluate(
     operator: Operator,
     *,
     plan: Plan,
+    how: Procedure,
     shows: Sequence[Show] = (),
     sandbox: bool = True,
-    dry: bool = True,
-    before_lung: Callable[[Bench, str], Sheet | None] = lambda bench, lung: None,
-    settings: SafetySettings = DEFAULT,
     operator_name: str = "",
-    notes: str = "",
-    rest: float = REST_S,
     calibration: Calibration | None = None,
-    fallback: FallbackSettings | None = None,
 ) -> Evaluation:
     """Run a plan, or what is left of it, and make the records once it is done.
 
@@ -284,31 +281,29 @@ def evaluate(
         out: folder of the log, the recording and the records.
         operator: the person at the bench.
         plan: from :func:`hardware_eval.bench.plan.make_plan`.
+        how: limits, notes, dry run, self-tests and rests.
         shows: show breaths.
         sandbox: run entries as in scoring; without it, in this process.
-        dry: run the plan on the frozen simulators first, unless the log has begun.
-        before_lung: tests a lung once it is set; None where nobody does.
-        settings: safety.
         operator_name: for the record.
-        notes: for the record.
-        rest: time at rest before each run, s.
-        calibration: of the device, for the record.
-        fallback: takes over from entries that are late or leave their envelope.
+        calibration: of the device, for the record and the self-tests.
 
     Raises:
-        InputError: if the log is of another plan, or the dry run finds the plan unsafe.
+        InputError: if the log is of another plan, a limit or a part of the self-test is none, or
+            the dry run finds the plan unsafe.
         LinkError: if the device is lost and does not come back.
     """
+    settings = SafetySettings(largest_u_in=how.largest_u_in, largest_rise=how.largest_rise)
+    fallback, left_out = FALLBACK if how.fallback else None, chosen_parts(how.skip)
     runner = make_runner(sandbox)
     log_path = out / LOG
     simulated: list[tuple[str, str, float, float]] = []
-    if dry and begun_plan(out) is None:
+    if how.dry_run and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
         problems, simulated = session.dry_run(
             plan,
             controllers(submissions, plan.track, runner, real_time=False),
             settings,
-            rest,
+            how.rest,
             fallback,
         )
         if problems:
@@ -324,12 +319,22 @@ def evaluate(
     about = {
         "device": device,
         "operator": operator_name,
-        "notes": notes,
+        "notes": how.notes,
         "entries": {x.manifest.name: x.sha256 for x in submissions},
         "sandbox": None if runner.sandbox is None else dict(runner.sandbox),
         "simulated": simulated,
     }
-    bench = Bench(line.client, line.clock, settings, operator, shows, rest, fallback)
+    bench = Bench(line.client, line.clock, settings, operator, shows, how.rest, fallback)
+    baseline = Baseline() if calibration is None else calibration.baseline()
+
+    def tested(lung: str) -> Sheet | None:
+        if not how.selftest:
+            return None
+        sheet = selftest(bench, lung, baseline=baseline, skip=left_out)
+        files.write_json(out / f"selftest-{lung}.json", sheet.as_dict())
+        operator.tell(str(sheet))
+        return sheet
+
     with contextlib.ExitStack() as stack:
         empty = None
         if line.real:
@@ -343,9 +348,7 @@ def evaluate(
         log = stack.enter_context(RawLog(log_path))
         stack.enter_context(_ends_by_exception())
         stack.enter_context(_quick_switches())
-        reason = session.run_plan(
-            bench, plan, make, log, about=about, before_lung=lambda lung: before_lung(bench, lung)
-        )
+        reason = session.run_plan(bench, plan, make, log, about=about, before_lung=tested)
     written: Path | None = None
     with contextlib.suppress(InputError):  # no whole breath yet
         breaths = recording(log_path, kinds=UNDISTURBED)

@@ -46,17 +46,7 @@ def plan_of(logged: list[dict[str, Any]], label: str) -> Plan:
     """
     for line in logged:
         if line["type"] == "plan":
-            given = line["plan"]
-            return make_plan(
-                given["entries"],
-                given["lungs"],
-                track=given["track"],
-                pips=given["pips"],
-                repeats=given["repeats"],
-                control_every=given["control_every"],
-                perturbations=given["perturbations"],
-                seed=given["seed"],
-            )
+            return make_plan(**line["plan"])
     raise InputError(f"{label} holds no plan: no session has begun")
 
 

@@ -17,7 +17,6 @@ from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.safety import DEFAULT, VALVE_GAIN
 from hardware_eval.bench.session import run_plan
 from hardware_eval.device.program import DeviceService, DeviceSettings, Sample
-from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import Client
 from tests.hardware_eval import stand_in
 from tests.hardware_eval.faults import Fault, FaultyDevice, LineFaultKind
@@ -30,7 +29,7 @@ BOOT = 1.6
 class Board:
     """A device that restarts whenever its port opens, or when a test says so."""
 
-    def __init__(self, device: LoopbackDevice, needs_lines: bool = False) -> None:
+    def __init__(self, device: FaultyDevice, needs_lines: bool = False) -> None:
         self.device, self.clock = device, device.clock
         self.mute = needs_lines
         self.restarts = 0

@@ -15,6 +15,7 @@ import numpy as np
 from hardware_eval.device.program import DeviceSettings, Hal, Sample
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal
+from hardware_eval.wire.client import DisconnectedError
 from ventbench.plants.catalog import load_simulators
 from ventbench.task.interfaces import Plant
 
@@ -199,18 +200,59 @@ class Line:
         return data
 
 
+@dataclass(frozen=True, slots=True)
+class Actuation:
+    """A change of the valves: device time, s; inspiratory valve, %; expiratory valve, 0 or 1."""
+
+    time: float
+    u_in: float
+    u_out: int
+
+
 class FaultyDevice(LoopbackDevice):
-    """A device in this process behind a line with faults."""
+    """A device in this process behind a line with faults, and a cable that can be pulled.
+
+    Attributes:
+        line: what it does to bytes.
+        actuations: every change of the valves.
+    """
 
     def __init__(
         self, hal: Hal, settings: DeviceSettings | None = None, latency: float = 0.001
     ) -> None:
-        self.line = Line()
+        self.line, self.plugged = Line(), True
+        self.actuations = [Actuation(0.0, 0.0, 1)]
         super().__init__(hal, settings, latency)
 
+    def unplug(self) -> None:
+        """Pull the cable; what is on the way is lost."""
+        self.plugged = False
+        self._incoming.clear()
+        self._outgoing.clear()
+
+    def plug(self) -> None:
+        """Put the cable back."""
+        self.plugged = True
+
     def write(self, data: bytes) -> None:
+        self.reopen()
         super().write(self.line.to_device(self.clock.now(), data))
 
+    def read(self, timeout: float) -> bytes:
+        self.reopen()
+        return super().read(timeout)
+
+    def reopen(self) -> None:
+        if not self.plugged:
+            raise DisconnectedError("the cable to the device is out")
+
+    def turn(self, now: float, data: bytes) -> None:
+        super().turn(now, data)
+        state, last = self.service.state, self.actuations[-1]
+        if (state.u_in, state.u_out) != (last.u_in, last.u_out):
+            self.actuations.append(Actuation(now, state.u_in, state.u_out))
+
     def answer(self, now: float, data: bytes) -> None:
-        due, data = self.line.to_host(now, data)
-        heapq.heappush(self._outgoing, (due + self.latency, next(self._order), data))
+        if self.plugged:
+            due, data = self.line.to_host(now, data)
+            heapq.heappush(self._outgoing, (due + self.latency, next(self._order), data))

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from hardware_eval.bench.console import ConsoleOperator, show_bars
 from hardware_eval.bench.loop import BreathLog, Operator
 from hardware_eval.bench.plan import PlannedRun
-from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import (
     Client,
     ClockWatch,
@@ -30,10 +29,11 @@ from hardware_eval.wire.client import (
 from hardware_eval.wire.messages import Mode
 from tests.hardware_eval import stand_in
 from tests.hardware_eval.bad_day import Board, bad_day
+from tests.hardware_eval.faults import FaultyDevice
 
 
 def test_a_board_that_restarts_when_its_port_opens_passes() -> None:
-    board = Board(LoopbackDevice(stand_in.Bench()))
+    board = Board(FaultyDevice(stand_in.Bench()))
     client = Client(board, board.clock)
     assert client.hello().name == "bench"
     assert board.clock.now() - board.device.start < 3.0
@@ -43,7 +43,7 @@ def test_a_board_that_restarts_when_its_port_opens_passes() -> None:
 
 
 def test_a_board_that_wants_its_lines_gets_them_and_silence_is_an_error() -> None:
-    board = Board(LoopbackDevice(stand_in.Bench()), needs_lines=True)
+    board = Board(FaultyDevice(stand_in.Bench()), needs_lines=True)
     assert Client(board, board.clock).hello().name == "bench"
     board.ready = math.inf
     with pytest.raises(NoAnswerError, match="hello"):
@@ -66,7 +66,7 @@ def test_a_port_is_opened_with_the_lines_down_that_restart_boards(
 
 
 def test_a_lost_session_is_opened_again_by_arming_and_by_nothing_else() -> None:
-    device = LoopbackDevice(stand_in.Bench())
+    device = FaultyDevice(stand_in.Bench())
     client, other = Client(device, device.clock), Client(device, device.clock)
     client.hello(40.0)
     client.arm()
@@ -85,7 +85,7 @@ def test_a_lost_session_is_opened_again_by_arming_and_by_nothing_else() -> None:
 
 
 def test_the_end_says_whether_the_lung_is_vented() -> None:
-    device = LoopbackDevice(stand_in.Bench())
+    device = FaultyDevice(stand_in.Bench())
     client = Client(device, device.clock)
     client.hello()
     client.arm()

@@ -19,7 +19,6 @@ from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
 from hardware_eval.bench.raw_log import RawLog, breaths, lines
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.session import run_plan
-from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import LinkError
 from tests.hardware_eval.faults import Fault, FaultKind, FaultyDevice, LineFaultKind
 from ventbench import rollout
@@ -362,7 +361,7 @@ def test_six_lungs_survive_three_crashes_and_two_cables(tmp_path: Path) -> None:
     from ventbench.task.lungs import LUNG_IDS
 
     lungs = {name: simulated_lung(name, "physics") for name in LUNG_IDS}
-    device = LoopbackDevice(simulated_lung(LUNG, "physics"))
+    device = FaultyDevice(simulated_lung(LUNG, "physics"))
     for other in lungs.values():  # another lung on the same ventilator
         other.identity = device.service.hal.identity
     client = Client(device, device.clock)

@@ -8,7 +8,6 @@ from typing import Any
 import flax.struct
 import pytest
 
-from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.wire.client import Client, DisconnectedError, NoAnswerError
 from hardware_eval.wire.messages import Capability, Flag, Mode
@@ -121,7 +120,7 @@ def test_a_stuck_valve_keeps_its_position(hal_of_a_textbook_lung: FaultyLung) ->
 
 def test_the_device_vents_an_occluded_lung(hal_of_a_textbook_lung: FaultyLung) -> None:
     hal = hal_of_a_textbook_lung.at_rest((Fault(FaultKind.OCCLUDED, 0.3),))
-    device = LoopbackDevice(hal)
+    device = FaultyDevice(hal)
     client = Client(device, device.clock)
     client.hello()
     reading = client.arm()
@@ -137,7 +136,7 @@ def test_the_device_vents_an_occluded_lung(hal_of_a_textbook_lung: FaultyLung) -
 
 
 def test_a_frozen_lung_breathes_and_shows_its_flow() -> None:
-    device = LoopbackDevice(simulated_lung("R20C50"))
+    device = FaultyDevice(simulated_lung("R20C50"))
     client = Client(device, device.clock)
     welcome = client.hello()
     assert welcome.name == "emulated R20C50"
@@ -193,7 +192,7 @@ def test_faults_of_the_line(kind: LineFaultKind, strength: float, times_out: boo
 
 def test_a_pulled_cable_vents_and_the_client_comes_back() -> None:
     bench = Bench()
-    device = LoopbackDevice(bench)
+    device = FaultyDevice(bench)
     client = Client(device, device.clock)
     client.hello(40.0)
     client.arm()

@@ -13,7 +13,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from hardware_eval.bench.loop import Operator
-from hardware_eval.bench.plan import make_plan
+from hardware_eval.bench.plan import Procedure, make_plan
 from hardware_eval.bench.raw_log import RECORDING
 from hardware_eval.results import acceptance, page
 from hardware_eval.results import evaluate as ev
@@ -32,6 +32,8 @@ from ventbench.task.metrics import measured
 
 LUNG, PIPS, REPEATS = "R5C20", (10.0, 15.0), 2
 
+HOW = Procedure(fallback=False, dry_run=False, selftest=False, rest=1.0)
+
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory, shared_device: Any) -> ev.Evaluation:
@@ -44,8 +46,7 @@ def done(tmp_path_factory: pytest.TempPathFactory, shared_device: Any) -> ev.Eva
         Operator(),
         plan=make_plan(["pid_best"], [LUNG], pips=PIPS, repeats=REPEATS, control_every=2),
         sandbox=False,
-        dry=False,
-        rest=1.0,
+        how=HOW,
     )
 
 

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from typer.testing import CliRunner
 
 from hardware_eval import cli
 from hardware_eval.bench.loop import Operator
-from hardware_eval.bench.plan import make_plan
+from hardware_eval.bench.plan import Procedure, make_plan
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results import record as records
 from hardware_eval.results.evaluate import Line
@@ -32,6 +33,8 @@ BOARD = "index.html"
 
 LUNG, PIPS = "R5C20", (10.0, 15.0)
 
+HOW = Procedure(fallback=False, dry_run=False, selftest=False, rest=1.0)
+
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory, shared_device: Any) -> ev.Evaluation:
@@ -48,10 +51,8 @@ def done(tmp_path_factory: pytest.TempPathFactory, shared_device: Any) -> ev.Eva
         Operator(),
         plan=plan,
         sandbox=False,
-        dry=False,
+        how=structs.replace(HOW, notes="a note"),
         operator_name="A. Person",
-        notes="a note",
-        rest=1.0,
     )
 
 
@@ -199,9 +200,7 @@ def test_a_plan_that_is_not_finished_has_no_record(line: Line, tmp_path: Path) -
 
     plan = make_plan(["pid_best"], [LUNG], pips=PIPS, repeats=1)
     submission = open_submission("pid_best")
-    made = ev.evaluate(
-        [submission], line, tmp_path, Refuses(), plan=plan, sandbox=False, dry=False, rest=0.5
-    )
+    made = ev.evaluate([submission], line, tmp_path, Refuses(), plan=plan, how=HOW, sandbox=False)
     assert not made.complete
     assert not made.records
     with pytest.raises(InputError, match="are left"):

@@ -16,7 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from queue import Empty, SimpleQueue
+from queue import Empty, Queue
 from typing import Protocol
 
 from hardware_eval.device.program import PERIOD
@@ -43,7 +43,8 @@ class Port:
                 is none. It is asked again every :data:`~hardware_eval.device.program.PERIOD`.
             close_line: closes a descriptor.
         """
-        self.inbox: SimpleQueue[bytes] = SimpleQueue()
+        # A signal whose handler outlasts the timeout would let SimpleQueue wait for ever.
+        self.inbox: Queue[bytes] = Queue()
         self._outbox: deque[bytes] = deque()
         self._open_line, self._close_line = open_line, close_line
         self._woken, self._wake = os.pipe()

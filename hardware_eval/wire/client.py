@@ -20,7 +20,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from queue import Empty, SimpleQueue
+from queue import Empty, Queue, SimpleQueue
 from typing import Protocol, TypeVar, cast
 
 import numpy as np
@@ -169,7 +169,8 @@ class _Traffic:
     def __init__(self, port: serial.Serial) -> None:
         self.outbox: SimpleQueue[bytes | None] = SimpleQueue()
         self.broken: Exception | None = None
-        self._inbox: SimpleQueue[bytes] = SimpleQueue()
+        # A signal whose handler outlasts the timeout would let SimpleQueue wait for ever.
+        self._inbox: Queue[bytes] = Queue()
         self._port, self._ended = port, False
         self._threads = [
             threading.Thread(target=work, name=f"port {work.__name__}", daemon=True)

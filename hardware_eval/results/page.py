@@ -25,7 +25,6 @@ from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import number, page_templates, plain
 from ventbench.pages import panels
-from ventbench.pages.report import frame
 from ventbench.task import protocol, waveform
 from ventbench.task.lungs import LUNG_IDS
 
@@ -106,7 +105,6 @@ def page(session: Session) -> str:
             tests=[line for line in session.logged if line["type"] == "selftest" and "go" in line],
             control=record.control(session.path),
             skipped=_skipped(session, len(done.remaining(plan))),
-            frame=frame(),
             shown_breath=panels.BREATH + 1,
             log=session.path.name,
             sha256=files.sha256(session.path),
@@ -171,36 +169,22 @@ def _entry(session: Session, name: str) -> dict[str, Any]:
 
 
 def _panel(pip: float, repeats: Sequence[LoggedBreath]) -> dict[str, Any]:
-    steps = panels.SHOWN + 1
+    steps = len(panels.TIMES)
     target = np.asarray(waveform.target(np.arange(steps), pip), float)
     pressures = [np.array(x.log.pressure[:steps]) for x in repeats]
-    low, height = protocol.PEEP, pip - protocol.PEEP
-    known = np.concatenate([*pressures, target])
-    top = min(float(np.nanmax(known)), pip + 0.8 * height) + 0.08 * height
-    bottom = min(float(np.nanmin(known)), low) - 0.08 * height
-
-    def y(pressure: Any) -> Any:
-        clipped = np.clip(pressure, bottom, top)
-        return panels.TOP + (top - clipped) / (top - bottom) * panels.PRESSURE_HEIGHT
-
-    x = panels.time_x(panels.sample_times())
-    inspired = [x.log.pressure[: protocol.INSPIRATION_STEPS] for x in repeats]
-    errors = [float(np.nanmean(np.abs(np.array(each) - pip))) for each in inspired]
-    highest = max((float(np.nanmax(each)) for each in pressures), default=-math.inf)
-
-    def stairs(u_in: Sequence[float]) -> str:
-        held = panels.valve_y(np.repeat(u_in[:steps], 2)[:-1])
-        return panels.path(np.stack([np.repeat(x, 2)[1 : 1 + len(held)], held], axis=-1))
-
+    pressure, valve = panels.axes(target, panels.pressure_limits(target, pressures))
+    for each, measured in zip(repeats, pressures, strict=True):
+        pressure.line("p r0", panels.TIMES[: len(measured)], np.clip(measured, *pressure.y))
+        u_in = each.log.u_in[:steps]
+        valve.held("u r0", panels.TIMES[: len(u_in)], u_in)
+    pressure.line("t", panels.TIMES, target)
+    errors = [float(np.nanmean(np.abs(x[: protocol.INSPIRATION_STEPS] - pip))) for x in pressures]
     return {
         "pip": f"{pip:g}",
         "repeats": len(repeats),
         "error": number(float(np.mean(errors))) if errors else "no run",
-        "target": panels.path(np.stack([x, y(target)], axis=-1)),
-        "ticks": [(f"{value:g}", round(float(y(value)), 1)) for value in (low, pip)],
-        "pressures": [panels.path(np.stack([x[: len(p)], y(p)], axis=-1)) for p in pressures],
-        "commands": [stairs(each.log.u_in) for each in repeats],
-        "above": f"{highest:.0f}" if highest > top else "",
+        "charts": (pressure, valve),
+        "above": panels.above(pressure, pressures),
     }
 
 

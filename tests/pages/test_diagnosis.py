@@ -17,18 +17,9 @@ from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
 from ventbench.diagnosis.residual_analysis import EDGE, profiles
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.mechanics.labels import Estimate
+from ventbench.pages.charts import Chart, limits, log_ticks, ticks
 from ventbench.pages.diagnosis import report
-from ventbench.pages.diagnosis.charts import (
-    Chart,
-    by_axis,
-    limits,
-    log_ticks,
-    panels,
-    rmse,
-    ticks,
-    window,
-    worst,
-)
+from ventbench.pages.diagnosis.charts import by_axis, panels, rmse, window, worst
 from ventbench.physics import library
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 

@@ -11,7 +11,7 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.base.text import number
-from ventbench.pages import panels, report, write_report
+from ventbench.pages import charts, panels, report, write_report
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
 
@@ -175,7 +175,7 @@ def test_path_does_not_drift() -> None:
     line = np.cumsum(rng.uniform(0.0, 3.0, (200, 2)), axis=0)
     x = y = 0.0
     points = []
-    for kind, body in re.findall(r"([Mlhv])([^Mlhv]*)", panels.path(line)):
+    for kind, body in re.findall(r"([Mlhv])([^Mlhv]*)", charts.path(line)):
         numbers = [float(n) for n in re.findall(r"-?\d*\.?\d+", body)]
         if kind == "M":
             x, y = numbers
@@ -188,8 +188,8 @@ def test_path_does_not_drift() -> None:
 
 def test_path_breaks_at_gaps() -> None:
     line = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, np.nan], [3.0, 3.0], [4.0, 2.5]])
-    assert panels.path(line) == "M0 0l1 1M3 3l1-.5"
-    assert panels.area(line, line) == ""
+    assert charts.path(line) == "M0 0l1 1M3 3l1-.5"
+    assert charts.area(line, line) == ""
 
 
 def test_protocol_is_the_shown_one(best: Trajectories, tmp_path: Path) -> None:
@@ -220,9 +220,16 @@ def test_the_valve_has_one_axis(best: Trajectories, robust: Trajectories) -> Non
         }
         assert len(figures) == 36
         assert len(marks) == 1
-    column = panels.panels([quiet])[0][0]
-    top = panels.VALVE_TOP + panels.VALVE_HEIGHT * (1.0 - quiet.u_in[0, 0].max() / protocol.U_MAX)
-    assert column.valves[0][:, 1].min() == pytest.approx(top, abs=2.0), "not stretched to its range"
+    _, valve = report.sections([quiet], ["quiet"], panels.collect([quiet]))[0]["panels"][0][
+        "charts"
+    ]
+    _, top, _, bottom = valve.frame
+    ((_, drawn),) = valve.paths
+    steps = [float(y) for kind, y in re.findall(r"([vM])(?:[\d.]+ )?(-?[\d.]+)", drawn)]
+    share = quiet.u_in[0, 0, panels.WINDOW].max() / protocol.U_MAX
+    assert min(np.cumsum(steps)) == pytest.approx(bottom - share * (bottom - top), abs=0.2), (
+        "not stretched to its range"
+    )
 
 
 def test_runs_of_two_tracks_are_headed_by_both(best: Trajectories, robust: Trajectories) -> None:

@@ -120,7 +120,7 @@ def html(runs: Sequence[Trajectories], scores: Sequence[Mapping[str, Any]] | Non
         title=names[0],
         names=names,
         classes=[f"r{palette.run_index(i)}" for i in range(len(runs))],
-        dashed=[i >= len(palette.RUNS) for i in range(len(runs))],
+        looks=[look(i) for i in range(len(runs))],
         colors=palette.css(),
         run_colors=palette.RUNS,
         shades=SHADES,
@@ -131,7 +131,6 @@ def html(runs: Sequence[Trajectories], scores: Sequence[Mapping[str, Any]] | Non
         draws=[panels.draws(score) for score in scores or ()],
         lungs=sections(runs, names, numbers),
         pips=runs[0].pips,
-        frame=frame(),
         protocol=protocol,
         scored=[breath + 1 for breath in protocol.SCORED_BREATHS],
         shown_breath=panels.BREATH + 1,
@@ -208,53 +207,51 @@ def sections(
     """A lung each: its numbers and its panels."""
     return [
         {
-            "id": row[0].lung,
-            "R": f"{parse_lung(row[0].lung).R:g}",
-            "C": f"{parse_lung(row[0].lung).C:g}",
+            "id": lung,
+            "R": f"{parse_lung(lung).R:g}",
+            "C": f"{parse_lung(lung).C:g}",
             "scores": [number(value) for value in numbers.lungs[:, i]],
-            "panels": [_panel(panel, names, numbers.cells[:, i, j]) for j, panel in enumerate(row)],
+            "panels": [
+                _panel(runs, i, j, names, numbers.cells[:, i, j]) for j in range(len(runs[0].pips))
+            ],
         }
-        for i, row in enumerate(panels.panels(runs))
+        for i, lung in enumerate(runs[0].lungs)
     ]
 
 
-def frame() -> dict[str, Any]:
-    """Elements that all panels share: sizes, time ticks, the scored part."""
-    end = float(panels.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
-    return {
-        "width": panels.WIDTH,
-        "height": panels.HEIGHT,
-        "left": panels.LEFT,
-        "right": panels.LEFT + panels.PLOT_WIDTH,
-        "top": panels.TOP,
-        "bottom": panels.TOP + panels.PRESSURE_HEIGHT,
-        "scored_width": round(end - panels.LEFT, 1),
-        "scored_end": round(end, 1),
-        "valve_top": panels.VALVE_TOP,
-        "valve_bottom": panels.VALVE_TOP + panels.VALVE_HEIGHT,
-        "commands": [(f"{u:g}", round(float(panels.valve_y(u)), 1)) for u in panels.VALVE_MARKS],
-        "times": [(f"{t:g}", round(float(panels.time_x(t)), 1)) for t in panels.TIMES],
-    }
+def look(k: int) -> str:
+    """Classes of the lines of a run, by its place."""
+    return f"r{palette.run_index(k)}" + " dash" * (k >= len(palette.RUNS))
 
 
-def _panel(panel: panels.RunPanel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
+def _panel(
+    runs: Sequence[Trajectories], i: int, j: int, names: Sequence[str], errors: Floats
+) -> dict[str, Any]:
     errors_text = "; ".join(
         f"{name} {number(e)}{' cmH2O' if np.isfinite(e) else ''}"
         for name, e in zip(names, errors, strict=True)
     )
-    first = panels.inspiration(panel.pressures[0])
+    lung, pip = runs[0].lungs[i], f"{runs[0].pips[j]:g}"
+    targets = runs[0].target[:, j, panels.WINDOW]
+    of_pip = [run.pressure[:, j, panels.WINDOW] for run in runs]
+    # The same axis down a column.
+    pressure, valve = panels.axes(targets[i], panels.pressure_limits(targets, of_pip))
+    inspired = slice(protocol.INSPIRATION_STEPS)
+    times = panels.TIMES[inspired]
+    pressure.between("r0", times, of_pip[0][i][inspired], targets[i][inspired])
+    pressure.line("t", panels.TIMES, targets[i])
+    for k, run in reversed([*enumerate(runs)]):
+        pressure.line(f"p {look(k)} n{k} after", panels.TIMES, of_pip[k][i])
+        pressure.line(f"p {look(k)} n{k}", times, of_pip[k][i][inspired])
+        u_in = np.clip(run.u_in[i, j, panels.WINDOW], 0.0, protocol.U_MAX)
+        valve.held(f"u {look(k)} n{k}", panels.TIMES, u_in)
     return {
-        "pip": f"{panel.pip:g}",
-        "alt": f"{panel.lung} at PIP {panel.pip:g} cmH2O: pressure and u_in over one breath. "
+        "pip": pip,
+        "alt": f"{lung} at PIP {pip} cmH2O: pressure and u_in over one breath. "
         f"Mean absolute error: {errors_text}.",
         "errors": [number(error) for error in errors],
-        "ticks": [(f"{value:g}", round(y, 1)) for value, y in panel.ticks],
-        "target": panels.path(panel.target),
-        "area": panels.area(first, panels.inspiration(panel.target)),
-        "pressures": [panels.path(line) for line in panel.pressures],
-        "scored": [panels.path(panels.inspiration(line)) for line in panel.pressures],
-        "valves": [panels.path(line) for line in panel.valves],
-        "above": None if panel.above is None else f"{panel.above:.0f}",
+        "charts": (pressure, valve),
+        "above": panels.above(pressure, [of_pip[0][i]]),
     }
 
 

@@ -1,22 +1,18 @@
-"""Charts of a diagnosis: lines, bands and ticks in picture units for the template."""
+"""Charts of a diagnosis for its template."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Floats, runs
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
 from ventbench.diagnosis.number_text import capital
 from ventbench.diagnosis.residual_analysis import EDGE, Profile, profiles
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.pages.panels import area, path
+from ventbench.pages.charts import Chart, limits
 from ventbench.physics.characteristics import Characteristic
-
-#: Room for the labels: left, right, top, bottom, picture units.
-LEFT, RIGHT, TOP, BOTTOM = 40.0, 16.0, 16.0, 30.0
 
 #: The three simulators in the order of the legend, by key, which is the class of the line.
 STAGES = {"before": "simulator as given", "refit": "R and C refitted", "after": "corrected"}
@@ -42,125 +38,6 @@ _WITHOUT, _WITH = "refit", "after"
 
 #: Breaths of a request that are drawn.
 REQUESTED = 4
-
-
-@dataclass
-class Chart:
-    """Axes with linear scales, or a logarithmic horizontal one; y of the picture runs downwards."""
-
-    x: tuple[float, float]  #: ends of the horizontal axis.
-    y: tuple[float, float]  #: ends of the vertical axis.
-    x_label: str  #: label under the frame, with the unit.
-    y_label: str  #: label above the frame, with the unit.
-    alt: str  #: description of the picture for those who cannot see it.
-    width: float = 300.0  #: width of the picture.
-    height: float = 170.0  #: height of the picture.
-    #: class and path data of lines, the lowest first.
-    paths: list[tuple[str, str]] = field(default_factory=list)
-    #: class and path data of filled areas, below the lines.
-    areas: list[tuple[str, str]] = field(default_factory=list)
-    #: left end and width of shaded ranges.
-    bands: list[tuple[float, float]] = field(default_factory=list)
-    #: whether the horizontal axis is logarithmic; smaller values stand at its left end.
-    log: bool = False
-
-    @property
-    def frame(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom of the frame, picture units."""
-        return LEFT, TOP, self.width - RIGHT, self.height - BOTTOM
-
-    @property
-    def x_ticks(self) -> list[tuple[str, float]]:
-        """Texts and places of the ticks, picture units."""
-        values, texts = log_ticks(*self.x) if self.log else ticks(*self.x, 6)
-        return [(t, round(float(self.at_x(v)), 1)) for t, v in zip(texts, values, strict=True)]
-
-    @property
-    def y_ticks(self) -> list[tuple[str, float]]:
-        """Texts and places of the ticks, picture units."""
-        values, texts = ticks(*self.y, 4)
-        return [(t, round(float(self.at_y(v)), 1)) for t, v in zip(texts, values, strict=True)]
-
-    @property
-    def zero(self) -> float | None:
-        """Place of y = 0, or None if it is outside."""
-        return round(float(self.at_y(0.0)), 1) if self.y[0] < 0 < self.y[1] else None
-
-    def at_x(self, value: ArrayLike) -> Floats:
-        """Place on the horizontal axis."""
-        left, _, right, _ = self.frame
-        value, (low, high) = np.asarray(value, float), self.x
-        if self.log:
-            value, low, high = np.log(np.maximum(value, low)), np.log(low), np.log(high)
-        share = (value - low) / (high - low)
-        return left + share * (right - left)
-
-    def at_y(self, value: ArrayLike) -> Floats:
-        """Place on the vertical axis; values far outside stay near the frame."""
-        _, top, _, bottom = self.frame
-        share = (np.asarray(value, float) - self.y[0]) / (self.y[1] - self.y[0])
-        return bottom - np.clip(share, -0.5, 1.5) * (bottom - top)
-
-    def line(self, look: str, x: ArrayLike, y: ArrayLike) -> None:
-        """Add a line, which breaks where a point is NaN."""
-        self.paths.append((look, path(self._points(x, y))))
-
-    def stairs(self, look: str, edges: ArrayLike, y: ArrayLike) -> None:
-        """Add one level for each of k ranges with ``k + 1`` edges."""
-        edges = np.asarray(edges, float)
-        self.line(look, np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(y, float), 2))
-
-    def boxes(self, look: str, edges: ArrayLike, low: ArrayLike, high: ArrayLike) -> None:
-        """Add an area from low to high in each of k ranges."""
-        edges, parts = np.asarray(edges, float), []
-        bounds = zip(np.asarray(low, float), np.asarray(high, float), strict=True)
-        for k, (bottom, top) in enumerate(bounds):
-            if np.isfinite(bottom) and np.isfinite(top):
-                ends = edges[[k, k + 1]]
-                upper, lower = self._points(ends, [top, top]), self._points(ends, [bottom, bottom])
-                parts.append(area(upper, lower))
-        if parts:
-            self.areas.append((look, "".join(parts)))
-
-    def band(self, low: float, high: float) -> None:
-        """Shade a range."""
-        ends = self.at_x(np.clip([low, high], *self.x))
-        left, right = float(ends[0]), float(ends[1])
-        self.bands.append((round(left, 1), round(max(right - left, 1.0), 1)))
-
-    def _points(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        return np.stack([self.at_x(x), self.at_y(y)], axis=-1)
-
-
-def ticks(low: float, high: float, count: int) -> tuple[list[float], list[str]]:
-    """Ticks: about ``count`` round numbers from ``low`` to ``high``, and their texts."""
-    spacing = max(high - low, 1e-9) / count
-    scale = 10.0 ** np.floor(np.log10(spacing))
-    step = float(scale * next(x for x in (1, 2, 5, 10) if x * scale >= 0.999 * spacing))
-    first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
-    values = [step * k for k in range(first, last + 1)]
-    places = max(0, -int(np.floor(np.log10(step) + 1e-9)))
-    return values, [f"{v + 0.0:.{places}f}" for v in values]
-
-
-def log_ticks(low: float, high: float) -> tuple[list[float], list[str]]:
-    """Ticks of a logarithmic axis at 1, 2 and 5 times powers of ten, and their texts."""
-    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    values = [digit * 10.0**power for power in powers for digit in (1.0, 2.0, 5.0)]
-    values = [value for value in values if low * (1 - 1e-9) <= value <= high * (1 + 1e-9)]
-    return values, [f"{value:.6g}" for value in values]
-
-
-def limits(*arrays: ArrayLike, around: float = 0.06, least: float = 0.0) -> tuple[float, float]:
-    """Ends of an axis that holds all finite values, of a least height, with air at either end."""
-    flat = np.concatenate([np.ravel(np.asarray(array, float)) for array in arrays])
-    flat = flat[np.isfinite(flat)]
-    if flat.size == 0:
-        return 0.0, max(least, 1.0)
-    low, high = float(flat.min()), float(flat.max())
-    missing = max(least - (high - low), 0.0) or (1.0 if high == low else 0.0)
-    low, high = low - 0.5 * missing, high + 0.5 * missing
-    return low - around * (high - low), high + around * (high - low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +167,7 @@ def command(time: Floats, u_in: Floats, end: float, alt: str, height: float) -> 
     """The inspiratory valve over time; a command holds until the next sample."""
     top = max(10.0, float(np.max(u_in, initial=0.0)))
     chart = Chart((0.0, end), (-0.04 * top, 1.08 * top), "s", "u_in, %", alt, height=height)
-    chart.line("u", np.repeat(time, 2)[1:], np.repeat(u_in, 2)[:-1])
+    chart.held("u", time, u_in)
     return chart
 
 

@@ -232,10 +232,13 @@ def axes(target: Floats, limits: tuple[float, float]) -> tuple[Chart, Chart]:
     The target is that of the shown steps, cmH2O; limits are the ends of the pressure's axis.
     """
     span, marks = (0.0, float(TIMES[-1])), (float(target.min()), float(target.max()))
-    size = {"width": WIDTH, "height": HEIGHT}
-    pressure = Chart(span, limits, "", "cmH2O", "", **size, room=PRESSURE, marks=marks)
+    pressure = Chart(
+        span, limits, "", "cmH2O", "", width=WIDTH, height=HEIGHT, room=PRESSURE, marks=marks
+    )
     pressure.band(0.0, protocol.INSPIRATION_STEPS * protocol.DT)
-    return pressure, Chart(span, (0.0, protocol.U_MAX), "", "u_in, %", "", **size, room=VALVE)
+    command = (0.0, protocol.U_MAX)
+    valve = Chart(span, command, "", "u_in, %", "", width=WIDTH, height=HEIGHT, room=VALVE)
+    return pressure, valve
 
 
 def pressure_limits(target: Floats, pressures: Sequence[Floats]) -> tuple[float, float]:

@@ -64,7 +64,6 @@ EXAMPLES = (
     "ventbench list entries",
     "ventbench list examples",
     "ventbench data import",
-    "ventbench board show",
     "ventbench board new-key",
 )
 

@@ -202,9 +202,9 @@ def _base_model(
     after, notes = recording_model.pressures(final, data, first), []
     model = final
     if not final.hypothesis.breath_terms:
-        of_scatter = gains_scatter(evaluator, final, recording_model.final, settings)
+        breath_gains = _breath_gains_predict(evaluator, final, recording_model.final, settings)
         again = fit_open_loop(
-            evaluator, final, recording_model.final, settings, of_scatter=of_scatter
+            evaluator, final, recording_model.final, settings, breath_gains=breath_gains
         )
         pressure = recording_model.pressures(again, data, first)
         if error(pressure) < settings.drift_ratio * error(after):
@@ -295,7 +295,7 @@ def fit_open_loop(
     settings: CorrectionSettings,
     *,
     label: bool = False,
-    of_scatter: bool = False,
+    breath_gains: bool = False,
 ) -> FittedModel:
     """Fit a hypothesis for the least open-loop error: at white noise, from several starts.
 
@@ -308,9 +308,9 @@ def fit_open_loop(
         partition: breaths to fit.
         settings: which starts to try.
         label: also start from the labels' R and C, and from other lungs around them.
-        of_scatter: integrate out each breath's gain; else all breaths have one.
+        breath_gains: integrate out each breath's gain; else all breaths have one.
     """
-    if not of_scatter:
+    if not breath_gains:
         evaluator = replace(evaluator, gain_sd=0.0)
     noise = replace(fitted.noise, ar=(0.0,) * len(fitted.noise.ar), tail=settings.tail)
     values, names = evaluator.transferred_values(fitted, partition), partition.predictor.names
@@ -324,7 +324,7 @@ def fit_open_loop(
     return min(models, key=lambda model: evaluator.square_error(model, partition))
 
 
-def gains_scatter(
+def _breath_gains_predict(
     evaluator: Evaluator, fitted: FittedModel, partition: Partition, settings: CorrectionSettings
 ) -> bool:
     """Whether breaths to come are predicted better if the fit leaves each breath its own gain.
@@ -343,16 +343,16 @@ def gains_scatter(
     if not evaluator.gain_sd:
         return False
     for lung in np.unique(data.lung):
-        held[np.flatnonzero(data.lung == lung)[1::3]] = True
+        held[np.flatnonzero(data.lung == lung)[1 :: evaluator.settings.data.held_out_every]] = True
     inner = make_evaluator(data, held, partition.predictor.names, (), evaluator.settings)
     inner = replace(inner, gain_sd=evaluator.gain_sd)
 
-    def error(of_scatter: bool) -> float:
-        model = fit_open_loop(inner, fitted, inner.training, settings, of_scatter=of_scatter)
+    def error(breath_gains: bool) -> float:
+        model = fit_open_loop(inner, fitted, inner.training, settings, breath_gains=breath_gains)
         off = inner.predict(model, inner.held_out) - inner.held_out.data.measured
         return float(np.mean(np.abs(off[inner.held_out.data.weight > 0.0])))
 
-    return error(of_scatter=True) < error(of_scatter=False)
+    return error(breath_gains=True) < error(breath_gains=False)
 
 
 def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, Floats]:

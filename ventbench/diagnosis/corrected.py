@@ -17,7 +17,7 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
+from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.experiment import Experiment, Judge, Split, open_loop_error
 from ventbench.diagnosis.findings import WHOLE, OpenLoopComparison, OpenLoopError, Stage
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
@@ -202,10 +202,7 @@ def _base_model(
     after, notes = recording_model.pressures(final, data, first), []
     model = final
     if not final.hypothesis.breath_terms:
-        breath_gains = _breath_gains_predict(evaluator, final, recording_model.final, settings)
-        again = fit_open_loop(
-            evaluator, final, recording_model.final, settings, breath_gains=breath_gains
-        )
+        again = fit_open_loop(evaluator, final, recording_model.final, settings)
         pressure = recording_model.pressures(again, data, first)
         if error(pressure) < settings.drift_ratio * error(after):
             model, after = again, pressure
@@ -295,7 +292,6 @@ def fit_open_loop(
     settings: CorrectionSettings,
     *,
     label: bool = False,
-    breath_gains: bool = False,
 ) -> FittedModel:
     """Fit a hypothesis for the least open-loop error: at white noise, from several starts.
 
@@ -308,10 +304,8 @@ def fit_open_loop(
         partition: breaths to fit.
         settings: which starts to try.
         label: also start from the labels' R and C, and from other lungs around them.
-        breath_gains: integrate out each breath's gain; else all breaths have one.
     """
-    if not breath_gains:
-        evaluator = replace(evaluator, gain_sd=0.0)
+    evaluator = replace(evaluator, gain_sd=0.0)  # a breath to come has the usual gain
     noise = replace(fitted.noise, ar=(0.0,) * len(fitted.noise.ar), tail=settings.tail)
     values, names = evaluator.transferred_values(fitted, partition), partition.predictor.names
     known = {p: values[:, names.index(p)] for p in fitted.hypothesis.paths if p in names}
@@ -322,37 +316,6 @@ def fit_open_loop(
         starts.append(_best_lung(partition, settings))
     models = [evaluator.fit(fitted.hypothesis, noise, start=s, partition=partition) for s in starts]
     return min(models, key=lambda model: evaluator.square_error(model, partition))
-
-
-def _breath_gains_predict(
-    evaluator: Evaluator, fitted: FittedModel, partition: Partition, settings: CorrectionSettings
-) -> bool:
-    """Whether breaths to come are predicted better if the fit leaves each breath its own gain.
-
-    The parameters are then those beside the gains, and a breath to come has the usual one. Beside
-    the wrong terms, gains of single breaths take what is physics. So a third of the breaths of the
-    fit, which is left out of it, decides; breaths that judge have no part.
-
-    Args:
-        evaluator: evaluator of the recording, with the scatter of the gains.
-        fitted: the hypothesis, fitted to some breaths.
-        partition: breaths of the fit.
-        settings: which starts to try.
-    """
-    data, held = partition.data, np.zeros(len(partition.data), bool)
-    if not evaluator.gain_sd:
-        return False
-    for lung in np.unique(data.lung):
-        held[np.flatnonzero(data.lung == lung)[1 :: evaluator.settings.data.held_out_every]] = True
-    inner = make_evaluator(data, held, partition.predictor.names, (), evaluator.settings)
-    inner = replace(inner, gain_sd=evaluator.gain_sd)
-
-    def error(breath_gains: bool) -> float:
-        model = fit_open_loop(inner, fitted, inner.training, settings, breath_gains=breath_gains)
-        off = inner.predict(model, inner.held_out) - inner.held_out.data.measured
-        return float(np.mean(np.abs(off[inner.held_out.data.weight > 0.0])))
-
-    return error(breath_gains=True) < error(breath_gains=False)
 
 
 def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, Floats]:

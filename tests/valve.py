@@ -1,4 +1,4 @@
-"""A pure controller whose commands have the step of the valve, as those of submissions do."""
+"""Pure controllers whose commands are those of submissions."""
 
 from __future__ import annotations
 
@@ -20,3 +20,20 @@ class Stepped:
     def step(self, state: Any, observation: Any) -> tuple[Any, Any]:
         state, command = self.controller.step(state, observation)
         return state, jnp.round(1000.0 * jnp.clip(command, 0.0, 100.0)) / 1000.0
+
+
+@flax.struct.dataclass
+class Lowered:
+    """Any controller whose largest command falls with each reading far above the target."""
+
+    controller: Any
+
+    def init(self, shape: tuple[int, ...]) -> Any:
+        return self.controller.init(shape), jnp.full(shape, 100.0)
+
+    def step(self, state: Any, observation: Any) -> tuple[Any, Any]:
+        state, most = state
+        state, command = self.controller.step(state, observation)
+        above = observation.pressure - observation.target > 8.0
+        most = jnp.where(above, 0.7 * most, most)
+        return (state, most), jnp.minimum(command, most)

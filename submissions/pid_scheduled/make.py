@@ -42,10 +42,12 @@ def main():
     def breath(plants, cells):
         controller = PID(*jnp.asarray(single, jnp.float32))
         _, _, kept = rollouts.inspiration(
-            env.vary(plants, cells, 0), cells, rollouts.controlled_by(controller),
+            env.vary(plants, cells, 0),
+            cells,
+            rollouts.controlled_by(controller),
             controller.init(cells.pip.shape),
             record=lambda before, _, __, applied: (applied, before.signals.reading),
-        )  # fmt: skip
+        )
         return kept
 
     applied, reading = (np.asarray(x, float).T for x in breath(plants, cells))
@@ -59,8 +61,11 @@ def main():
     print("standard deviations", np.sqrt(np.diag(np.linalg.inv(precision))))
     np.savez(
         Path(__file__).parent / "lungs.npz",
-        gains=gains, single=single, centre=centre, precision=precision,
-    )  # fmt: skip
+        gains=gains,
+        single=single,
+        centre=centre,
+        precision=precision,
+    )
 
 
 if __name__ == "__main__":

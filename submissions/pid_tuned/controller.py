@@ -3,7 +3,7 @@
 TIME_CONSTANT = 0.5  # s, of both averages
 
 #: Each reading so far above the target, cmH2O, leaves this share of the largest command until the
-#: run ends: gains for all lungs swing on rigs that answer late.
+#: run ends: the loop swings on rigs that answer later than those it was tuned on.
 ABOVE, SHARE = 8.0, 0.7
 
 # (P, I, D), %/cmH2O
@@ -21,7 +21,6 @@ GAINS = {
 class Controller:
     def reset(self, task):
         self.gains, self.most = GAINS[task.lung], 100.0
-        self.told = task.lung is not None
 
     def act(self, observation):
         if observation.time == 0:  # a new breath
@@ -31,7 +30,7 @@ class Controller:
         self.integral += a * (error - self.integral)
         self.derivative += a * (error - self.before - self.derivative)
         self.before = error
-        if error < -ABOVE and not self.told:
+        if error < -ABOVE:
             self.most *= SHARE
         p, i, d = self.gains
         return min(p * error + i * self.integral + d * self.derivative, self.most)

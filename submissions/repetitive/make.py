@@ -12,6 +12,7 @@ then made smaller until the norm of ``Q - L T`` is below a limit on all rigs of 
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -81,9 +82,13 @@ def breath(plants, cells, number, gains, forward):
 
     def step(carry, at):
         carry, (pressure, u) = rollouts.control_step(
-            varied, cells, policy, lambda before, _, __, u: (before.signals.scored, u),
-            carry, (number, *at),
-        )  # fmt: skip
+            varied,
+            cells,
+            policy,
+            lambda before, _, __, u: (before.signals.scored, u),
+            carry,
+            (number, *at),
+        )
         return carry, (pressure, carry[1][3], u)
 
     begin = (env.start_breath(varied, cells), (zero,) * 4)
@@ -163,8 +168,11 @@ def told(p, bench, wanted):
         own = took.reshape(6, -1, took.shape[-1])
         away = (own - own.mean(1, keepdims=True)).reshape(len(took), -1)
         covariance = away.T @ away / len(away)
-        p |= {"centre": own.mean(1), "precision": np.linalg.inv(covariance),
-              "deviation": np.sqrt(covariance.diagonal())}  # fmt: skip
+        p |= {
+            "centre": own.mean(1),
+            "precision": np.linalg.inv(covariance),
+            "deviation": np.sqrt(covariance.diagonal()),
+        }
     pairs = zip(took, wanted, strict=True)
     return np.array([kinds(p, x) for x in took]), np.array([features(p, *x) for x in pairs])
 
@@ -241,14 +249,17 @@ def design():
     cell_key, key, valve_key = jax.random.split(jax.random.key(0), 3)
     member = np.asarray(jax.random.randint(key, lung.shape, 0, members))
     plants = jax.tree.map(lambda leaf: np.asarray(leaf)[member, lung], given.plants)
-    cells = draws.random_scenarios(cell_key, jnp.asarray(PIPS[pip], jnp.float32), smooth=True)
+    cells: Any = draws.random_scenarios(cell_key, jnp.asarray(PIPS[pip], jnp.float32), smooth=True)
     scatter = jnp.exp(VALVES * jax.random.normal(valve_key, lung.shape))
     bench = Bench(plants, cells.replace(gain=cells.gain * scatter[:, None]))
     away = abs(np.subtract.outer(np.arange(STEPS), np.arange(STEPS)))
     with np.load(PIDS) as pids:
         p = {"first": pids["single"], "gains": pids["gains"]}
-    p |= {"begin": np.zeros((6, 5, STEPS)), "learning": np.zeros((6, STEPS, STEPS)),
-          "keep": 0.6 * (away == 0) + 0.1 * (away == 1)}  # fmt: skip
+    p |= {
+        "begin": np.zeros((6, 5, STEPS)),
+        "learning": np.zeros((6, STEPS, STEPS)),
+        "keep": 0.6 * (away == 0) + 0.1 * (away == 1),
+    }
     weight, each = told(p, bench, bench.pip[:, 0] - np.asarray(cells.start))
     right = np.mean(weight.argmax(1) == lung)
     print(f"kind of lung told in {100 * right:.0f} % of the cells", flush=True)
@@ -260,6 +271,7 @@ def design():
 def check():
     """Print the largest norm by lung on rigs held out and drawn; say whether all are below 1."""
     p, official, most = dict(np.load(FILE)), frozen.load(), []
+    assert official.population is not None, "the official simulators have a population"
     for at, name in enumerate(official.lung_ids):
         apart = list(official.held_out_rigs[at])
         known = jax.tree.map(lambda leaf, apart=apart: leaf[0, apart], official.sessions_plants)

@@ -26,7 +26,7 @@ from ventbench.task.interfaces import Task
 from ventbench.task.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.task.metrics.score import run_error
 
-from ..valve import Stepped
+from ..valve import Lowered, Stepped
 
 GAINS = {
     "R5C10": (10.0, 0.0, 10.0),
@@ -44,7 +44,7 @@ def pure_errors(plants, cells, gains):
     with compilation.float64():
         for i, gain in enumerate(gains):
             own = cells if cells.pip.ndim == 1 else jax.tree.map(lambda x, i=i: x[i], cells)
-            found, _ = rollouts.closed_loop(take(plants, i), Stepped(PID(*gain)), own)
+            found, _ = rollouts.closed_loop(take(plants, i), Stepped(Lowered(PID(*gain))), own)
             errors.append(run_error(found.pressure, np.asarray(own.pip)[..., None, None]))
     return np.stack(errors)
 
@@ -142,7 +142,7 @@ def test_trajectories(best, plants):
     np.testing.assert_allclose(error, result.nominal, rtol=0, atol=1e-9)
     with compilation.float64():
         cells = environment.nominal_scenario(np.array(protocol.PIPS))
-        pid = Stepped(PID(*GAINS["R20C20"]))
+        pid = Stepped(Lowered(PID(*GAINS["R20C20"])))
         inspired, expired = rollouts.closed_loop(take(plants, 4), pid, cells, whole=True)
     for name in ("pressure", "u_in"):
         whole = np.concatenate([getattr(inspired, name), getattr(expired, name)], axis=-1)

@@ -18,7 +18,7 @@ from ventbench.task import environment, rollouts
 from ventbench.task.metrics.score import run_error
 
 from ..textbook_rigs import OFFSET, TextbookRigs
-from ..valve import Stepped
+from ..valve import Lowered, Stepped
 
 PIPS = (10.0, 35.0)
 
@@ -45,7 +45,7 @@ def compiled(rigs, draws):
         plants, cells = jax.tree.map(jax.numpy.asarray, (plants, cells))
 
         def run(plant, cell):
-            return rollouts.closed_loop(plant, Stepped(PID(*PID_ROBUST)), cell)[0]
+            return rollouts.closed_loop(plant, Stepped(Lowered(PID(*PID_ROBUST))), cell)[0]
 
         inspired = jax.tree.map(np.asarray, jax.vmap(run)(plants, cells))
     return run_error(inspired.pressure, np.asarray(cells.pip)[..., None, None]), inspired

@@ -7,8 +7,8 @@ a valve that nobody has looked at. The steps are those that a laboratory would t
 2. take the simulator that one would have without recordings: an R-C lung at its label;
 3. diagnose it (``ventbench diagnose``), which gives ``corrected.json``;
 4. learn a simulator from the recordings alone (``ventbench train simulator``);
-5. train the same controllers on each (``ventbench tune pid``, ``ventbench train residual``), and
-   run all of them on the rig, under noise and deviations that are the same for all.
+5. train the same controllers on each (``ventbench tune pid``, ``submissions/residual_mlp``),
+   and run all of them on the rig, under noise and deviations that are the same for all.
 
 Usage: ``python benchmarks/own_rig.py [--out DIR] [--rig NAME]``.
 Diagnosis, simulators and each training are kept in ``--out`` when they are finished, so that the
@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 import typer
 
+from submissions.residual_mlp import train as residual_mlp
 from ventbench import recordings
 from ventbench.base import compilation
 from ventbench.base.arrays import Floats
@@ -42,7 +43,6 @@ from ventbench.task.lungs import lung
 from ventbench.task.metrics.score import run_error
 from ventbench.train import pid_search
 from ventbench.train.exploration import ExplorationRanges, SimulatedVentilator, explore
-from ventbench.train.residual import ResidualConfig, train_residual
 from ventbench.train.rigs.fit import FitConfig
 from ventbench.train.rigs.train import RigConfig, train_rigs
 
@@ -136,10 +136,10 @@ def trained_on(
     simulator: Any, best: Sequence[float], plant: Plant, out: Path, seed: int, updates: int
 ) -> dict[str, Any]:
     """Train a network on a simulator, and run it on the rig; errors as of :func:`tuned_on`."""
-    trained = train_residual(
+    trained = residual_mlp.train(
         [LUNG],
         out,
-        config=ResidualConfig(updates=updates, members=1),
+        config=residual_mlp.ResidualConfig(updates=updates, members=1),
         seeds=[seed],
         gains=np.array([best]),  # the grid was searched before
         simulator=simulator,

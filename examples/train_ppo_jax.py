@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import linen as nn
+from jax.scipy.stats import norm
 
 from ventbench.base.files import write_json
 from ventbench.train.rl import environment
 from ventbench.train.rl.environment import advantages
-from ventbench.train.rl.learners import clipped_loss, log_probability
 
 ITERATIONS = int(sys.argv[1]) if len(sys.argv) > 1 else 500
 ENVIRONMENTS, EPOCHS, PARTS = 48, 4, 4
@@ -63,7 +63,7 @@ def rollout(parameters, key):
         spread = parameters["log_spread"]
         action = mean + jnp.exp(spread) * jax.random.normal(key, mean.shape)
         state, seen, reward, _ = jax.vmap(environment.step)(state, action)
-        kept = x, action, log_probability(action, mean, spread), value, reward
+        kept = x, action, norm.logpdf(action, mean, jnp.exp(spread)), value, reward
         return (state, seen, memory), kept
 
     memory = jnp.zeros((ENVIRONMENTS, 4, environment.OBSERVATION))
@@ -75,9 +75,11 @@ def rollout(parameters, key):
 def loss(parameters, part):
     x, action, before, value, advantage = part
     mean, now = network.apply(parameters["network"], x)
-    ratio = jnp.exp(log_probability(action, mean, parameters["log_spread"]) - before)
+    ratio = jnp.exp(norm.logpdf(action, mean, jnp.exp(parameters["log_spread"])) - before)
     scaled = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
-    return clipped_loss(ratio, scaled, 0.2).mean() + jnp.mean((now - value - advantage) ** 2)
+    # No gain from going further than 0.2 from the policy that acted.
+    gain = jnp.minimum(ratio * scaled, jnp.clip(ratio, 0.8, 1.2) * scaled)
+    return -gain.mean() + jnp.mean((now - value - advantage) ** 2)
 
 
 def update(carry, part):

@@ -120,7 +120,7 @@ def test_doctor_names_what_is_missing(monkeypatch):
     [
         ("ventbench", "score pid_r", "pid_robust"),
         ("ventbench", "tune pid --lung R5C1", "R5C10"),
-        ("ventbench", "train ppo --lung R20C1", "R20C10"),
+        ("ventbench", "tune pid --lung R20C1", "R20C10"),
         ("ventbench", "data open-loop --plant two", "two_balloon"),
         ("ventbench-hardware", "run ppo", "ppo"),
         ("ventbench-hardware", "compare --plant phy", "physics"),

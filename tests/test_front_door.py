@@ -25,7 +25,7 @@ TESTS = Path(__file__)
 ROOT = TESTS.parents[1]
 
 #: What a name does is said by an example; these take minutes, and are tried where they are tested.
-LONG = ("diagnose", "train_dqn", "train_ppo", "train_residual", "train_rigs")
+LONG = ("diagnose", "train_rigs")
 
 FUNCTIONS = sorted(
     name for name in ventbench.__all__ if inspect.isfunction(getattr(ventbench, name))

@@ -101,7 +101,6 @@ CASES = {
     "board withdraw 123 --reason x --folder folder": "holds no single record",
     "board headroom --check noise.json": "not a file of reference errors: it is no .npz archive",
     "tune pid --lung R1": "R1",
-    "train ppo --lung R1C1 --out o": "R1C1",
 }
 
 

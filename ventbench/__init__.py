@@ -5,8 +5,7 @@ Everything that a notebook needs is an attribute of this package and is imported
 - recordings: ``load_recording``, ``import_recording``, ``example``, ``Breaths``;
 - simulators: ``load_simulators``, ``simulate``, ``simulate_breaths``, ``open_loop``, the protocol
   ``Plant``;
-- controllers: ``score``, ``rollout``, ``tune_pid``, ``train_residual``, ``train_ppo``,
-  ``train_dqn``, the protocol ``Controller``;
+- controllers: ``score``, ``rollout``, ``tune_pid``, the protocol ``Controller``;
 - missing physics: ``diagnose``, ``Diagnosis``, ``isolability``;
 - learned simulators: ``train_rigs``; the leaderboard: ``load_board``.
 
@@ -48,10 +47,7 @@ if TYPE_CHECKING:
     from ventbench.task.lungs import LUNGS as LUNGS
     from ventbench.task.lungs import Lung as Lung
     from ventbench.train.pid_search import tune_pid as tune_pid
-    from ventbench.train.residual import train_residual as train_residual
     from ventbench.train.rigs.train import train_rigs as train_rigs
-    from ventbench.train.rl.train import train_dqn as train_dqn
-    from ventbench.train.rl.train import train_ppo as train_ppo
     from ventbench.trajectories import Trajectories as Trajectories
     from ventbench.trajectories import rollout as rollout
 
@@ -85,9 +81,6 @@ _SOURCES = {
     "score": ("entries.scoring", "score"),
     "simulate": ("simulation", "simulate"),
     "simulate_breaths": ("simulation", "simulate_breaths"),
-    "train_dqn": ("train.rl.train", "train_dqn"),
-    "train_ppo": ("train.rl.train", "train_ppo"),
-    "train_residual": ("train.residual", "train_residual"),
     "train_rigs": ("train.rigs.train", "train_rigs"),
     "tune_pid": ("train.pid_search", "tune_pid"),
 }

@@ -146,8 +146,8 @@ def controllers(
     Example: `python -m proofs study controllers --seeds 3 --updates 1000`
     """
     from proofs.studies import controllers as work
+    from submissions.residual_mlp.train import ResidualConfig
     from ventbench.plants import frozen
-    from ventbench.train.residual import ResidualConfig
 
     config = ResidualConfig(updates=updates)
     _check(only, work.variants(config))

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from proofs.studies.networks import Progress, Tell, finish
+from submissions.residual_mlp.train import ResidualConfig, fit
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.base.resume import WorkFolder
@@ -25,7 +26,6 @@ from ventbench.task.interfaces import Controller
 from ventbench.task.lungs import LUNGS
 from ventbench.task.metrics.score import run_error
 from ventbench.train import pid_search
-from ventbench.train.residual import ResidualConfig, fit
 
 #: Published draws to score on.
 DRAWS = 20

@@ -25,10 +25,10 @@ import numpy as np
 import optax
 from jax import Array
 
+from submissions.residual_mlp.train import optimiser
 from ventbench.base.arrays import Floats
 from ventbench.controllers.residual import Layer, apply
 from ventbench.recordings import Breaths
-from ventbench.train.residual import optimiser
 
 #: Interval at which the network's rate output is an increment, s (mean of the recordings').
 REFERENCE_DT = 0.033

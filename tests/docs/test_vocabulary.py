@@ -23,9 +23,6 @@ FUNCTIONS = {
     "isolability": "isolability",
     "simulate": "simulate_breaths",
     "tune pid": "tune_pid",
-    "train residual": "train_residual",
-    "train ppo": "train_ppo",
-    "train dqn": "train_dqn",
 }
 FILES = {"help", "json", "out", "clip", "pad", "missing", "report"}
 

@@ -1,8 +1,7 @@
-"""``ventbench train`` and ``tune``: simulators, controllers that correct a PID, gains of PIDs."""
+"""``ventbench train`` and ``tune``: simulators of rigs, and gains of PIDs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +14,6 @@ from ventbench.cli.options import (
     PlantName,
     RecordingsDir,
     bar,
-    bars,
     claim_out,
     complete_lungs,
     recordings_folder,
@@ -23,31 +21,8 @@ from ventbench.cli.options import (
     written_console,
 )
 
-app = typer.Typer(name="train", help="Train simulators and controllers.", no_args_is_help=True)
+app = typer.Typer(name="train", help="Train simulators.", no_args_is_help=True)
 tune = typer.Typer(name="tune", help="Search for the gains of a controller.", no_args_is_help=True)
-
-Lung = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ID",
-        help="Train only the network for this lung, such as R20C50.",
-        autocompletion=complete_lungs,
-    ),
-]
-All = Annotated[
-    bool,
-    typer.Option(
-        "--all", help="Train only one network for all six lungs, which is not told the lung."
-    ),
-]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the first training.")]
-Seeds = Annotated[
-    int, typer.Option(min=1, max=32, help="Number of trainings of each network; the best is kept.")
-]
-Steps = Annotated[
-    int | None,
-    typer.Option(min=1, help="Control steps of experience; default: as in docs/reinforcement.md."),
-]
 
 
 @app.command()
@@ -116,172 +91,6 @@ def population(
     with bar("fitting the population") as progress:
         train_population(folder, simulators, progress=progress)
     typer.echo(f"wrote {simulators / 'population.npz'}")
-
-
-@app.command()
-def residual(
-    lung: Lung = None,
-    every: All = False,
-    seed: Seed = 0,
-    seeds: Seeds = 1,
-    updates: Annotated[
-        int | None, typer.Option(min=1, help="Updates of each network; default: 3000.")
-    ] = None,
-    members: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Plants of each lung, 1 for the reference rig alone; default: all."
-        ),
-    ] = None,
-    penalty: Annotated[
-        float,
-        typer.Option(
-            "--lambda", min=0.0, help="Weight of the size of the correction, cmH2O for each %."
-        ),
-    ] = 0.0,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
-    ] = Path("runs/residual"),
-    plant: PlantName = "frozen",
-    json: JsonFile = None,
-) -> None:
-    """Train networks that correct the best PID, by differentiating through the simulators.
-
-    Writes training.json and weights.npz, which `submissions/residual_mlp` and
-    `submissions/residual_mlp_all` can read. Without `--lung` and `--all` it trains six networks,
-    one for each lung. Ctrl-C keeps the finished work; the same command continues.
-
-    Example: `ventbench train residual --all --out runs/residual_all`
-    """
-    from ventbench.train.plants import ALL
-    from ventbench.train.residual import ResidualConfig, train_residual
-
-    if lung is not None and every:
-        raise InputError("give --lung ID or --all, not both")
-    names = (ALL,) if every else None if lung is None else (lung,)
-    updates = updates or ResidualConfig.updates
-    config = ResidualConfig(updates=updates, members=members, lam=penalty)
-    with bars() as tell:
-
-        def report(stage: str, progress: tuple[int, int, float] | None) -> None:
-            if progress is None:
-                tell(stage, 0, None)
-            else:
-                tell(stage, *progress[:2], text=f"{stage}: {progress[2]:.3f} cmH2O")
-
-        trained = train_residual(
-            names,
-            out,
-            config=config,
-            seeds=range(seed, seed + seeds),
-            simulator=plant,
-            progress=report,
-        )
-    console = written_console(trained.report, json)
-    console.print(_residual_table(trained.report))
-    console.print(f"wrote {out}", soft_wrap=True)
-
-
-def _residual_table(result: dict[str, Any]) -> Any:
-    rows = []
-    for network, figures in result["networks"].items():
-        for lung, error in figures["error"].items():
-            before = figures["error_pid"][lung]
-            change = f"{100 * (error / before - 1):+.1f} %"
-            rows.append((network, lung, f"{before:.3f}", f"{error:.3f}", change))
-    columns = ("network", "lung", "PID", "corrected", "change")
-    return table_of("Nominal mean |pressure - target|, cmH2O", columns, rows, left=["lung"])
-
-
-def _policies(method: str, purpose: str) -> Callable[..., None]:
-    """The command that trains networks by a method of reinforcement learning."""
-
-    def command(
-        lung: Lung = None,
-        all_lungs: All = False,
-        seed: Seed = 0,
-        seeds: Seeds = 2,
-        steps: Steps = None,
-        out: Annotated[
-            Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
-        ] = Path("runs", method),
-        plant: PlantName = "frozen",
-        json: JsonFile = None,
-    ) -> None:
-        _train_policies(method, lung, all_lungs, range(seed, seed + seeds), steps, out, plant, json)
-
-    command.__doc__ = f"""Train networks that {purpose}.
-
-    Writes training.json and weights.npz, which `submissions/{method}` can read. Without `--lung`
-    and `--all` it trains seven networks: one for each lung, and one for all six. Ctrl-C keeps the
-    finished work; the same command continues.
-
-    Example: `ventbench train {method} --lung R20C50 --out runs/{method}-R20C50`
-    """
-    return command
-
-
-app.command("ppo")(_policies("ppo", "correct the PID, by proximal policy optimisation (PPO)"))
-app.command("dqn")(
-    _policies("dqn", "choose among 19 corrections of the PID, by deep Q-learning (DQN)")
-)
-
-
-def _train_policies(
-    method: str,
-    lung: str | None,
-    all_lungs: bool,
-    seeds: range,
-    steps: int | None,
-    out: Path,
-    plant: str,
-    json: Path | None,
-) -> None:
-    from ventbench.train.plants import ALL
-    from ventbench.train.rl.train import train_dqn, train_ppo
-
-    if lung is not None and all_lungs:
-        raise InputError("give --lung ID or --all, not both; neither trains all seven networks")
-    networks = (ALL,) if all_lungs else None if lung is None else (lung,)
-    work = {"ppo": train_ppo, "dqn": train_dqn}[method]
-    with bars() as tell:
-        trained = work(
-            networks,
-            out,
-            seeds=seeds,
-            steps=steps,
-            simulator=plant,
-            progress=lambda label, share, best: tell(
-                label, share, text=f"{method}, {label}: {best:.3f} cmH2O"
-            ),
-        )
-    console = written_console(trained.report, json)
-    console.print(_trained(trained.report))
-    console.print(f"wrote {out}", soft_wrap=True)
-
-
-def _trained(report: dict[str, Any]) -> Any:
-    def values(errors: list[float]) -> str:
-        return " ".join(f"{error:.3f}" for error in errors)
-
-    rows = (
-        (
-            name,
-            str(figures["breaths"]),
-            f"{figures['error_pid']:.3f}",
-            values(figures["error_nominal_at_end"]),
-            values(figures["error_fresh"]),
-            str(figures["seed"]),
-        )
-        for name, figures in report["networks"].items()
-    )
-    columns = ("network", "breaths", "PID", "at the end", "fresh cells", "best seed")
-    return table_of(
-        f"{report['method']}: mean |pressure - target|, cmH2O",
-        columns,
-        rows,
-        caption="Fresh cells: new deviations, drawn like the published draws.",
-    )
 
 
 PLOT = "grid.png"

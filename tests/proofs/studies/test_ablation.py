@@ -17,13 +17,13 @@ from proofs.__main__ import app
 from proofs.paper.paper import load_stored
 from proofs.studies import controllers, networks
 from proofs.studies.stitched import Architecture, Training
+from submissions.residual_mlp.train import ResidualConfig
 from tests.train.conftest import synthetic
 from ventbench.base.errors import InputError
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.recordings import write
 from ventbench.task.lungs import LUNGS
-from ventbench.train.residual import ResidualConfig
 
 SMALL = ResidualConfig(
     updates=2, copies=1, widths=(8,), pressures=2, commands=2, ahead=2, members=2

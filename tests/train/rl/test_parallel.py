@@ -16,6 +16,9 @@ import numpy as np
 import pytest
 from jax import Array
 
+from proofs.studies.samples import PolicyGradient
+from submissions.dqn.train import DQN
+from submissions.ppo.train import PPO
 from ventbench.base.errors import InputError
 from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment
@@ -23,7 +26,6 @@ from ventbench.plants.stacking import stack
 from ventbench.task.lungs import LUNGS
 from ventbench.train.rl import environment
 from ventbench.train.rl import train as parallel
-from ventbench.train.rl.learners import DQN, PPO, PolicyGradient
 
 PG = PolicyGradient(breaths=6, iterations=160, widths=(8,), learning_rate=1e-2)
 SMALL_PPO = PPO(breaths=12, iterations=4, widths=(8,), epochs=2, minibatches=2)

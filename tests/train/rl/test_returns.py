@@ -6,7 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.train.rl import environment, learners
+from submissions.dqn.train import double_q_target
+from submissions.ppo.train import clipped_loss, log_probability
+from ventbench.train.rl import environment
 
 RNG = np.random.default_rng(0)
 REWARDS, VALUES = RNG.normal(size=(7, 3)), RNG.normal(size=(7, 3))
@@ -38,14 +40,14 @@ def test_double_q_takes_the_targets_value_of_the_online_choice():
     online = jnp.array([[1.0, 3.0, 2.0], [5.0, 4.0, 0.0]])
     target = jnp.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])
     reward, discount = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.0])
-    found = environment.double_q_target(reward, discount, online, target)
+    found = double_q_target(reward, discount, online, target)
     np.testing.assert_allclose(found, [1.0 + 0.5 * 20.0, 2.0])
 
 
 def test_clipped_loss_gains_nothing_beyond_the_clip():
     ratio = jnp.array([0.5, 0.9, 1.1, 2.0, 0.5, 2.0])
     advantage = jnp.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
-    found = learners.clipped_loss(ratio, advantage, 0.2)
+    found = clipped_loss(ratio, advantage, 0.2)
     np.testing.assert_allclose(found, [-0.5, -0.9, -1.1, -1.2, 0.8, 2.0], rtol=1e-6)
 
 
@@ -53,6 +55,6 @@ def test_log_probability_is_a_gaussians_up_to_a_constant():
     from scipy.stats import norm
 
     action, mean, spread = np.array([0.3, -1.0, 2.0]), 0.5, 0.7
-    found = learners.log_probability(jnp.asarray(action), jnp.asarray(mean), jnp.log(spread))
+    found = log_probability(jnp.asarray(action), jnp.asarray(mean), jnp.log(spread))
     wanted = norm.logpdf(action, mean, spread) + 0.5 * np.log(2 * np.pi)
     np.testing.assert_allclose(found, wanted, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""The commands `train ppo` and `train dqn`."""
+"""Networks of PPO and DQN, as the scripts of their entries train them."""
 
 from __future__ import annotations
 
@@ -6,32 +6,40 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from ventbench.base.errors import InputError
-from ventbench.cli import app
+from submissions.dqn import train as dqn
+from submissions.ppo import train as ppo
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.train.plants import NETWORKS
 from ventbench.train.rl import environment
-from ventbench.train.rl.train import METHODS, _groups, method_for
+from ventbench.train.rl.train import _groups, command, shortened
+
+RECIPES = {"ppo": ppo.RECIPE, "dqn": dqn.RECIPE}
 
 
-def run(*arguments: object):
-    return CliRunner().invoke(app, [str(one) for one in arguments])
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    """Run the script of an entry."""
+
+    def started(name: str, asked: str) -> None:
+        monkeypatch.setattr("sys.argv", ["train.py", *asked.split(), "--out", str(tmp_path)])
+        command(RECIPES[name], "")
+
+    return started
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("asked", "said"),
     [
-        (["--lung", "R20C50", "--all"], "not both"),
-        (["--lung", "R20C51"], "not a scored lung"),
-        (["--lung", "R20C50", "--steps", "100"], "less than one iteration of ppo, 96 breaths"),
+        ("--lung R20C50 --all", "not allowed with argument"),
+        ("--lung R20C51", "not a scored lung"),
+        ("--lung R20C50 --steps 100", "less than one iteration of ppo, 96 breaths"),
     ],
 )
-def test_what_cannot_be_trained(arguments, said, tmp_path):
-    found = run("train", "ppo", *arguments, "--out", tmp_path).exception
-    assert isinstance(found, InputError)
-    assert said in str(found)
+def test_what_cannot_be_trained(asked, said, run, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run("ppo", asked)
+    assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
@@ -42,21 +50,19 @@ def test_networks_of_one_lung_and_of_all_are_trained_apart():
     assert _groups(["R5C10"], 6) == [_groups(["R5C10", "all"], 6)[0]]
 
 
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("lungs", [1, 6])
-def test_published_settings_fit_their_lungs(name, lungs):
-    found = method_for(name, lungs)
-    assert found.breaths % lungs == 0
-    steps = found.breaths * environment.MOVES * 7
-    assert method_for(name, lungs, steps + 10).iterations == 7
+@pytest.mark.parametrize("name", RECIPES)
+def test_published_settings_fit_their_lungs(name):
+    recipe = RECIPES[name]
+    for lungs, found in ((1, recipe.one), (6, recipe.every)):
+        assert found.breaths % lungs == 0
+        steps = found.breaths * environment.MOVES * 7
+        assert shortened(found, name, steps + 10).iterations == 7
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "steps"), [("ppo", 32_000), ("dqn", 40_000)])
-def test_train(method, steps, tmp_path):
-    arguments = ("--lung", "R20C50", "--steps", steps, "--out", tmp_path, "--json", "-")
-    result = run("train", method, *arguments)
-    assert result.exit_code == 0, result.output
+def test_train(method, steps, run, tmp_path):
+    run(method, f"--lung R20C50 --steps {steps}")
     about = json.loads((tmp_path / "training.json").read_text())
     # As `ventbench.score` has it of this PID on the reference rig.
     assert about["networks"]["R20C50"]["error_pid"] == pytest.approx(3.443, abs=2e-3)

@@ -1,1 +1,1 @@
-"""Reinforcement learning of a correction of the PID: policy gradient, PPO and DQN."""
+"""Reinforcement learning of a correction of the PID: environment, trainings side by side."""

@@ -204,19 +204,6 @@ def advantages(rewards: Array, values: Array, discount: float, trace: float) -> 
     return discounted(rewards + discount * following - values, discount * trace)
 
 
-def double_q_target(reward: Array, discount: Array, online: Array, target: Array) -> Array:
-    """Target of the value of a choice: the online network chooses, the target network evaluates.
-
-    Args:
-        reward: shape ``(...)``.
-        discount: factor of what follows, 0 at the end of an episode, shape ``(...)``.
-        online: values of the following choices, shape ``(..., choices)``.
-        target: values by the target network, shape ``(..., choices)``.
-    """
-    choice = jnp.argmax(online, axis=-1, keepdims=True)
-    return reward + discount * jnp.take_along_axis(target, choice, axis=-1)[..., 0]
-
-
 @flax.struct.dataclass
 class Episode:
     """What stays the same in an episode."""

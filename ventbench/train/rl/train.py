@@ -1,16 +1,21 @@
-"""Networks for the lungs by PPO or DQN: settings, trainings of several seeds, weights, a report.
+"""Networks for the lungs by a method of reinforcement learning: trainings, weights, a report.
 
-:func:`train` runs several trainings side by side in one compiled step, with their learning curves.
+:func:`train` runs several trainings side by side in one compiled step, with their learning curves;
+:func:`train_networks` makes what an entry needs, and :func:`command` does so from a command line.
+The methods themselves stand beside their entries: ``submissions/ppo/train.py`` and
+``submissions/dqn/train.py``.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import flax.struct
 import jax
@@ -36,10 +41,42 @@ from ventbench.train.plants import (
     plants_to_train_on,
 )
 from ventbench.train.rl import environment
-from ventbench.train.rl.learners import DQN, PPO, PolicyGradient
 
-#: Settings of a way of learning: hashable, static in ``jit``; their methods are pure.
-Method = PolicyGradient | PPO | DQN
+
+@flax.struct.dataclass
+class State:
+    """One training: parameters, the optimiser's state, key, number of the iteration."""
+
+    parameters: Any  #: of the network; for PPO of both networks and the spread, by name.
+    optimiser: Any
+    key: Array
+    iteration: Array
+
+
+class Method(Protocol):
+    """Settings of a way of learning: a frozen dataclass, static in ``jit``, of pure methods."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def breaths(self) -> int:
+        """Breaths of an iteration, three an episode."""
+        ...
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of a training."""
+        ...
+
+    def init(self, key: Array) -> Any:
+        """State at the start of a training."""
+
+    def iterate(self, state: Any, plants: environment.Lungs) -> Any:
+        """State after one more iteration on lungs."""
+
+    def policy(self, state: Any) -> Any:
+        """Policy learned so far."""
+
 
 #: Cells on each lung by which the best policy of a training is chosen, and the seed they come from.
 VALIDATION_CELLS, VALIDATION_SEED = 48, 2021
@@ -207,106 +244,26 @@ def train(
         )
 
 
-#: Names of the methods, as commands and tables have them.
-METHODS = ("policy-gradient", "ppo", "dqn")
-
-#: Iterations between two points of a learning curve.
-CHUNKS = {"policy-gradient": 10, "ppo": 10, "dqn": 50}
-
-_ONE_LUNG: dict[str, Method] = {"policy-gradient": PolicyGradient(), "ppo": PPO(), "dqn": DQN()}
-_ALL_LUNGS: dict[str, Method] = {
-    "policy-gradient": PolicyGradient(breaths=36),
-    "ppo": PPO(breaths=288, iterations=1200, widths=(64, 64)),
-    "dqn": DQN(breaths=72, iterations=4800, memory=7200, widths=(128, 128)),
-}
-
 #: Called with what is trained, the share that is done and the best error so far, cmH2O.
 Progress = Callable[[str, float, float], None]
 
 
-def train_ppo(
-    networks: Sequence[str] | None = None,
-    out: Path | str = "runs/ppo",
-    *,
-    seeds: Sequence[int] = (0, 1),
-    steps: int | None = None,
-    method: PPO | None = None,
-    simulator: Given = "frozen",
-    progress: Progress | None = None,
-) -> TrainedControllers:
-    """Train corrections of a PID by proximal policy optimisation.
+@dataclass(frozen=True)
+class Recipe:
+    """Published settings of a method."""
 
-    Writes ``weights.npz``, as ``submissions/ppo`` reads it, ``training.json`` and, of each of
-    several seeds, ``weights-SEED.npz``. Of the trainings of a network the one with the lowest error
-    on freshly drawn cells is kept; the published draws have no part in that choice. An interrupted
-    training continues where it was.
-
-    Example::
-
-        trained = ventbench.train_ppo(["R20C50"], "runs/mine", steps=60_000)
-        trained.report["networks"]["R20C50"]["error_fresh"]  # cmH2O, by seed
-
-    Args:
-        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; if not
-            given, a network for each lung of the simulators and one for all of several.
-        out: folder; checkpoints lie there until all is done.
-        seeds: seeds of the trainings of each network.
-        steps: control steps of experience of each training; those of the method if not given.
-        method: settings of every training; the published ones, which differ for one lung and for
-            all six, if not given.
-        simulator: simulators with plants, see :func:`ventbench.load_simulators`.
-        progress: see :data:`Progress`.
-
-    Returns:
-        The best policy of each network, float32, and the report.
-
-    Raises:
-        InputError: if a network's name is unknown, ``steps`` do not make one iteration, or ``out``
-            holds an unfinished training with other settings.
-        FloatingPointError: if a training diverges.
-    """
-    return _train("ppo", networks, out, seeds, steps, method, simulator, progress)
+    name: str  #: of the method, as reports and checkpoints have it.
+    one: Method  #: settings for one lung.
+    every: Method  #: settings for all six.
+    chunk: int  #: iterations between two points of a learning curve.
 
 
-def train_dqn(
-    networks: Sequence[str] | None = None,
-    out: Path | str = "runs/dqn",
-    *,
-    seeds: Sequence[int] = (0, 1),
-    steps: int | None = None,
-    method: DQN | None = None,
-    simulator: Given = "frozen",
-    progress: Progress | None = None,
-) -> TrainedControllers:
-    """Train a choice among 19 corrections of a PID by deep Q-learning.
-
-    Writes ``weights.npz``, as ``submissions/dqn`` reads it, and ``training.json``. Arguments,
-    the choice of the best seed and errors are those of :func:`train_ppo`.
-
-    Example::
-
-        trained = ventbench.train_dqn(["R20C50"], "runs/mine", steps=60_000)
-        trained.report["networks"]["R20C50"]["error_fresh"]  # cmH2O, by seed
-    """
-    return _train("dqn", networks, out, seeds, steps, method, simulator, progress)
-
-
-def method_for(name: str, lungs: int, steps: int | None = None) -> Method:
-    """Return the published settings of a method.
-
-    Args:
-        name: one of :data:`METHODS`.
-        lungs: on which one network is trained: 1 or 6.
-        steps: control steps of experience; those of the published settings if not given.
+def shortened(method: Any, name: str, steps: int | None) -> Any:
+    """Settings with so many control steps of experience; as they are if not given.
 
     Raises:
         InputError: if the steps do not make one iteration.
     """
-    method = (_ONE_LUNG if lungs == 1 else _ALL_LUNGS)[name]
-    return _shortened(method, name, steps)
-
-
-def _shortened(method: Method, name: str, steps: int | None) -> Method:
     if steps is None:
         return method
     iterations = steps // (method.breaths * environment.MOVES)
@@ -333,26 +290,50 @@ def _groups(names: Sequence[str], lungs: int) -> list[_Group]:
     return [*groups, _Group((ALL,), lungs)] if ALL in names else groups
 
 
-def _train(
-    name: str,
+def train_networks(
+    recipe: Recipe,
     networks: Sequence[str] | None,
-    out: Path | str,
-    seeds: Sequence[int],
-    steps: int | None,
-    method: Method | None,
-    simulator: Given,
-    progress: Progress | None,
+    out: Path,
+    *,
+    seeds: Sequence[int] = (0, 1),
+    steps: int | None = None,
+    simulator: Given = "frozen",
+    progress: Progress | None = None,
 ) -> TrainedControllers:
+    """Train networks that correct a PID.
+
+    Writes ``weights.npz``, as the entry of the method reads it, ``training.json`` and, of each of
+    several seeds, ``weights-SEED.npz``. Of the trainings of a network the one with the lowest error
+    on freshly drawn cells is kept; the published draws have no part in that choice. An interrupted
+    training continues where it was.
+
+    Args:
+        recipe: method and its settings.
+        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; if not
+            given, a network for each lung of the simulators and one for all of several.
+        out: folder; checkpoints lie there until all is done.
+        seeds: seeds of the trainings of each network.
+        steps: control steps of experience of each training; those of the recipe if not given.
+        simulator: simulators with plants, see :func:`ventbench.load_simulators`.
+        progress: see :data:`Progress`.
+
+    Returns:
+        The best policy of each network, float32, and the report.
+
+    Raises:
+        InputError: if a network's name is unknown, ``steps`` do not make one iteration, or ``out``
+            holds an unfinished training with other settings.
+        FloatingPointError: if a training diverges.
+    """
     began = time.perf_counter()
-    trained_on, out = plants_to_train_on(simulator), Path(out)
+    name, trained_on = recipe.name, plants_to_train_on(simulator)
     available = list(trained_on.names)
     names = check_names(networks, trained_on)
     if networks is None and len(available) > 1:
         names = (*names, ALL)
     groups = _groups(names, len(available))
     methods = [
-        method_for(name, group.lungs, steps) if method is None else _shortened(method, name, steps)
-        for group in groups
+        shortened(recipe.one if group.lungs == 1 else recipe.every, name, steps) for group in groups
     ]
     report = progress or (lambda *_: None)
     networks_report, checkpoints, used = {}, [], {}
@@ -366,7 +347,7 @@ def _train(
             settings,
             plants,
             [seed for _ in group.names for seed in seeds],
-            chunk=CHUNKS[name],
+            chunk=recipe.chunk,
             about=f"{group.names} {fingerprint(plants)}",
             file=checkpoints[-1],
             progress=lambda share, best, label=label: report(label, share, float(best.mean())),
@@ -429,3 +410,50 @@ def _best_run(trained: TrainedPolicies, network: int, seeds: Sequence[int]) -> d
         "breaths": int(trained.episodes[-1]),
         "training_seconds": round(float(trained.seconds[-1]), 1),
     }
+
+
+def options(description: str, out: Path) -> argparse.ArgumentParser:
+    """Parser of the options of all trainings of networks: which, of which seeds, on what, where."""
+    parser = argparse.ArgumentParser(description=description)
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--lung", metavar="ID", help="only the network for this lung")
+    which.add_argument("--all", action="store_true", help="only one network for all lungs")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first training")
+    parser.add_argument("--seeds", type=int, default=1, help="trainings; the best is kept")
+    parser.add_argument("--plant", default="frozen", help="simulators to train on")
+    parser.add_argument("--out", type=Path, default=out, help="folder for the results")
+    return parser
+
+
+@contextmanager
+def asked(
+    parser: argparse.ArgumentParser,
+) -> Iterator[tuple[argparse.Namespace, tuple[str, ...] | None, range]]:
+    """What a command line asks for, its networks and its seeds; errors end it with a sentence."""
+    given = parser.parse_args()
+    compilation.keep()
+    names = (ALL,) if given.all else given.lung and (given.lung,)
+    try:
+        yield given, names, range(given.seed, given.seed + given.seeds)
+    except InputError as error:
+        parser.exit(1, f"error: {error}\n")
+    except KeyboardInterrupt:
+        parser.exit(130, "interrupted; the same command continues\n")
+
+
+def command(recipe: Recipe, description: str) -> None:
+    """Train the networks of an entry, as a command line asks."""
+    parser = options(description, Path("runs", recipe.name))
+    parser.set_defaults(seeds=2)
+    parser.add_argument("--steps", type=int, help="control steps of experience of each training")
+    with asked(parser) as (given, names, seeds):
+        trained = train_networks(
+            recipe,
+            names,
+            given.out,
+            seeds=seeds,
+            steps=given.steps,
+            simulator=given.plant,
+            progress=lambda label, share, best: print(f"{label}: {share:.0%}, {best:.3f} cmH2O"),
+        )
+        print(trained.to_frame().to_string())

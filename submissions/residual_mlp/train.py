@@ -1,10 +1,15 @@
-"""Training of the residual controller: gradients through the simulators, Adam, one compiled scan.
+"""Train the networks by gradients through the simulators, and write ``weights.npz``.
+
+    python submissions/residual_mlp/train.py --seeds 5 --updates 533          # one for each lung
+    python submissions/residual_mlp/train.py --all --seeds 5 --updates 2000   # residual_mlp_all
+
+Ctrl-C keeps the finished work; the same command continues.
 
 The paper's objective, the mean of ``|pressure - PIP| + lambda |correction|`` over inspirations, is
 differentiated through the controller, the valve and the simulator. Each update runs every lung at
 every PIP, several times: on any training rig and member, with deviations drawn as those of the
 scored draws are. Errors are divided by what there is to gain in the cell, as in the normalised
-score. :func:`train_residual` takes the gains of the PIDs from the grid.
+score. The gains of the PIDs are the best of the grid.
 """
 
 from __future__ import annotations
@@ -40,7 +45,7 @@ from ventbench.task.metrics.score import run_error
 from ventbench.train.pid_search import tune_pid
 from ventbench.train.plants import ALL, TrainedControllers, check_names, plants_to_train_on
 from ventbench.train.rl import environment
-from ventbench.train.rl.train import fresh_error
+from ventbench.train.rl.train import asked, fresh_error, options
 
 
 @dataclass(frozen=True)
@@ -327,7 +332,7 @@ WEIGHTS, RESULT, PARTS = "weights.npz", "training.json", "parts"
 Progress = Callable[[str, tuple[int, int, float] | None], None]
 
 
-def train_residual(
+def train(
     networks: Sequence[str] | None = None,
     out: Path | str = "runs/residual",
     *,
@@ -339,15 +344,10 @@ def train_residual(
 ) -> TrainedControllers:
     """Train corrections of the best PIDs by differentiating through simulators.
 
-    Writes ``weights.npz``, as ``submissions/residual_mlp`` reads it, ``training.json`` and, of each
-    of several seeds, ``weights-SEED.npz``. Of the trainings of a network the one with the lowest
+    Writes ``weights.npz``, as the controller reads it, ``training.json`` and, of each of several
+    seeds, ``weights-SEED.npz``. Of the trainings of a network the one with the lowest
     error on freshly drawn cells is kept. An interrupted training continues where it was; a finished
     one is repeated, to the same bytes.
-
-    Example::
-
-        trained = ventbench.train_residual(["R20C50"], "runs/mine")
-        trained.report["networks"]["R20C50"]["error"]  # cmH2O, by lung
 
     Args:
         networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; a
@@ -449,3 +449,33 @@ def _errors(
             error = run_error(inspirations.pressure, np.asarray(cells.pip)[:, None, None])
             errors[name] = round(float(error.mean()), 6)
     return errors
+
+
+def main() -> None:
+    """Train as the command line asks."""
+    parser = options(
+        "Train networks that correct the best PID: one for each lung, or what is asked for.",
+        Path("runs/residual"),
+    )
+    parser.add_argument("--updates", type=int, default=ResidualConfig.updates)
+    parser.add_argument("--members", type=int, help="plants of each lung; default: all")
+    parser.add_argument(
+        "--lambda", type=float, default=0.0, help="weight of the correction, cmH2O for each %%"
+    )
+    with asked(parser) as (given, names, seeds):
+        config = ResidualConfig(
+            updates=given.updates, members=given.members, lam=vars(given)["lambda"]
+        )
+
+        def show(step: str, state: tuple[int, int, float] | None) -> None:
+            done = "" if state is None else f": {state[0]} of {state[1]}, {state[2]:.3f} cmH2O"
+            print(step + done, flush=True)
+
+        trained = train(
+            names, given.out, config=config, seeds=seeds, simulator=given.plant, progress=show
+        )
+        print(trained.to_frame().to_string())
+
+
+if __name__ == "__main__":
+    main()

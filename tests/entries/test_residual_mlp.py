@@ -1,4 +1,4 @@
-"""The residual controller: against its submission, its gradient, its training, its command."""
+"""The residual controller: against its submission, its gradient, its training, its script."""
 
 from __future__ import annotations
 
@@ -11,11 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from submissions.residual_mlp.train import (
+    CHUNK,
+    ResidualConfig,
+    fit,
+    main,
+    objective,
+    run,
+    train,
+    valve,
+)
 from ventbench.base import compilation
 from ventbench.base.errors import InputError
-from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import (
     Residual,
@@ -36,15 +44,6 @@ from ventbench.task.metrics.score import run_error
 from ventbench.train import pid_search
 from ventbench.train.pid_search import tune_pid
 from ventbench.train.plants import ALL, plants_to_train_on
-from ventbench.train.residual import (
-    CHUNK,
-    ResidualConfig,
-    fit,
-    objective,
-    run,
-    train_residual,
-    valve,
-)
 
 GAINS = (2.0, 4.0, 0.3)
 SMALL = ResidualConfig(updates=CHUNK, copies=2, widths=(8,), ahead=3, members=2)
@@ -280,11 +279,11 @@ PIDS = np.array([(2.0, 4.0, 0.0), (5.0, 5.0, 0.0)])
 
 
 @pytest.mark.slow
-def test_the_command_trains_and_tells(monkeypatch, tmp_path):
+def test_the_script_trains_and_tells(monkeypatch, tmp_path):
     monkeypatch.setattr(pid_search, "paper_gains", lambda: PIDS)
-    arguments = ["train", "residual", "--lung", "R20C50", "--updates", "3", "--members", "1"]
-    run = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path), "--json", "-"])
-    assert run.exit_code == 0, run.output
+    asked = f"train.py --lung R20C50 --updates 3 --members 1 --out {tmp_path}"
+    monkeypatch.setattr("sys.argv", asked.split())
+    main()
     result = json.loads((tmp_path / "training.json").read_text())
     (one,) = result["networks"].values()
     assert one["gains"] == [5.0, 5.0, 0.0]
@@ -294,13 +293,15 @@ def test_the_command_trains_and_tells(monkeypatch, tmp_path):
     assert not list((tmp_path / "parts").iterdir())
 
 
-def test_the_command_takes_one_lung_or_all(tmp_path):
-    command = ["train", "residual", "--out", str(tmp_path)]
-    run = CliRunner().invoke(app, [*command, "--lung", "R20C50", "--all"])
-    assert isinstance(run.exception, InputError)
-    assert "not both" in str(run.exception)
-    run = CliRunner().invoke(app, [*command, "--lung", "R50C10"])
-    assert "not a scored lung" in str(run.exception)
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [("--lung R20C50 --all", "not allowed with argument"), ("--lung R50C10", "not a scored lung")],
+)
+def test_the_script_takes_one_lung_or_all(asked, said, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("sys.argv", ["train.py", *asked.split(), "--out", str(tmp_path)])
+    with pytest.raises(SystemExit):
+        main()
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -309,7 +310,7 @@ def test_an_interrupted_training_continues_to_the_same_bytes(tmp_path):
     names = ("R5C10", ALL)
 
     def go(folder, report=None):
-        return train_residual(
+        return train(
             names,
             folder,
             config=config,

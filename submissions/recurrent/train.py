@@ -445,7 +445,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     here = Path(__file__).parent
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--updates", type=int, default=15000)
+    parser.add_argument("--updates", type=int, default=20000)
     parser.add_argument("--rate", type=float, default=2e-3)
     parser.add_argument("--out", type=Path, default=here)
     parser.add_argument("--checkpoint", type=Path)

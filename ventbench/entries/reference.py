@@ -258,6 +258,14 @@ def compute(
         parts[name] = part
         report(len(parts) * lungs * pips, lungs * draws * pips)
     stacked = np.stack([parts[name] for name in jobs], axis=1)
+    if draws > 1:
+        for draw in range(draws):
+            own, cell = jax.tree.map(lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells))
+            jobs[f"draw-{draw}"] = (own, cell, stacked[:, draw], _of_relatives(stacked))
+        again = {f"again-{name}": job for name, job in jobs.items()}
+        for name, part in kept_results(work, pool or InProcess(), _again, again, ARRAY):
+            parts[name] = part
+        stacked = np.stack([parts[name] for name in again], axis=1)
     columns = {name: stacked[..., k] for k, name in enumerate(_COLUMNS)}
     commands = stacked[..., len(_COLUMNS) :]
     commands = commands.reshape(*commands.shape[:3], len(protocol.SCORED_BREATHS), -1)
@@ -275,6 +283,37 @@ def _part(own: Plant, cell: Scenario, gains: Floats, starts: tuple[int, ...]) ->
         bounds.append(attainable.attainable(*_inspirations(own, cell, breath), starts=near))
     columns = [np.mean([getattr(b, k) for b in bounds], axis=0) for k in ("error", "lower")]
     columns += [np.max([b.stationarity for b in bounds], axis=0), pid.ravel()]
+    commands = np.concatenate([b.commands for b in bounds], axis=-1)
+    return np.column_stack([*columns, commands]).reshape(lungs, pips, -1)
+
+
+def _of_relatives(stacked: Floats) -> Floats:
+    """Commands to start again from, shape ``(2, L, P, B, COMMANDS)``.
+
+    Draws of one lung and PIP differ by little, so that a cell that ended in a poor local minimum
+    has relatives that did not: the draw whose error is nearest to its lower bound, and the median.
+
+    Args:
+        stacked: columns of all draws, ``(L, 1 + K, P, columns)``.
+    """
+    commands = stacked[..., len(_COLUMNS) :]
+    gap = stacked[..., 0] - stacked[..., 1]
+    nearest = np.argmin(gap, axis=1)[:, None, :, None]
+    best = np.take_along_axis(commands, nearest, axis=1)[:, 0]
+    starts = np.stack([best, np.median(commands, axis=1)])
+    return starts.reshape(*starts.shape[:3], len(protocol.SCORED_BREATHS), -1)
+
+
+def _again(own: Plant, cell: Scenario, part: Floats, relatives: Floats) -> Floats:
+    """A draw's reference once more, from its commands and from those of its relatives."""
+    lungs, pips = part.shape[:2]
+    commands = part[..., len(_COLUMNS) :].reshape(lungs, pips, len(protocol.SCORED_BREATHS), -1)
+    bounds: list[attainable.Attainable] = []
+    for breath in range(len(protocol.SCORED_BREATHS)):
+        starts = [x[:, :, breath].reshape(lungs * pips, -1) for x in (commands, *relatives)]
+        bounds.append(attainable.attainable(*_inspirations(own, cell, breath), starts=starts))
+    columns = [np.mean([getattr(b, k) for b in bounds], axis=0) for k in ("error", "lower")]
+    columns += [np.max([b.stationarity for b in bounds], axis=0), part[..., 3].ravel()]
     commands = np.concatenate([b.commands for b in bounds], axis=-1)
     return np.column_stack([*columns, commands]).reshape(lungs, pips, -1)
 

@@ -47,6 +47,9 @@ TOLERANCE = 0.1 * metric.LEAST_HEADROOM
 #: Largest file that is read, bytes.
 MAX_BYTES = 20_000_000
 
+#: How often each cell starts again from its neighbours' commands.
+SWEEPS = 2
+
 #: P, I and D of the best PID of each lung, %/cmH2O: the 100 of rounds. What
 #: :func:`ventbench.train.pid_search.best_pids` finds on the rigs of the training.
 PID_GAINS = (
@@ -246,52 +249,63 @@ def compute(
     work = None
     if folder is not None:
         keys = {"about": dict(about), "starts": starts, "iterations": attainable.ITERATIONS}
+        keys["sweeps"] = SWEEPS
         keys["inputs"] = fingerprint((plants, cells, gains))
         work = WorkFolder(folder, keys)
     report = progress or (lambda done, total: None)
+    size, whole = lungs * pips, lungs * draws * pips * (1 + SWEEPS)
     parts: dict[str, Floats] = {}
-    jobs: dict[str, tuple[Any, ...]] = {}
-    for draw in range(draws):
-        own, cell = jax.tree.map(lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells))
-        jobs[f"draw-{draw}"] = (own, cell, np.asarray(gains), starts)
-    for name, part in kept_results(work, pool or InProcess(), _part, jobs, ARRAY):
-        parts[name] = part
-        report(len(parts) * lungs * pips, lungs * draws * pips)
-    stacked = np.stack([parts[name] for name in jobs], axis=1)
-    if draws > 1:
+    stacked = np.empty(0)
+    for sweep in range(1 + SWEEPS):
+        jobs: dict[str, tuple[Any, ...]] = {}
+        neighbours = _neighbours(stacked) if sweep else None
         for draw in range(draws):
-            own, cell = jax.tree.map(lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells))
-            jobs[f"draw-{draw}"] = (own, cell, stacked[:, draw], _of_relatives(stacked))
-        again = {f"again-{name}": job for name, job in jobs.items()}
-        for name, part in kept_results(work, pool or InProcess(), _again, again, ARRAY):
+            each = jax.tree.map(lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells))
+            begin = starts if neighbours is None else neighbours[:, :, draw]
+            jobs[f"draw-{draw}.{sweep}"] = (*each, np.asarray(gains), begin)
+        for name, part in kept_results(work, pool or InProcess(), _part, jobs, ARRAY):
             parts[name] = part
-        stacked = np.stack([parts[name] for name in again], axis=1)
+            report(len(parts) * size, whole)
+        stacked = np.stack([parts[name] for name in jobs], axis=1)
     columns = {name: stacked[..., k] for k, name in enumerate(_COLUMNS)}
     commands = stacked[..., len(_COLUMNS) :]
     commands = commands.reshape(*commands.shape[:3], len(protocol.SCORED_BREATHS), -1)
     return Reference(dict(about), np.asarray(gains), **columns, commands=commands)
 
 
-def _part(own: Plant, cell: Scenario, gains: Floats, starts: tuple[int, ...]) -> Floats:
-    """Reference of one draw, shape ``(L, P, columns)``; cells have batch shape ``(L, 1, P)``."""
-    lungs, _, pips = np.shape(cell.pip)
-    pid = pid_errors(own, cell, gains)[:, 0]
+def _part(
+    plants: Plant, cells: Scenario, gains: Floats, starts: tuple[int, ...] | Floats
+) -> Floats:
+    """Reference of one draw, shape ``(L, P, columns)``.
+
+    Args:
+        plants, cells: of one draw; cells have batch shape ``(L, 1, P)``.
+        gains: of :func:`compute`.
+        starts: of :func:`compute`, or commands, ``(n, L, P, B, COMMANDS)``.
+    """
+    lungs, _, pips = np.shape(cells.pip)
+    pid = pid_errors(plants, cells, gains)[:, 0]
     bounds: list[attainable.Attainable] = []
     for breath in range(len(protocol.SCORED_BREATHS)):
-        # Another gain moves the best commands but little: the next breath begins there.
-        near = [bounds[0].commands, _FEW_STEPS] if bounds else starts
-        bounds.append(attainable.attainable(*_inspirations(own, cell, breath), starts=near))
+        if isinstance(starts, np.ndarray):
+            begin = list(starts[..., breath, :].reshape(len(starts), lungs * pips, -1))
+        else:
+            # Another gain moves the best commands but little: the next breath begins there.
+            begin = [bounds[0].commands, _FEW_STEPS] if bounds else list(starts)
+        bounds.append(attainable.attainable(*_inspirations(plants, cells, breath), starts=begin))
     columns = [np.mean([getattr(b, k) for b in bounds], axis=0) for k in ("error", "lower")]
     columns += [np.max([b.stationarity for b in bounds], axis=0), pid.ravel()]
     commands = np.concatenate([b.commands for b in bounds], axis=-1)
     return np.column_stack([*columns, commands]).reshape(lungs, pips, -1)
 
 
-def _of_relatives(stacked: Floats) -> Floats:
-    """Commands to start again from, shape ``(2, L, P, B, COMMANDS)``.
+def _neighbours(stacked: Floats) -> Floats:
+    """Commands to start again from, shape ``(5, L, 1 + K, P, B, COMMANDS)``.
 
-    Draws of one lung and PIP differ by little, so that a cell that ended in a poor local minimum
-    has relatives that did not: the draw whose error is nearest to its lower bound, and the median.
+    Cells of one lung that differ in their draw or PIP have optima that differ by little, so that a
+    cell which ended in a poor local minimum has neighbours that did not: the draw whose error is
+    nearest to its lower bound, the median of draws, the PIP below and the PIP above. Its best
+    commands so far come first.
 
     Args:
         stacked: columns of all draws, ``(L, 1 + K, P, columns)``.
@@ -299,23 +313,14 @@ def _of_relatives(stacked: Floats) -> Floats:
     commands = stacked[..., len(_COLUMNS) :]
     gap = stacked[..., 0] - stacked[..., 1]
     nearest = np.argmin(gap, axis=1)[:, None, :, None]
-    best = np.take_along_axis(commands, nearest, axis=1)[:, 0]
-    starts = np.stack([best, np.median(commands, axis=1)])
-    return starts.reshape(*starts.shape[:3], len(protocol.SCORED_BREATHS), -1)
-
-
-def _again(own: Plant, cell: Scenario, part: Floats, relatives: Floats) -> Floats:
-    """A draw's reference once more, from its commands and from those of its relatives."""
-    lungs, pips = part.shape[:2]
-    commands = part[..., len(_COLUMNS) :].reshape(lungs, pips, len(protocol.SCORED_BREATHS), -1)
-    bounds: list[attainable.Attainable] = []
-    for breath in range(len(protocol.SCORED_BREATHS)):
-        starts = [x[:, :, breath].reshape(lungs * pips, -1) for x in (commands, *relatives)]
-        bounds.append(attainable.attainable(*_inspirations(own, cell, breath), starts=starts))
-    columns = [np.mean([getattr(b, k) for b in bounds], axis=0) for k in ("error", "lower")]
-    columns += [np.max([b.stationarity for b in bounds], axis=0), part[..., 3].ravel()]
-    commands = np.concatenate([b.commands for b in bounds], axis=-1)
-    return np.column_stack([*columns, commands]).reshape(lungs, pips, -1)
+    across = [
+        np.take_along_axis(commands, nearest, axis=1),
+        np.median(commands, axis=1, keepdims=True),
+    ]
+    pip = np.arange(commands.shape[2])
+    along = [commands[:, :, np.clip(pip + step, 0, pip[-1])] for step in (-1, 1)]
+    starts = np.stack([np.broadcast_to(x, commands.shape) for x in (commands, *across, *along)])
+    return starts.reshape(*starts.shape[:4], len(protocol.SCORED_BREATHS), -1)
 
 
 def _inspirations(plants: Plant, cells: Scenario, breath: int) -> tuple[Plant, Scenario]:

@@ -104,7 +104,7 @@ def test_an_interrupted_computation_continues(inputs, found, tmp_path):
     with pytest.raises(Stop):
         references.compute(*inputs, folder=folder, starts=(1,), progress=stop)
     kept = {path.name: path.stat().st_mtime_ns for path in folder.glob("draw-*.npy")}
-    assert sorted(kept) == ["draw-0.npy", "draw-1.npy"]
+    assert sorted(kept) == ["draw-0.0.npy", "draw-1.0.npy"]
     again = references.compute(*inputs, folder=folder, starts=(1,))
     np.testing.assert_array_equal(again.attainable, found.attainable)
     assert all((folder / name).stat().st_mtime_ns == then for name, then in kept.items())

@@ -121,8 +121,9 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
     )
     assert not result.failures
     expected = np.stack(errors)
-    np.testing.assert_allclose(result.nominal, expected[:, 0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(result.drawn, np.moveaxis(expected[:, 1:], 1, 0), rtol=0, atol=1e-9)
+    # The environment rounds a submission's commands to 0.001 %.
+    np.testing.assert_allclose(result.nominal, expected[:, 0], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(result.drawn, np.moveaxis(expected[:, 1:], 1, 0), rtol=0, atol=1e-4)
 
 
 def test_both_submissions_have_the_same_controller():

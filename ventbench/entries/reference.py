@@ -47,7 +47,8 @@ TOLERANCE = 0.1 * metric.LEAST_HEADROOM
 #: Largest file that is read, bytes.
 MAX_BYTES = 20_000_000
 
-#: How often each cell starts again from its neighbours' commands.
+#: How often each cell starts again from its neighbours' commands. On the draws of a round the first
+#: sweep found 0.01 to 0.5 cmH2O less in 123 of 756 cells, the second 0.015 at most, a third 0.01.
 SWEEPS = 2
 
 #: P, I and D of the best PID of each lung, %/cmH2O: the 100 of rounds. What
@@ -279,7 +280,8 @@ def _part(
     """Reference of one draw, shape ``(L, P, columns)``.
 
     Args:
-        plants, cells: of one draw; cells have batch shape ``(L, 1, P)``.
+        plants: of one draw, leaves ``(L, 1, 1, ...)``.
+        cells: of one draw, batch shape ``(L, 1, P)``.
         gains: of :func:`compute`.
         starts: of :func:`compute`, or commands, ``(n, L, P, B, COMMANDS)``.
     """

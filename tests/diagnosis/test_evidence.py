@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ventbench.diagnosis.evidence import Posterior, _integrated_out, evidence
+from ventbench.diagnosis.evidence import Posterior, _marginalise, evidence
 from ventbench.diagnosis.in_time import EXCHANGEABLE, _affected, command_p_value, phase_p_value
 from ventbench.diagnosis.linearised import Term, gaussian
 from ventbench.system_id.data import Data
@@ -81,8 +81,8 @@ def test_what_acts_in_time_is_integrated_out_once_for_all_sets() -> None:
     G, b = X.T @ X, X.T @ y
     wide = Term("cough", [0.5] * 6, (3, 4, 5, 6, 7, 8), odds=-1.5)
     others = (Term("leak", [1.0], (0,)), Term("flow_shape", [0.3, 0.8], (1, 2)))
-    value, left, rest = _integrated_out(G, b, wide)
-    apart = value + evidence(left, rest, others)
+    value, information, rest = _marginalise(G, b, wide)
+    apart = value + evidence(information, rest, others)
     assert apart == pytest.approx(evidence(G, b, (*others, wide)), abs=1e-9)
 
 

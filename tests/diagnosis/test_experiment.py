@@ -180,19 +180,21 @@ def test_the_judge_answers_with_errors_of_its_breaths_alone():
 def test_breaths_that_judge_keep_their_commands_and_are_never_set_aside(n):
     experiment = prepare(recorded(nothing, 0, n=n), load_simulators("physics"))
     judging, given = experiment.uses.judging, experiment.data.u_in
-    reached = experiment.without(np.ones(n, bool), given + 1.0)
+    reached = experiment.set_aside(np.ones(n, bool), given + 1.0)
     assert reached is not None
     np.testing.assert_array_equal(reached.data.u_in, given + ~judging[:, None])
-    np.testing.assert_allclose(reached.seen.u_in, given[experiment.uses.identifying] + 1.0)
+    np.testing.assert_allclose(
+        reached.identification_data.u_in, given[experiment.uses.identifying] + 1.0
+    )
     affected = np.arange(n) % 5 == 1
     assert (affected & judging).any()
-    left = experiment.without(affected, None)
+    left = experiment.set_aside(affected, None)
     assert left is not None
     assert left.judge is experiment.judge
     assert not (left.uses.identifying & affected).any()
     assert not (left.uses.fitted & affected).any()
     assert np.array_equal(left.uses.judging, judging)
-    assert experiment.without(np.arange(n) > 3, None) is None, "too little is left"
+    assert experiment.set_aside(np.arange(n) > 3, None) is None, "too little is left"
 
 
 @pytest.mark.slow

@@ -108,7 +108,7 @@ def test_functions_get_the_flow_and_learned_simulators_are_refused():
 
 
 def test_the_ventilators_side_is_left_out():
-    terms = flow_drive.without_ventilator(DEFAULT).search.nonparametric_terms
+    terms = flow_drive.lung_side_settings(DEFAULT).search.nonparametric_terms
     assert terms is not None
     assert not {"valve_shape", "outlet_shape"} & set(terms)
     assert "flow_shape" in terms

@@ -36,16 +36,16 @@ def test_nothing_added_changes_nothing(one):
     assert one.plus(Hypothesis()) == one
     assert Hypothesis().plus(one) == one
     assert one.plus(one) == one
-    assert one.without() == one
+    assert one.minus() == one
 
 
 @given(hypotheses, st.sampled_from(NAMES))
 def test_without_a_term_all_its_parameters_are_gone(one, name):
-    left = one.without(name)
+    left = one.minus(name)
     assert name not in left.names
     owned = (*left.paths, *left.free, *dict(left.fixed))
     assert not [path for path in owned if path.startswith(f"{name}.")]
-    assert left.without(name) == left
+    assert left.minus(name) == left
     assert set(one.names) - set(left.names) <= {name}
     kept = {path for path in one.free if not path.startswith(f"{name}.")}
     assert set(left.free) == kept

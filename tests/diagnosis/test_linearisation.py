@@ -80,10 +80,12 @@ def test_each_breath_absorbs_its_own_start(bent, breath):
 
 
 def test_bases_are_orthonormal(bent):
-    own, shared = bent.place.own_basis, bent.place.shared_basis
+    own, shared = bent.place.breath_basis, bent.place.shared_basis
     np.testing.assert_allclose(own @ own.swapaxes(1, 2), np.ones((8, 1, 1)), atol=1e-6)
     np.testing.assert_allclose(shared @ shared.T, np.eye(4), atol=1e-6)
-    again = bent.place.without_shared(bent.place.without_own(bent.place.residual[:, None]))
+    again = bent.place.project_out_shared(
+        bent.place.project_out_breath(bent.place.residual[:, None])
+    )
     np.testing.assert_allclose(again[:, 0], bent.place.residual, atol=1e-6)
 
 
@@ -119,5 +121,5 @@ def test_a_valve_gain_of_each_breath_is_absorbed_by_the_breath(bent):
     evaluator = dataclasses.replace(bent.evaluator, gain_sd=0.1)
     fitted = evaluator.fit(Hypothesis(), NOISE, iterations=2)
     place = linearise(fitted.problem, fitted.minimum.x)
-    assert place.own_basis.shape[1] == 2
+    assert place.breath_basis.shape[1] == 2
     assert place.shared_basis.shape[0] == 4

@@ -50,7 +50,7 @@ def test_a_negligible_term_is_far_weaker_than_mild_and_explains_little(turbulent
     two = turbulent.fit(Hypothesis(("turbulent_resistance", "sensor_drift")), named.noise, named)
     assert abs(two.column("sensor_drift.drift")[0]) < 0.2 * 1.2
     assert validation.is_negligible(turbulent, two, named, "sensor_drift")
-    without = turbulent.fit(two.hypothesis.without("turbulent_resistance"), two.noise, two)
+    without = turbulent.fit(two.hypothesis.minus("turbulent_resistance"), two.noise, two)
     assert not validation.is_negligible(turbulent, two, without, "turbulent_resistance")
 
 

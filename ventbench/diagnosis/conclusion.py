@@ -39,7 +39,7 @@ from ventbench.system_id.data import Noise, robust_noise
 Progress: TypeAlias = Callable[[str], None]
 
 #: Least posterior odds of a name that is listed as an alternative, and most that are.
-_NEAR, _LISTED = 0.05, 2
+_MIN_ODDS, _LISTED = 0.05, 2
 
 #: Least posterior probability of an effect of some breaths that is looked for.
 _LOOKED_FOR = 0.5
@@ -139,30 +139,32 @@ def conclude(
         earlier: a model whose mechanisms are tried in any case.
     """
     tell("searching")
-    found = evidence.search(
+    posterior = evidence.search(
         replace(evaluator, training=every), () if earlier is None else earlier.names
     )
     tell("comparing with held-out breaths")
     base = fit_with_noise(evaluator, Hypothesis())
-    judged = _judge(evaluator, found, found.undecided(evaluator.settings.held_out_test.threshold))
-    best, evaluator, whole, full, gains, worths = judged
+    judged = _judge(
+        evaluator, posterior, posterior.undecided(evaluator.settings.held_out_test.threshold)
+    )
+    best, evaluator, candidate, full, gains, worths = judged
     names = names_of(best.terms)
     unknown = [name for name in full.names if name in basis_terms()]
-    if len(unknown) > 1:  # one of them is told
+    if len(unknown) > 1:  # one of them is reported
         unknown.sort(key=gains.__getitem__)
-        full = fit_with_noise(evaluator, full.hypothesis.without(*unknown[:-1]), full)
+        full = fit_with_noise(evaluator, full.hypothesis.minus(*unknown[:-1]), full)
     named, unnamed = full, None
     if unknown:
         term = unknown[-1]
-        named = fit_with_noise(evaluator, full.hypothesis.without(term), full)
+        named = fit_with_noise(evaluator, full.hypothesis.minus(term), full)
         unnamed = UnnamedEffect(
             component_of(term),
             term,
             None,
             gains[term],
-            _places(found, names, component_of(term), term),
+            _places(posterior, names, component_of(term), term),
             worths[term],
-            found.marginal(term),
+            posterior.marginal(term),
         )
     noise = full.noise
     for term in best.terms:
@@ -179,9 +181,9 @@ def conclude(
                     None,
                     swing,
                     float(gained.sum()),
-                    _places(found, names, place, term.name),
+                    _places(posterior, names, place, term.name),
                     swing.worth,
-                    found.marginal(term.name) * preference(float(gained.sum()) - rival),
+                    posterior.marginal(term.name) * preference(float(gained.sum()) - rival),
                 )
                 noise = swing.noise
     return Conclusion(
@@ -191,48 +193,48 @@ def conclude(
         unnamed,
         noise,
         {name: gains[name] for name in named.names},
-        {name: _alternatives(evaluator, found, names, named, name) for name in named.names},
+        {name: _alternatives(evaluator, posterior, names, named, name) for name in named.names},
         evaluator.gain_sd,
-        unnamed is None and not named.names and _is_unresolved(evaluator, whole),
+        unnamed is None and not named.names and _is_unresolved(evaluator, candidate),
         {name: worths[name] for name in named.names},
-        found.weights,
+        posterior.weights,
     )
 
 
-class _Judged(NamedTuple):
+class _Judgement(NamedTuple):
     """A set after held-out breaths had their say."""
 
     chosen: Scored  #: the set.
     evaluator: Evaluator  #: with the scatter of the gains.
-    whole: FittedModel  #: all of its terms that are parameters of a fit.
-    left: FittedModel  #: those that are accepted.
+    candidate: FittedModel  #: all of its terms that are parameters of a fit.
+    accepted: FittedModel  #: those that are accepted.
     gains: dict[str, float]  #: of each of these, held-out log-likelihood, nats.
     worths: dict[str, float]  #: of each of these, root-mean-square error, cmH2O.
 
 
-def _judge(evaluator: Evaluator, found: Posterior, chosen: Scored) -> _Judged:
+def _judge(evaluator: Evaluator, posterior: Posterior, chosen: Scored) -> _Judgement:
     """Let held-out breaths judge a set, and what is likelier than the rest of it.
 
     Of these, the one is taken whose open-loop error on held-out breaths is least: coloured noise
     makes up for much of what a likelihood sees.
     """
     rejected: set[str] = set()
-    each: list[tuple[float, _Judged]] = []
+    judgements: list[tuple[float, _Judgement]] = []
     while True:
-        whole, now = _fitted(evaluator, chosen), evaluator
-        gain_sd = _gain_sd(evaluator, whole, found.fitted[0].scatter)
+        candidate, now = _fitted(evaluator, chosen), evaluator
+        gain_sd = _gain_sd(evaluator, candidate, posterior.fitted[0].scatter)
         if gain_sd:
             now = replace(evaluator, gain_sd=gain_sd)
-            whole = fit_with_noise(now, whole.hypothesis, whole)
-        judged = _Judged(chosen, now, whole, *_supported(now, whole))
-        each.append((_square(now, judged.left), judged))
-        dropped = frozenset(whole.names) - frozenset(judged.left.names)
+            candidate = fit_with_noise(now, candidate.hypothesis, candidate)
+        judged = _Judgement(chosen, now, candidate, *_supported(now, candidate))
+        judgements.append((_square(now, judged.accepted), judged))
+        dropped = frozenset(candidate.names) - frozenset(judged.accepted.names)
         rejected |= dropped
         rest = names_of(chosen.terms) - dropped
-        others = (s for s in found.fitted if not names_of(s.terms) & rejected)
-        likelier = next((s for s in others if len(s.terms) <= len(rest)), None)
+        alternatives = (s for s in posterior.fitted if not names_of(s.terms) & rejected)
+        likelier = next((s for s in alternatives if len(s.terms) <= len(rest)), None)
         if not dropped or likelier is None or names_of(likelier.terms) == rest:
-            return min(each, key=lambda pair: pair[0])[1]
+            return min(judgements, key=lambda pair: pair[0])[1]
         chosen = likelier
 
 
@@ -261,20 +263,20 @@ def _supported(
     settings = evaluator.settings
 
     def compared(name: str) -> tuple[Floats, float, bool]:
-        left = evaluator.fit(model.hypothesis.without(name), model.noise, model)
+        reduced = evaluator.fit(model.hypothesis.minus(name), model.noise, model)
         held_out = evaluator.held_out_log_likelihood(model)
-        gains = held_out - evaluator.held_out_log_likelihood(left)
-        before, after = _square(evaluator, left), _square(evaluator, model)
+        gains = held_out - evaluator.held_out_log_likelihood(reduced)
+        before, after = _square(evaluator, reduced), _square(evaluator, model)
         worth = float(np.sqrt(before) - np.sqrt(after))
-        if not is_needed(evaluator, model, left):
+        if not is_needed(evaluator, model, reduced):
             return gains, worth, False
         if name in basis_terms():
             least = max(settings.search.least_change, 0.5 * model.noise.sigma[0])
             return gains, worth, before - after > least**2 or len(model.names) == 1
-        if is_negligible(evaluator, model, left, name):
+        if is_negligible(evaluator, model, reduced, name):
             return gains, worth, False
         if not is_consistent(gains, settings.plausibility):
-            gains = cross_validated_gain(evaluator, model, left)
+            gains = cross_validated_gain(evaluator, model, reduced)
             return gains, worth, is_consistent(gains, settings.plausibility)
         return gains, worth, True
 
@@ -285,7 +287,7 @@ def _supported(
             nats = {name: float(gains.sum()) for name, (gains, _, _) in results.items()}
             return model, nats, {name: worth for name, (_, worth, _) in results.items()}
         least = min(weak, key=lambda name: float(results[name][0].sum()))
-        model = fit_with_noise(evaluator, model.hypothesis.without(least), model)
+        model = fit_with_noise(evaluator, model.hypothesis.minus(least), model)
 
 
 def _square(evaluator: Evaluator, model: FittedModel) -> float:
@@ -310,10 +312,10 @@ def _marginal_gains(
         Log-likelihood of each breath, nats, ``(n,)``, and expected coefficients, ``(n, k)``.
     """
     linear = linearise(*evaluator.refit_breath_parameters(fitted, partition), clip=6.0)
-    white = linear.without_own(linear.whiten(columns[:, :, None]))
+    white = linear.project_out_breath(linear.whiten(columns[:, :, None]))
     nats, means = [], []
-    for X, left in zip(white, linear.residual, strict=True):
-        value, mean, _ = gaussian(X @ X.T, -X @ left, sd)
+    for X, residual in zip(white, linear.residual, strict=True):
+        value, mean, _ = gaussian(X @ X.T, -X @ residual, sd)
         nats.append(value)
         means.append(mean)
     return np.array(nats), np.array(means)
@@ -335,7 +337,7 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
 
     Parameters and noise beside it are estimated in turn with its course.
     """
-    frequency, spread = term.told["frequency"], term.told["spread"]
+    frequency, spread = term.swing["frequency"], term.swing["spread"]
     training, held_out = evaluator.training, evaluator.held_out
 
     def at(
@@ -346,81 +348,83 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
         columns, courses = swing_columns(term.name, partition, values, frequency)
         sds = swing_spreads(columns.shape[1], spread)
         nats, sizes = _marginal_gains(evaluator, model, partition, columns, sds)
-        change, course = (np.einsum("nk,nkt->nt", sizes, each) for each in (columns, courses))
+        change, course = (np.einsum("nk,nkt->nt", sizes, basis) for basis in (columns, courses))
         return nats, sizes, change, course
 
     beside, data = fitted, training.data
     for _ in range(3):
         change = at(frequency, beside, training)[2][:, None]
-        told = Partition(replace(data, measured=data.measured - change), training.predictor)
-        refit = evaluator.fit(fitted.hypothesis, beside.noise, beside, partition=told)
+        remainder = Partition(replace(data, measured=data.measured - change), training.predictor)
+        refit = evaluator.fit(fitted.hypothesis, beside.noise, beside, partition=remainder)
         noise = robust_noise(refit.residual, data.weight)
         beside = replace(refit, problem=replace(refit.problem, data=data, noise=noise))
     step = 0.02 * frequency
-    near = frequency + step * np.arange(-4, 5)
-    each = np.array([float(at(f, beside, training)[0].sum()) for f in near])
-    best = int(np.clip(np.argmax(each), 1, len(near) - 2))
-    below, top, above = each[best - 1 : best + 2]
+    frequencies = frequency + step * np.arange(-4, 5)
+    profile = np.array([float(at(f, beside, training)[0].sum()) for f in frequencies])
+    best = int(np.clip(np.argmax(profile), 1, len(frequencies) - 2))
+    below, top, above = profile[best - 1 : best + 2]
     curvature = (2.0 * top - below - above) / step**2
     beyond = 0.5 * (above - below) / step / max(curvature, 1e-9)  # the top of their parabola
-    frequency = float(near[best] + np.clip(beyond, -step, step))
+    frequency = float(frequencies[best] + np.clip(beyond, -step, step))
     _, sizes, _, course = at(frequency, beside, training)
     power = np.mean(sizes**2, axis=0).reshape(2, -1).sum(axis=0)  # of each harmonic
-    told = frequency * (1 + int(np.argmax(power)))
+    reported = frequency * (1 + int(np.argmax(power)))
     # Where it is likeliest at an end, no parabola says more than the range.
-    sd = told / frequency * min(float(max(curvature, 1e-9) ** -0.5), float(np.ptp(near)))
+    sd = reported / frequency * min(float(max(curvature, 1e-9) ** -0.5), float(np.ptp(frequencies)))
     gain, _, change, _ = at(frequency, beside, held_out)
     nats = evaluator.held_out_log_likelihood(beside) + gain
     gained = nats - evaluator.held_out_log_likelihood(fitted)
     less = replace(held_out.data, measured=held_out.data.measured - change[:, None])
     after = _square(replace(evaluator, held_out=Partition(less, held_out.predictor)), beside)
     worth = float(np.sqrt(_square(evaluator, fitted)) - np.sqrt(after))
-    return Swing(told, sd, course, beside.noise, nats, worth), gained
+    return Swing(reported, sd, course, beside.noise, nats, worth), gained
 
 
 def _places(
-    found: Posterior, names: frozenset[str], place: str, term: str
+    posterior: Posterior, names: frozenset[str], place: str, term: str
 ) -> tuple[tuple[str, float], ...]:
     """Posterior weights of the places of an unnamed effect, the largest first."""
     odds = {place: 1.0}
-    for name, each in found.swaps(names, term).items():
+    for name, ratio in posterior.swaps(names, term).items():
         where = SWINGS[name][0] if name in SWINGS else None
         where = component_of(name) if name in basis_terms() else where
-        if where is not None and each > _NEAR:
-            odds[where] = odds.get(where, 0.0) + each
+        if where is not None and ratio > _MIN_ODDS:
+            odds[where] = odds.get(where, 0.0) + ratio
     total = sum(odds.values())
     return tuple(sorted(((n, p / total) for n, p in odds.items()), key=lambda pair: -pair[1]))
 
 
 def _alternatives(
-    evaluator: Evaluator, found: Posterior, names: frozenset[str], named: FittedModel, name: str
+    evaluator: Evaluator, posterior: Posterior, names: frozenset[str], named: FittedModel, name: str
 ) -> Alternatives:
     """Other names of the posterior in the place of one of a set."""
     odds = {
-        other: each
-        for other, each in found.swaps(names, name).items()
-        if other in library() and each > _NEAR
+        rival: ratio
+        for rival, ratio in posterior.swaps(names, name).items()
+        if rival in library() and ratio > _MIN_ODDS
     }
-    others = (*odds, *(n for n in mechanism(name).description.equivalents if n not in odds))
+    rivals = (*odds, *(n for n in mechanism(name).description.equivalents if n not in odds))
     models = []
-    for other in list(odds)[:_LISTED]:
-        if other != EFFORT and EFFORT not in named.names:
-            hypothesis = named.hypothesis.without(name).plus(Hypothesis((other,)))
+    for rival in list(odds)[:_LISTED]:
+        if rival != EFFORT and EFFORT not in named.names:
+            hypothesis = named.hypothesis.minus(name).plus(Hypothesis((rival,)))
             models.append(evaluator.fit(hypothesis, named.noise, named))
-    return Alternatives(others[:_LISTED], found.marginal(name), tuple(models))
+    return Alternatives(rivals[:_LISTED], posterior.marginal(name), tuple(models))
 
 
-def _is_unresolved(evaluator: Evaluator, whole: FittedModel) -> bool:
+def _is_unresolved(evaluator: Evaluator, candidate: FittedModel) -> bool:
     """Whether a set explains much of training and held-out breaths though no term is accepted."""
-    if not whole.names or EFFORT in whole.names:
+    if not candidate.names or EFFORT in candidate.names:
         return False
-    base = evaluator.fit(Hypothesis(), whole.noise, whole)
-    much = evaluator.criterion(base) - evaluator.criterion(whole) > evaluator.settings.search.much
-    gains = evaluator.held_out_log_likelihood(whole) - evaluator.held_out_log_likelihood(base)
+    base = evaluator.fit(Hypothesis(), candidate.noise, candidate)
+    much = (
+        evaluator.criterion(base) - evaluator.criterion(candidate) > evaluator.settings.search.much
+    )
+    gains = evaluator.held_out_log_likelihood(candidate) - evaluator.held_out_log_likelihood(base)
     return much and float(gains.sum()) > evaluator.settings.held_out_test.threshold
 
 
-def without_name(conclusion: Conclusion, name: str, evaluator: Evaluator) -> Conclusion:
+def drop_mechanism(conclusion: Conclusion, name: str, evaluator: Evaluator) -> Conclusion:
     """The conclusion without a mechanism whose strength may as well be none.
 
     Args:
@@ -429,14 +433,14 @@ def without_name(conclusion: Conclusion, name: str, evaluator: Evaluator) -> Con
         evaluator: evaluator of the conclusion.
     """
     named = conclusion.named
-    left = fit_with_noise(evaluator, named.hypothesis.without(name), named)
-    full = left
+    reduced = fit_with_noise(evaluator, named.hypothesis.minus(name), named)
+    full = reduced
     if conclusion.unnamed is not None and conclusion.unnamed.term is not None:
-        full = fit_with_noise(evaluator, conclusion.full.hypothesis.without(name), conclusion.full)
+        full = fit_with_noise(evaluator, conclusion.full.hypothesis.minus(name), conclusion.full)
     swing = None if conclusion.unnamed is None else conclusion.unnamed.swing
     return replace(
         conclusion,
-        named=left,
+        named=reduced,
         full=full,
         noise=full.noise if swing is None else swing.noise,
         held_out_gains={k: v for k, v in conclusion.held_out_gains.items() if k != name},
@@ -444,7 +448,7 @@ def without_name(conclusion: Conclusion, name: str, evaluator: Evaluator) -> Con
     )
 
 
-def without_term(conclusion: Conclusion) -> Conclusion:
+def drop_nonparametric_term(conclusion: Conclusion) -> Conclusion:
     """The conclusion with its mechanisms alone, without a nonparametric term beside them."""
     named = conclusion.named
     return replace(conclusion, full=named, unnamed=None, noise=named.noise)

@@ -19,7 +19,7 @@ from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.experiment import Experiment, Judge, Split, open_loop_error
-from ventbench.diagnosis.findings import WHOLE, OpenLoopComparison, OpenLoopError, Stage
+from ventbench.diagnosis.findings import FULL_BREATH, OpenLoopComparison, OpenLoopError, Stage
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.settings import CorrectionSettings
@@ -94,8 +94,8 @@ def correct(
         pressures, notes = dict.fromkeys(pressures, before), []  # notes on the correction
     refitted, chosen = choose(breaths, experiment.judge, pressures)
     if unchanged:
-        given_everywhere: dict[str, Stage] = dict.fromkeys(chosen, "before")
-        refitted = chosen = given_everywhere
+        unchanged_stages: dict[str, Stage] = dict.fromkeys(chosen, "before")
+        refitted = chosen = unchanged_stages
     final = {
         "before": before,
         "refit": _by_lung(breaths, pressures, refitted),
@@ -109,7 +109,7 @@ def correct(
         )
         return Correction(final, errors, {}, chosen, unchanged, (*notes, note))
     # Plants of one kind can be run together: the base model is the library's physics here.
-    given = {
+    uncorrected = {
         name: simulators.plant(name)
         if simulators.is_base_physics
         else simulators.plant_of_breath(breaths, int(index[0]))
@@ -118,10 +118,10 @@ def correct(
     result: Plants = {}
     for name, stage in chosen.items():
         if simulator_model is None:
-            result[name] = given[name] if stage == "before" else plants[stage][name]
+            result[name] = uncorrected[name] if stage == "before" else plants[stage][name]
         else:
-            own = plants["before"][name]
-            result[name] = Corrected(given[name], plants[stage][name], own)
+            identified = plants["before"][name]
+            result[name] = Corrected(uncorrected[name], plants[stage][name], identified)
     return Correction(final, errors, result, chosen, unchanged, tuple(notes))
 
 
@@ -239,10 +239,10 @@ def _any_model(
     first = breaths.pressure[:, 0]
     conclusion, evaluator = recording_model.conclusion, recording_model.evaluator
     # The simulator's own model, and the same with the recording's R, C, R_ex and PEEP.
-    own = simulator_model.conclusion.full
+    simulator_fit = simulator_model.conclusion.full
     noise = replace(conclusion.noise, ar=(0.0, 0.0))
     refitted = refit_base_parameters(simulator_model, evaluator.training.data, noise)
-    identified = simulator_model.pressures(own, data, first)
+    identified = simulator_model.pressures(simulator_fit, data, first)
     after = before + recording_model.pressures(conclusion.full, data, first) - identified
     plants_after, notes = recording_model.plants(), []
     again = _least_error_model(data, split, before, recording_model, simulator_model)
@@ -308,8 +308,8 @@ def fit_open_loop(
     evaluator = replace(evaluator, gain_sd=0.0)  # a breath to come has the usual gain
     noise = replace(fitted.noise, ar=(0.0,) * len(fitted.noise.ar), tail=settings.tail)
     values, names = evaluator.transferred_values(fitted, partition), partition.predictor.names
-    known = {p: values[:, names.index(p)] for p in fitted.hypothesis.paths if p in names}
-    starts = [known]
+    estimates_of_fit = {p: values[:, names.index(p)] for p in fitted.hypothesis.paths if p in names}
+    starts = [estimates_of_fit]
     if label:
         data = partition.data
         starts.append({"R": data.R, "C": data.C})
@@ -326,16 +326,16 @@ def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, 
     points = np.repeat(label[None], len(factors), axis=0)
     for point, (of_R, of_C) in zip(points, factors, strict=True):
         for path, factor in (("R", of_R), ("C", of_C)):
-            about, column = parameter_of(path), names.index(path)
-            point[:, column] = np.clip(point[:, column] * factor, about.low, about.high)
-    seen = partition.predictor.predict_all(points)
-    square = np.sum(((seen - data.measured) * data.weight) ** 2, axis=(2, 3))  # (m, n)
+            parameter, column = parameter_of(path), names.index(path)
+            point[:, column] = np.clip(point[:, column] * factor, parameter.low, parameter.high)
+    predicted = partition.predictor.predict_all(points)
+    square = np.sum(((predicted - data.measured) * data.weight) ** 2, axis=(2, 3))  # (m, n)
     start = {"R": data.R.copy(), "C": data.C.copy()}
     for lung in np.unique(data.lung):
-        own = data.lung == lung
-        best = int(np.argmin(square[:, own].sum(axis=1)))
+        members = data.lung == lung
+        best = int(np.argmin(square[:, members].sum(axis=1)))
         for path in start:
-            start[path][own] = points[best][own, names.index(path)]
+            start[path][members] = points[best][members, names.index(path)]
     return start
 
 
@@ -361,17 +361,17 @@ def compare_open_loop(
             that is exact.
     """
     # The first sample is where every simulation starts.
-    whole = breaths.valid & (breaths.time > 0) & judge.judging[:, None]
-    inspiration = breaths.inspiratory & whole
+    judged = breaths.valid & (breaths.time > 0) & judge.judging[:, None]
+    inspiration = breaths.inspiratory & judged
 
     def by_stage(mask: Bools) -> dict[str, OpenLoopError]:
         return {stage: judge.error(simulated, mask) for stage, simulated in pressures.items()}
 
     def root(values: Floats | None) -> float:
-        return 0.0 if values is None else float(np.sqrt(np.mean(values[whole] ** 2)))
+        return 0.0 if values is None else float(np.sqrt(np.mean(values[judged] ** 2)))
 
     parts = {
-        WHOLE: whole,
+        FULL_BREATH: judged,
         f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
         "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
         "expiration": (breaths.u_out == 1) & breaths.valid & judge.judging[:, None],

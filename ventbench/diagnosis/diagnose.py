@@ -21,7 +21,7 @@ from ventbench.diagnosis.corrected import (
     compare_open_loop,
     correct,
 )
-from ventbench.diagnosis.evidence import IN_TIME, told_posterior
+from ventbench.diagnosis.evidence import IN_TIME, likeliest_sets
 from ventbench.diagnosis.experiment import Experiment, Split, prepare
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import (
@@ -137,7 +137,7 @@ def diagnose(
     simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:
         breaths = _of_lung(breaths, parse_lung(lung).id)
-    tell = progress or (lambda what, share: None)
+    tell = progress or (lambda step, share: None)
     tell("simulating", _STARTED)
     by_flow = drive == "flow" or (drive == "auto" and flow_drive.lacks_commands(breaths))
     compilation.keep()
@@ -145,27 +145,27 @@ def diagnose(
     excluded = () if patient else ("patient_effort",)
     if by_flow:
         excluded += (*flow_drive.ventilator_side(), *IN_TIME)
-        settings = flow_drive.without_ventilator(settings)
-    told: list[MissingMechanism] = []
+        settings = flow_drive.lung_side_settings(settings)
+    intermittent: list[MissingMechanism] = []
     posterior = None  # that of all breaths has all effects
     with compilation.one_blas_thread():
         while True:
             alone = _identify(experiment, excluded, tell, settings)
             posterior = posterior or alone.conclusion.posterior
-            if by_flow or len(told) == _MOST_INTERMITTENT:
+            if by_flow or len(intermittent) == _MOST_INTERMITTENT:
                 break
             tell("looking for effects of some breaths", _halfway(experiment))
-            left = _without_effect(experiment, alone)
-            if left is None:
+            reduced = _set_aside_effect(experiment, alone)
+            if reduced is None:
                 break
-            experiment, missing = left
-            told.append(missing)
-        found = _conclude(experiment, alone, excluded, tell, settings)
+            experiment, missing = reduced
+            intermittent.append(missing)
+        diagnosis = _conclude(experiment, alone, excluded, tell, settings)
     return replace(
-        found,
-        verdict="named" if told else found.verdict,
-        posterior=told_posterior(posterior),
-        mechanisms=(*told, *found.mechanisms),
+        diagnosis,
+        verdict="named" if intermittent else diagnosis.verdict,
+        posterior=likeliest_sets(posterior),
+        mechanisms=(*intermittent, *diagnosis.mechanisms),
         simulator=_name(simulator, simulators),
         seconds=time.perf_counter() - began,
     )
@@ -195,28 +195,28 @@ def _identify(
         earlier: mechanisms to start from too.
     """
     uses = experiment.uses
-    seen = uses.identifying
+    identifying = uses.identifying
     high = 1.0 if earlier is not None else _halfway(experiment)
     return identify(
-        experiment.seen,
-        uses.testing[seen],
+        experiment.identification_data,
+        uses.testing[identifying],
         excluded,
         steps_between(tell, low, high),
         settings,
-        uses.fitted[seen],
+        uses.fitted[identifying],
         earlier,
     )
 
 
-def _without_effect(
+def _set_aside_effect(
     experiment: Experiment, model: IdentifiedModel
 ) -> tuple[Experiment, MissingMechanism] | None:
     """The experiment without an effect of some breaths, and that effect; None if there is none.
 
     It competes with an error of some breaths that nobody can place.
     """
-    seen = experiment.uses.identifying
-    some = find(model, experiment.seen, experiment.breaths.breath_id[seen])
+    identifying = experiment.uses.identifying
+    some = find(model, experiment.identification_data, experiment.breaths.breath_id[identifying])
     if some is None:
         return None
     evaluator, full, nats = model.evaluator, model.conclusion.full, some.missing.nats
@@ -230,13 +230,13 @@ def _without_effect(
         worth=worth,
         explains=share,
     )
-    affected, u_in = np.zeros(len(seen), bool), None
-    affected[seen] = some.affected
+    affected, u_in = np.zeros(len(identifying), bool), None
+    affected[identifying] = some.affected
     if some.u_in is not None:
         u_in = experiment.reached.copy()
-        u_in[seen] = some.u_in
-    left = experiment.without(affected, u_in)
-    return None if left is None else (left, missing)
+        u_in[identifying] = some.u_in
+    reduced = experiment.set_aside(affected, u_in)
+    return None if reduced is None else (reduced, missing)
 
 
 def _compare(
@@ -247,18 +247,18 @@ def _compare(
     """What the recording has and the simulator has not, and the simulator corrected by it."""
     missing, notes = missing_mechanisms(recording_model, simulator_model)
     if simulator_model is not None:
-        seen = experiment.uses.identifying
+        identifying = experiment.uses.identifying
         steady = refit_at_simulator_parameters(
-            experiment.seen,
-            experiment.uses.testing[seen],
-            experiment.before[seen],
+            experiment.identification_data,
+            experiment.uses.testing[identifying],
+            experiment.before[identifying],
             recording_model,
             simulator_model,
             tuple(missing),
         )
         if steady is not None:  # the simulator keeps its mechanisms, shown or not
-            (recording_model, kept), notes = steady, []
-            missing = {name: changed for name, changed in missing.items() if name in kept}
+            (recording_model, confirmed), notes = steady, []
+            missing = {name: changed for name, changed in missing.items() if name in confirmed}
     correction = correct(experiment, recording_model, simulator_model)
     return _Comparison(recording_model, missing, notes, correction)
 
@@ -285,18 +285,18 @@ def _conclude(
         experiment.uses,
         experiment.judge,
     )
-    simulators, seen = experiment.simulators, experiment.uses.identifying
+    simulators, identifying = experiment.simulators, experiment.uses.identifying
     recording_model, simulator_model = alone, None
     if not simulators.is_base_physics:
         tell("fitting the simulator's response", _halfway(experiment))
         recording_model, simulator_model = identify_both(
-            experiment.seen,
-            uses.testing[seen],
-            experiment.before[seen],
+            experiment.identification_data,
+            uses.testing[identifying],
+            experiment.before[identifying],
             alone,
             excluded,
             steps_between(tell, _halfway(experiment), _IDENTIFIED),
-            uses.fitted[seen],
+            uses.fitted[identifying],
         )
     tell("drawing conclusions", _IDENTIFIED)
     comparison = _compare(experiment, recording_model, simulator_model)
@@ -312,38 +312,38 @@ def _conclude(
         comparison = min(
             comparison,
             _compare(experiment, in_its_terms, simulator_model),
-            key=lambda each: each.error(data, uses.testing),
+            key=lambda candidate: candidate.error(data, uses.testing),
         )
     recording_model, correction = comparison.recording_model, comparison.correction
     missing, notes_on_simulator = comparison.missing, comparison.notes
     conclusion = recording_model.conclusion
     term = estimates.nonparametric_term(conclusion)
-    own = simulator_model.conclusion.unnamed if simulator_model is not None else None
-    if own is not None and term is not None and own.name == term.name:
+    simulator_effect = simulator_model.conclusion.unnamed if simulator_model is not None else None
+    if simulator_effect is not None and term is not None and simulator_effect.name == term.name:
         notes_on_simulator.append(f"The simulator needs a nonparametric term at {term.name} too.")
-    lungs, notes_on_lungs = _lungs(experiment.recorded.select(seen), alone.fit)
+    lungs, notes_on_lungs = _lungs(experiment.recorded.select(identifying), alone.fit)
     noise, pressures = conclusion.noise, correction.pressures
     if experiment.by_flow and breaths.flow is not None:
         flow = breaths.flow
         volume = np.cumsum(data.u_in * data.dt, axis=1) * float(parameter("gain").neutral)
     else:
         flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
-    here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1) & seen)
+    tested = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1) & identifying)
     gain, start = recording_model.sensitivities(data)
     # What each breath may have of its own: a start, as its first reading is noisy, and a gain.
     scattered = conclusion.gain_sd > 0.0
-    own = np.stack([start, gain] if scattered else [start], axis=-1)
+    nuisance = np.stack([start, gain] if scattered else [start], axis=-1)
     judged = None  # efforts of breaths to come are unknown
     if not conclusion.full.hypothesis.breath_terms:
-        judged = judge.excess(pressures["after"], own, quiet_samples(breaths))
+        judged = judge.excess(pressures["after"], nuisance, quiet_samples(breaths))
     adequacy = check_residuals(
-        breaths.select(here),
-        pressures["after"][here],
-        gain[here],
-        start[here],
+        breaths.select(tested),
+        pressures["after"][tested],
+        gain[tested],
+        start[tested],
         noise.sigma[0],
-        flow[here],
-        volume[here],
+        flow[tested],
+        volume[tested],
         judged=judged,
         gains_scatter=scattered,
         settings=settings.residuals,
@@ -369,16 +369,16 @@ def _conclude(
         missing, notes_on_simulator = {}, [_note_on_unchanged(correction)]
         term = term if is_input and not correction.unchanged else None
     location = locate(
-        breaths.select(here),
-        pressures["refit"][here],
+        breaths.select(tested),
+        pressures["refit"][tested],
         noise.sigma[0],
-        flow[here],
-        volume[here],
+        flow[tested],
+        volume[tested],
         settings=settings.residuals,
     )
     form, term = estimates.split_form(term, tuple(missing))
-    left = (open_loop.whole.rmse, adequacy.excess)
-    swings = None if term is None else estimates.oscillation(conclusion, left)
+    errors = (open_loop.whole.rmse, adequacy.excess)
+    swings = None if term is None else estimates.oscillation(conclusion, errors)
     term = term if swings is None else None
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
     unnamed = unnamed or adequacy.vetoed
@@ -393,7 +393,7 @@ def _conclude(
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(
-            _missing_mechanism(name, changed, recording_model, simulator_model, experiment, left)
+            _missing_mechanism(name, changed, recording_model, simulator_model, experiment, errors)
             for name, changed in missing.items()
         )
         + ((swings,) if swings else ()),
@@ -405,7 +405,7 @@ def _conclude(
         lungs=lungs,
         request=None if rejected or experiment.by_flow else _request(conclusion),
         traces=Traces(
-            replace(experiment.whole, u_in=breaths.u_in),
+            replace(experiment.unsealed, u_in=breaths.u_in),
             judge.judging,
             pressures["before"],
             pressures["refit"],
@@ -419,7 +419,7 @@ def _conclude(
         saturated=experiment.saturated,
         left_out=notable(breaths),
         gain_scatter=conclusion.gain_sd,
-        posterior=told_posterior(conclusion.posterior),
+        posterior=likeliest_sets(conclusion.posterior),
         detection_limits=limits,
         plants=correction.plants,
         simulator=simulators.name,
@@ -462,9 +462,9 @@ def steps_between(tell: Progress, low: float, high: float) -> Callable[[str], No
     """
     share = low
 
-    def step(what: str) -> None:
+    def step(description: str) -> None:
         nonlocal share
-        tell(what, share)
+        tell(description, share)
         share += _STEP * (high - share)
 
     return step
@@ -493,13 +493,13 @@ def _helps(
         return by_breath or correction.helps
     base = evaluator.fit(conclusion.base.hypothesis, conclusion.full.noise)
     first = experiment.breaths.pressure[:, 0]
-    with_it, without = (
+    nats_full, nats_base = (
         experiment.judge.log_likelihood(
             recording_model.pressures(model, experiment.data, first), conclusion.full.noise
         )
         for model in (conclusion.full, base)
     )
-    return with_it > without
+    return nats_full > nats_base
 
 
 def _ids(breaths: Breaths, uses: Split) -> dict[str, tuple[int, ...]]:
@@ -548,8 +548,8 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
     if breaths.flow is not None or breaths.volume is not None:
         try:
             lungs = mechanics.identify(breaths)
-            notes = [note for each in lungs for note in each.notes]
-            return tuple(each.match for each in lungs), notes
+            notes = [note for lung in lungs for note in lung.notes]
+            return tuple(lung.match for lung in lungs), notes
         except InputError as error:
             return mechanics.match_labels(fit), [f"R and C are from pressure alone: {error}."]
     return mechanics.match_labels(fit), []
@@ -561,16 +561,16 @@ def _missing_mechanism(
     recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None,
     experiment: Experiment,
-    left: tuple[float, float],
+    errors: tuple[float, float],
 ) -> MissingMechanism:
-    """A missing mechanism; ``left`` are the error and what is shown to be no noise of it, cmH2O."""
+    """A missing mechanism; ``errors``: error, and its part that is shown not to be noise, cmH2O."""
     conclusion = recording_model.conclusion
     # Nobody knows the efforts of breaths to come: their errors do not tell what efforts are worth.
     worth = float("nan") if varies_by_breath(name) else conclusion.worths.get(name, float("nan"))
     alternatives = conclusion.alternatives.get(name, Alternatives((), 1.0, ()))
-    own = {}
+    simulator_estimates = {}
     if simulator_model is not None and changed:
-        own = estimates.parameter_estimates(simulator_model.fit, name)
+        simulator_estimates = estimates.parameter_estimates(simulator_model.fit, name)
     values = estimates.with_form_error(
         estimates.parameter_estimates(recording_model.fit, name),
         name,
@@ -580,7 +580,7 @@ def _missing_mechanism(
     affected = None
     if changes:
         model, path = recording_model, f"{name}.{changes[0]}"
-        at = place_of_change(model.evaluator, model.fit, experiment.seen, path)
+        at = place_of_change(model.evaluator, model.fit, experiment.identification_data, path)
         values[changes[0]] = replace(values[changes[0]], value=at.value, ci95=(at.low, at.high))
         ids = experiment.breaths.breath_id
         first = np.searchsorted(experiment.data.position, at).clip(max=len(ids) - 1)
@@ -593,14 +593,14 @@ def _missing_mechanism(
         alternatives=alternatives.names,
         nats=conclusion.held_out_gains.get(name, 0.0),
         changed=changed,
-        simulator_values={key: estimate.value for key, estimate in own.items()},
+        simulator_values={key: estimate.value for key, estimate in simulator_estimates.items()},
         worth=worth,
         breaths=affected,
-        explains=explained_share(worth, *left),
+        explains=explained_share(worth, *errors),
     )
 
 
 def _request(conclusion: Conclusion) -> BreathRequest | None:
-    rivals = [rival for other in conclusion.alternatives.values() for rival in other.models]
+    rivals = [rival for listed in conclusion.alternatives.values() for rival in listed.models]
     noise = Noise((conclusion.noise.sigma[0],), (0.0,))
     return request_breaths(conclusion.named, rivals, noise)

@@ -57,10 +57,10 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
         evaluator: evaluator with which the model was fitted.
     """
     hypothesis = fitted.hypothesis
-    own = [path for path in paths(hypothesis.names) if "." in path]
-    free = [path for path in own if parameter(path).uncertain]
-    data, known = partition.data, fitted.problem.data
-    same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
+    term_paths = [path for path in paths(hypothesis.names) if "." in path]
+    free = [path for path in term_paths if parameter(path).uncertain]
+    data, reference = partition.data, fitted.problem.data
+    same = (data.R[:, None] == reference.R) & (data.C[:, None] == reference.C)
     start: dict[str, Any] = {}
     for path in fitted.problem.unknowns.paths:
         if path != START and not ("." in path and varies_by_breath(path.rpartition(".")[0])):
@@ -68,13 +68,13 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
             by_label = parameter(path).follows is not None
             start[path] = column[np.argmax(same, axis=1)] if by_label else float(np.median(column))
     if hypothesis.breath_terms:  # the efforts of each breath start where they are likeliest
-        near = evaluator.fit(
+        nearest = evaluator.fit(
             hypothesis, fitted.noise, start=start, partition=partition, restart=True
         )
-        start |= {path: near.column(path) for path in near.problem.unknowns.paths}
+        start |= {path: nearest.column(path) for path in nearest.problem.unknowns.paths}
     # Where rigs differ, gains that are the same in all breaths would be made up for by mechanisms.
     start.pop("gain", None)
-    found = fit(
+    solution = fit(
         data,
         hypothesis.names,
         free=dict.fromkeys((*hypothesis.free, *free)),
@@ -84,7 +84,7 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
         noise=fitted.noise,
         predictor=partition.predictor,
     )
-    return FittedModel(hypothesis.names, found.problem, found.minimum, hypothesis)
+    return FittedModel(hypothesis.names, solution.problem, solution.minimum, hypothesis)
 
 
 def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
@@ -94,20 +94,20 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
     that differs between lungs: median over the lungs, and an interval that holds those of all.
     """
     values = {}
-    for about in mechanism(name).description.parameters:
-        path = f"{name}.{about.name}"
+    for spec in mechanism(name).description.parameters:
+        path = f"{name}.{spec.name}"
         if path not in fitted.problem.unknowns.paths:
             continue
-        if about.scope == "breath":
+        if spec.scope == "breath":
             column = fitted.column(path)
             low, middle, high = np.quantile(column, [0.025, 0.5, 0.975])
-            values[about.name] = Estimate(float(middle), about.unit, (float(low), float(high)))
+            values[spec.name] = Estimate(float(middle), spec.unit, (float(low), float(high)))
         else:
             groups = range(len(fitted.problem.unknowns.of(path)))
             ends = [_interval(fitted, path, group) for group in groups]
             low, high = min(end.low for end in ends), max(end.high for end in ends)
             middle = float(np.median([end.value for end in ends]))
-            values[about.name] = Estimate(middle, about.unit, (low, high))
+            values[spec.name] = Estimate(middle, spec.unit, (low, high))
     return values
 
 
@@ -127,18 +127,20 @@ def with_form_error(
     """
     widened, description = {}, mechanism(name).description
     share = np.hypot(FORM_ERROR, 0.0 if alone else description.beside_error)
-    for about in description.parameters:
-        if about.name not in estimates:
+    for spec in description.parameters:
+        if spec.name not in estimates:
             continue
-        own = estimates[about.name]
-        if about.scope != "breath" and not about.change_point:
+        estimate = estimates[spec.name]
+        if spec.scope != "breath" and not spec.change_point:
             # A time that is written as 1 s when it does not matter is not off there.
-            off = about.neutral if about is description.strength else 0.0
-            low, high = _wider(own.value - off, own.ci95[0] - off, own.ci95[1] - off, share)
+            off = spec.neutral if spec is description.strength else 0.0
+            low, high = _wider(
+                estimate.value - off, estimate.ci95[0] - off, estimate.ci95[1] - off, share
+            )
             if np.isfinite(low) and np.isfinite(high):
-                low, high = max(off + low, about.low), min(off + high, about.high)
-                own = replace(own, ci95=(low, high))
-        widened[about.name] = own
+                low, high = max(off + low, spec.low), min(off + high, spec.high)
+                estimate = replace(estimate, ci95=(low, high))
+        widened[spec.name] = estimate
     return widened
 
 
@@ -170,11 +172,11 @@ def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
     """
     ends = interval(fitted, path, group)
     owner, _, short = path.rpartition(".")
-    about = parameter(path)
+    spec = parameter(path)
     # The sum of two lags in series is known where their difference is not.
     exchanged = any(short in pair for pair in mechanism(owner).description.interchangeable)
     unclear = path == strength_path(owner) or exchanged
-    if not unclear or about.kinked or not ends.low <= about.neutral <= ends.high:
+    if not unclear or spec.kinked or not ends.low <= spec.neutral <= ends.high:
         return ends
     return ConfidenceInterval(ends.value, *profile_interval(fitted, path, group))
 
@@ -191,17 +193,17 @@ def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     """
     data, predictor = evaluator.training.data, evaluator.training.predictor
     values = evaluator.transferred_values(fitted, evaluator.training)
-    own = [name for name in library() if varies_by_breath(name)]
-    names = [path for path in paths(fitted.names) if path.rpartition(".")[0] not in own]
+    breathwise = [name for name in library() if varies_by_breath(name)]
+    names = [path for path in paths(fitted.names) if path.rpartition(".")[0] not in breathwise]
     names.remove("position")
     columns = [predictor.names.index(name) for name in names]
     result: dict[str, Plant] = {}
     for R, C in np.unique(np.stack([data.R, data.C], axis=1), axis=0):
         breath = int(np.flatnonzero((data.R == R) & (data.C == C))[0])
-        given = dict(zip(names, values[breath, columns], strict=True))
+        parameters = dict(zip(names, values[breath, columns], strict=True))
         if any(mechanism(name).uses_position for name in fitted.names):
-            given["position"] = 1.0
-        result[f"R{R:g}C{C:g}"] = predictor.plant(given)
+            parameters["position"] = 1.0
+        result[f"R{R:g}C{C:g}"] = predictor.plant(parameters)
     return result
 
 
@@ -222,13 +224,13 @@ def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
 
 
 def oscillation(
-    conclusion: Conclusion, left: tuple[float, float] = (0.0, 0.0)
+    conclusion: Conclusion, errors: tuple[float, float] = (0.0, 0.0)
 ) -> MissingMechanism | None:
     """The mechanism that a periodic input is; None if there is none, or no name for it.
 
     Args:
         conclusion: has the input.
-        left: error beside it, and what is shown to be no noise of that, cmH2O.
+        errors: error beside it, and what is shown to be no noise of that, cmH2O.
     """
     effect = conclusion.unnamed
     source = None if effect is None else effect.swing
@@ -237,9 +239,9 @@ def oscillation(
     names = [_OSCILLATIONS.get(place) for place, weight in effect.places if weight >= _LEAST_WEIGHT]
     if _OSCILLATIONS.get(effect.name) is None or None in names:
         return None
-    name, others = _OSCILLATIONS[effect.name], [each for each in names if each is not None]
-    each = np.sqrt(2.0 * np.mean(source.course**2, axis=1))  # amplitude of each breath
-    amplitude, wide = float(each.mean()), 1.96 * float(each.std()) / len(each) ** 0.5
+    name, rivals = _OSCILLATIONS[effect.name], [rival for rival in names if rival is not None]
+    sizes = np.sqrt(2.0 * np.mean(source.course**2, axis=1))  # amplitude of each breath
+    amplitude, wide = float(sizes.mean()), 1.96 * float(sizes.std()) / len(sizes) ** 0.5
     frequency, sd = source.frequency, 1.96 * source.frequency_sd
     unit = mechanism(name).description.strength.unit
     return MissingMechanism(
@@ -249,10 +251,10 @@ def oscillation(
             "frequency": Estimate(frequency, "Hz", (frequency - sd, frequency + sd)),
         },
         effect.probability,
-        tuple(other for other in others if other != name),
+        tuple(rival for rival in rivals if rival != name),
         effect.nats,
         worth=effect.worth,
-        explains=explained_share(effect.worth, *left),
+        explains=explained_share(effect.worth, *errors),
     )
 
 
@@ -318,12 +320,12 @@ def _curve(full: FittedModel, element: str) -> tuple[Floats, Floats, str, str]:
     paths = {p.name: f"{element}.{p.name}" for p in term.description.parameters}
     paths |= {name: name for name in ("R", "C", "gain", "R_ex", "PEEP")}
     values = {name: float(np.median(full.column(path))) for name, path in paths.items()}
-    shown = characteristic(element, values)
-    if shown is None:  # it acts beyond what is drawn
+    curve = characteristic(element, values)
+    if curve is None:  # it acts beyond what is drawn
         return np.linspace(0.0, 1.0, 2), np.zeros(2), "share of the range", "no change"
-    added = shown.acting - shown.without
+    added = curve.acting - curve.without
     assert isinstance(term, BasisTerm)
     if term.absorbed:
-        powers = np.stack([shown.x**power for power in term.absorbed], axis=1)
+        powers = np.stack([curve.x**power for power in term.absorbed], axis=1)
         added = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
-    return shown.x, added, shown.x_label, f"extra {shown.y_label}"
+    return curve.x, added, curve.x_label, f"extra {curve.y_label}"

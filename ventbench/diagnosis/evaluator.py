@@ -58,8 +58,8 @@ def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFA
         for value in parameter_of(path).scan:
             trial = linear.values.copy()
             trial[:, predictor.names.index(path)] = value
-            left = linear.residual + linear.template(predictor.predict(trial))
-            loss = float(np.sum(noise.loss(left)))
+            residual = linear.residual + linear.template(predictor.predict(trial))
+            loss = float(np.sum(noise.loss(residual)))
             if loss < least:
                 x, least = x.copy(), loss
                 x[problem.unknowns.of(path)] = parameter_of(path).coordinate(value)
@@ -68,24 +68,26 @@ def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFA
 
 def _dead_times(problem: Problem) -> tuple[str, ...]:
     """Free dead times, of which other values may be likelier."""
-    about = {path: parameter_of(path) for path in problem.unknowns.paths}
-    return tuple(path for path, each in about.items() if each.kinked and each.scan)
+    parameters = {path: parameter_of(path) for path in problem.unknowns.paths}
+    return tuple(
+        path for path, parameter in parameters.items() if parameter.kinked and parameter.scan
+    )
 
 
-def _known_minimum(problem: Problem, x: Floats, earlier: FittedModel | None) -> Minimum | None:
+def _reusable_minimum(problem: Problem, x: Floats, earlier: FittedModel | None) -> Minimum | None:
     """The minimum of an earlier fit to the same problem that ended at ``x``; None if there is none.
 
     A model whose parameters were taken over and not fitted has no normal equations.
     """
     if earlier is None or earlier.minimum.iterations == 0:
         return None
-    known, layout = earlier.problem, earlier.problem.unknowns
-    same = known.predictor is problem.predictor and known.noise == problem.noise
-    same &= known.data is problem.data  # the same breaths, less what acts in time
+    earlier_problem, layout = earlier.problem, earlier.problem.unknowns
+    same = earlier_problem.predictor is problem.predictor and earlier_problem.noise == problem.noise
+    same &= earlier_problem.data is problem.data  # the same breaths, less what acts in time
     same &= layout.paths == problem.unknowns.paths
     same &= np.array_equal(layout.index, problem.unknowns.index)
     for name in ("fixed", "mean", "precision"):
-        same &= np.array_equal(getattr(known, name), getattr(problem, name))
+        same &= np.array_equal(getattr(earlier_problem, name), getattr(problem, name))
     # A value and its logarithm differ in the last digit.
     same = same and np.allclose(earlier.minimum.x, x, rtol=1e-12, atol=1e-12)
     return earlier.minimum if same else None
@@ -146,10 +148,10 @@ class Evaluator:
         iterations = settings.iterations if iterations is None else iterations
         fixed = dict(hypothesis.fixed)
         problem = make_problem(partition, hypothesis.paths, noise, fixed, self.gain_sd)
-        known: dict[str, ArrayLike] = {}
+        earlier: dict[str, ArrayLike] = {}
         if warm_start is not None:
-            known = {path: warm_start.column(path) for path in warm_start.problem.unknowns.paths}
-        x = problem.start(known | dict(start or {}))
+            earlier = {path: warm_start.column(path) for path in warm_start.problem.unknowns.paths}
+        x = problem.start(earlier | dict(start or {}))
         if restart:
             x = delay_restarts(problem, x, self.settings)
         before = () if warm_start is None else warm_start.names
@@ -159,7 +161,7 @@ class Evaluator:
             x = problem.smoothed_start(x, tolerance=settings.tolerance, iterations=iterations)
         low, high = problem.unknowns.bounds()
 
-        def search(x: Floats, known: Minimum | None = None) -> Minimum:
+        def search(x: Floats, previous: Minimum | None = None) -> Minimum:
             return minimise(
                 problem.cost,
                 problem.normal,
@@ -168,20 +170,20 @@ class Evaluator:
                 high,
                 tolerance=settings.tolerance,
                 iterations=iterations,
-                known=known,
+                known=previous,
             )
 
-        minimum = search(x, _known_minimum(problem, x, warm_start))
+        minimum = search(x, _reusable_minimum(problem, x, warm_start))
         for _ in range(settings.delay_rounds):
             beyond = problem.at_likeliest_changes(minimum.x, settings.delay_gain)
             if beyond is None:  # a step may carry a dead time over a sample, and none leads back
                 beyond = problem.best_of_scan(minimum, _dead_times(problem), settings.delay_gain)
             if beyond is None:
                 break
-            other = search(beyond)
-            if other.cost >= minimum.cost:
+            trial = search(beyond)
+            if trial.cost >= minimum.cost:
                 break
-            minimum = other
+            minimum = trial
         return FittedModel(hypothesis.names, problem, minimum, hypothesis)
 
     @cached_property
@@ -301,10 +303,10 @@ class Evaluator:
             partition: the other breaths. Those of a label that the model has not seen take the
                 values of its first breath.
         """
-        data, known = partition.data, fitted.problem.data
+        data, reference = partition.data, fitted.problem.data
         names = fitted.problem.predictor.names
         values = parameter_values(data, partition.predictor.names, {})
-        same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
+        same = (data.R[:, None] == reference.R) & (data.C[:, None] == reference.C)
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
         for column, name in enumerate(partition.predictor.names):
@@ -327,8 +329,8 @@ class Evaluator:
     def square_error(self, fitted: FittedModel, partition: Partition) -> float:
         """Sum of the squared errors of breaths that start from their first readings, cmH2O^2."""
         data = partition.data
-        left = self.predict(fitted, partition) - data.measured
-        return float(np.sum(np.square(left[data.weight > 0.0])))
+        error = self.predict(fitted, partition) - data.measured
+        return float(np.sum(np.square(error[data.weight > 0.0])))
 
     def breath_term(self, fitted: FittedModel) -> BreathTerm:
         """Term of a model whose parameters differ from breath to breath."""
@@ -359,24 +361,22 @@ def make_evaluator(
     """
 
     def split(mask: Bools) -> tuple[Partition, Partition]:
-        training, other = data.select(~mask), data.select(mask)
-        return make_partition(training, names, settings), make_partition(other, names, settings)
+        training, testing = data.select(~mask), data.select(mask)
+        return make_partition(training, names, settings), make_partition(testing, names, settings)
 
     order = np.cumsum(~held_out)
     folds = [~held_out & (order % 2 == k) for k in range(2)]
-    others = tuple(split(fold) for fold in folds if fold.any() and not fold.all())
-    return Evaluator(*split(held_out), excluded=excluded, folds=others, settings=settings)
+    splits = tuple(split(fold) for fold in folds if fold.any() and not fold.all())
+    return Evaluator(*split(held_out), excluded=excluded, folds=splits, settings=settings)
 
 
-def cross_validated_gain(
-    evaluator: Evaluator, with_term: FittedModel, without_term: FittedModel
-) -> Floats:
+def cross_validated_gain(evaluator: Evaluator, full: FittedModel, reduced: FittedModel) -> Floats:
     """Log-likelihood that a term gains in each breath, by fits to other breaths, ``(n,)``.
 
     Args:
         evaluator: evaluator of the recording; the gains are in the order of its folds.
-        with_term: fitted to the training breaths.
-        without_term: the hypothesis without the term, at the same noise.
+        full: fitted to the training breaths.
+        reduced: the hypothesis without the term, at the same noise.
     """
 
     def evaluate(work: tuple[tuple[Partition, Partition], FittedModel]) -> Floats:
@@ -385,11 +385,11 @@ def cross_validated_gain(
         start = fold.transferred(fitted, training)
         return fold.held_out_log_likelihood(fold.fit(fitted.hypothesis, fitted.noise, start=start))
 
-    likelihoods = parallel_map(evaluate, product(evaluator.folds, (with_term, without_term)))
+    likelihoods = parallel_map(evaluate, product(evaluator.folds, (full, reduced)))
     pairs = zip(likelihoods[::2], likelihoods[1::2], strict=True)
-    first = evaluator.held_out_log_likelihood(with_term)
-    first = first - evaluator.held_out_log_likelihood(without_term)
-    return np.concatenate([first, *(with_it - without for with_it, without in pairs)])
+    first = evaluator.held_out_log_likelihood(full)
+    first = first - evaluator.held_out_log_likelihood(reduced)
+    return np.concatenate([first, *(nats_full - nats_reduced for nats_full, nats_reduced in pairs)])
 
 
 def fit_with_noise(

@@ -27,9 +27,9 @@ from ventbench.diagnosis.linearised import (
     EFFORT,
     OPEN,
     SCATTER,
-    Known,
+    CandidateEffects,
+    LinearModel,
     Set,
-    Simulated,
     Term,
     gaussian,
     latent_of,
@@ -67,14 +67,14 @@ class Scored(NamedTuple):
     evidence: float  #: log evidence, nats.
 
     @classmethod
-    def of(cls, known: Known) -> Scored:
+    def of(cls, model: LinearModel) -> Scored:
         """From a linearised fit."""
-        return cls(known.fitted, known.terms, known.noise, known.scatter, known.evidence)
+        return cls(model.fitted, model.terms, model.noise, model.scatter, model.evidence)
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What the search has found."""
+    """Posterior over the sets of terms that were scored."""
 
     fitted: tuple[Scored, ...]  #: sets that were fitted, likeliest first.
     weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
@@ -88,12 +88,12 @@ class Posterior:
 
         One may stand in the place of several: equal delays of both valves are a late clock.
         """
-        own = self.weights[names]
+        current = self.weights[names]
         odds: dict[str, float] = {}
-        for other, weight in self.weights.items():
-            new = other - names
-            if name not in other and len(new) == 1:
-                odds[next(iter(new))] = odds.get(next(iter(new)), 0.0) + weight / own
+        for alternative, weight in self.weights.items():
+            new = alternative - names
+            if name not in alternative and len(new) == 1:
+                odds[next(iter(new))] = odds.get(next(iter(new)), 0.0) + weight / current
         return dict(sorted(odds.items(), key=lambda pair: -pair[1]))
 
     def undecided(self, nats: float) -> Scored:
@@ -101,10 +101,10 @@ class Posterior:
 
         A further term beside others may be no more than their form.
         """
-        best, *others = self.fitted
+        best, *alternatives = self.fitted
         most = _log_posterior(best)
-        near = (s for s in others if len(s.terms) == 1 and not best.terms)
-        return next((s for s in near if most - _log_posterior(s) < nats), best)
+        singles = (s for s in alternatives if len(s.terms) == 1 and not best.terms)
+        return next((s for s in singles if most - _log_posterior(s) < nats), best)
 
 
 def search(wide: Evaluator, also: Sequence[str] = ()) -> Posterior:
@@ -125,12 +125,12 @@ def hypothesis_of(terms: Iterable[Term]) -> tuple[Hypothesis, dict[str, float]]:
             continue
         names.append(term.name)
         for path, value in term.values.items():
-            about = parameter_of(path)
-            if about.shape and about.grid and about.discrete:
+            parameter = parameter_of(path)
+            if parameter.shape and parameter.grid and parameter.discrete:
                 fixed.append((path, float(value)))
                 continue
-            start[path] = float(np.clip(value, about.low, about.high))
-            if about.shape and not (about.grid and about.discrete):
+            start[path] = float(np.clip(value, parameter.low, parameter.high))
+            if parameter.shape and not (parameter.grid and parameter.discrete):
                 free.append(path)
     return Hypothesis(tuple(names), tuple(free), tuple(fixed)), start
 
@@ -143,8 +143,8 @@ def prior(names: Iterable[str], warmth: float = 1.0) -> float:
         warmth: power of the likelihood that it is weighed against. Beside a whole likelihood, which
             is surer than any model is, an unknown at a place must be as much less likely.
     """
-    one, unknown = np.log(_ODDS / len(library())), np.log(_PLACE) / warmth
-    return float(sum(one + unknown * (n in basis_terms() or ":" in n) for n in names))
+    per_term, unknown = np.log(_ODDS / len(library())), np.log(_PLACE) / warmth
+    return float(sum(per_term + unknown * (n in basis_terms() or ":" in n) for n in names))
 
 
 def evidence(G: Floats, b: Floats, terms: Set) -> float:
@@ -153,47 +153,49 @@ def evidence(G: Floats, b: Floats, terms: Set) -> float:
     for _ in range(2 if any(term.forms for term in terms) else 1):
         index: list[int] = []
         spread: list[float] = []
-        own = []
+        leading = []
         for term, mean in zip(terms, means, strict=True):
-            own.append(len(index))
+            leading.append(len(index))
             index += [*term.main, *(term.forms if mean else ())]
             spread += [*term.spread, *(abs(mean) * c for c in term.forms.values() if mean)]
-        value, found, sds = gaussian(G[np.ix_(index, index)], b[index], np.array(spread))
-        means = [float(found[k]) for k in own]
-    for k, term in zip(own, terms, strict=True):
+        value, coefficients, sds = gaussian(G[np.ix_(index, index)], b[index], np.array(spread))
+        means = [float(coefficients[k]) for k in leading]
+    for k, term in zip(leading, terms, strict=True):
         value += term.odds
         if np.isfinite(term.limits[0]):
-            value += within(term.limits, float(found[k]), float(sds[k]), 0.0, term.spread[0])
+            value += within(term.limits, float(coefficients[k]), float(sds[k]), 0.0, term.spread[0])
     return value
 
 
 def enumerate_sets(
-    known: Known, latent: Sequence[Term], most: int, beam: int
+    model: LinearModel, latent: Sequence[Term], most: int, beam: int
 ) -> list[tuple[float, Set]]:
     """Sets of terms by log posterior over the empty one, likeliest first, one of each names.
 
     Args:
-        known: the linearised experiment.
+        model: the linearised experiment.
         latent: terms that act in time.
         most: most terms of a set.
         beam: sets of each size that are extended.
     """
-    columns, numbered = [*known.around.columns], []
+    columns, numbered = [*model.around.columns], []
     for term in latent:
-        own = tuple(range(len(columns), len(columns) + len(term.latent)))
-        numbered.append(replace(term, main=own))
+        indices = tuple(range(len(columns), len(columns) + len(term.latent)))
+        numbered.append(replace(term, main=indices))
         columns += term.latent
-    weight = known.around.data.weight
-    G, b = known.products(known.rows(np.stack(columns, axis=1) * weight))
+    weight = model.around.data.weight
+    G, b = model.products(model.rows(np.stack(columns, axis=1) * weight))
     best: dict[frozenset[str], tuple[float, Set]] = {frozenset(): (0.0, ())}
 
-    beside = {term.name: _integrated_out(G, b, term) for term in numbered}
+    beside = {term.name: _marginalise(G, b, term) for term in numbered}
 
     def score(terms: Set) -> float:
         wide = max(terms, key=lambda term: len(term.latent))
         if len(wide.latent):
-            own, left, rest = beside[wide.name]
-            value = own + evidence(left, rest, tuple(term for term in terms if term is not wide))
+            marginal, information, rest = beside[wide.name]
+            value = marginal + evidence(
+                information, rest, tuple(term for term in terms if term is not wide)
+            )
         else:
             value = evidence(G, b, terms)
         key = names_of(terms)
@@ -203,26 +205,30 @@ def enumerate_sets(
         return value
 
     ranked: dict[str, list[tuple[float, Term]]] = {}
-    for term in (*known.around.terms, *numbered):
+    for term in (*model.around.terms, *numbered):
         ranked.setdefault(term.name, []).append((score((term,)), term))
-    for each in ranked.values():
-        each.sort(key=lambda pair: -pair[0])
-    kept = {name: [term for _, term in each[:2]] for name, each in ranked.items()}
+    for candidates in ranked.values():
+        candidates.sort(key=lambda pair: -pair[0])
+    shortlist = {name: [term for _, term in candidates[:2]] for name, candidates in ranked.items()}
 
     def top(size: int, count: int) -> list[Set]:
-        alike = [pair for key, pair in best.items() if len(key) == size]
-        return [terms for _, terms in sorted(alike, key=lambda pair: -pair[0])[:count]]
+        same_size = [pair for key, pair in best.items() if len(key) == size]
+        return [terms for _, terms in sorted(same_size, key=lambda pair: -pair[0])[:count]]
 
     for size in range(2, most + 1):
-        sets = [(t,) for each in kept.values() for t in each] if size == 2 else top(size - 1, beam)
+        sets = (
+            [(t,) for candidates in shortlist.values() for t in candidates]
+            if size == 2
+            else top(size - 1, beam)
+        )
         for terms in sets:
-            for name in kept.keys() - names_of(terms):
-                for term in kept[name] if size > 2 or name > terms[0].name else ():
+            for name in shortlist.keys() - names_of(terms):
+                for term in shortlist[name] if size > 2 or name > terms[0].name else ():
                     score((*terms, term))
         for terms in top(size, beam // 3):
             for k, term in enumerate(terms):
-                for _, other in ranked[term.name]:
-                    score((*terms[:k], other, *terms[k + 1 :]))
+                for _, alternative in ranked[term.name]:
+                    score((*terms[:k], alternative, *terms[k + 1 :]))
     return sorted(best.values(), key=lambda pair: -pair[0])
 
 
@@ -231,23 +237,23 @@ def _log_posterior(scored: Scored) -> float:
     return scored.evidence + prior(names_of(scored.terms), WARMTH)
 
 
-def _integrated_out(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
-    """Log evidence of a term, and what is left of the products beside its coefficients."""
+def _marginalise(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
+    """Log evidence of a term, and the products with its coefficients integrated out."""
     at, sd = list(term.main), np.array(term.spread)
     L = cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
     R = linalg.solve_triangular(L, sd[:, None] * np.column_stack([G[at], b[at]]), lower=True)
-    left = R.T @ R
-    return evidence(G, b, (term,)), G - left[:-1, :-1], b - left[:-1, -1]
+    explained = R.T @ R
+    return evidence(G, b, (term,)), G - explained[:-1, :-1], b - explained[:-1, -1]
 
 
 class _View(NamedTuple):
     """A linearisation, and its sets of terms."""
 
     base: FittedModel
-    around: Simulated
+    around: CandidateEffects
     noise: Noise
     scatters: tuple[float, ...]  #: of the gains, that are compared.
-    ways: tuple[list[tuple[float, Set]], ...]  #: ranked sets at each scatter.
+    ranked: tuple[list[tuple[float, Set]], ...]  #: ranked sets at each scatter.
     latent: Sequence[Term]  #: what may act in time.
 
 
@@ -265,130 +271,139 @@ class _Search:
         self.unnamed = self.settings.nonparametric_terms
         if self.unnamed is None:
             self.unnamed = tuple(basis_terms())
-        self.tried: dict[frozenset[str], Scored] = {}
-        self.near: set[frozenset[str]] = set()  # of those, what is not far behind
+        self.scored: dict[frozenset[str], Scored] = {}
+        self.contenders: set[frozenset[str]] = (
+            set()
+        )  # of those, those whose evidence is within the margin of the best
 
     def run(self, also: Sequence[str]) -> Posterior:
         """Search."""
         data, first = self.evaluator.training.data, self.fit(())
-        data = without_spikes(first, data)
+        data = mask_spikes(first, data)
         noise = estimate_noise(self.fit((), data))
         self.data, self.base = data, self.fit((), data, noise)
         views = [self.view(self.base, noise)]
-        if self.is_far_from_label(self.base):
+        if self.deviates_from_label(self.base):
             views.append(self.view(self.at_label(noise), noise))
         for view in views:
             self.scatters = view.scatters
-            for terms in (terms for way in view.ways for _, terms in way[: self.settings.fits]):
+            for terms in (
+                terms for ranking in view.ranked for _, terms in ranking[: self.settings.fits]
+            ):
                 self.attempt(view.around, view.noise, terms, view.base)
         main = min(views, key=lambda view: float(view.noise.log_scale(data.weight).sum()))
         around, noise, self.scatters = main.around, main.noise, main.scatters
-        told = {*self.excluded, *names_of(main.latent)}
-        self.refused = [name for name in SWINGS if name not in told]
+        handled = {*self.excluded, *names_of(main.latent)}
+        self.refused = [name for name in SWINGS if name not in handled]
         self.muscles = [term for term in main.latent if term.name in (EFFORT, MUSCLES[0])]
-        self.tried[frozenset()] = Scored.of(self.known(around, self.base, noise))
-        self.near.add(frozenset())
+        self.scored[frozenset()] = Scored.of(self.linear_model(around, self.base, noise))
+        self.contenders.add(frozenset())
         self.rescore(around, noise)
         if also:
             points = [t for n in also for t in around.terms if t.name == n]
             terms = tuple({t.name: t for t in reversed(points)}.values())
             self.attempt(around, noise, terms, self.base)
-        seen: dict[frozenset[str], tuple[Simulated, Noise]] = {frozenset(): (around, noise)}
+        expanded: dict[frozenset[str], tuple[CandidateEffects, Noise]] = {
+            frozenset(): (around, noise)
+        }
         for _ in range(2 * self.settings.most_terms):
-            chosen = next((s for s in self.leading() if names_of(s.terms) not in seen), None)
+            chosen = next((s for s in self.leading() if names_of(s.terms) not in expanded), None)
             if chosen is None:
                 break
-            seen[names_of(chosen.terms)] = self.extend(chosen, noise)
-            around, noise = seen.get(names_of(self.ordered()[0].terms), (around, noise))
+            expanded[names_of(chosen.terms)] = self.extend(chosen, noise)
+            around, noise = expanded.get(names_of(self.ordered()[0].terms), (around, noise))
             self.rescore(around, noise)
         ordered = self.ordered()
-        ranked = main.ways[main.scatters.index(ordered[0].scatter)]
+        ranked = main.ranked[main.scatters.index(ordered[0].scatter)]
         return Posterior(tuple(ordered), weigh(ordered, ranked))
 
     def leading(self) -> list[Scored]:
         """The likeliest set, and the likeliest of names alone if it is not far behind."""
         ordered = self.ordered()
         named = [s for s in ordered if not names_of(s.terms) & basis_terms().keys()]
-        near = [s for s in named[:1] if ordered[0].evidence - s.evidence < self.settings.much]
-        return [ordered[0], *near]
+        close = [s for s in named[:1] if ordered[0].evidence - s.evidence < self.settings.much]
+        return [ordered[0], *close]
 
-    def extend(self, chosen: Scored, noise: Noise) -> tuple[Simulated, Noise]:
+    def extend(self, chosen: Scored, noise: Noise) -> tuple[CandidateEffects, Noise]:
         """Fit sets with one term more, less or other, and return what they were chosen by."""
-        around, own = self.around(chosen.fitted), names_of(chosen.terms)
-        noise = self.known(around, chosen.fitted, noise, chosen.terms, loose=True).left
-        if len(own) < self.settings.most_terms:
-            known = self.known(around, chosen.fitted, noise, chosen.terms)
-            more = enumerate_sets(known, self.events(known), 1, self.settings.beam)
-            for terms in [t for _, t in more if t and not names_of(t) & own][:3]:
-                if names_of(terms) | own not in self.tried:
+        around, names = self.around(chosen.fitted), names_of(chosen.terms)
+        noise = self.linear_model(
+            around, chosen.fitted, noise, chosen.terms, loose=True
+        ).residual_noise
+        if len(names) < self.settings.most_terms:
+            model = self.linear_model(around, chosen.fitted, noise, chosen.terms)
+            more = enumerate_sets(model, self.events(model), 1, self.settings.beam)
+            for terms in [t for _, t in more if t and not names_of(t) & names][:3]:
+                if names_of(terms) | names not in self.scored:
                     self.attempt(around, noise, (*chosen.terms, *terms), chosen.fitted)
         for term in chosen.terms:
             rest = tuple(t for t in chosen.terms if t is not term)
-            if names_of(rest) not in self.tried:
+            if names_of(rest) not in self.scored:
                 self.attempt(around, noise, rest, chosen.fitted)
             if term.name in basis_terms():
                 self.name(term.name, rest, noise)
-            if term.name in EVENTS and names_of(rest) in self.tried:  # its breaths, beside the rest
-                left = self.tried[names_of(rest)]
-                known = self.known(self.around(left.fitted), left.fitted, noise, rest)
-                for other in self.events(known):
-                    if other.name == term.name:
-                        self.attempt(known.around, noise, (*rest, other), left.fitted)
-            for other in self.muscles if term.name == MUSCLES[-1] else ():
-                if names_of((*rest, other)) not in self.tried:
-                    self.attempt(around, noise, (*rest, other), self.base)
+            if term.name in EVENTS and names_of(rest) in self.scored:
+                # The breaths in which it acts, beside the rest.
+                reduced = self.scored[names_of(rest)]
+                model = self.linear_model(self.around(reduced.fitted), reduced.fitted, noise, rest)
+                for alternative in self.events(model):
+                    if alternative.name == term.name:
+                        self.attempt(model.around, noise, (*rest, alternative), reduced.fitted)
+            for alternative in self.muscles if term.name == MUSCLES[-1] else ():
+                if names_of((*rest, alternative)) not in self.scored:
+                    self.attempt(around, noise, (*rest, alternative), self.base)
         return around, noise
 
     def name(self, unknown: str, rest: Set, noise: Noise) -> None:
         """Fit the likeliest mechanisms in the place of a basis term that contains them."""
-        left = self.tried.get(names_of(rest))
-        if left is None:
+        reduced = self.scored.get(names_of(rest))
+        if reduced is None:
             return
-        around = self.around(left.fitted)
-        known = self.known(around, left.fitted, noise, rest)
+        around = self.around(reduced.fitted)
+        model = self.linear_model(around, reduced.fitted, noise, rest)
         special = {
             n for n in self.names if unknown in mechanism(n).description.special_case_of
         } - names_of(rest)
-        terms = [t[0] for _, t in enumerate_sets(known, (), 1, 1) if t and t[0].name in special]
+        terms = [t[0] for _, t in enumerate_sets(model, (), 1, 1) if t and t[0].name in special]
         for term in terms[: self.settings.fits - 1]:
-            if names_of(rest) | {term.name} not in self.tried:
-                self.attempt(around, noise, (*rest, term), left.fitted)
+            if names_of(rest) | {term.name} not in self.scored:
+                self.attempt(around, noise, (*rest, term), reduced.fitted)
 
-    def events(self, known: Known) -> list[Term]:
+    def events(self, model: LinearModel) -> list[Term]:
         """Effects of some breaths beside a fit, and swings that commands predicted before it."""
         partition = Partition(self.data, self.predictor)
-        terms = of_some_breaths(known, partition, self.excluded, self.evaluator.settings)
+        terms = of_some_breaths(model, partition, self.excluded, self.evaluator.settings)
         return [
             *terms,
             *(
                 with_course(t, self.evaluator.settings)
-                for t in swings(known, partition, self.refused)
+                for t in swings(model, partition, self.refused)
             ),
         ]
 
-    def around(self, fitted: FittedModel) -> Simulated:
+    def around(self, fitted: FittedModel) -> CandidateEffects:
         """All candidates, simulated around a fit."""
         events = [name for name in EVENTS if name not in self.excluded]
         return simulate(self.data, self.predictor, fitted, self.names, self.unnamed or (), events)
 
-    def known(
+    def linear_model(
         self,
-        around: Simulated,
+        around: CandidateEffects,
         fitted: FittedModel,
         noise: Noise,
         terms: Set = (),
         *,
         loose: bool = False,
-    ) -> Known:
+    ) -> LinearModel:
         """A linearised fit at the scatter of the gains that is likelier beside it.
 
         A drift of the gain is scatter, too, until it is among the terms.
         """
-        ways = (
-            Known(around, fitted, self.base, noise, terms, scatter=scatter, loose=loose)
+        models = (
+            LinearModel(around, fitted, self.base, noise, terms, scatter=scatter, loose=loose)
             for scatter in self.scatters
         )
-        return max(ways, key=lambda known: known.evidence)
+        return max(models, key=lambda model: model.evidence)
 
     def fit(
         self,
@@ -409,30 +424,30 @@ class _Search:
     def view(self, base: FittedModel, noise: Noise) -> _View:
         """Sets of terms by a linearisation around a base model."""
         around, self.scatters = self.around(base), _SCATTERS
-        likeliest = self.known(around, base, noise, loose=True).scatter
+        likeliest = self.linear_model(around, base, noise, loose=True).scatter
         self.scatters = tuple(sorted({min(SCATTER, likeliest), likeliest}))
         for _ in range(2):
-            noise = self.known(around, base, noise, loose=True).left
-        known = self.known(around, base, noise)
+            noise = self.linear_model(around, base, noise, loose=True).residual_noise
+        model = self.linear_model(around, base, noise)
         latent = in_time(
-            known,
+            model,
             Partition(self.data, self.predictor),
             base,
             self.excluded,
             self.evaluator.settings,
         )
-        ways = [
+        ranked = [
             enumerate_sets(
-                Known(around, base, self.base, noise, scatter=scatter),
+                LinearModel(around, base, self.base, noise, scatter=scatter),
                 latent,
                 3,
                 self.settings.beam,
             )
             for scatter in self.scatters
         ]
-        return _View(base, around, noise, self.scatters, tuple(ways), latent)
+        return _View(base, around, noise, self.scatters, tuple(ranked), latent)
 
-    def is_far_from_label(self, base: FittedModel) -> bool:
+    def deviates_from_label(self, base: FittedModel) -> bool:
         """Whether the base model makes up for much by R or C."""
         ratios = [base.column(path) / getattr(self.data, path) for path in ("R", "C")]
         return bool(np.max(np.abs(np.log(ratios))) > np.log(self.settings.label_factor))
@@ -448,43 +463,49 @@ class _Search:
             iterations=0,
         )
 
-    def attempt(self, around: Simulated, noise: Noise, terms: Set, start: FittedModel) -> None:
+    def attempt(
+        self, around: CandidateEffects, noise: Noise, terms: Set, start: FittedModel
+    ) -> None:
         """Fit a set; what acts in time is taken from the readings before a second fit."""
         if not terms:
             return
-        fitted, told, latent = start, self.data, latent_of(terms)
+        fitted, reduced, latent = start, self.data, latent_of(terms)
         for k in range(2 if latent else 1):
             if k or len(terms) > len(latent):
-                fitted = self.fit(terms, told, noise, fitted)
+                fitted = self.fit(terms, reduced, noise, fitted)
             elif start is not self.base:
                 fitted = self.base
-            if not all(np.isfinite(each).all() for each in fitted.jacobian):
+            if not all(np.isfinite(part).all() for part in fitted.jacobian):
                 return  # the model cannot simulate it
-            made = self.known(around, fitted, noise, terms)
-            told = replace(self.data, measured=self.data.measured - made.in_time[:, None])
-        before = self.tried.get(names_of(terms))
+            model = self.linear_model(around, fitted, noise, terms)
+            reduced = replace(self.data, measured=self.data.measured - model.in_time[:, None])
+        before = self.scored.get(names_of(terms))
         if (
             before is None
-            or self.known(around, before.fitted, noise, terms).evidence < made.evidence
+            or self.linear_model(around, before.fitted, noise, terms).evidence < model.evidence
         ):
-            self.tried[names_of(terms)] = Scored.of(made)
-            self.near.add(names_of(terms))
+            self.scored[names_of(terms)] = Scored.of(model)
+            self.contenders.add(names_of(terms))
 
-    def rescore(self, around: Simulated, noise: Noise) -> None:
+    def rescore(self, around: CandidateEffects, noise: Noise) -> None:
         """Score all sets alike, but for those that are far behind."""
-        for key in self.near:
-            s = self.tried[key]
-            self.tried[key] = Scored.of(self.known(around, s.fitted, noise, s.terms))
-        most = max(self.tried[key].evidence for key in self.near)
-        far = self.settings.far_behind
-        self.near = {key for key in self.near if self.tried[key].evidence > most - far}
+        for key in self.contenders:
+            s = self.scored[key]
+            self.scored[key] = Scored.of(self.linear_model(around, s.fitted, noise, s.terms))
+        most = max(self.scored[key].evidence for key in self.contenders)
+        margin = self.settings.far_behind
+        self.contenders = {
+            key for key in self.contenders if self.scored[key].evidence > most - margin
+        }
 
     def ordered(self) -> list[Scored]:
         """Sets that were fitted and are not far behind, likeliest first."""
-        return sorted((self.tried[key] for key in self.near), key=_log_posterior, reverse=True)
+        return sorted(
+            (self.scored[key] for key in self.contenders), key=_log_posterior, reverse=True
+        )
 
 
-def told_posterior(
+def likeliest_sets(
     weights: Mapping[frozenset[str], float], count: int = 60
 ) -> tuple[tuple[tuple[str, ...], float], ...]:
     """The likeliest sets of terms with their probabilities, the likeliest first."""
@@ -492,15 +513,17 @@ def told_posterior(
     return tuple((tuple(sorted(names)), weight) for names, weight in most)
 
 
-def without_spikes(fitted: FittedModel, data: Data) -> Data:
+def mask_spikes(fitted: FittedModel, data: Data) -> Data:
     """Take the weight off single readings that are far off, away from edges of the valves."""
     r = fitted.residual[:, 0] * data.weight[:, 0]
-    away = np.abs(r - np.median([np.roll(r, k, axis=1) for k in (-2, -1, 0, 1, 2)], axis=0))
-    size = 1.4826 * float(np.median(away[data.weight[:, 0] > 0])) + 0.05
+    deviation = np.abs(r - np.median([np.roll(r, k, axis=1) for k in (-2, -1, 0, 1, 2)], axis=0))
+    size = 1.4826 * float(np.median(deviation[data.weight[:, 0] > 0])) + 0.05
     edge = np.abs(np.diff(data.u_out, axis=1, prepend=data.u_out[:, :1])) > 0
-    far = (away > 8.0 * size) & ~np.any([np.roll(edge, k, axis=1) for k in range(-2, 4)], axis=0)
-    far[:, :4] = far[:, -2:] = False
-    return replace(data, weight=data.weight * ~far[:, None])
+    outlier = (deviation > 8.0 * size) & ~np.any(
+        [np.roll(edge, k, axis=1) for k in range(-2, 4)], axis=0
+    )
+    outlier[:, :4] = outlier[:, -2:] = False
+    return replace(data, weight=data.weight * ~outlier[:, None])
 
 
 def weigh(

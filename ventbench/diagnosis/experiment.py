@@ -33,7 +33,7 @@ _INSPIRATORY = 3
 _LISTED = 5
 
 #: Fewest breaths that must be left beside an effect of some breaths, and of each lung.
-_LEFT, _LEFT_OF_LUNG = 8, 2
+_MIN_BREATHS, _MIN_PER_LUNG = 8, 2
 
 _NOTE_ON_FLOW = (
     "No valve command: the recorded flow drives the model, so nothing is said of the valves, R_ex "
@@ -121,18 +121,18 @@ def saturation(
     that saturates on one lung of a session does so on all.
     """
     pressure = np.where(breaths.valid, breaths.pressure, np.nan)
-    known = np.isfinite(pressure)
-    top = float(np.max(pressure, initial=-np.inf, where=known))
+    finite = np.isfinite(pressure)
+    top = float(np.max(pressure, initial=-np.inf, where=finite))
 
-    def piles_up(own: Floats) -> bool:
-        values, counts = np.unique(own[np.isfinite(own)], return_counts=True)
+    def piles_up(readings: Floats) -> bool:
+        values, counts = np.unique(readings[np.isfinite(readings)], return_counts=True)
         if len(values) < 2 or values[-1] < top:
             return False
         return bool(counts[-1] >= max(settings.saturated_share * counts.sum(), 10 * counts[-2]))
 
     if not any(piles_up(pressure[index]) for index in breaths.by_lung_index.values()):
         return None
-    return top, float(np.mean(pressure[known] == top))
+    return top, float(np.mean(pressure[finite] == top))
 
 
 def below(breaths: Breaths, top: float) -> Breaths:
@@ -188,19 +188,19 @@ class Judge:
         """Error of predictions over the samples of a mask, ``(n, T)``; NaN if there is none."""
         return open_loop_error(self._recorded, predicted, where)
 
-    def excess(self, predicted: Floats, own: Floats, quiet: Bools) -> Excess:
+    def excess(self, predicted: Floats, nuisance: Floats, quiet: Bools) -> Excess:
         """What neighbouring errors share beyond noise; see :func:`.excess_over_noise`.
 
         Args:
             predicted: predictions, cmH2O, ``(n, T)``.
-            own: changes of the pressure by what each breath may have of its own, such as another
-                start than its first reading, which is noisy, ``(n, T, k)``.
+            nuisance: derivatives of the pressure by nuisance parameters of each breath, such as a
+                start that differs from its first reading, which is noisy, ``(n, T, k)``.
             quiet: where nothing moves, ``(n, T)``.
         """
         error = (self._recorded - predicted)[self.judging]
-        usable, own = np.isfinite(error), own[self.judging]
+        usable, nuisance = np.isfinite(error), nuisance[self.judging]
         error = np.where(usable, error, 0.0)
-        error = error - np.einsum("ntk,nk->nt", own, amplitudes(error, usable, own))
+        error = error - np.einsum("ntk,nk->nt", nuisance, amplitudes(error, usable, nuisance))
         return excess_over_noise(error, usable, quiet[self.judging])
 
     def log_likelihood(self, predicted: Floats, noise: Noise) -> float:
@@ -231,7 +231,7 @@ class Experiment:
     """n breaths of T samples, on the grid of the fits."""
 
     recorded: Breaths  #: the breaths as they were sampled; sealed.
-    whole: Breaths  #: the breaths with all readings, for pictures of the result alone.
+    unsealed: Breaths  #: the breaths with all readings, for pictures of the result alone.
     #: the breaths; sealed. Commands of those that do not judge are those that reached the valve,
     #: as far as that is found.
     breaths: Breaths
@@ -247,11 +247,11 @@ class Experiment:
     notes: tuple[str, ...]
 
     @property
-    def seen(self) -> Data:
+    def identification_data(self) -> Data:
         """Breaths that the identification sees."""
         return replace(self.data, u_in=self.reached).select(self.uses.identifying)
 
-    def without(self, affected: Bools, u_in: Floats | None) -> Experiment | None:
+    def set_aside(self, affected: Bools, u_in: Floats | None) -> Experiment | None:
         """The experiment without an effect of some breaths; None if too little is left.
 
         Breaths that judge keep their commands and judge on.
@@ -263,8 +263,8 @@ class Experiment:
         """
         uses = self.uses
         if u_in is not None:
-            kept = uses.judging[:, None]
-            breaths = replace(self.breaths, u_in=np.where(kept, self.breaths.u_in, u_in))
+            judging = uses.judging[:, None]
+            breaths = replace(self.breaths, u_in=np.where(judging, self.breaths.u_in, u_in))
             changed = replace(
                 self, breaths=breaths, data=replace(self.data, u_in=breaths.u_in), reached=u_in
             )
@@ -274,23 +274,24 @@ class Experiment:
             if (
                 isinstance(self.simulators, SimulatedPressures)
                 or decimated
-                or (~uses.sealed & kept[:, 0]).any()
+                or (~uses.sealed & judging[:, 0]).any()
             ):
                 return None  # no answer of the simulator to these commands is known
             answered = self.simulators.pressures(breaths)
-            return replace(changed, before=np.where(kept, self.before, answered))
+            return replace(changed, before=np.where(judging, self.before, answered))
         aside = uses.aside | affected
-        left = replace(uses, testing=uses.testing & ~aside, aside=aside)
+        remaining = replace(uses, testing=uses.testing & ~aside, aside=aside)
         of_lungs = [
-            np.count_nonzero(left.fitted[index]) for index in self.breaths.by_lung_index.values()
+            np.count_nonzero(remaining.fitted[index])
+            for index in self.breaths.by_lung_index.values()
         ]
         if (
-            left.identifying.sum() < _LEFT
-            or not left.testing.any()
-            or min(of_lungs) < _LEFT_OF_LUNG
+            remaining.identifying.sum() < _MIN_BREATHS
+            or not remaining.testing.any()
+            or min(of_lungs) < _MIN_PER_LUNG
         ):
             return None
-        return replace(self, uses=left)
+        return replace(self, uses=remaining)
 
 
 def prepare(
@@ -314,33 +315,33 @@ def prepare(
     notes: list[str] = []
     if by_flow:
         breaths, notes = flow_drive.with_flow(breaths)
-    whole, notes_on_breaths = usable(breaths, settings)
-    uses = split(whole, settings, never_fitted(whole, simulators))
-    saturated = saturation(whole.select(~uses.sealed), settings)
+    unsealed, notes_on_breaths = usable(breaths, settings)
+    uses = split(unsealed, settings, never_fitted(unsealed, simulators))
+    saturated = saturation(unsealed.select(~uses.sealed), settings)
     if saturated is not None:
-        whole = below(whole, saturated[0])
-    recorded = seal(whole, uses)[0]
+        unsealed = below(unsealed, saturated[0])
+    recorded = seal(unsealed, uses)[0]
     notes = [*notes_on_breaths, *notes]
     if by_flow:
-        driven, index = flow_drive.drive_grid(whole)
-        before = flow_drive.simulate(simulators, whole, driven, index)
+        driven, index = flow_drive.drive_grid(unsealed)
+        before = flow_drive.simulate(simulators, unsealed, driven, index)
         # Phases of the report are those of the recording.
         fitted = driven
-        whole = replace(driven, u_out=np.take_along_axis(whole.u_out, index, axis=1))
+        unsealed = replace(driven, u_out=np.take_along_axis(unsealed.u_out, index, axis=1))
         notes.append(_NOTE_ON_FLOW)
     else:
-        before = simulators.pressures(whole)
-        if is_fast(whole):
-            rate = 1.0 / float(np.median(whole.dt[whole.valid]))
-            grid = decimate(whole)
-            whole, before = grid.breaths, grid.of(before)
-            notes.append(_note_on_rate(rate, whole))
-        fitted = whole
-    sealed, judge = seal(whole, uses)
+        before = simulators.pressures(unsealed)
+        if is_fast(unsealed):
+            rate = 1.0 / float(np.median(unsealed.dt[unsealed.valid]))
+            grid = decimate(unsealed)
+            unsealed, before = grid.breaths, grid.of(before)
+            notes.append(_note_on_rate(rate, unsealed))
+        fitted = unsealed
+    sealed, judge = seal(unsealed, uses)
     data = make_data(replace(sealed, u_out=fitted.u_out))
     return Experiment(
         recorded,
-        whole,
+        unsealed,
         sealed,
         data,
         data.u_in,
@@ -356,9 +357,9 @@ def prepare(
 
 def _note_on_rate(rate: float, breaths: Breaths) -> str:
     """Note on what was kept of a fast recording."""
-    kept = breaths.valid.sum(axis=1)
+    commands = breaths.valid.sum(axis=1)
     readings = np.isfinite(breaths.pressure).sum(axis=1)
     return (
         f"Recorded at {rate:.0f} Hz: {int(np.median(readings))} readings of a breath are used, "
-        f"and {int(np.median(kept))} samples of its commands, whose changes keep their times."
+        f"and {int(np.median(commands))} samples of its commands, whose changes keep their times."
     )

@@ -78,9 +78,9 @@ class Forecast:
 
     white: Floats  #: predicted readings, whitened, ``(m, c T)``.
     rows: Floats  #: derivatives of the readings by the shared unknowns, ``(m, s, c T)``.
-    own: Floats  #: derivatives of the readings by each breath's own unknowns, ``(m, o, c T)``.
-    own_precision: Floats  #: prior precision of each breath's own unknowns, ``(o,)``.
-    known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
+    breath_rows: Floats  #: the same by the unknowns of each breath, ``(m, o, c T)``.
+    breath_precision: Floats  #: prior precision of the unknowns of each breath, ``(o,)``.
+    information: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
 
 
 def values_of(fitted: Fit, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
@@ -114,14 +114,16 @@ def forecast(
     problem = fitted.problem
     layout = problem.unknowns
     values = values_of(fitted, data, lung, start)
-    seen, slopes = predictor.derivatives(values, problem.columns)
+    predicted, slopes = predictor.derivatives(values, problem.columns)
     slopes = slopes * layout.slopes(values[:, list(problem.columns)])[:, :, None, None]
     rows = noise.whiten(slopes, data.weight).reshape(len(data), len(layout.paths), -1)
-    white = noise.whiten(seen, data.weight).reshape(len(data), -1)
-    mine = np.array([_is_own(problem, column) for column in range(len(layout.paths))])
+    white = noise.whiten(predicted, data.weight).reshape(len(data), -1)
+    mine = np.array([_is_breathwise(problem, column) for column in range(len(layout.paths))])
     index = layout.index[lung[0]]
-    known = _information(fitted.minimum.hessian, index[~mine])
-    return Forecast(white, rows[:, ~mine], rows[:, mine], problem.precision[index[mine]], known)
+    information = _information(fitted.minimum.hessian, index[~mine])
+    return Forecast(
+        white, rows[:, ~mine], rows[:, mine], problem.precision[index[mine]], information
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +135,7 @@ class Contrast:
 
     difference: Floats  #: whitened, ``(m, k)``.
     rows: Floats  #: derivatives by the shared unknowns of the refitted hypothesis, ``(m, s, k)``.
-    known: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
+    information: Floats  #: information of the recorded breaths on the shared unknowns, ``(s, s)``.
     noise: Noise  #: model of the measurement noise.
 
     def nats(self, which: NDArray[np.intp]) -> float:
@@ -143,48 +145,48 @@ class Contrast:
     def refit(self, which: NDArray[np.intp]) -> tuple[float, Floats]:
         """The same, and by how much the refit moves the shared unknowns, ``(s,)``."""
         rows, difference = self.rows[which], self.difference[which]
-        left, step = difference, np.zeros(len(self.known))
+        residual, step = difference, np.zeros(len(self.information))
         for _ in range(_REFITS):
-            weighted = rows * self.noise.influence(left)[:, None]
-            hessian = self.known + np.matmul(weighted, rows.swapaxes(1, 2)).sum(axis=0)
+            weighted = rows * self.noise.influence(residual)[:, None]
+            hessian = self.information + np.matmul(weighted, rows.swapaxes(1, 2)).sum(axis=0)
             gradient = np.matmul(weighted, difference[:, :, None])[:, :, 0].sum(axis=0)
             step = solve(_regular(hessian), gradient)
-            left = difference - np.einsum("msk,s->mk", rows, step)
-        return float(np.sum(self.noise.loss(left)) + 0.5 * step @ self.known @ step), step
+            residual = difference - np.einsum("msk,s->mk", rows, step)
+        return float(np.sum(self.noise.loss(residual)) + 0.5 * step @ self.information @ step), step
 
 
 def contrast(truth: Forecast, refitted: Forecast, noise: Noise) -> Contrast:
     """Contrast of two hypotheses, if the first is true and the second is refitted."""
-    count, extra = len(truth.white), len(refitted.own_precision)
+    count, extra = len(truth.white), len(refitted.breath_precision)
     no_difference = np.zeros((count, extra))
     difference = np.concatenate([truth.white - refitted.white, no_difference], axis=1)
     rows = np.concatenate([refitted.rows, np.zeros((*refitted.rows.shape[:2], extra))], axis=2)
     # The prior of a breath's own unknowns counts as further readings of them.
-    before = np.broadcast_to(np.diag(np.sqrt(refitted.own_precision)), (count, extra, extra))
-    own = np.concatenate([refitted.own, before], axis=2)
-    both = without_own(np.concatenate([rows, difference[:, None]], axis=1), own)
-    return Contrast(both[:, -1], both[:, :-1], refitted.known, noise)
+    before = np.broadcast_to(np.diag(np.sqrt(refitted.breath_precision)), (count, extra, extra))
+    nuisance = np.concatenate([refitted.breath_rows, before], axis=2)
+    both = project_out(np.concatenate([rows, difference[:, None]], axis=1), nuisance)
+    return Contrast(both[:, -1], both[:, :-1], refitted.information, noise)
 
 
-def without_own(columns: Floats, own: Floats) -> Floats:
+def project_out(columns: Floats, nuisance: Floats) -> Floats:
     """What a refit of each breath's own unknowns leaves of whitened columns, ``(m, q, k)``.
 
     Args:
         columns: readings, or derivatives of these, ``(m, q, k)``.
-        own: derivatives by the breath's own unknowns, ``(m, o, k)``.
+        nuisance: derivatives by the breath's own unknowns, ``(m, o, k)``.
     """
-    inner = np.matmul(own, own.swapaxes(1, 2))
-    share = solve(_regular(inner), np.matmul(own, columns.swapaxes(1, 2)))
-    return columns - np.matmul(share.swapaxes(1, 2), own)
+    inner = np.matmul(nuisance, nuisance.swapaxes(1, 2))
+    share = solve(_regular(inner), np.matmul(nuisance, columns.swapaxes(1, 2)))
+    return columns - np.matmul(share.swapaxes(1, 2), nuisance)
 
 
-def _is_own(problem: Problem, column: int) -> bool:
+def _is_breathwise(problem: Problem, column: int) -> bool:
     """Whether a free parameter has a value of its own in each breath."""
     path = problem.unknowns.paths[column]
     if path in ("R", "C"):
         return False
-    own = len(np.unique(problem.unknowns.index[:, column])) == len(problem.data) > 1
-    return own or path == START or parameter_of(path).scope == "breath"
+    breathwise = len(np.unique(problem.unknowns.index[:, column])) == len(problem.data) > 1
+    return breathwise or path == START or parameter_of(path).scope == "breath"
 
 
 def _information(hessian: Floats, which: Ints) -> Floats:
@@ -234,10 +236,10 @@ def _best_on_lung(
     ]
     pairs = [
         pair
-        for other in expected[1:]
+        for rival in expected[1:]
         for pair in (
-            contrast(expected[0], other, noise),
-            contrast(other, expected[0], noise),
+            contrast(expected[0], rival, noise),
+            contrast(rival, expected[0], noise),
         )
     ]
     lung = Lung(float(problem.data.R[recorded_rows[0]]), float(problem.data.C[recorded_rows[0]]))
@@ -259,9 +261,9 @@ def _best(kinds: tuple[Family, ...], pairs: Sequence[Contrast], lung: Lung) -> _
         picks = [(kinds[i], m.tolist()) for i, m in zip(chosen, members, strict=True)]
         return _Design(min(pair.nats(which) for pair in pairs), picks, lung)
 
-    one = [design(i) for i in range(len(kinds))]
-    two = [design(*both) for both in combinations(range(len(kinds)), 2)]
-    return max([*one, *two], key=lambda design: design.nats)
+    single = [design(i) for i in range(len(kinds))]
+    mixed = [design(*both) for both in combinations(range(len(kinds)), 2)]
+    return max([*single, *mixed], key=lambda design: design.nats)
 
 
 def _safe(
@@ -288,8 +290,8 @@ def _safe(
             kind.scaled(np.where(part, 1.0, _WEAKER))
             for kind, part in zip(kinds, parts, strict=True)
         )
-    left = (kind.select(part) for kind, part in zip(kinds, parts, strict=True))
-    return tuple(kind for kind in left if len(kind.u_in))
+    parts_within = (kind.select(part) for kind, part in zip(kinds, parts, strict=True))
+    return tuple(kind for kind in parts_within if len(kind.u_in))
 
 
 def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.intp]) -> Data:
@@ -319,7 +321,7 @@ def _worded(design: _Design, hypotheses: Sequence[Fit], dt: float) -> BreathRequ
     u_out = np.concatenate([kind.u_out[members] for kind, members in design.picks])
     acts = [set(hypothesis.names) for hypothesis in hypotheses]
     common = acts[0].intersection(*acts[1:])
-    names = [" + ".join(sorted(own - common)) or "no further mechanism" for own in acts]
+    names = [" + ".join(sorted(terms - common)) or "no further mechanism" for terms in acts]
     return BreathRequest(
         f"{'; '.join(parts)} (lung {design.lung.id})",
         tuple(dict.fromkeys(names)),
@@ -372,11 +374,11 @@ def families(rig: Rig, samples: int, dt: float) -> tuple[Family, ...]:
     """
     times = np.arange(samples, dtype=np.float64) * dt
     t = np.broadcast_to(times, (_VARIANTS, samples))
-    made = []
+    result = []
     for title, shape in _KINDS:
         u_in, u_out, peaks = shape(rig, t)
-        made.append(Family(title, _sized(rig, dt, u_in, peaks), u_out))
-    return tuple(made)
+        result.append(Family(title, _sized(rig, dt, u_in, peaks), u_out))
+    return tuple(result)
 
 
 def _sized(rig: Rig, dt: float, u: Floats, peaks: Floats) -> Floats:

@@ -22,7 +22,7 @@ Stage = Literal["before", "refit", "after"]
 
 
 #: Name of the group of all samples but the first of each breath.
-WHOLE = "whole breath"
+FULL_BREATH = "whole breath"
 
 #: What may have an order in time: the valve's gain, the zero of the pressure, the errors' size.
 Quantity = Literal["gain", "zero", "error"]
@@ -142,7 +142,7 @@ class OpenLoopComparison:
     @property
     def whole(self) -> OpenLoopError:
         """Error of the corrected simulator over whole breaths."""
-        return self.groups.get(WHOLE, {}).get("after", self.after)
+        return self.groups.get(FULL_BREATH, {}).get("after", self.after)
 
     @property
     def unexplained(self) -> float:

@@ -31,7 +31,7 @@ _READINGS, _MOST = 0.03, 150
 _AT_READING = 0.0002
 
 #: Least share of a breath's samples that need a flow or volume.
-_KNOWN = 0.5
+_MIN_RECORDED = 0.5
 
 
 def lacks_commands(breaths: Breaths) -> bool:
@@ -59,8 +59,8 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
             [np.gradient(v, t) for v, t in zip(breaths.volume, breaths.time, strict=True)]
         )
         notes.append("Flow is the derivative of the recorded volume.")
-    known = np.isfinite(flow) & breaths.valid
-    good = known.sum(axis=1) >= _KNOWN * breaths.valid.sum(axis=1)
+    recorded = np.isfinite(flow) & breaths.valid
+    good = recorded.sum(axis=1) >= _MIN_RECORDED * breaths.valid.sum(axis=1)
     if not good.any():
         raise InputError("no breath has flow or volume in at least half of its samples")
     if not good.all():
@@ -68,13 +68,13 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
     filled = np.zeros_like(flow)
     pressure = breaths.pressure.copy()
     for i in np.flatnonzero(good):
-        filled[i] = np.interp(breaths.time[i], breaths.time[i, known[i]], flow[i, known[i]])
-        last = np.flatnonzero(known[i])[-1]
+        filled[i] = np.interp(breaths.time[i], breaths.time[i, recorded[i]], flow[i, recorded[i]])
+        last = np.flatnonzero(recorded[i])[-1]
         pressure[i, last + 1 :] = np.nan  # what flowed there is unknown
     ahead = np.concatenate([filled[:, 1:], filled[:, -1:]], axis=1)
     u_in = 0.5 * (filled + ahead) / _gain()
-    whole = replace(breaths, flow=filled, u_in=u_in, pressure=pressure)
-    return whole.select(good), notes
+    complete = replace(breaths, flow=filled, u_in=u_in, pressure=pressure)
+    return complete.select(good), notes
 
 
 def drive_grid(breaths: Breaths) -> tuple[Breaths, Ints]:
@@ -145,8 +145,8 @@ def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: 
     """
     if not isinstance(simulators, PlantSimulators):
         return np.take_along_axis(simulators.pressures(recorded), index, axis=1)
-    of_others = not isinstance(simulators, FrozenSimulators) and simulators.at_label is None
-    if simulators.is_base_physics or of_others:
+    external = not isinstance(simulators, FrozenSimulators) and simulators.at_label is None
+    if simulators.is_base_physics or external:
         return simulators.pressures(driven)
     raise InputError(
         f"the recording has no valve command, and {simulators.name} needs one; diagnose physics, "
@@ -163,7 +163,7 @@ def _is_of_ventilator(name: str) -> bool:
     return mechanism(name).description.site in _VENTILATOR
 
 
-def without_ventilator(settings: SelectionConfig) -> SelectionConfig:
+def lung_side_settings(settings: SelectionConfig) -> SelectionConfig:
     """Settings whose nonparametric terms are those of the lung's side."""
     chosen = settings.search.nonparametric_terms
     terms = tuple(t for t in (chosen or basis_terms()) if not _is_of_ventilator(t))

@@ -38,7 +38,8 @@ class Linearisation:
     values: Floats  #: physical values of all parameters and of the start, ``(n, P + 1)``.
     prediction: Floats  #: simulated readings, ``(n, c, T)``.
     residual: Floats  #: simulated minus measured, whitened and projected, ``(n, m)``.
-    own_basis: Floats  #: orthonormal directions that each breath absorbs by itself, ``(n, j, m)``.
+    #: orthonormal directions that each breath absorbs by itself, ``(n, j, m)``.
+    breath_basis: Floats
     shared_basis: Floats  #: orthonormal directions that all breaths absorb together, ``(s, n m)``.
 
     def whiten(self, difference: Floats) -> Floats:
@@ -49,12 +50,12 @@ class Linearisation:
         )
         return white.reshape(*white.shape[:-2], -1)
 
-    def without_own(self, white: Floats) -> Floats:
+    def project_out_breath(self, white: Floats) -> Floats:
         """Project out what each breath absorbs by itself, ``(n, q, m)``."""
-        basis = self.own_basis
+        basis = self.breath_basis
         return white - np.matmul(np.matmul(white, basis.swapaxes(1, 2)), basis)
 
-    def without_shared(self, white: Floats) -> Floats:
+    def project_out_shared(self, white: Floats) -> Floats:
         """Project out what all breaths absorb together, ``(n, q, m)``."""
         n, q, m = white.shape
         flat = white.swapaxes(0, 1).reshape(q, n * m)
@@ -63,8 +64,8 @@ class Linearisation:
 
     def template(self, prediction: Floats) -> Floats:
         """Part of another prediction ``(n, c, T)`` that no refit can absorb, ``(n, m)``."""
-        white = self.without_own(self.whiten(prediction - self.prediction)[:, None])
-        return self.without_shared(white)[:, 0]
+        white = self.project_out_breath(self.whiten(prediction - self.prediction)[:, None])
+        return self.project_out_shared(white)[:, 0]
 
 
 def linearise(problem: Problem, x: Floats, *, clip: float = 4.0) -> Linearisation:
@@ -87,20 +88,25 @@ def linearise(problem: Problem, x: Floats, *, clip: float = 4.0) -> Linearisatio
     # Groups may give a shared parameter, such as the valve's gain, one unknown for each breath.
     counts = [len(np.unique(layout.index[:, k])) for k in range(len(layout.paths))]
     breath |= np.array([count == len(white) and count > 1 for count in counts])
-    own = _orthonormal(rows[:, breath])
+    breath_basis = _orthonormal(rows[:, breath])
     linear = Linearisation(
-        problem, problem.values(x), problem.predict(x), white, own, np.zeros((0, white.size))
+        problem,
+        problem.values(x),
+        problem.predict(x),
+        white,
+        breath_basis,
+        np.zeros((0, white.size)),
     )
     columns = []
     for k in np.flatnonzero(~breath):
-        left = linear.without_own(rows[:, [k]])[:, 0]
+        residual_slope = linear.project_out_breath(rows[:, [k]])[:, 0]
         columns.extend(
-            np.where((layout.index[:, k] == unknown)[:, None], left, 0.0).ravel()
+            np.where((layout.index[:, k] == unknown)[:, None], residual_slope, 0.0).ravel()
             for unknown in np.unique(layout.index[:, k])
         )
     if columns:
         linear = replace(linear, shared_basis=_orthonormal(np.asarray(columns)[None])[0])
-    clean = linear.without_shared(linear.without_own(white[:, None]))[:, 0]
+    clean = linear.project_out_shared(linear.project_out_breath(white[:, None]))[:, 0]
     return replace(linear, residual=clean)
 
 
@@ -115,8 +121,8 @@ def _orthonormal(rows: Floats) -> Floats:
     gram = np.matmul(rows, rows.swapaxes(1, 2))
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / scale[:, :, None] / scale[:, None, :])
-    kept = values > _RIDGE * np.maximum(values[:, -1:], 1e-300)
-    size = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+    regular = values > _RIDGE * np.maximum(values[:, -1:], 1e-300)
+    size = np.where(regular, 1.0 / np.sqrt(np.where(regular, values, 1.0)), 0.0)
     return np.matmul((vectors * size[:, None, :]).swapaxes(1, 2), rows / scale[:, :, None])
 
 
@@ -129,24 +135,24 @@ class Hypothesis:
     #: parameters that keep a value other than their neutral one, by path.
     fixed: tuple[tuple[str, float], ...] = ()
 
-    def plus(self, other: Hypothesis) -> Hypothesis:
-        """The union of two hypotheses; ``other`` wins where both fix a parameter."""
+    def plus(self, addition: Hypothesis) -> Hypothesis:
+        """The union of two hypotheses; ``addition`` wins where both fix a parameter."""
         return Hypothesis(
-            tuple(dict.fromkeys(self.names + other.names)),
-            tuple(dict.fromkeys(self.free + other.free)),
-            tuple(dict(self.fixed + other.fixed).items()),
+            tuple(dict.fromkeys(self.names + addition.names)),
+            tuple(dict.fromkeys(self.free + addition.free)),
+            tuple(dict(self.fixed + addition.fixed).items()),
         )
 
-    def without(self, *names: str) -> Hypothesis:
+    def minus(self, *names: str) -> Hypothesis:
         """The hypothesis without some terms and their parameters."""
 
-        def kept(path: str) -> bool:
+        def remains(path: str) -> bool:
             return path.rpartition(".")[0] not in names
 
         return Hypothesis(
             tuple(name for name in self.names if name not in names),
-            tuple(path for path in self.free if kept(path)),
-            tuple((path, value) for path, value in self.fixed if kept(path)),
+            tuple(path for path in self.free if remains(path)),
+            tuple((path, value) for path, value in self.fixed if remains(path)),
         )
 
     @property
@@ -175,9 +181,9 @@ def all_parameter_paths(
     Mechanisms that cannot act are left out; those that differ from breath to breath stay in any
     case, so that test lungs and patients share compiled functions.
     """
-    kept = [name for name in library() if name not in excluded or varies_by_breath(name)]
+    candidates = [name for name in library() if name not in excluded or varies_by_breath(name)]
     chosen = settings.search.nonparametric_terms
-    return paths((*kept, *intermittent(), *(basis_terms() if chosen is None else chosen)))
+    return paths((*candidates, *intermittent(), *(basis_terms() if chosen is None else chosen)))
 
 
 def make_partition(
@@ -204,7 +210,7 @@ class FittedModel(Fit):
         """Residual and its derivative by the free parameters; see :meth:`Problem.jacobian`."""
         return self.problem.jacobian(self.minimum.x)
 
-    def residual_without(self, name: str) -> Floats:
+    def residual_excluding(self, name: str) -> Floats:
         """Residual with the strength of one mechanism set to zero, ``(n, c, T)``."""
         values = self.values.copy()
         values[:, self.problem.predictor.names.index(strength_path(name))] = 0.0

@@ -9,7 +9,12 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name, without_term
+from ventbench.diagnosis.conclusion import (
+    Conclusion,
+    conclude,
+    drop_mechanism,
+    drop_nonparametric_term,
+)
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
@@ -121,9 +126,9 @@ def identify(
         # The least needed one first: the intervals of others may shrink once it has gone.
         name = min(vague, key=lambda name: conclusion.held_out_gains.get(name, 0.0))
         if _is_idle_form(conclusion, name, settings):
-            conclusion = without_term(conclusion)
+            conclusion = drop_nonparametric_term(conclusion)
         else:
-            conclusion = without_name(conclusion, name, evaluator)
+            conclusion = drop_mechanism(conclusion, name, evaluator)
 
 
 def _with_changes_of(conclusion: Conclusion, fit: Fit) -> Conclusion:
@@ -138,8 +143,8 @@ def _with_changes_of(conclusion: Conclusion, fit: Fit) -> Conclusion:
             x[layout.of(path)] = fit.value(path)
     if np.array_equal(x, full.minimum.x):
         return conclusion
-    moved = replace(full, minimum=replace(full.minimum, x=x))
-    return replace(conclusion, full=moved, named=moved if named is full else named)
+    changed = replace(full, minimum=replace(full.minimum, x=x))
+    return replace(conclusion, full=changed, named=changed if named is full else named)
 
 
 def place_of_change(
@@ -153,8 +158,8 @@ def place_of_change(
     """
     partition = evaluator.partition(data)
     fixed = evaluator.transferred(fitted, partition)
-    starts, about = [], parameter_of(path)
-    for place in (about.high, about.low):  # all breaths before, and after
+    starts, parameter = [], parameter_of(path)
+    for place in (parameter.high, parameter.low):  # all breaths before, and after
         fixed[path] = np.full(len(data), place)
         side = make_problem(partition, (START,), fitted.noise, fixed)
         bounds = side.unknowns.bounds()

@@ -32,7 +32,7 @@ from scipy import special
 
 from ventbench.base.arrays import Floats
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition
-from ventbench.diagnosis.linearised import CONSTANT, EFFORT, OPEN, Known, Term, gaussian
+from ventbench.diagnosis.linearised import CONSTANT, EFFORT, OPEN, LinearModel, Term, gaussian
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.events import HALF_SWING
 from ventbench.system_id.data import Data
@@ -89,7 +89,7 @@ def _affected(G: Floats, b: Floats, sd: float, cost: float) -> tuple[Any, Floats
         gained, mean, _ = gaussian(G[np.ix_(at, at)], b[at], np.full(len(at), sd))
         return gained + _share(n, len(at)) - cost * len(at) - 1e3 * float(np.sum(mean < 0.0))
 
-    found: list[tuple[float, Any, Floats]] = []
+    optima: list[tuple[float, Any, Floats]] = []
     mean = gaussian(G, b, np.full(n, sd))[1]
     for acts in (np.zeros(n, bool), mean > 0.3 * max(float(mean.max()), 0.0)):
         reached, moves = value(acts), True
@@ -98,10 +98,10 @@ def _affected(G: Floats, b: Floats, sd: float, cost: float) -> tuple[Any, Floats
             moves = bool(flips.max() > reached)
             if moves:
                 acts, reached = acts ^ (np.arange(n) == int(np.argmax(flips))), float(flips.max())
-        found.append(
+        optima.append(
             (reached, acts, special.expit(np.where(acts, reached - flips, flips - reached)))
         )
-    _, acts, likely = max(found, key=lambda each: each[0])
+    _, acts, likely = max(optima, key=lambda optimum: optimum[0])
     return np.flatnonzero(acts), likely
 
 
@@ -113,7 +113,7 @@ def _commands_of(data: Data, pressure: Floats) -> Floats:
     inspiratory = (data.u_out == 0) * data.u_in
     volume = np.sum(inspiratory * data.dt, axis=1)
     series = (inspiratory.max(axis=1), volume, pressure.max(axis=1), data.R, data.C)
-    ranks = np.stack([np.unique(each, return_inverse=True)[1] for each in series])
+    ranks = np.stack([np.unique(values, return_inverse=True)[1] for values in series])
     ranks = ranks - ranks.mean(axis=1, keepdims=True)
     return ranks / np.maximum(np.linalg.norm(ranks, axis=1, keepdims=True), 1e-12)
 
@@ -127,9 +127,9 @@ def command_p_value(affected: Floats, data: Data, pressure: Floats) -> float:
         pressure: what a model without the effect predicts, cmH2O, ``(n, T)``.
     """
     rng = np.random.default_rng(0)
-    drawn = rng.permuted(np.tile(affected, (_PERMUTATIONS, 1)), axis=1)
-    drawn = np.concatenate([affected[None], drawn])
-    largest = np.abs(drawn @ _commands_of(data, pressure).T).max(axis=1)
+    permuted = rng.permuted(np.tile(affected, (_PERMUTATIONS, 1)), axis=1)
+    permuted = np.concatenate([affected[None], permuted])
+    largest = np.abs(permuted @ _commands_of(data, pressure).T).max(axis=1)
     return float(np.mean(largest >= largest[0] * (1.0 - 1e-9)))
 
 
@@ -147,15 +147,15 @@ def phase_p_value(sizes: Floats, data: Data, pressure: Floats) -> float:
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PERMUTATIONS + 1, len(sizes)))
     signs[0] = 1.0
     norm = np.linalg.norm(sizes, axis=0)
-    drawn = np.einsum(
+    projected = np.einsum(
         "pn,kn,nm->pkm", signs, series, sizes / np.maximum(norm, 1e-12), optimize=True
     )
-    largest = np.abs(drawn).max(axis=(1, 2))
+    largest = np.abs(projected).max(axis=(1, 2))
     return float(np.mean(largest >= largest[0] * (1.0 - 1e-9)))
 
 
 def in_time(
-    known: Known,
+    model: LinearModel,
     partition: Partition,
     around: FittedModel,
     excluded: Collection[str],
@@ -164,38 +164,38 @@ def in_time(
     """Terms that act in time.
 
     Args:
-        known: the breaths, linearised around the base model.
+        model: the breaths, linearised around the base model.
         partition: the same breaths.
         around: the base model.
         excluded: effects that cannot act.
         settings: every threshold.
     """
-    terms = of_some_breaths(known, partition, excluded, settings)
-    found = swings(known, partition, [name for name in SWINGS if name not in excluded])
+    terms = of_some_breaths(model, partition, excluded, settings)
+    unpenalised = swings(model, partition, [name for name in SWINGS if name not in excluded])
     if "lost_commands" not in excluded:
-        found += _commands(known, partition, around, settings)
-    return [*terms, *(with_course(term, settings) for term in found)]
+        unpenalised += _commands(model, partition, around, settings)
+    return [*terms, *(with_course(term, settings) for term in unpenalised)]
 
 
-def swings(known: Known, partition: Partition, names: Collection[str]) -> list[Term]:
+def swings(model: LinearModel, partition: Partition, names: Collection[str]) -> list[Term]:
     """Swings, each at its likeliest frequency and size, but for those that commands predict."""
-    found = []
+    terms = []
     for name in names:
         place, frequencies, harmonics, spreads = SWINGS[name]
-        by_input = input_responses(partition, known.around.values, place)
-        ways = [
+        by_input = input_responses(partition, model.around.values, place)
+        candidates = [
             (np.matmul(_waves(partition, f, harmonics), by_input), float(f), spread)
             for f, spread in product(frequencies, spreads)
         ]
-        term, sizes = _likeliest_swing(known, name, ways)
-        if phase_p_value(sizes, partition.data, _predicted(known)) > EXCHANGEABLE:
-            found.append(term)
-    return found
+        term, sizes = _likeliest_swing(model, name, candidates)
+        if phase_p_value(sizes, partition.data, _predicted(model)) > EXCHANGEABLE:
+            terms.append(term)
+    return terms
 
 
-def _predicted(known: Known) -> Floats:
+def _predicted(model: LinearModel) -> Floats:
     """Pressure without what acts in time, cmH2O, ``(n, T)``."""
-    return (known.fitted.residual + known.fitted.problem.data.measured)[:, 0]
+    return (model.fitted.residual + model.fitted.problem.data.measured)[:, 0]
 
 
 def with_course(term: Term, settings: SelectionConfig) -> Term:
@@ -204,35 +204,35 @@ def with_course(term: Term, settings: SelectionConfig) -> Term:
 
 
 def of_some_breaths(
-    known: Known, partition: Partition, excluded: Collection[str], settings: SelectionConfig
+    model: LinearModel, partition: Partition, excluded: Collection[str], settings: SelectionConfig
 ) -> list[Term]:
     """Events, each with the likeliest course in each breath and the likeliest breaths.
 
     Events whose breaths commands predict are left out.
     """
-    n, data, terms = known.n, partition.data, []
-    predicted = _predicted(known)
+    n, data, terms = model.n, partition.data, []
+    predicted = _predicted(model)
     time = np.cumsum(data.dt, axis=1) - data.dt
     sizes = {name: size for name, (_, size) in CONSTANT.items()} | {OPEN: 1.0}
-    every = {(name, sizes[name]): known.around.events[name][None] for name in known.around.events}
-    pushes = {name: about for name, about in _PUSHES.items() if name not in excluded}
-    push = input_responses(partition, known.around.values, ALVEOLUS)
+    every = {(name, sizes[name]): model.around.events[name][None] for name in model.around.events}
+    pushes = {name: pulse for name, pulse in _PUSHES.items() if name not in excluded}
+    push = input_responses(partition, model.around.values, ALVEOLUS)
     for name, (sign, size, durations, onsets) in pushes.items():
         x = np.clip([(time - a) / d for a, d in product(onsets, durations)], 0.0, 1.0)
         shape = [sign * np.sin(np.pi * h * x) for h in range(1, len(_HARMONICS) + 1)]
         every[name, size] = np.matmul(np.stack(shape)[:, :, :, None], push)[:, :, :, 0]
-    for (name, size), each in every.items():  # the first, and deviations of its form
+    for (name, size), responses in every.items():  # the first, and deviations of its form
         gains = []
-        for course in each[0]:
-            power, b = known.of_each_breath(course)
+        for course in responses[0]:
+            power, b = model.breath_diagonal(course)
             curvature = power + size**-2.0
             gains.append(0.5 * np.maximum(b, 0.0) ** 2 / curvature - 0.5 * np.log(curvature))
-        chosen = each[:, np.argmax(gains, axis=0), np.arange(n)]
-        cost = float(np.log(each.shape[1]))
-        at, likely = _affected(*known.of_breaths(chosen[0, :, None]), size, cost)
+        chosen = responses[:, np.argmax(gains, axis=0), np.arange(n)]
+        cost = float(np.log(responses.shape[1]))
+        at, likely = _affected(*model.of_breaths(chosen[0, :, None]), size, cost)
         if len(at) and command_p_value(likely, data, predicted) > EXCHANGEABLE:
             which = (at[:, None] == np.arange(n))[:, :, None]
-            columns = [one for form in chosen for one in np.where(which, form, 0.0)]
+            columns = [column for form in chosen for column in np.where(which, form, 0.0)]
             spread = [size * h for h in _HARMONICS[: len(chosen)] for _ in at]
             odds = _share(n, len(at)) - cost * len(at)
             terms.append(with_course(Term(name, spread, odds=odds, latent=columns), settings))
@@ -260,8 +260,8 @@ def swing_spreads(count: int, spread: float) -> Floats:
 
     Else half of a frequency explains as much as the frequency.
     """
-    each = spread / np.arange(1, count // 2 + 1)
-    return np.concatenate([each, each])
+    spreads = spread / np.arange(1, count // 2 + 1)
+    return np.concatenate([spreads, spreads])
 
 
 def _waves(partition: Partition, frequency: float, harmonics: int) -> Floats:
@@ -271,61 +271,61 @@ def _waves(partition: Partition, frequency: float, harmonics: int) -> Floats:
 
 
 def _likeliest_swing(
-    known: Known, name: str, ways: list[tuple[Floats, float, float]]
+    model: LinearModel, name: str, candidates: list[tuple[Floats, float, float]]
 ) -> tuple[Term, Floats]:
     """The frequency and size of the largest evidence, and coefficients of each breath, (n, m)."""
-    best, at, each = -np.inf, ways[0], np.zeros((known.n, 0))
-    for way in ways:
-        G, b = known.of_breaths(way[0])
-        spreads = np.tile(swing_spreads(way[0].shape[1], way[2]), known.n)
+    best, at, coefficients = -np.inf, candidates[0], np.zeros((model.n, 0))
+    for candidate in candidates:
+        G, b = model.of_breaths(candidate[0])
+        spreads = np.tile(swing_spreads(candidate[0].shape[1], candidate[2]), model.n)
         value, mean, _ = gaussian(G, b, spreads)
         if value > best:
-            best, at, each = value, way, mean.reshape(known.n, -1)
+            best, at, coefficients = value, candidate, mean.reshape(model.n, -1)
     columns_at, frequency, spread = at
-    which = np.eye(known.n, dtype=bool)[:, :, None]
+    which = np.eye(model.n, dtype=bool)[:, :, None]
     sizes = range(columns_at.shape[1])
-    columns = [one for m in sizes for one in np.where(which, columns_at[:, m], 0.0)]
-    told = {"frequency": frequency, "spread": spread}
-    odds = -float(np.log(len(ways)))
-    spreads = np.repeat(swing_spreads(columns_at.shape[1], spread), known.n).tolist()
-    return Term(name, spreads, odds=odds, latent=columns, told=told), each
+    columns = [column for m in sizes for column in np.where(which, columns_at[:, m], 0.0)]
+    swing = {"frequency": frequency, "spread": spread}
+    odds = -float(np.log(len(candidates)))
+    spreads = np.repeat(swing_spreads(columns_at.shape[1], spread), model.n).tolist()
+    return Term(name, spreads, odds=odds, latent=columns, swing=swing), coefficients
 
 
 def _commands(
-    known: Known, partition: Partition, around: FittedModel, settings: SelectionConfig
+    model: LinearModel, partition: Partition, around: FittedModel, settings: SelectionConfig
 ) -> list[Term]:
     """Lost and late commands."""
-    data, values, terms = partition.data, known.around.values, []
-    problem, x, share = replace(around.problem, noise=known.noise), around.minimum.x, 0.1
+    data, values, terms = partition.data, model.around.values, []
+    problem, x, share = replace(around.problem, noise=model.noise), around.minimum.x, 0.1
     for name, (expected, lags) in _COMMANDS.items():
-        ways = [follow(problem, x, partition, share, lag) for lag in lags]
-        way = max(ways, key=lambda each: float(each.nats.sum()))
-        kept, sent = float(way.kept.sum()), float(way.sent.sum())
-        if not kept or ask_for_little(way, data.u_in) <= EXCHANGEABLE:
+        candidates = [follow(problem, x, partition, share, lag) for lag in lags]
+        best = max(candidates, key=lambda paths: float(paths.nats.sum()))
+        missed, sent = float(best.missed.sum()), float(best.sent.sum())
+        if not missed or ask_for_little(best, data.u_in) <= EXCHANGEABLE:
             break
-        share = min(kept / sent, 0.5)  # a valve that waits counts at every sample
+        share = min(missed / sent, 0.5)  # a valve that waits counts at every sample
         names = partition.predictor.names
-        reached = make_partition(replace(data, u_in=way.u_in), names, settings).predictor
+        reached = make_partition(replace(data, u_in=best.u_in), names, settings).predictor
         column = reached.predict(values)[:, 0] - partition.predictor.predict(values)[:, 0]
-        odds = kept * np.log(share) + max(sent - kept, 0.0) * np.log1p(-share)
+        odds = missed * np.log(share) + max(sent - missed, 0.0) * np.log1p(-share)
         odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2 + np.log(len(lags))
         terms.append(Term(name, [1.0], odds=float(odds), latent=[column]))
     return terms
 
 
-def ask_for_little(way: Paths, u_in: Floats) -> float:
+def ask_for_little(paths: Paths, u_in: Floats) -> float:
     """Probability that commands which are lost at random ask for as little of a move (rank sum).
 
     Args:
-        way: what reached the valve.
+        paths: what reached the valve.
         u_in: commands that were sent, %, ``(n, T)``.
     """
-    valve = np.pad(way.u_in[:, :-1], ((0, 0), (1, 0)))
-    asked, lost = np.abs(u_in - valve), way.u_in != u_in
-    new = asked > _SAME
+    valve = np.pad(paths.u_in[:, :-1], ((0, 0), (1, 0)))
+    demand, lost = np.abs(u_in - valve), paths.u_in != u_in
+    new = demand > _SAME
     new[:, -1] = False  # nobody sees what it does
-    asked, lost = asked[new], lost[new]
-    ranks = np.unique(asked, return_inverse=True)[1]
+    demand, lost = demand[new], lost[new]
+    ranks = np.unique(demand, return_inverse=True)[1]
     ranks = ranks - ranks.mean()
     n, k = len(lost), int(lost.sum())
     sd = np.sqrt(k * (n - k) * np.mean(ranks**2) / max(n - 1, 1))
@@ -386,7 +386,7 @@ class Paths(NamedTuple):
 
     nats: Floats  #: log-likelihood with them, ``(n,)``.
     u_in: Floats  #: commands on the likeliest path, %, ``(n, T)``.
-    kept: Floats  #: at how many samples the valve did not follow a new command, ``(n,)``.
+    missed: Floats  #: at how many samples the valve did not follow a new command, ``(n,)``.
     sent: Floats  #: how many new commands there were, ``(n,)``.
 
 
@@ -409,34 +409,37 @@ def follow(
     by_command[:, :-1] = input_responses(unit, problem.values(x), SUPPLY)[:, 1:]
     white = noise.whiten(by_command[:, :, None], data.weight)[:, :, 0]
     first = noise.whiten(problem.residual(x), data.weight)
-    left = np.repeat(first, _PATHS, axis=1)  # (n, b, T)
+    residuals = np.repeat(first, _PATHS, axis=1)  # (n, b, T)
     score = np.full((n, _PATHS), -np.inf)
     score[:, 0] = 0.0
     path, held = np.zeros((n, _PATHS, samples)), np.zeros((n, _PATHS), int)
     rows = np.arange(n)[:, None]
-    kept = np.zeros((n, _PATHS))
+    missed = np.zeros((n, _PATHS))
     for k in range(samples - 1):
         sent = data.u_in[:, k, None]
         valve = path[:, :, k - 1] if k else np.zeros((n, _PATHS))
         if lag is not None and k >= lag:  # the late one arrives, as none has overtaken it
             valve = np.where(held >= lag, data.u_in[:, k - lag, None], valve)
         new = np.abs(valve - sent) > _SAME
-        moved = np.concatenate([np.zeros_like(valve), valve - sent], axis=1)
+        deviation = np.concatenate([np.zeros_like(valve), valve - sent], axis=1)
         prior = np.concatenate(
             [np.where(new, np.log1p(-share), 0.0), np.where(new, np.log(share), -np.inf)], axis=1
         )
-        both = np.concatenate([left, left], axis=1)[:, :, k + 1] + moved * white[:, k, None, k + 1]
+        both = (
+            np.concatenate([residuals, residuals], axis=1)[:, :, k + 1]
+            + deviation * white[:, k, None, k + 1]
+        )
         total = np.concatenate([score, score], axis=1) + prior - noise.loss(both)
         best = np.argsort(-total, axis=1)[:, :_PATHS]
-        parent, moved = best % _PATHS, np.take_along_axis(moved, best, axis=1)
+        parent, deviation = best % _PATHS, np.take_along_axis(deviation, best, axis=1)
         stays = best >= _PATHS
         score = np.take_along_axis(total, best, axis=1)
-        left = left[rows, parent] + moved[:, :, None] * white[:, k, None]
-        path, kept = path[rows, parent], kept[rows, parent] + stays
-        path[:, :, k] = sent + moved
+        residuals = residuals[rows, parent] + deviation[:, :, None] * white[:, k, None]
+        path, missed = path[rows, parent], missed[rows, parent] + stays
+        path[:, :, k] = sent + deviation
         held = np.where(stays, held[rows, parent] + 1, 0)
     path[:, :, -1] = data.u_in[:, -1:]
     changes = np.abs(np.diff(data.u_in[:, :-1], axis=1, prepend=0.0)) > _SAME
     constant = noise.log_scale(data.weight) + data.weight.sum(axis=(1, 2)) * noise.log_norm()
     nats = np.logaddexp.reduce(score, axis=1) - noise.loss(first[:, 0, 0]) - constant
-    return Paths(nats, path[:, 0], kept[:, 0], changes.sum(axis=1))
+    return Paths(nats, path[:, 0], missed[:, 0], changes.sum(axis=1))

@@ -48,18 +48,18 @@ _SHARES = np.array([0.03, 0.08, 0.15, 0.25, 0.4, 0.6])
 #: Standard deviation of the logarithm of strengths between affected breaths.
 _SPREAD = 0.3
 
-#: Multiples of the strength that refine it, and most times that fit and breaths are found in turn.
+#: Multiples of the strength that refine it, and most alternations of fit and affected breaths.
 _MULTIPLES, _ROUNDS = np.geomspace(0.6, 1.0 / 0.6, 9), 4
 
 #: Fewest breaths that must be affected, and must not be.
-_FEWEST, _LEFT = 2, 4
+_FEWEST, _MIN_UNAFFECTED = 2, 4
 
 #: p-value below which affected breaths have an order in time.
 _ORDERED = 0.002
 
 #: Samples by which commands may be late, least share of them that are lost or late, and nats by
 #: which two delays are alike.
-_LAGS, _RARE, _ALIKE = (2, 3, 4, 5), 0.003, 2.0
+_LAGS, _RARE, _TIE = (2, 3, 4, 5), 0.003, 2.0
 
 #: Nats within which another effect is an alternative; a posterior probability of 1 : 150.
 _CLOSE = 5.0
@@ -86,7 +86,7 @@ class Intermittent:
     u_in: Floats | None
 
 
-class _Found(NamedTuple):
+class _EventFit(NamedTuple):
     """An effect fitted to the training breaths."""
 
     evaluator: Evaluator  #: evaluator of the recording.
@@ -112,33 +112,37 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         ids: their ids, ``(n,)``.
     """
     evaluator, conclusion = model.evaluator, model.conclusion
-    known, likely = conclusion.named.hypothesis, conclusion.likely_events
+    hypothesis, likely = conclusion.named.hypothesis, conclusion.likely_events
     if not likely:
         return None
-    alone = fit_with_noise(evaluator, known.without(*known.breath_terms))
+    alone = fit_with_noise(evaluator, hypothesis.minus(*hypothesis.breath_terms))
     names = [name for name in likely if name not in COMMANDS]
-    found = [each for name in names if (each := _fit(evaluator, alone, name)) is not None]
+    candidates = [
+        candidate for name in names if (candidate := _fit(evaluator, alone, name)) is not None
+    ]
     if len(names) < len(likely):
-        found += _fit_commands(evaluator, alone)
-    found.sort(key=lambda each: -each.total)
-    gained = found[0].held_out - _log_likelihood(model) if found else np.zeros(1)
+        candidates += _fit_commands(evaluator, alone)
+    candidates.sort(key=lambda candidate: -candidate.total)
+    gained = candidates[0].held_out - _log_likelihood(model) if candidates else np.zeros(1)
     if float(gained.sum()) <= _least(evaluator):
         return None
-    best = found[0]
+    best = candidates[0]
     odds: dict[str, float] = {}
-    for each in found:
-        odds[each.name] = odds.get(each.name, 0.0) + float(np.exp(each.total - best.total))
+    for candidate in candidates:
+        odds[candidate.name] = odds.get(candidate.name, 0.0) + float(
+            np.exp(candidate.total - best.total)
+        )
     affected, u_in, estimates = _everywhere(best, data)
     if affected.sum() < _FEWEST or (u_in is None and _is_change(affected, evaluator, data)):
         return None
     if u_in is None and _is_commanded(best):
         return None
-    near = np.exp(-_CLOSE)
+    least_odds = np.exp(-_CLOSE)
     missing = MissingMechanism(
         best.name,
         estimates,
         odds[best.name] / sum(odds.values()),
-        tuple(name for name, value in odds.items() if value > near and name != best.name),
+        tuple(name for name, value in odds.items() if value > least_odds and name != best.name),
         float(gained.sum()),
         affected=tuple(int(i) for i in ids[affected]),
     )
@@ -153,19 +157,19 @@ def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:
     return order_p_value(ranked, data.lung, evaluator.settings.residuals) < _ORDERED
 
 
-def _is_commanded(found: _Found) -> bool:
+def _is_commanded(candidate: _EventFit) -> bool:
     """Whether commands predict in which breaths an effect acts."""
-    evaluator = found.evaluator
+    evaluator = candidate.evaluator
     both = evaluator.partition(_joined(evaluator.training.data, evaluator.held_out.data))
-    evidence = _Evidence.of(evaluator, found.fitted, both, found.name)
-    likely = evidence.chances(found.strength, found.share)
-    pressure = evaluator.predict(found.fitted, both)[:, 0]
+    evidence = _Evidence.of(evaluator, candidate.fitted, both, candidate.name)
+    likely = evidence.chances(candidate.strength, candidate.share)
+    pressure = evaluator.predict(candidate.fitted, both)[:, 0]
     return command_p_value(likely, both.data, pressure) <= EXCHANGEABLE
 
 
-def _joined(one: Data, other: Data) -> Data:
+def _joined(first: Data, second: Data) -> Data:
     """The breaths of both."""
-    pairs = zip(vars(one).items(), vars(other).values(), strict=True)
+    pairs = zip(vars(first).items(), vars(second).values(), strict=True)
     return Data(**{name: np.concatenate([mine, theirs]) for (name, mine), theirs in pairs})
 
 
@@ -177,14 +181,14 @@ def _log_likelihood(model: IdentifiedModel) -> Floats:
     return model.evaluator.held_out_log_likelihood(conclusion.full)
 
 
-def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _Found | None:
+def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _EventFit | None:
     """Fit an effect beside a model of all training breaths; None if it acts in no breath.
 
     The first breaths are found at white noise, as coloured noise excuses whole breaths. Where most
     breaths are affected, the model is one of these, and the others show the opposite effect.
     """
     training = evaluator.training
-    fitted, known = fit_with_white_noise(evaluator, alone), np.zeros(len(training.data), bool)
+    fitted, affected = fit_with_white_noise(evaluator, alone), np.zeros(len(training.data), bool)
     for k in range(_ROUNDS):
         evidence = _Evidence.of(evaluator, fitted, training, name)
         strength, share, nats = evidence.likeliest()
@@ -192,14 +196,14 @@ def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _Found | None:
         against = [-s for s in evidence.strengths if -s >= mechanism(name).description.strength.low]
         if k == 0 and against:
             opposite = _Evidence.of(evaluator, fitted, training, name, tuple(against))
-            other, others, more = opposite.likeliest()
+            opposite_strength, opposite_share, more = opposite.likeliest()
             if more > nats:
-                acts = ~opposite.acts(other, others)
-        if np.array_equal(known, acts):
+                acts = ~opposite.acts(opposite_strength, opposite_share)
+        if np.array_equal(affected, acts):
             break
-        if (~acts).sum() < _LEFT or not acts.any():
+        if (~acts).sum() < _MIN_UNAFFECTED or not acts.any():
             return None
-        known, rest = acts, evaluator.partition(training.data.select(~acts))
+        affected, rest = acts, evaluator.partition(training.data.select(~acts))
         start = evaluator.transferred(fitted, rest)
         now = replace(evaluator, training=rest, folds=())
         fitted = fit_with_noise(
@@ -208,13 +212,13 @@ def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _Found | None:
     gained, ahead = evidence.gains(strength, share)
     nats = float((evidence.plain + gained).sum())
     least = float(evaluator.log_likelihood(alone, training).sum()) + _least(evaluator)
-    if not known.any() or nats < least or ahead < _least(evaluator):
+    if not affected.any() or nats < least or ahead < _least(evaluator):
         return None
     evidence = _Evidence.of(evaluator, fitted, evaluator.held_out, name)
     gained, ahead = evidence.gains(strength, share)
     if ahead < 0.0:
         return None
-    return _Found(evaluator, name, fitted, strength, share, nats, evidence.plain + gained)
+    return _EventFit(evaluator, name, fitted, strength, share, nats, evidence.plain + gained)
 
 
 def _least(evaluator: Evaluator) -> float:
@@ -222,18 +226,18 @@ def _least(evaluator: Evaluator) -> float:
     return evaluator.settings.search.course_nats
 
 
-def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_Found]:
+def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_EventFit]:
     """Lost and late commands beside a model of all training breaths."""
-    training, fitted, share, found = evaluator.training, alone, float(_SHARES[1]), []
+    training, fitted, share, candidates = evaluator.training, alone, float(_SHARES[1]), []
     least = float(evaluator.log_likelihood(alone, training).sum()) + _least(evaluator)
     for _ in range(_ROUNDS):
         paths = _paths(evaluator, fitted, training, share, 0)
         if fitted is alone and float(paths.nats.sum()) < least:
-            return found  # late ones seem lost, too
-        share = float(np.clip(paths.kept.sum() / max(paths.sent.sum(), 1.0), _RARE, _SHARES[-1]))
+            return candidates  # late ones seem lost, too
+        share = float(np.clip(paths.missed.sum() / max(paths.sent.sum(), 1.0), _RARE, _SHARES[-1]))
         now = replace(evaluator, training=_with_commands(evaluator, training, paths))
         before, fitted = fitted, fit_with_noise(now, alone.hypothesis, fitted)
-        if not paths.kept.any() or before.noise == fitted.noise:
+        if not paths.missed.any() or before.noise == fitted.noise:
             break
     for lag in (0, *_LAGS):
         total = float(_paths(evaluator, fitted, training, share, lag).nats.sum())
@@ -241,8 +245,8 @@ def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_Found]:
             tested = _paths(evaluator, fitted, evaluator.held_out, share, lag).nats
             name = COMMANDS[lag > 0]
             total -= np.log(len(_LAGS)) if lag else 0.0  # each delay is as likely
-            found.append(_Found(evaluator, name, fitted, lag, share, total, tested))
-    return found
+            candidates.append(_EventFit(evaluator, name, fitted, lag, share, total, tested))
+    return candidates
 
 
 def _paths(
@@ -270,40 +274,44 @@ def _from_first_readings(
     return problem, x
 
 
-def _everywhere(found: _Found, data: Data) -> tuple[Bools, Floats | None, dict[str, Estimate]]:
+def _everywhere(
+    candidate: _EventFit, data: Data
+) -> tuple[Bools, Floats | None, dict[str, Estimate]]:
     """In which of n breaths the effect acts, with which commands, and how strong it is."""
-    evaluator, name = found.evaluator, found.name
+    evaluator, name = candidate.evaluator, candidate.name
     partition = evaluator.partition(data)
     if name in COMMANDS:
-        paths = _paths(evaluator, found.fitted, partition, found.share, found.strength)
-        kept, sent = int(paths.kept.sum()), max(int(paths.sent.sum()), 1)
-        p, width = kept / sent, 1.96 * np.sqrt(kept + 1.0) / sent
+        paths = _paths(evaluator, candidate.fitted, partition, candidate.share, candidate.strength)
+        missed, sent = int(paths.missed.sum()), max(int(paths.sent.sum()), 1)
+        p, width = missed / sent, 1.96 * np.sqrt(missed + 1.0) / sent
         estimates = {"share": Estimate(p, "1", (max(p - width, 0.0), min(p + width, 1.0)))}
-        if found.strength:
+        if candidate.strength:
             dt = float(np.median(data.dt[:, :-1]))
-            near = [
-                _paths(evaluator, found.fitted, partition, found.share, k).nats.sum() for k in _LAGS
+            profile = [
+                _paths(evaluator, candidate.fitted, partition, candidate.share, k).nats.sum()
+                for k in _LAGS
             ]
-            likely = np.array(_LAGS)[np.array(near) > max(near) - _ALIKE]
+            likely = np.array(_LAGS)[np.array(profile) > max(profile) - _TIE]
             ends = (float(likely[0] - 1) * dt, float(likely[-1]) * dt)
             estimates["delay"] = Estimate(0.5 * sum(ends), "s", ends)
-        return paths.kept > 0, paths.u_in, estimates
-    evidence = _Evidence.of(evaluator, found.fitted, partition, name)
-    acts = evidence.acts(found.strength, found.share)
-    about, centre = mechanism(name).description.strength, evidence.strengths[found.strength]
+        return paths.missed > 0, paths.u_in, estimates
+    evidence = _Evidence.of(evaluator, candidate.fitted, partition, name)
+    acts = evidence.acts(candidate.strength, candidate.share)
+    strength, centre = mechanism(name).description.strength, evidence.strengths[candidate.strength]
     if len(evidence.strengths) < 2 or not acts.any():
         return acts, None, {}
     some = evaluator.partition(data.select(acts))
-    fine = _Evidence.of(evaluator, found.fitted, some, name, tuple(centre * _MULTIPLES))
+    fine = _Evidence.of(evaluator, candidate.fitted, some, name, tuple(centre * _MULTIPLES))
     logs = np.log(centre * _MULTIPLES)
-    each = np.logaddexp.reduce(fine.nats, axis=1)  # whatever its course
-    weights = np.exp(each - np.logaddexp.reduce(each, axis=0))  # (s, k)
-    own = logs @ weights
+    marginal = np.logaddexp.reduce(fine.nats, axis=1)  # whatever its course
+    weights = np.exp(marginal - np.logaddexp.reduce(marginal, axis=0))  # (s, k)
+    means = logs @ weights
     step = logs[1] - logs[0]
-    width = np.sqrt(np.maximum(logs**2 @ weights - own**2, step**2 / 12.0) + np.var(own))
-    middle, sd = np.average(own, weights=width**-2.0), np.sum(width**-2.0) ** -0.5
+    width = np.sqrt(np.maximum(logs**2 @ weights - means**2, step**2 / 12.0) + np.var(means))
+    middle, sd = np.average(means, weights=width**-2.0), np.sum(width**-2.0) ** -0.5
     value, low, high = np.exp(middle + 1.96 * sd * np.array([0.0, -1.0, 1.0]))
-    return acts, None, {about.name: Estimate(float(value), about.unit, (float(low), float(high)))}
+    estimate = Estimate(float(value), strength.unit, (float(low), float(high)))
+    return acts, None, {strength.name: estimate}
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,20 +339,20 @@ class _Evidence:
         """
         problem, x = _from_first_readings(evaluator, fitted, partition)
         linear = linearise(problem, x, clip=np.inf)
-        strength, *others = mechanism(name).description.parameters
+        strength, *secondary = mechanism(name).description.parameters
         strengths = strengths or strength.scan
-        names, grids = [p.name for p in others if p.grid], [p.grid for p in others if p.grid]
+        names, grids = [p.name for p in secondary if p.grid], [p.grid for p in secondary if p.grid]
         columns = [partition.predictor.names.index(f"{name}.{p}") for p in names]
-        own = partition.predictor.names.index(f"{name}.{strength.name}")
+        strength_column = partition.predictor.names.index(f"{name}.{strength.name}")
         count = problem.data.weight.sum(axis=(1, 2))
 
         def density(white: Floats, scales: Floats) -> Floats:
             """Logarithm of the mean density of residuals ``(n, q, m)`` over the scales, (n, q)."""
-            each = [
+            densities = [
                 -problem.noise.loss(white / k).sum(axis=2) - count[:, None] * np.log(k)
                 for k in scales
             ]
-            return np.logaddexp.reduce(each, axis=0) - np.log(len(scales))
+            return np.logaddexp.reduce(densities, axis=0) - np.log(len(scales))
 
         plain = density(linear.residual[:, None], _ROUGH[:1])
         rough = (density(linear.residual[:, None], _ROUGH[1:]) - plain)[:, 0]
@@ -352,14 +360,15 @@ class _Evidence:
         def gained(courses: Floats) -> Floats:
             """Gain ``(s, k, n)`` at each strength and k courses of each breath, (s, k, n, g)."""
             points = np.tile(linear.values, (*courses.shape[:2], 1, 1))
-            points[..., own] = np.reshape(strengths, (-1, 1, 1))
+            points[..., strength_column] = np.reshape(strengths, (-1, 1, 1))
             points[..., columns] = courses
             points, parts = points.reshape(-1, *linear.values.shape), []
             for k in range(0, len(points), _AT_ONCE):
-                seen = partition.predictor.predict_all(points[k : k + _AT_ONCE])
-                change = linear.whiten(np.moveaxis(seen - linear.prediction, 0, 1))  # (n, q, m)
-                left = linear.residual[:, None] + linear.without_own(change)
-                parts.append((density(left, _ROUGH) - plain).T)
+                predicted = partition.predictor.predict_all(points[k : k + _AT_ONCE])
+                change = np.moveaxis(predicted - linear.prediction, 0, 1)
+                change = linear.whiten(change)  # (n, q, m)
+                residuals = linear.residual[:, None] + linear.project_out_breath(change)
+                parts.append((density(residuals, _ROUGH) - plain).T)
             return np.nan_to_num(np.concatenate(parts), nan=-np.inf).reshape(courses.shape[:3])
 
         grid = np.array(list(product(*grids)))
@@ -372,11 +381,11 @@ class _Evidence:
                 [np.interp(course[..., k], g, np.gradient(g)) for k, g in enumerate(grids)], axis=-1
             )
             moves = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(grids))))
-            near = course + finer * moves[:, None] * step  # (s, k, n, g)
-            each = gained(near)
-            chosen = np.argmax(each, axis=1)[:, None]
-            course = np.take_along_axis(near, chosen[..., None], axis=1)
-            top = np.maximum(top, np.take_along_axis(each, chosen, axis=1))
+            refined = course + finer * moves[:, None] * step  # (s, k, n, g)
+            gains = gained(refined)
+            chosen = np.argmax(gains, axis=1)[:, None]
+            course = np.take_along_axis(refined, chosen[..., None], axis=1)
+            top = np.maximum(top, np.take_along_axis(gains, chosen, axis=1))
         np.put_along_axis(nats, best, top, axis=1)
         constant = problem.noise.log_scale(problem.data.weight) + count * problem.noise.log_norm()
         return cls(tuple(strengths), nats, rough, plain[:, 0] - constant)
@@ -384,10 +393,10 @@ class _Evidence:
     def acting(self) -> Floats:
         """Gain of each breath if the effect acts in it, at a common strength, ``(s, n)``."""
         logs = np.log(np.abs(self.strengths))
-        near = -0.5 * ((logs[:, None] - logs) / _SPREAD) ** 2
-        near = near - np.logaddexp.reduce(near, axis=1, keepdims=True)
-        each = np.logaddexp.reduce(self.nats, axis=1) - np.log(self.nats.shape[1])
-        return np.logaddexp.reduce(near[:, :, None] + each, axis=1)
+        log_prior = -0.5 * ((logs[:, None] - logs) / _SPREAD) ** 2
+        log_prior = log_prior - np.logaddexp.reduce(log_prior, axis=1, keepdims=True)
+        log_marginal = np.logaddexp.reduce(self.nats, axis=1) - np.log(self.nats.shape[1])
+        return np.logaddexp.reduce(log_prior[:, :, None] + log_marginal, axis=1)
 
     def likeliest(self) -> tuple[int, float, float]:
         """The likeliest common strength, by its index, share of the breaths, and their gain."""
@@ -399,8 +408,8 @@ class _Evidence:
     def gains(self, strength: int, share: float) -> tuple[Floats, float]:
         """Gain of each breath by the mixture, ``(n,)``, and how far that is ahead of rough ones."""
         gained, rough = (
-            np.logaddexp(np.log1p(-share), np.log(share) + each)
-            for each in (self.acting()[strength], self.rough)
+            np.logaddexp(np.log1p(-share), np.log(share) + gain)
+            for gain in (self.acting()[strength], self.rough)
         )
         return gained, float(np.sum(gained - rough))
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.base.errors import InputError, InputTypeError
-from ventbench.diagnosis.experiment_design import Contrast, Rig, families, without_own
+from ventbench.diagnosis.experiment_design import Contrast, Rig, families, project_out
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.mechanism import REFITTED
@@ -54,10 +54,10 @@ class Isolability:
 
     lung: str  #: label.
     sensors: tuple[str, ...]  #: what is measured.
-    threshold: float  #: nats from which something is told.
+    threshold: float  #: nats from which a mechanism is detectable.
     #: nats that each mechanism is worth at its mild strength, by name.
     detectable: dict[str, float]
-    #: nats by which each pair of detectable mechanisms is told apart.
+    #: nats by which each pair of detectable mechanisms differs.
     nats: dict[tuple[str, str], float]
     confused: tuple[Pair, ...]  #: the pairs below the threshold, the closest first.
     unseen: tuple[Pair, ...]  #: mechanisms that the plan would not show at a mild strength.
@@ -115,11 +115,13 @@ def isolability(
         planned = read_controls(planned, by_breath=True)
     if isinstance(planned, Breaths):
         rows = zip(planned.time, planned.u_in, planned.u_out, planned.valid, strict=True)
-        planned = [Controls(t[own], u[own], np.asarray(out[own], float)) for t, u, out, own in rows]
+        planned = [
+            Controls(t[mask], u[mask], np.asarray(out[mask], float)) for t, u, out, mask in rows
+        ]
     planned = [planned] if isinstance(planned, Controls) else planned
     if not isinstance(planned, list | tuple) or not all(isinstance(x, Controls) for x in planned):
-        wanted = "breaths, a CSV file of them, or ventbench.simulation.Controls"
-        raise InputTypeError("controls", controls, wanted)
+        expected = "breaths, a CSV file of them, or ventbench.simulation.Controls"
+        raise InputTypeError("controls", controls, expected)
     if not planned:
         raise InputError("no breath is planned: controls is empty")
     label = parse_lung(lung)
@@ -140,8 +142,8 @@ def isolability(
     both = now if "flow" in sensors else _Responses(data, chosen, SENSORS, white)
     plan = list(range(len(planned)))
     detectable = {name: now.worth(name, plan) for name in chosen}
-    seen = [name for name in chosen if detectable[name] >= threshold]
-    nats = {pair: now.apart(*pair, plan) for pair in combinations(seen, 2)}
+    detected = [name for name in chosen if detectable[name] >= threshold]
+    nats = {pair: now.apart(*pair, plan) for pair in combinations(detected, 2)}
 
     def remedy(measure: Callable[[_Responses, list[int]], float]) -> tuple[str | None, float]:
         options = [
@@ -171,7 +173,7 @@ def isolability(
         nats,
         tuple(confused),
         tuple(unseen),
-        _groups(seen, confused),
+        _groups(detected, confused),
     )
 
 
@@ -206,51 +208,56 @@ class _Responses:
         self._of: dict[str, list[int]] = {}
         for name in names:
             mild = _mild(name)
-            moved = [simulator.predict(_with(values, simulator.names, mild))]
+            perturbed = [simulator.predict(_with(values, simulator.names, mild))]
             for path in mild:
                 if path != strength_path(name):
-                    other = mild | {path: mild[path] * (1.0 + _STEP)}
-                    moved.append(simulator.predict(_with(values, simulator.names, other)))
-            changes = [moved[0] - first, *(each - moved[0] for each in moved[1:])]
+                    rescaled = mild | {path: mild[path] * (1.0 + _STEP)}
+                    perturbed.append(simulator.predict(_with(values, simulator.names, rescaled)))
+            changes = [
+                perturbed[0] - first,
+                *(response - perturbed[0] for response in perturbed[1:]),
+            ]
             self._of[name] = list(range(len(columns), len(columns) + len(changes)))
             columns += changes
         weight = data.weight * np.array([[sensor in sensors] for sensor in SENSORS])
         white = noise.whiten(np.stack([*columns, slopes[:, -1]], axis=1), weight)
         white = white.reshape(*white.shape[:2], -1)
-        self._columns, self._noise = without_own(white[:, :-1], white[:, -1:]), noise
+        self._columns, self._noise = project_out(white[:, :-1], white[:, -1:]), noise
 
     def worth(self, name: str, breaths: Sequence[int]) -> float:
         """Nats that a mechanism is worth after a refit."""
         return self._refit(name, [], breaths)[0]
 
-    def apart(self, one: str, other: str, breaths: Sequence[int]) -> float:
+    def apart(self, first: str, second: str, breaths: Sequence[int]) -> float:
         """Nats by which two mechanisms are told apart, in the worse of both directions."""
-        return min(self._against(one, other, breaths), self._against(other, one, breaths))
+        return min(self._against(first, second, breaths), self._against(second, first, breaths))
 
     def _against(self, true: str, rival: str, breaths: Sequence[int]) -> float:
         nats, weights = self._refit(true, self._of[rival], breaths)
         strength = mechanism(rival).description.strength
-        one_sided = not strength.low < strength.neutral < strength.high
-        return self.worth(true, breaths) if one_sided and weights[0] < 0.0 else nats
+        is_bounded = not strength.low < strength.neutral < strength.high
+        return self.worth(true, breaths) if is_bounded and weights[0] < 0.0 else nats
 
     def _refit(
         self, name: str, rivals: Sequence[int], breaths: Sequence[int]
     ) -> tuple[float, Floats]:
         """Nats of a mechanism after rivals are refitted too, and the weights of these first."""
         rows = [*rivals, *range(len(REFITTED))]
-        known = np.zeros((len(rows), len(rows)))  # nothing is recorded yet
+        information = np.zeros((len(rows), len(rows)))  # nothing is recorded yet
         change = self._columns[:, self._of[name][0]]
-        return Contrast(change, self._columns[:, rows], known, self._noise).refit(np.array(breaths))
+        return Contrast(change, self._columns[:, rows], information, self._noise).refit(
+            np.array(breaths)
+        )
 
 
 def _mild(name: str) -> dict[str, float]:
-    about = mechanism(name).description.parameters
-    return {f"{name}.{each.name}": float(each.mild) for each in about if not each.shape}
+    parameters = mechanism(name).description.parameters
+    return {f"{name}.{p.name}": float(p.mild) for p in parameters if not p.shape}
 
 
-def _with(values: Floats, names: tuple[str, ...], given: Mapping[str, float]) -> Floats:
+def _with(values: Floats, names: tuple[str, ...], changes: Mapping[str, float]) -> Floats:
     changed = values.copy()
-    for path, value in given.items():
+    for path, value in changes.items():
         changed[:, names.index(path)] = value
     return changed
 
@@ -262,5 +269,5 @@ def _groups(names: Sequence[str], confused: Sequence[Pair]) -> tuple[tuple[str, 
         joined = group[pair.names[0]] | group[pair.names[1]]
         for name in joined:
             group[name] = joined
-    found = {tuple(sorted(each)) for each in group.values()}
-    return tuple(sorted(found, key=lambda each: (-len(each), each)))
+    groups = {tuple(sorted(members)) for members in group.values()}
+    return tuple(sorted(groups, key=lambda members: (-len(members), members)))

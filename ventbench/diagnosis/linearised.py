@@ -52,7 +52,8 @@ class Term:
     forms: Mapping[int, float] = field(default_factory=dict)
     #: changes of pressure ``(n, T)`` by what acts in time, which no fit knows.
     latent: Sequence[Floats] = ()
-    told: Mapping[str, float] = field(default_factory=dict)  #: what is told of a swing.
+    #: frequency, Hz, and spread of a swing.
+    swing: Mapping[str, float] = field(default_factory=dict)
 
 
 Set = tuple[Term, ...]
@@ -84,8 +85,8 @@ def gaussian(G: Floats, b: Floats, sd: Floats) -> tuple[float, Floats, Floats]:
 
 
 @dataclass(frozen=True, eq=False)
-class Simulated:
-    """What candidates change, simulated around a fit."""
+class CandidateEffects:
+    """Effects of candidates on the pressure, simulated around a fit."""
 
     data: Data  #: n breaths of T samples.
     values: Floats  #: physical values of the fit, ``(n, P + 1)``.
@@ -102,22 +103,22 @@ class Simulated:
 
     def forms(self, effect: Floats, name: str) -> dict[int, float]:
         """Deviations of an effect's characteristic in the basis terms that contain it."""
-        found: dict[int, float] = {}
+        deviations: dict[int, float] = {}
         for basis in mechanism(name).description.special_case_of:
-            if own := self.of_basis.get(basis):
-                width = np.array([self.basis[j][1] for j in own])
-                A = np.stack([self.columns[j].reshape(-1) for j in own], axis=1) * width
-                ridge = 1e-3 * np.trace(A.T @ A) / len(own) * np.eye(len(own))
+            if indices := self.of_basis.get(basis):
+                width = np.array([self.basis[j][1] for j in indices])
+                A = np.stack([self.columns[j].reshape(-1) for j in indices], axis=1) * width
+                ridge = 1e-3 * np.trace(A.T @ A) / len(indices) * np.eye(len(indices))
                 c = width * (np.linalg.pinv(A.T @ A + ridge) @ (A.T @ effect.reshape(-1)))
-                found |= dict(zip(own, (_FORM * np.abs(c) + 1e-12).tolist(), strict=True))
-        return found
+                deviations |= dict(zip(indices, (_FORM * np.abs(c) + 1e-12).tolist(), strict=True))
+        return deviations
 
 
 def points(name: str) -> list[dict[str, float]]:
     """Values, by path, at which the effect of a mechanism is computed."""
-    strength, *others = mechanism(name).description.parameters
+    strength, *secondary = mechanism(name).description.parameters
     sizes: tuple[float, ...] = (strength.mild, strength.strong)
-    if any(p.change_point for p in others):
+    if any(p.change_point for p in secondary):
         sizes = (strength.mild,)
     elif strength.kinked and strength.unit == "s":  # beyond a sample, it acts in proportion
         sizes = tuple(strength.strong * x for x in (0.15, 0.35, 0.6, 1.0))
@@ -131,8 +132,8 @@ def points(name: str) -> list[dict[str, float]]:
             return (-1.0,)
         return p.grid or ((0.4, 1.0, 2.5) if p.uncertain else (p.neutral,))
 
-    paths = [f"{name}.{p.name}" for p in (strength, *others)]
-    every = product(sizes, *(grid(p) for p in others))
+    paths = [f"{name}.{p.name}" for p in (strength, *secondary)]
+    every = product(sizes, *(grid(p) for p in secondary))
     return [dict(zip(paths, point, strict=True)) for point in every]
 
 
@@ -153,7 +154,7 @@ def simulate(
     names: Sequence[str],
     unnamed: Sequence[str],
     events: Collection[str],
-) -> Simulated:
+) -> CandidateEffects:
     """Simulate all candidates around a fit; what it has is no candidate.
 
     Args:
@@ -165,62 +166,71 @@ def simulate(
         events: effects of some breaths.
     """
     values, order = around.values, (*predictor.names, START)
-    moved, scale = [values], {0: 0.01}
+    perturbed, scale = [values], {0: 0.01}
 
-    def move(changes: Mapping[str, Any]) -> int:
+    def perturb(changes: Mapping[str, Any]) -> int:
         point = values.copy()
         for path, value in changes.items():
             point[:, order.index(path)] = value
-        moved.append(point)
-        return len(moved) - 2
+        perturbed.append(point)
+        return len(perturbed) - 2
 
-    move({"gain": 1.01 * values[:, order.index("gain")]})
+    perturb({"gain": 1.01 * values[:, order.index("gain")]})
     basis: dict[int, tuple[str, float]] = {}
     of_basis: dict[str, list[int]] = {}
     for name in unnamed:
         for p in mechanism(name).description.parameters:
             path, spread = f"{name}.{p.name}", p.spread or 1.0
-            k = move({path: values[:, order.index(path)] + 0.1 * spread})
+            k = perturb({path: values[:, order.index(path)] + 0.1 * spread})
             scale[k], basis[k] = 0.1 * spread, (path, spread)
             of_basis.setdefault(name, []).append(k)
-    others = [n for n in names if n not in around.names]
-    found = [(name, point, move(point)) for name in others for point in points(name)]
-    acting = {n: [move(point) for point in courses(n)] for n in (*CONSTANT, OPEN) if n in events}
-    seen = predictor.predict_all(np.stack(moved))[:, :, 0]
+    candidates = [n for n in names if n not in around.names]
+    evaluations = [(name, point, perturb(point)) for name in candidates for point in points(name)]
+    acting = {n: [perturb(point) for point in courses(n)] for n in (*CONSTANT, OPEN) if n in events}
+    predicted = predictor.predict_all(np.stack(perturbed))[:, :, 0]
     # a point that the model cannot simulate changes nothing, so no evidence chooses it
-    seen = np.where(np.isfinite(seen).all(axis=(1, 2), keepdims=True), seen, seen[0])
-    columns = [(each - seen[0]) / scale.get(k, 1.0) for k, each in enumerate(seen[1:])]
-    courses_of = {name: np.stack([columns[k] for k in own]) for name, own in acting.items()}
-    made = Simulated(data, values, columns, basis, of_basis, {}, (), courses_of)
+    predicted = np.where(
+        np.isfinite(predicted).all(axis=(1, 2), keepdims=True), predicted, predicted[0]
+    )
+    columns = [
+        (pressure - predicted[0]) / scale.get(k, 1.0) for k, pressure in enumerate(predicted[1:])
+    ]
+    courses_of = {name: np.stack([columns[k] for k in indices]) for name, indices in acting.items()}
+    effects = CandidateEffects(data, values, columns, basis, of_basis, {}, (), courses_of)
     terms, least = [], {}
     places = np.unique(data.position)
     between = (0.5 * (places[1:] + places[:-1])[1:-1]).tolist()
-    for name, point, k in found:
-        about, size = mechanism(name).description, point[strength_path(name)]
-        at = [f"{name}.{p.name}" for p in about.parameters if p.change_point]
-        alike = sum(other == name for other, _, _ in found) * (len(between) if at else 1)
-        low, high = sorted((about.strength.low / size, about.strength.high / size))
+    for name, point, k in evaluations:
+        description, size = mechanism(name).description, point[strength_path(name)]
+        at = [f"{name}.{p.name}" for p in description.parameters if p.change_point]
+        count = sum(candidate == name for candidate, _, _ in evaluations) * (
+            len(between) if at else 1
+        )
+        low, high = sorted((description.strength.low / size, description.strength.high / size))
         term = Term(
             name,
-            (abs(about.strength.strong / size),),
+            (abs(description.strength.strong / size),),
             (k,),
             point,
             (low, high),
-            -float(np.log(max(alike, 1))),
+            -float(np.log(max(count, 1))),
         )
         for x in between if at else ():
             columns.append(np.where(data.position[:, None] > x, columns[k], 0.0))
             terms.append(replace(term, main=(len(columns) - 1,), values=point | {at[0]: x}))
         if not at:
-            terms.append(replace(term, forms=made.forms(columns[k], name)))
-            if about.least and not any(t.name == name for t in terms[:-1]):
-                share = _UBIQUITOUS if about.ubiquitous else _LEAST
-                least[k] = share * about.least / abs(size)
-    terms += [Term(name, [basis[j][1] for j in own], tuple(own)) for name, own in of_basis.items()]
-    return replace(made, least=least, terms=tuple(terms))
+            terms.append(replace(term, forms=effects.forms(columns[k], name)))
+            if description.least and not any(t.name == name for t in terms[:-1]):
+                share = _UBIQUITOUS if description.ubiquitous else _LEAST
+                least[k] = share * description.least / abs(size)
+    terms += [
+        Term(name, [basis[j][1] for j in indices], tuple(indices))
+        for name, indices in of_basis.items()
+    ]
+    return replace(effects, least=least, terms=tuple(terms))
 
 
-class Known:
+class LinearModel:
     """An experiment, linearised around a fit whose parameters return to their prior means.
 
     These are the labels of R and C, and the base fit's R_ex, PEEP and starts.
@@ -231,7 +241,7 @@ class Known:
 
     def __init__(
         self,
-        around: Simulated,
+        around: CandidateEffects,
         fitted: FittedModel,
         base: FittedModel,
         noise: Noise,
@@ -256,42 +266,47 @@ class Known:
         self.scatter = scatter
         measured, weight = around.data.measured[:, 0], around.data.weight[:, 0]
         residual, slopes = fitted.jacobian
-        left = weight * (measured - residual[:, 0] - fitted.problem.data.measured[:, 0])
+        remainder = weight * (measured - residual[:, 0] - fitted.problem.data.measured[:, 0])
         free = {k: s for k, (p, s) in around.basis.items() if owner_of(p) not in fitted.names}
         form = {k: (1.0 if loose else _REST) * s for k, s in free.items()}
-        own, each = [], [scatter * around.columns[0]]
+        shared_columns, breath_columns = [], [scatter * around.columns[0]]
         self.paths: list[tuple[str, float, float]] = []
         layout = fitted.problem.unknowns
         for j, path in enumerate(layout.paths):
-            about, here = parameter_of(path), fitted.minimum.x[layout.index[:, j]]
-            if about.change_point:
+            parameter, estimate = parameter_of(path), fitted.minimum.x[layout.index[:, j]]
+            if parameter.change_point:
                 continue
-            mean: Any = about.prior()[0] if "." in path else about.coordinate(base.column(path))
+            mean: Any = (
+                parameter.prior()[0] if "." in path else parameter.coordinate(base.column(path))
+            )
             if path in ("R", "C"):
-                mean = about.coordinate(getattr(around.data, path))
-            sd = _BASE[path] if "." not in path else about.prior()[1]
+                mean = parameter.coordinate(getattr(around.data, path))
+            sd = _BASE[path] if "." not in path else parameter.prior()[1]
             if "." in path and path == strength_path(owner_of(path)):
-                mean = float(about.coordinate(about.neutral))
-                sd = about.spread or abs(about.strong - about.neutral)
-                forms = around.forms(slopes[:, j, 0] * (here - mean)[:, None], owner_of(path))
+                mean = float(parameter.coordinate(parameter.neutral))
+                sd = parameter.spread or abs(parameter.strong - parameter.neutral)
+                forms = around.forms(slopes[:, j, 0] * (estimate - mean)[:, None], owner_of(path))
                 form |= {k: float(np.hypot(form[k], s)) for k, s in forms.items() if k in form}
-            mean = np.broadcast_to(mean, here.shape)
-            left = left - slopes[:, j, 0] * (mean - here)[:, None]
+            mean = np.broadcast_to(mean, estimate.shape)
+            remainder = remainder - slopes[:, j, 0] * (mean - estimate)[:, None]
             if path == START:
-                each.append(sd * slopes[:, j, 0])
+                breath_columns.append(sd * slopes[:, j, 0])
                 continue
             for unknown in np.unique(layout.index[:, j]):  # one of each lung that has its own
                 which = layout.index[:, j] == unknown
-                own.append(sd * slopes[:, j, 0] * which[:, None])
+                shared_columns.append(sd * slopes[:, j, 0] * which[:, None])
                 self.paths.append((path, float(np.mean(mean[which])), sd))
-        own += [s * around.columns[k] for k, s in (form | around.least).items()]
-        own += [s * one for t in latent for one, s in zip(t.latent, t.spread, strict=True)]
+        shared_columns += [s * around.columns[k] for k, s in (form | around.least).items()]
+        shared_columns += [
+            s * column for t in latent for column, s in zip(t.latent, t.spread, strict=True)
+        ]
         self.latent = sum(len(t.latent) for t in latent)
-        shared = np.stack(own, axis=1) * weight[:, None]  # (n, z, T)
-        self.residual, self.of_each = left * weight, np.stack(each, axis=1) * weight[:, None]
+        shared = np.stack(shared_columns, axis=1) * weight[:, None]  # (n, z, T)
+        self.residual = remainder * weight
+        self.breathwise = np.stack(breath_columns, axis=1) * weight[:, None]
         self.shared = shared
         self.y = self.rows(self.residual[:, None])[:, 0]
-        white = np.moveaxis(self.rows(self.of_each).reshape(self.n, -1, 2), 2, 0)
+        white = np.moveaxis(self.rows(self.breathwise).reshape(self.n, -1, 2), 2, 0)
         blocks = [np.asarray(linalg.block_diag(*x[:, :, None])) for x in white]
         self.Z = np.concatenate([self.rows(shared), *blocks], axis=1)
         self.factor = cholesky(np.eye(self.Z.shape[1]) + self.Z.T @ self.Z), True
@@ -315,7 +330,7 @@ class Known:
         G = linalg.block_diag(*np.matmul(P, P.swapaxes(1, 2)))
         return G - ZP @ linalg.cho_solve(self.factor, ZP.T), b
 
-    def of_each_breath(self, course: Floats) -> tuple[Floats, Floats]:
+    def breath_diagonal(self, course: Floats) -> tuple[Floats, Floats]:
         """Diagonal of the same, and products with the residual, of a course ``(n, T)``."""
         P = self.noise.whiten(course[:, None, None], self.around.data.weight)[:, 0, 0]
         ZP = np.einsum("nt,ntz->nz", P, self.Z.reshape(self.n, P.shape[1], -1))
@@ -328,11 +343,14 @@ class Known:
         power = self.y @ self.y - (self.Z.T @ self.y) @ self.mean
         value = -0.5 * float(power) - float(np.log(np.diag(self.factor[0])).sum())
         value += sum(term.odds for term in self.terms)
-        for (path, mean, sd), found in zip(self.paths, self._parameters, strict=True):
+        for (path, mean, sd), posterior in zip(self.paths, self._parameters, strict=True):
             if owner_of(path) in library() and path == strength_path(owner_of(path)):
-                about = parameter_of(path)
-                ends = (float(about.coordinate(about.low)), float(about.coordinate(about.high)))
-                value += within(ends, *found, mean, sd)
+                parameter = parameter_of(path)
+                ends = (
+                    float(parameter.coordinate(parameter.low)),
+                    float(parameter.coordinate(parameter.high)),
+                )
+                value += within(ends, *posterior, mean, sd)
         return value
 
     @cached_property
@@ -351,13 +369,13 @@ class Known:
         return np.einsum("nkt,k->nt", self.shared[:, which], self.mean[which])
 
     @property
-    def left(self) -> Noise:
-        """Noise beside all that is known here."""
+    def residual_noise(self) -> Noise:
+        """Noise that the fit and the posterior means of all coefficients leave."""
         count = self.shared.shape[1]
-        told = np.einsum("nkt,k->nt", self.shared, self.mean[:count])
-        told += np.einsum("nkt,kn->nt", self.of_each, self.mean[count:].reshape(2, self.n))
+        explained = np.einsum("nkt,k->nt", self.shared, self.mean[:count])
+        explained += np.einsum("nkt,kn->nt", self.breathwise, self.mean[count:].reshape(2, self.n))
         weight = self.around.data.weight
-        return robust_noise((self.residual - told)[:, None] * weight, weight)
+        return robust_noise((self.residual - explained)[:, None] * weight, weight)
 
 
 def owner_of(path: str) -> str:

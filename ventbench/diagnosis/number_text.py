@@ -132,9 +132,9 @@ def error_phrase(region: ErrorRegion, noise: float) -> str:
 def where(region: ErrorRegion) -> str:
     """A region in words that follow "the pressure is too high"."""
     if region.axis in _MOMENTS:
-        after, whole = _MOMENTS[region.axis]
+        after, phase = _MOMENTS[region.axis]
         if region.low == 0:
-            return f"in the first {_time(region.high)} {whole}"
+            return f"in the first {_time(region.high)} {phase}"
         ends = f"{region.low:.6g} to {region.high:.6g} s"
         if region.high <= _SHORT_MOMENT:
             ends = f"{1000 * region.low:.6g} to {1000 * region.high:.6g} ms"
@@ -154,10 +154,10 @@ def _time(seconds: float) -> str:
 def breaths_in_words(ids: Sequence[int]) -> str:
     """Ids of breaths in words; those that follow each other as a range."""
     parts = np.split(np.asarray(ids), np.flatnonzero(np.diff(ids) != 1) + 1)
-    shown = [" to ".join(map(str, dict.fromkeys((part[0], part[-1])))) for part in parts]
-    if len(shown) > _LISTED:
-        shown = [*shown[: _LISTED - 1], f"others up to {ids[-1]}"]
-    text = " and ".join(filter(None, [", ".join(shown[:-1]), *shown[-1:]]))
+    phrases = [" to ".join(map(str, dict.fromkeys((part[0], part[-1])))) for part in parts]
+    if len(phrases) > _LISTED:
+        phrases = [*phrases[: _LISTED - 1], f"others up to {ids[-1]}"]
+    text = " and ".join(filter(None, [", ".join(phrases[:-1]), *phrases[-1:]]))
     return f"breath{'s' * (len(ids) > 1)} {text}"
 
 
@@ -178,12 +178,16 @@ def lung(match: LungMatch) -> str:
     if match.source == "pressure":
         gain = f", and a valve gain wrong by {100 * (GAIN - 1):.0f} %"
     tolerance = f"tolerance: {tolerance_text()}{gain}"
-    others = [name for name in match.settings if name != match.label][:2]
+    alternatives = [name for name in match.settings if name != match.label][:2]
     if match.label_matches:
-        also = f" Within the same tolerance it could be {' or '.join(others)}." if others else ""
+        also = (
+            f" Within the same tolerance it could be {' or '.join(alternatives)}."
+            if alternatives
+            else ""
+        )
         return f"The lung matches its label {match.label}: {fitted} ({tolerance}).{also}"
-    known = f" It may be {' or '.join(others)}." if others else ""
+    hint = f" It may be {' or '.join(alternatives)}." if alternatives else ""
     if not match.informative:
         why = "" if match.doubt else ", since the intervals are too wide"
-        return f"Whether the lung matches its label {match.label} is unknown{why}: {fitted}.{known}"
-    return f"The lung does not match its label {match.label}: {fitted} ({tolerance}).{known}"
+        return f"Whether the lung matches its label {match.label} is unknown{why}: {fitted}.{hint}"
+    return f"The lung does not match its label {match.label}: {fitted} ({tolerance}).{hint}"

@@ -113,17 +113,19 @@ class PatientEffortTerm(BreathTerm):
         duration = float(values[0, names.index(DURATION)])
         passive = values.copy()
         passive[:, names.index(AMPLITUDE)] = 0.0
-        own, none = make_unknowns(problem.data, (START,)), np.zeros(len(values))
-        passive_problem = replace(problem, unknowns=own, fixed=passive, mean=none, precision=none)
-        at = own.pack({START: values[:, -1]})
+        unknowns, none = make_unknowns(problem.data, (START,)), np.zeros(len(values))
+        passive_problem = replace(
+            problem, unknowns=unknowns, fixed=passive, mean=none, precision=none
+        )
+        at = unknowns.pack({START: values[:, -1]})
         evidence = self._evidence(linearise(passive_problem, at, clip=np.inf), duration)
-        tried = {AMPLITUDE: evidence.amplitude, ONSET: evidence.onset}
+        effort = {AMPLITUDE: evidence.amplitude, ONSET: evidence.onset}
         if refit:
-            breathwise, minimum = self._fit_each_breath(passive_problem, at, evidence)
-            tried = {p: minimum.x[breathwise.unknowns.of(p)] for p in (*tried, START)}
+            breathwise, minimum = self._fit_breathwise(passive_problem, at, evidence)
+            effort = {p: minimum.x[breathwise.unknowns.of(p)] for p in (*effort, START)}
         trial = x.copy()
-        columns = [layout.index[:, layout.paths.index(path)] for path in tried]
-        for column, value in zip(columns, tried.values(), strict=True):
+        columns = [layout.index[:, layout.paths.index(path)] for path in effort]
+        for column, value in zip(columns, effort.values(), strict=True):
             trial[column] = value
         trial = np.clip(trial, *layout.bounds())
         least = problem.log_likelihood(x) + _RESTART_GAIN
@@ -136,7 +138,7 @@ class PatientEffortTerm(BreathTerm):
         """Integrate efforts out of breaths without any, at the fitted duration, ``(n,)``."""
         duration = float(fitted.column(DURATION)[0])
         start = self._evidence(linearise(problem, x), duration)
-        breathwise, minimum = self._fit_each_breath(problem, x, start)
+        breathwise, minimum = self._fit_breathwise(problem, x, start)
         curvature = minimum.hessian[
             breathwise.unknowns.index[:, :, None], breathwise.unknowns.index[:, None, :]
         ]
@@ -152,9 +154,9 @@ class PatientEffortTerm(BreathTerm):
         problem, noise = fitted.problem, fitted.noise
         layout, data = problem.unknowns, problem.data
         every = range(len(layout.paths))
-        own = [k for k in every if len(np.unique(layout.index[:, k])) == len(data)]
-        own = [k for k in own if layout.paths[k] not in (AMPLITUDE, ONSET)]
-        columns = [*own, layout.paths.index(AMPLITUDE), layout.paths.index(ONSET)]
+        breathwise = [k for k in every if len(np.unique(layout.index[:, k])) == len(data)]
+        breathwise = [k for k in breathwise if layout.paths[k] not in (AMPLITUDE, ONSET)]
+        columns = [*breathwise, layout.paths.index(AMPLITUDE), layout.paths.index(ONSET)]
         residual, slopes = fitted.jacobian
         white = noise.whiten(residual, data.weight).reshape(len(data), -1)
         rows = noise.whiten(slopes[:, columns], data.weight)
@@ -166,7 +168,7 @@ class PatientEffortTerm(BreathTerm):
         curvature = curvature + prior[:, :, None] * np.eye(len(columns))
         active = noise.log_likelihood(residual, data.weight)
         active = active + self._log_volume(curvature, fitted.column(AMPLITUDE))
-        passive = noise.log_likelihood(fitted.residual_without(EFFORT), data.weight)
+        passive = noise.log_likelihood(fitted.residual_excluding(EFFORT), data.weight)
         return np.logaddexp(np.log(1.0 - PROBABILITY) + passive, np.log(PROBABILITY) + active)
 
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
@@ -200,7 +202,7 @@ class PatientEffortTerm(BreathTerm):
         precision = (_TEMPLATE / AMPLITUDE_SD) ** 2
         for effect in predictor.predict_all(points) - linear.prediction:
             white = linear.whiten(effect)
-            template = linear.without_own(white[:, None])[:, 0]
+            template = linear.project_out_breath(white[:, None])[:, 0]
             power = np.sum(template**2, axis=1)
             match = -np.sum(linear.residual * template, axis=1)
             logs.append(0.5 * match**2 / (power + precision) - 0.5 * np.log1p(power / precision))
@@ -212,7 +214,7 @@ class PatientEffortTerm(BreathTerm):
         nats = np.logaddexp(np.log(1.0 - PROBABILITY), mixed)
         return _Evidence(nats, amplitudes[np.arange(len(top)), top], ONSETS[top])
 
-    def _fit_each_breath(
+    def _fit_breathwise(
         self, passive_problem: Problem, x: Floats, start: _Evidence
     ) -> tuple[Problem, Minimum]:
         """Fit an effort to each breath, together with the breath's other own parameters."""
@@ -250,8 +252,8 @@ class PatientEffortTerm(BreathTerm):
                 prior's precision, ``(n, k, k)``.
             amplitude: the best, cmH2O, ``(n,)``.
         """
-        across, own = curvature[:, -2:, :-2], curvature[:, :-2, :-2]
-        inner = curvature[:, -2:, -2:] - across @ solve(own, across.swapaxes(1, 2))
+        across, nuisance = curvature[:, -2:, :-2], curvature[:, :-2, :-2]
+        inner = curvature[:, -2:, -2:] - across @ solve(nuisance, across.swapaxes(1, 2))
         norm = np.sqrt(2.0 * np.pi) * AMPLITUDE_SD * _SPAN
         prior = -0.5 * (amplitude / AMPLITUDE_SD) ** 2 - np.log(norm)
         return np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(inner)[1] + prior

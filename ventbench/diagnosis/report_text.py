@@ -46,7 +46,7 @@ _NUMBERS = {3: "Three", 4: "Four", 5: "Five", 6: "Six"}
 #: Fewer judging breaths than these leave the worth of a correction vague.
 _FEW_BREATHS = 10
 
-#: Places of less weight than this are told from the likeliest one; the others are one answer.
+#: Places of less weight than this are excluded; the others are one answer.
 _LEAST_WEIGHT = 0.05
 
 #: Posterior probability below which a name is weak.
@@ -74,36 +74,36 @@ def answer(findings: Findings) -> str:
 def headline(findings: Findings) -> str:
     """What is missing and what mending it is worth, in one short sentence."""
     if findings.left_out is not None:
-        others = headline(dataclasses.replace(findings, left_out=None))
-        return f"{findings.left_out}. {others}"
+        rest = headline(dataclasses.replace(findings, left_out=None))
+        return f"{findings.left_out}. {rest}"
     if findings.saturated is not None:
-        others = headline(dataclasses.replace(findings, saturated=None))
-        return f"Readings saturate at {rounded(findings.saturated[0], 1)} cmH2O. {others}"
+        rest = headline(dataclasses.replace(findings, saturated=None))
+        return f"Readings saturate at {rounded(findings.saturated[0], 1)} cmH2O. {rest}"
     simulator, errors = f"the {findings.simulator} simulator", findings.open_loop
     before, after = rounded(errors.refit.rmse, 2), rounded(errors.after.rmse, 2)
     if findings.verdict == "nothing_missing":
         nothing = "No mechanism is shown to be" if findings.remaining else "Nothing is"
         return f"{nothing} missing in {simulator}: it errs by {after} cmH2O"
     if findings.verdict == "unnamed":
-        what = f"Something is missing in {simulator} that has no name"
+        summary = f"Something is missing in {simulator} that has no name"
         if findings.nonparametric is None and findings.changes:
-            what = f"Missing in {simulator}: {change(findings.changes[0])}"
+            summary = f"Missing in {simulator}: {change(findings.changes[0])}"
     else:
-        titles = [told(missing) for missing in findings.mechanisms]
+        titles = [mechanism_phrase(missing) for missing in findings.mechanisms]
         several = f"{_NUMBERS.get(len(titles), str(len(titles)))} effects are missing in"
-        what = f"Missing in {simulator}: {_listed(titles)}"
+        summary = f"Missing in {simulator}: {_listed(titles)}"
         if len(titles) >= _SEVERAL:
-            what = f"{several} {simulator}"
+            summary = f"{several} {simulator}"
     if after == before:
-        return f"{what}, and the error stays at {after} cmH2O"
-    return f"{what}; mending {_it(findings)} takes the error from {before} to {after} cmH2O"
+        return f"{summary}, and the error stays at {after} cmH2O"
+    return f"{summary}; mending {_pronoun(findings)} takes the error from {before} to {after} cmH2O"
 
 
 def verdict(findings: Findings) -> str:
     """What is missing, and how sure that is; without a full stop."""
     if findings.left_out is not None:
-        others = verdict(dataclasses.replace(findings, left_out=None))
-        return f"{findings.left_out}; by the others: {others}"
+        continuation = verdict(dataclasses.replace(findings, left_out=None))
+        return f"{findings.left_out}; by the others: {continuation}"
     if findings.saturated is not None:
         reading, share = findings.saturated
         saturates = (
@@ -121,12 +121,12 @@ def verdict(findings: Findings) -> str:
                 f"{error_phrase(region, findings.noise[0])} ({probability(region.p_value)})"
             )
         return f"Nothing is missing: {how}{simulator} explains the recording"
-    besides = "".join(f", and {change(each)}" for each in findings.changes[:1])
+    addition = "".join(f", and {change(shift)}" for shift in findings.changes[:1])
     if findings.verdict == "unnamed":
         if term is not None:
             return (
                 f"Something is missing in {simulator} that is not in the library of mechanisms "
-                f"({evidence(term.nats)}); its place in the model is {_places(term)}{besides}"
+                f"({evidence(term.nats)}); its place in the model is {_places(term)}{addition}"
             )
         if findings.changes:
             return (
@@ -137,13 +137,15 @@ def verdict(findings: Findings) -> str:
             f"Something is missing in {simulator}, but the recording singles out neither a "
             "mechanism nor a place in the model"
         )
-    names = _listed([told(missing, others=True) for missing in findings.mechanisms])
+    names = _listed(
+        [mechanism_phrase(missing, with_rivals=True) for missing in findings.mechanisms]
+    )
     rest = "" if term is None else ", and an effect that is not in the library"
     if findings.form is not None:
         several = len(findings.mechanisms) > 1
         which = f"; {_listed([title(name) for name in findings.form.form_of])}" if several else ""
         rest = f"{which}, in another form than the library's{rest}"
-    return f"Missing in {simulator}: {names}{rest} ({sureness(findings)}){besides}"
+    return f"Missing in {simulator}: {names}{rest} ({sureness(findings)}){addition}"
 
 
 def sureness(findings: Findings) -> str:
@@ -158,19 +160,22 @@ def sureness(findings: Findings) -> str:
     if not findings.mechanisms:
         term = findings.nonparametric
         return "" if term is None else evidence(term.nats)
-    each = "each at " if len(findings.mechanisms) > 1 else ""
-    return f"{each}{posterior(min(missing.confidence for missing in findings.mechanisms))}"
+    prefix = "each at " if len(findings.mechanisms) > 1 else ""
+    return f"{prefix}{posterior(min(missing.confidence for missing in findings.mechanisms))}"
 
 
 def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
     """What speaks against a name or its strength, in words."""
     doubts = []
-    about = mechanism(missing.name).description.strength
+    strength = mechanism(missing.name).description.strength
     if missing.confidence < _WEAK:
         doubts.append(f"{missing.name} has a {posterior(missing.confidence)} only")
-    if about.name in missing.parameters:
-        value, near = missing.parameters[about.name].value, _AT_END * (about.high - about.low)
-        if min(value - about.low, about.high - value) < near and about.neutral != value:
+    if strength.name in missing.parameters:
+        value, margin = (
+            missing.parameters[strength.name].value,
+            _AT_END * (strength.high - strength.low),
+        )
+        if min(value - strength.low, strength.high - value) < margin and strength.neutral != value:
             doubts.append(f"the strength of {missing.name} is at the end of its range")
     least = findings.settings.residuals.negligible
     if missing.worth < least:
@@ -180,19 +185,19 @@ def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
     return doubts
 
 
-def change(found: Change) -> str:
+def change(shift: Change) -> str:
     """What changes in the course of the recording, as a phrase."""
-    what = {
+    subject = {
         "gain": "the gain of the valve",
         "zero": "the zero of the pressure",
         "error": "the size of the error",
-    }[found.of]
-    by = f"x {found.size:.3g}" if found.of != "zero" else f"by {signed(found.size)} cmH2O"
-    if found.drifts:
+    }[shift.of]
+    by = f"x {shift.size:.3g}" if shift.of != "zero" else f"by {signed(shift.size)} cmH2O"
+    if shift.drifts:
         how = f"drifts from the first to the last breath ({by}"
     else:
-        how = f"changes at breath {found.breath} ({by}"
-    return f"{what} {how}, {probability(found.p_value)})"
+        how = f"changes at breath {shift.breath} ({by}"
+    return f"{subject} {how}, {probability(shift.p_value)})"
 
 
 def evidence(nats: float) -> str:
@@ -222,43 +227,43 @@ def worth(findings: Findings) -> str:
     if errors.scatter_error:
         scatter = rounded(errors.scatter_error, 2)
         noise = f"{noise} and the {scatter} of what differs from breath to breath"
-    whole = f"of the {rounded(errors.whole.rmse, 2)} over whole breaths"
-    left = f"{whole}, {rounded(errors.unexplained, 2)} cmH2O stay unexplained beyond {noise}"
+    total = f"of the {rounded(errors.whole.rmse, 2)} over whole breaths"
+    remainder = f"{total}, {rounded(errors.unexplained, 2)} cmH2O stay unexplained beyond {noise}"
     if not math.isfinite(errors.unexplained):
-        left = f"there is {noise}"
+        remainder = f"there is {noise}"
     elif errors.unexplained < 0.5 * errors.least_error:
-        left = f"{whole}, hardly more than {noise} is left"
+        remainder = f"{total}, hardly more than {noise} is left"
     count = len(errors.held_out_breaths)
     out = errors.groups.get("expiration", {})
     before_out, after_out = (
         rounded(out[stage].rmse, 2) if stage in out else "unknown" for stage in ("refit", "after")
     )
     also = "" if after_out == "unknown" else f" in inspiration and {after_out} in expiration"
-    given = "" if _is_unchanged(findings) else f"{rounded(errors.before.rmse, 2)} as given"
-    stays = f"{after} cmH2O{also}{given and f' ({given})'}"
+    original = "" if _is_unchanged(findings) else f"{rounded(errors.before.rmse, 2)} as given"
+    stays = f"{after} cmH2O{also}{original and f' ({original})'}"
     if findings.verdict == "nothing_missing":
-        return f"it errs by {stays} on {count} breaths set aside, and {left}"
+        return f"it errs by {stays} on {count} breaths set aside, and {remainder}"
     refit = rounded(errors.refit.rmse, 2)
     term = findings.nonparametric
     by_breath = term is not None and term.x_unit.startswith("sample") and not findings.mechanisms
     if by_breath or _swings(findings):
         return (
             "it differs from breath to breath, so that no correction of the simulator mends it: "
-            f"the error on {count} breaths set aside stays at {stays}, and {left}"
+            f"the error on {count} breaths set aside stays at {stays}, and {remainder}"
         )
     if errors.after == errors.refit or (after, after_out) == (refit, before_out):
         return (
-            f"mending {_it(findings)} is worth nothing on the {count} breaths set aside, where the "
-            f"error stays at {stays}, and {left}"
+            f"mending {_pronoun(findings)} is worth nothing on the {count} breaths set aside, "
+            f"where the error stays at {stays}, and {remainder}"
         )
     if also:
         worse = out["after"].rmse - out["refit"].rmse >= findings.settings.residuals.negligible
         also = f" in inspiration, and from {before_out} to {after_out} in expiration"
         also += ", where it gets worse" if worse else ""
-    start = given and f" (R and C refitted; {given})"
+    start = original and f" (R and C refitted; {original})"
     return (
-        f"mending {_it(findings)} takes the error on {count} breaths set aside from {refit}{start} "
-        f"to {after} cmH2O{also}, and {left}"
+        f"mending {_pronoun(findings)} takes the error on {count} breaths set aside from "
+        f"{refit}{start} to {after} cmH2O{also}, and {remainder}"
     )
 
 
@@ -267,10 +272,10 @@ def would_change(findings: Findings) -> list[str]:
     texts = []
     names = [missing.name for missing in findings.mechanisms]
     if names:
-        it, them = ("it", "the name") if len(names) == 1 else ("one", "that name")
+        pronoun, them = ("it", "the name") if len(names) == 1 else ("one", "that name")
         texts.append(
             f"A further recording whose held-out breaths gain less than {_deciding(findings):g} "
-            f"nats by {it} would withdraw {them}."
+            f"nats by {pronoun} would withdraw {them}."
         )
     texts.extend(
         f"Pressure alone can never tell {name} from {_listed(same, 'or')}; flow or volume of the "
@@ -295,7 +300,7 @@ def would_change(findings: Findings) -> list[str]:
             "More than the noise is unexplained: a further effect may act, and with it the "
             "strengths given here may move."
         )
-    steps = [found.breath for found in findings.changes if not found.drifts]
+    steps = [shift.breath for shift in findings.changes if not shift.drifts]
     if steps:
         texts.append(
             f"The breaths before {steps[0]}, and those from it on, diagnosed by themselves, show "
@@ -311,8 +316,10 @@ def would_change(findings: Findings) -> list[str]:
 
 def _swings(findings: Findings) -> bool:
     """Whether all that is missing oscillates, with a phase of its own in each breath."""
-    own = [each.name in events() and not each.affected for each in findings.mechanisms]
-    return bool(own) and all(own)
+    periodic = [
+        missing.name in events() and not missing.affected for missing in findings.mechanisms
+    ]
+    return bool(periodic) and all(periodic)
 
 
 def remaining(findings: Findings) -> str:
@@ -330,16 +337,18 @@ def visible_strengths(findings: Findings) -> dict[str, str]:
     """
     texts = {}
     for name, limit in findings.detection_limits.items():
-        about = mechanism(name).description.strength
-        factor, unit = scaled(Estimate(limit, about.unit, (limit, limit)), f"{name}.{about.name}")
-        shown = f"{two_digits(factor * limit)}{f' {unit}' if unit else ''}"
-        texts[name] = shown if math.isfinite(limit) else ""
+        strength = mechanism(name).description.strength
+        factor, unit = scaled(
+            Estimate(limit, strength.unit, (limit, limit)), f"{name}.{strength.name}"
+        )
+        text = f"{two_digits(factor * limit)}{f' {unit}' if unit else ''}"
+        texts[name] = text if math.isfinite(limit) else ""
     return texts
 
 
 def scatter(findings: Findings) -> str:
     """That breaths have valve gains of their own; gains with an order in time do not scatter."""
-    if findings.gain_scatter <= 0.0 or any(each.of == "gain" for each in findings.changes):
+    if findings.gain_scatter <= 0.0 or any(shift.of == "gain" for shift in findings.changes):
         return ""
     share = 100.0 * math.expm1(findings.gain_scatter)
     return (
@@ -354,26 +363,26 @@ def title(name: str) -> str:
     return mechanism(name).description.title
 
 
-def told(missing: MissingMechanism, *, others: bool = False) -> str:
+def mechanism_phrase(missing: MissingMechanism, *, with_rivals: bool = False) -> str:
     """A missing mechanism in words; of a change at a breath, what changes from which breath on.
 
     Args:
         missing: the mechanism.
-        others: whether to add what else a change in the session may be: a drift that is no worse is
-            one answer with the step.
+        with_rivals: whether to add what else a change in the session may be: a drift that is no
+            worse is one answer with the step.
     """
-    text, about = title(missing.name), mechanism(missing.name)
+    text, model = title(missing.name), mechanism(missing.name)
     if missing.breaths is not None:
-        strength = about.description.strength
+        strength = model.description.strength
         size = missing.parameters[strength.name]
         factor, unit = scaled(size, f"{missing.name}.{strength.name}")
         how = "rises" if size.value > 0.0 else "falls"
         by = f"{two_digits(abs(factor * size.value))} {unit}"
         text = f"{text.removeprefix('step of ')} {how} by {by} from breath {missing.breaths[0]} on"
-    rivals = [name for name in missing.alternatives if others and about.uses_position]
+    rivals = [name for name in missing.alternatives if with_rivals and model.uses_position]
     rivals = [title(name) for name in rivals if mechanism(name).uses_position]
     if missing.affected or missing.name in events():  # places that are alike are one answer
-        rivals = [title(name) for name in missing.alternatives if others]
+        rivals = [title(name) for name in missing.alternatives if with_rivals]
     if missing.explains < _NEAREST:
         text = f"an effect to which the nearest in the library is {text}"
     if rivals:
@@ -383,8 +392,8 @@ def told(missing: MissingMechanism, *, others: bool = False) -> str:
 
 def missing_mechanism(missing: MissingMechanism) -> str:
     """Values of a missing mechanism with their 95 % intervals, and how far its name is ahead."""
-    about = mechanism(missing.name).description
-    meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
+    description = mechanism(missing.name).description
+    meanings = {parameter.name: parameter.meaning for parameter in description.parameters}
     values = []
     if missing.breaths is not None:
         first, low, high = missing.breaths
@@ -394,12 +403,12 @@ def missing_mechanism(missing: MissingMechanism) -> str:
             continue  # which is told as a breath
         text, path = quantity(estimate, f"{missing.name}.{name}"), f"{missing.name}.{name}"
         if name in missing.simulator_values:
-            other = quantity_like(missing.simulator_values[name], estimate, path)
-            text += f" instead of {other} in the simulator"
+            reference = quantity_like(missing.simulator_values[name], estimate, path)
+            text += f" instead of {reference} in the simulator"
         meaning = meanings.get(name, name)
         # "Dead time" need not be said twice.
-        values.append(text if meaning in about.title else f"{text} ({meaning})")
-    start = capital(about.title)
+        values.append(text if meaning in description.title else f"{text} ({meaning})")
+    start = capital(description.title)
     if missing.changed and not missing.simulator_values:
         start += ", which the simulator has with another strength"
     values_in_words = "; ".join(values)
@@ -417,8 +426,8 @@ def effect(findings: Findings) -> str:
     region = max(phases or findings.location, key=lambda region: region.share)
     text = error_phrase(region, findings.noise[0])
     if findings.verdict == "named":
-        without = "Without it" if len(findings.mechanisms) == 1 else "Without them"
-        return f"{without} {text}, even with R and C refitted."
+        condition = "Without it" if len(findings.mechanisms) == 1 else "Without them"
+        return f"{condition} {text}, even with R and C refitted."
     if _is_unchanged(findings):
         return error_region(region, findings.noise[0])
     return f"With R and C refitted, {text}."
@@ -435,26 +444,26 @@ def alternatives(findings: Findings) -> list[str]:
 
 def request(findings: Findings) -> str:
     """Sentence on what to record next."""
-    wanted = findings.request
-    if wanted is None:
+    proposal = findings.request
+    if proposal is None:
         return ""
-    text = f"Record next: {wanted.title.rstrip('.')}."
-    if not wanted.why:
+    text = f"Record next: {proposal.title.rstrip('.')}."
+    if not proposal.why:
         return text
-    what = f"distinguish between {_listed(wanted.why)}"
-    if len(wanted.why) == 1:
-        what = f"test {wanted.why[0]}"
-    expected = f"expected evidence {wanted.nats:.0f} nats; {_deciding(findings):g} decide"
-    return f"{text} These breaths {what} ({expected})."
+    purpose = f"distinguish between {_listed(proposal.why)}"
+    if len(proposal.why) == 1:
+        purpose = f"test {proposal.why[0]}"
+    expected = f"expected evidence {proposal.nats:.0f} nats; {_deciding(findings):g} decide"
+    return f"{text} These breaths {purpose} ({expected})."
 
 
 def nonparametric_term(findings: Findings) -> str:
     """Sentence on where an unnamed effect acts, or on a mechanism's form, and what it explains."""
     form, term = findings.form, findings.nonparametric
     if form is not None:
-        what = _listed([title(name) for name in form.form_of])
+        names = _listed([title(name) for name in form.form_of])
         return (
-            f"The form of the {what} differs from the library's: a nonparametric term for "
+            f"The form of the {names} differs from the library's: a nonparametric term for "
             f"{place(form)} beside it gains {form.nats:.0f} nats on held-out breaths and explains "
             f"{100 * form.explains:.0f} % of the squared error that it leaves above the noise."
         )
@@ -480,17 +489,17 @@ def _certainty(term: NonparametricTerm) -> str:
     if not term.x_unit.startswith("sample"):
         return text
     if len(listed) == 1:
-        others = _listed([name for name, _ in term.places if name != listed[0][0]], "and")
-        text = f" A course as smooth at other places ({others}) is less likely." if others else ""
+        rest = _listed([name for name, _ in term.places if name != listed[0][0]], "and")
+        text = f" A course as smooth at other places ({rest}) is less likely." if rest else ""
     return f"{text} From pressure alone, a rougher course elsewhere would read the same."
 
 
 def _places(term: NonparametricTerm) -> str:
     """Place of a term, with those that the recording cannot tell from it."""
-    others = [n for n, share in term.places if share >= _LEAST_WEIGHT and n != term.name]
-    if not others:
+    rivals = [n for n, share in term.places if share >= _LEAST_WEIGHT and n != term.name]
+    if not rivals:
         return place(term)
-    return f"{place(term)}, or {_listed(others, 'or')}, which these breaths cannot tell from it"
+    return f"{place(term)}, or {_listed(rivals, 'or')}, which these breaths cannot tell from it"
 
 
 def place(term: NonparametricTerm) -> str:
@@ -498,7 +507,7 @@ def place(term: NonparametricTerm) -> str:
     return f"{term.name} ({term.meaning.removeprefix(f'{term.name}: ')})"
 
 
-def _it(findings: Findings) -> str:
+def _pronoun(findings: Findings) -> str:
     """Pronoun for what is missing."""
     count = len(findings.mechanisms) + (findings.nonparametric is not None)
     return "it" if count < 2 else "them"

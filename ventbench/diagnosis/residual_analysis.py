@@ -139,9 +139,9 @@ def locate(
     squares = np.where(usable, error**2 - variance, 0.0)
     offset = 0
     for axis in all_axes:
-        own = slice(offset, offset + len(axis))
+        ranges = slice(offset, offset + len(axis))
         offset += len(axis)
-        for first, last in _runs(p_value[own] <= settings.level, sign[own], axis.merge):
+        for first, last in _runs(p_value[ranges] <= settings.level, sign[ranges], axis.merge):
             if axis.merge and len(axis) > 1 and _is_most_of_axis(axis, usable, first, last):
                 continue  # nearly the whole of an axis is no place
             inside = usable & (axis.bins >= first) & (axis.bins <= last)
@@ -153,7 +153,7 @@ def locate(
                     high=float(axis.edges[last + 1]),
                     unit=axis.unit,
                     mean_error=_mean_over_breaths(error, inside),
-                    p_value=float(p_value[own][first : last + 1].min()),
+                    p_value=float(p_value[ranges][first : last + 1].min()),
                     share=float(np.clip(share, 0.0, 1.0)),
                 )
             )
@@ -260,11 +260,11 @@ def p_values(
 
 
 def _scaled(values: Floats, weight: Floats | None, min_breaths: int) -> tuple[Floats, Floats]:
-    known = np.isfinite(values)
-    filled = np.where(known, values, 0.0)
+    finite = np.isfinite(values)
+    filled = np.where(finite, values, 0.0)
     norm = np.sqrt(np.sum(filled**2, axis=0))
-    enough = (known.sum(axis=0) >= min_breaths) & (norm > 0)
-    scale = np.divide(1.0, norm, out=np.zeros_like(norm), where=enough)
+    testable = (finite.sum(axis=0) >= min_breaths) & (norm > 0)
+    scale = np.divide(1.0, norm, out=np.zeros_like(norm), where=testable)
     return filled, scale if weight is None else scale * weight
 
 
@@ -275,8 +275,8 @@ def _mean_over_breaths(error: Floats, inside: Bools) -> float:
     independent unit of the tests.
     """
     count = inside.sum(axis=1)
-    known = count > 0
-    return float(np.mean(np.where(inside, error, 0.0).sum(axis=1)[known] / count[known]))
+    occupied = count > 0
+    return float(np.mean(np.where(inside, error, 0.0).sum(axis=1)[occupied] / count[occupied]))
 
 
 def _breath_means(axis: Axis, values: Floats, usable: Bools) -> Floats:
@@ -316,10 +316,10 @@ def _test_columns(axis: Axis, error: Floats, usable: Bools) -> tuple[Floats, Flo
     for k in range(len(axis)):
         have = count[:, k] > 0
         if have.any() and not (rest[have, k] > 0).any():
-            others = ~have & (all_count[:, 0] > 0)
-            level = square[others].sum() / max(usable[others].sum(), 1)
-            outside[:, k] = level if others.any() else np.nan
-            weight[0, k] = np.sqrt(others.sum() / max(others.sum() + have.sum(), 1))
+            reference = ~have & (all_count[:, 0] > 0)
+            level = square[reference].sum() / max(usable[reference].sum(), 1)
+            outside[:, k] = level if reference.any() else np.nan
+            weight[0, k] = np.sqrt(reference.sum() / max(reference.sum() + have.sum(), 1))
     return _breath_means(axis, error, usable), inside - outside, weight
 
 
@@ -328,12 +328,12 @@ def shared_square(error: Floats, usable: Bools) -> Floats:
 
     Its mean is the variance of what they share, and zero for white noise of any size.
     """
-    near, count = np.zeros(error.shape), np.zeros(error.shape)
-    known = np.where(usable, error, 0.0)
+    neighbours, count = np.zeros(error.shape), np.zeros(error.shape)
+    filled = np.where(usable, error, 0.0)
     for ahead, behind in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
-        near[:, ahead] += known[:, behind]
+        neighbours[:, ahead] += filled[:, behind]
         count[:, ahead] += usable[:, behind]
-    return known * near / np.maximum(count, 1.0)
+    return filled * neighbours / np.maximum(count, 1.0)
 
 
 class Excess(NamedTuple):
@@ -366,7 +366,7 @@ def excess_over_noise(error: Floats, usable: Bools, quiet: Bools) -> Excess:
         usable: where they are known.
         quiet: where nothing moves.
     """
-    rows = [(error[b, own], quiet[b, own]) for b, own in enumerate(usable) if own.sum() > 2]
+    rows = [(error[b, mask], quiet[b, mask]) for b, mask in enumerate(usable) if mask.sum() > 2]
     if not rows:
         return Excess(float("nan"), float("nan"), 0.0, 1.0)
     now = np.concatenate([r[2:] for r, _ in rows])
@@ -418,8 +418,8 @@ def amplitudes(error: Floats, usable: Bools, signals: Floats) -> Floats:
 
 def _nanmean(values: Floats) -> Floats:
     """Mean over the first axis without NaN; unlike NumPy's it does not warn of empty columns."""
-    known = np.isfinite(values)
-    total, count = np.where(known, values, 0.0).sum(axis=0), known.sum(axis=0)
+    finite = np.isfinite(values)
+    total, count = np.where(finite, values, 0.0).sum(axis=0), finite.sum(axis=0)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 
@@ -503,9 +503,9 @@ def round_edges(values: Floats, valid: Bools) -> Floats:
     if inside.size == 0:
         return np.array([0.0, 1.0])
     low, high = np.quantile(inside, [_EXTREME, 1.0 - _EXTREME])
-    wanted = max((high - low) / _RANGES, 1e-6)
-    scale = 10.0 ** np.floor(np.log10(wanted))
-    step = scale * next(x for x in (1.0, 2.0, 5.0, 10.0) if x * scale >= 0.999 * wanted)
+    width = max((high - low) / _RANGES, 1e-6)
+    scale = 10.0 ** np.floor(np.log10(width))
+    step = scale * next(x for x in (1.0, 2.0, 5.0, 10.0) if x * scale >= 0.999 * width)
     first, last = np.floor(low / step), max(np.ceil(high / step), np.floor(low / step) + 1)
     return np.round(step * np.arange(first, last + 1), 9)
 

@@ -143,7 +143,7 @@ class Diagnosis(Findings):
             corrected.unlink(missing_ok=True)
             return written
         breaths = self.traces.breaths
-        about = {
+        metadata = {
             "corrected": self.simulator,
             "mechanisms": [missing.name for missing in self.mechanisms],
             "recording": breaths.source,
@@ -152,7 +152,7 @@ class Diagnosis(Findings):
             "chosen": dict(self.chosen),
             "ventbench": VERSION,
         }
-        save_plants(corrected, self.plants, about)
+        save_plants(corrected, self.plants, metadata)
         return [*written, corrected]
 
     def __repr__(self) -> str:
@@ -165,11 +165,11 @@ class Diagnosis(Findings):
 
     def _repr_html_(self) -> str:
         """Sentences and table for a notebook."""
-        first, *others = (html.escape(text) for text in report_text.sentences(self))
+        first, *rest = (html.escape(text) for text in report_text.sentences(self))
         table = ""
         if self.mechanisms:
             table = self.to_frame().to_html(index=False, float_format="%.4g", na_rep="")
-        return f"<p><b>{first}</b></p>{table}" + "".join(f"<p>{text}</p>" for text in others)
+        return f"<p><b>{first}</b></p>{table}" + "".join(f"<p>{text}</p>" for text in rest)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values of ``diagnosis.json``; numbers that are not finite become None.

@@ -173,5 +173,5 @@ class SelectionConfig:
     version: str = VERSION
 
 
-#: What a diagnosis uses unless it is told otherwise.
+#: Settings of a diagnosis by default.
 DEFAULT = SelectionConfig()

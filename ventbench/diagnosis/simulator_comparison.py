@@ -63,31 +63,31 @@ def identify_both(
     settings, noise = recording_only_model.evaluator.settings, recording_only_model.conclusion.noise
     measured = with_sensor_noise(data, response, noise, settings.simulator.noise_seed)
     simulator_model = identify(
-        measured, held, excluded, lambda what: tell(f"simulator: {what}"), settings, fitted
+        measured, held, excluded, lambda step: tell(f"simulator: {step}"), settings, fitted
     )
     simulator_model = with_mechanisms_of(simulator_model, recording_only_model)
     first = response[:, 0]
-    own = simulator_model.pressures(simulator_model.conclusion.full, data, first)
-    unmodelled = np.nan_to_num(response - own)
+    modelled = simulator_model.pressures(simulator_model.conclusion.full, data, first)
+    unmodelled = np.nan_to_num(response - modelled)
     reduced = data.with_pressure(data.measured[:, 0] - unmodelled)
     refitted = refit_base_parameters(simulator_model, reduced.select(~held))
     refit = simulator_model.pressures(refitted, data, first) + unmodelled
     # Predicted as breaths to come: parameters of each breath are not known of them.
     predicted = recording_only_model.pressures(recording_only_model.conclusion.full, data, first)
-    seen = data.select(~held)
-    error = min(mean_error(seen, response[~held]), mean_error(seen, refit[~held]))
+    training = data.select(~held)
+    error = min(mean_error(training, response[~held]), mean_error(training, refit[~held]))
     share = settings.simulator.residual_model_share
-    if error >= share * mean_error(seen, predicted[~held]):
+    if error >= share * mean_error(training, predicted[~held]):
         return recording_only_model, simulator_model
     recording_model = identify(
         reduced,
         held,
         excluded,
-        lambda what: tell(f"recording less the simulator's part: {what}"),
+        lambda step: tell(f"recording less the simulator's part: {step}"),
         settings,
         fitted,
     )
-    fit = _noiseless_fit(simulator_model, data.with_pressure(own), held, recording_model)
+    fit = _noiseless_fit(simulator_model, data.with_pressure(modelled), held, recording_model)
     return recording_model, replace(simulator_model, fit=fit)
 
 
@@ -108,16 +108,16 @@ def with_mechanisms_of(
         BIC or held-out breaths do not prefer that.
     """
     evaluator, conclusion = simulator_model.evaluator, simulator_model.conclusion
-    wanted, own = recording_model.conclusion.named, conclusion.full
-    added = tuple(name for name in wanted.names if name not in own.names)
+    recording_fit, simulator_fit = recording_model.conclusion.named, conclusion.full
+    added = tuple(name for name in recording_fit.names if name not in simulator_fit.names)
     if not added:
         return simulator_model
-    joint = own.hypothesis.plus(wanted.hypothesis.without(*own.names))
+    joint = simulator_fit.hypothesis.plus(recording_fit.hypothesis.minus(*simulator_fit.names))
     # From the values of the base model: those of a poor description lie in a minimum of their own.
     fitted = fit_with_noise(evaluator, joint)
     fitted = drop_redundant_terms(evaluator, fitted, added)
     full = fit_with_noise(evaluator, fitted.hypothesis, fitted)
-    against = evaluator.fit(own.hypothesis, full.noise, own)
+    against = evaluator.fit(simulator_fit.hypothesis, full.noise, simulator_fit)
     gains = evaluator.held_out_log_likelihood(full) - evaluator.held_out_log_likelihood(against)
     if evaluator.criterion(full) >= evaluator.criterion(against) or not passes_heldout_test(
         gains, evaluator.settings.held_out_test
@@ -125,7 +125,7 @@ def with_mechanisms_of(
         return simulator_model
     named, unnamed = full, conclusion.unnamed
     if unnamed is not None and unnamed.term is not None:
-        named = evaluator.fit(full.hypothesis.without(unnamed.term), full.noise, full)
+        named = evaluator.fit(full.hypothesis.minus(unnamed.term), full.noise, full)
     else:
         unnamed = None  # an input that varied in time beside the mechanisms of before
     conclusion = replace(conclusion, named=named, full=full, unnamed=unnamed, noise=full.noise)
@@ -140,8 +140,11 @@ def describe_otherwise(recording_model: IdentifiedModel, simulator_model: Identi
     all of those names seem to be missing. The recording should be described by the simulator's
     names too; held-out breaths tell which description corrects the simulator.
     """
-    recorded, own = set(recording_model.conclusion.names), set(simulator_model.conclusion.names)
-    return bool(recorded - own) and bool(own - recorded)
+    recorded, simulated = (
+        set(recording_model.conclusion.names),
+        set(simulator_model.conclusion.names),
+    )
+    return bool(recorded - simulated) and bool(simulated - recorded)
 
 
 def mean_error(data: Data, pressure: Floats) -> float:
@@ -165,8 +168,8 @@ def less_unmodelled(data: Data, response: Floats, simulator_model: IdentifiedMod
         response: pressures of the simulator for the recorded commands, cmH2O, ``(n, T)``.
         simulator_model: identified from the simulator's response.
     """
-    own = simulator_model.pressures(simulator_model.conclusion.full, data, response[:, 0])
-    return data.with_pressure(data.measured[:, 0] - np.nan_to_num(response - own))
+    modelled = simulator_model.pressures(simulator_model.conclusion.full, data, response[:, 0])
+    return data.with_pressure(data.measured[:, 0] - np.nan_to_num(response - modelled))
 
 
 def with_sensor_noise(
@@ -203,10 +206,10 @@ def refit_base_parameters(
         data: the breaths.
         noise: model of the measurement noise; that of the model if not given.
     """
-    own, evaluator = simulator_model.conclusion.full, simulator_model.evaluator
+    simulator_fit, evaluator = simulator_model.conclusion.full, simulator_model.evaluator
     noise = noise or simulator_model.conclusion.noise
     partition = Partition(data, evaluator.training.predictor)
-    return evaluator.fit(own.hypothesis, noise, own, partition=partition)
+    return evaluator.fit(simulator_fit.hypothesis, noise, simulator_fit, partition=partition)
 
 
 def missing_mechanisms(
@@ -267,8 +270,8 @@ def refit_at_simulator_parameters(
         The model of the recording with the simulator's own R, C, R_ex, PEEP and other mechanisms,
         and the mechanisms that are still missing; None if held-out breaths ask for other values.
     """
-    full, own = recording_model.conclusion.full, simulator_model.conclusion.full
-    if any(varies_by_breath(name) for name in (*full.names, *own.names)):
+    full, simulator_fit = recording_model.conclusion.full, simulator_model.conclusion.full
+    if any(varies_by_breath(name) for name in (*full.names, *simulator_fit.names)):
         return None
     place = recording_model.conclusion.unnamed
     term = (place.term,) if place is not None and place.term else ()
@@ -284,9 +287,9 @@ def refit_at_simulator_parameters(
     test = evaluator.settings.held_out_test
 
     def fit_with(names: Sequence[str]) -> FittedModel:
-        asked = (*names, *term)
-        hypothesis = _combined(full.hypothesis, own.hypothesis, asked)
-        return _fit_beside(evaluator, hypothesis, asked, full, own)
+        requested = (*names, *term)
+        hypothesis = _combined(full.hypothesis, simulator_fit.hypothesis, requested)
+        return _fit_beside(evaluator, hypothesis, requested, full, simulator_fit)
 
     score = evaluator.held_out_log_likelihood
     names, fitted = tuple(missing), fit_with(missing)
@@ -296,30 +299,32 @@ def refit_at_simulator_parameters(
     nothing = score(fit_with(()))
     while names:
         # A mechanism that only compensated another R or C is idle beside the simulator's own.
-        fewer = [fit_with([other for other in names if other != name]) for name in names]
+        fewer = [
+            fit_with([candidate for candidate in names if candidate != name]) for name in names
+        ]
         lost = [score(fitted) - score(less) for less in fewer]
         least = int(np.argmin([nats.sum() for nats in lost]))
         name = names[least]
-        whole = float((score(fitted) - nothing).sum())
-        negligible = is_faint(fitted, own, name, test.negligible_strength)
-        negligible &= bool(lost[least].sum() < test.negligible_share * whole)
+        total = float((score(fitted) - nothing).sum())
+        negligible = is_faint(fitted, simulator_fit, name, test.negligible_strength)
+        negligible &= bool(lost[least].sum() < test.negligible_share * total)
         if passes_heldout_test(lost[least], test) and not negligible:
             break
         fitted = fewer[least]
-        names = tuple(other for other in names if other != name)
+        names = tuple(candidate for candidate in names if candidate != name)
     conclusion = replace(recording_model.conclusion, full=fitted)
     return IdentifiedModel(evaluator, conclusion, fitted, evaluator.training), names
 
 
-def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> bool:
+def is_faint(fitted: FittedModel, simulator_fit: FittedModel, name: str, share: float) -> bool:
     """Whether a mechanism differs from the simulator's by less than a share of a mild strength."""
     path = strength_path(name)
-    return is_weak(name, fitted.column(path) - own.column(path)[0], share)
+    return is_weak(name, fitted.column(path) - simulator_fit.column(path)[0], share)
 
 
 def _noiseless_fit(
     simulator_model: IdentifiedModel,
-    own: Data,
+    modelled: Data,
     held: Bools,
     recording_model: IdentifiedModel,
 ) -> FittedModel:
@@ -328,7 +333,7 @@ def _noiseless_fit(
     The values are those of the model; their intervals are what such breaths tell of them.
     """
     fitted, evaluator = simulator_model.conclusion.full, simulator_model.evaluator
-    partition = Partition(own.select(~held), evaluator.training.predictor)
+    partition = Partition(modelled.select(~held), evaluator.training.predictor)
     problem = replace(fitted.problem, noise=recording_model.conclusion.noise)
     return estimates.final_fit(replace(fitted, problem=problem), partition, evaluator)
 
@@ -348,36 +353,38 @@ def _differs(recording_model: IdentifiedModel, simulator_model: IdentifiedModel,
     return bool(gap > separation * np.hypot(half[0], half[1]))
 
 
-def _combined(full: Hypothesis, own: Hypothesis, asked: tuple[str, ...]) -> Hypothesis:
+def _combined(full: Hypothesis, simulated: Hypothesis, requested: tuple[str, ...]) -> Hypothesis:
     """The mechanisms asked for as the recording has them, all others as the simulator has them."""
-    others = [name for name in full.names if name not in asked]
-    return own.without(*asked).plus(full.without(*others))
+    rest = [name for name in full.names if name not in requested]
+    return simulated.minus(*requested).plus(full.minus(*rest))
 
 
 def _fit_beside(
     evaluator: Evaluator,
     hypothesis: Hypothesis,
-    asked: tuple[str, ...],
+    requested: tuple[str, ...],
     full: FittedModel,
-    own: FittedModel,
+    simulator_fit: FittedModel,
 ) -> FittedModel:
     """Fit the parameters of the mechanisms asked for; all others stay at the simulator's values."""
     partition = evaluator.training
-    free = [p for p in (*free_paths(asked), *hypothesis.free) if p.rpartition(".")[0] in asked]
-    values = evaluator.transferred(own, partition)
+    free = [
+        p for p in (*free_paths(requested), *hypothesis.free) if p.rpartition(".")[0] in requested
+    ]
+    values = evaluator.transferred(simulator_fit, partition)
     fixed: dict[str, ArrayLike] = {p: x for p, x in values.items() if p not in free}
-    given = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in asked}
-    found = fit(
+    constants = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in requested}
+    solution = fit(
         partition.data,
         hypothesis.names,
         free=free,
-        fixed=fixed | given,
+        fixed=fixed | constants,
         start={p: float(np.median(full.column(p))) for p in free},
         gain_sd=evaluator.gain_sd,
         noise=full.noise,
         predictor=partition.predictor,
     )
-    return FittedModel(hypothesis.names, found.problem, found.minimum, hypothesis)
+    return FittedModel(hypothesis.names, solution.problem, solution.minimum, hypothesis)
 
 
 def _wider(recording: Evaluator, simulator: Evaluator) -> Evaluator:

@@ -47,26 +47,26 @@ def unplaced_gain(evaluator: Evaluator, fitted: FittedModel, partition: Partitio
     """
     linear = linearise(*evaluator.refit_breath_parameters(fitted, partition), clip=np.inf)
     columns = linear.whiten(_hats(partition.data)[:, :, None])
-    X = linear.without_own(columns)  # (n, k, m)
+    X = linear.project_out_breath(columns)  # (n, k, m)
     noise, error = linear.problem.noise, linear.residual
     before = noise.loss(error).sum(axis=1)
     totals = []
     for size in _SIZES:
         course, eye = np.zeros(X.shape[:2]), np.eye(X.shape[1]) / size**2
-        left = error
+        residual = error
         for _ in range(_STEPS):
-            weighted = X * noise.influence(left)[:, None]
+            weighted = X * noise.influence(residual)[:, None]
             curvature = weighted @ X.swapaxes(1, 2) + eye
             course = -solve(curvature, (weighted @ error[:, :, None]))[:, :, 0]
-            left = error + np.einsum("nk,nkm->nm", course, X)
-        after = noise.loss(left).sum(axis=1) + 0.5 * np.sum(course**2, axis=1) / size**2
+            residual = error + np.einsum("nk,nkm->nm", course, X)
+        after = noise.loss(residual).sum(axis=1) + 0.5 * np.sum(course**2, axis=1) / size**2
         volume = 0.5 * np.linalg.slogdet(curvature * size**2)[1]
         totals.append(before - after - volume)
-    each = [
+    log_evidence = [
         np.logaddexp(np.log1p(-share), np.log(share) + gained).sum()
         for gained, share in product(totals, _SHARES)
     ]
-    return float(np.logaddexp.reduce(each) - np.log(len(each)))
+    return float(np.logaddexp.reduce(log_evidence) - np.log(len(log_evidence)))
 
 
 def preference(nats: float) -> float:

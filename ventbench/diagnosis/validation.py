@@ -79,15 +79,15 @@ def is_plausible(fitted: FittedModel, name: str, settings: PlausibilitySettings)
         name: name of the mechanism, or of a basis term, which has no least strength.
         settings: every threshold.
     """
-    about = mechanism(name).description
-    beyond = fitted.column(strength_path(name)) - about.strength.neutral
-    felt = np.abs(beyond) >= about.least
+    description = mechanism(name).description
+    beyond = fitted.column(strength_path(name)) - description.strength.neutral
+    felt = np.abs(beyond) >= description.least
     if not varies_by_breath(name):
         return bool(felt.any())
-    enough = felt.sum() >= max(settings.effort_breaths, settings.effort_share * len(felt))
+    frequent = felt.sum() >= max(settings.effort_breaths, settings.effort_share * len(felt))
     # By their squares: a breath without an effort may be given a small one of either sign.
     square = np.where(felt, beyond**2, 0.0)
-    return bool(enough and square[beyond > 0].sum() >= settings.effort_pulls * square.sum())
+    return bool(frequent and square[beyond > 0].sum() >= settings.effort_pulls * square.sum())
 
 
 def excludes_neutral(estimate: Estimate, name: str) -> bool:
@@ -129,11 +129,11 @@ def is_consistent(gains: np.ndarray, settings: PlausibilitySettings) -> bool:
     if len(gains) < settings.bootstrap_breaths:
         return True
     rng = np.random.default_rng(0)
-    drawn = gains[rng.integers(0, len(gains), (settings.bootstraps, len(gains)))]
-    return bool(np.quantile(drawn.sum(axis=1), settings.bootstrap_level) > 0.0)
+    resampled = gains[rng.integers(0, len(gains), (settings.bootstraps, len(gains)))]
+    return bool(np.quantile(resampled.sum(axis=1), settings.bootstrap_level) > 0.0)
 
 
-def explained_share(worth: float, left: float, rest: float) -> float:
+def explained_share(worth: float, error: float, rest: float) -> float:
     """Share of the squared error which is no noise that a name explains, 0..1.
 
     A name may be no more than the shadow of an effect that the library lacks: if one effect causes
@@ -141,13 +141,13 @@ def explained_share(worth: float, left: float, rest: float) -> float:
 
     Args:
         worth: root-mean-square error that the name takes away, cmH2O; NaN if unknown.
-        left: error with the name, cmH2O.
+        error: error with the name, cmH2O.
         rest: part of it that tests of the residuals show to be no noise, cmH2O.
 
     Returns:
         The share; 1 where nothing is known to be left.
     """
-    explained = max(worth, 0.0) * (2.0 * left + max(worth, 0.0))
+    explained = max(worth, 0.0) * (2.0 * error + max(worth, 0.0))
     return explained / (explained + rest**2) if rest > 0.0 and np.isfinite(worth) else 1.0
 
 
@@ -173,13 +173,13 @@ def passes_heldout_test(
     if float(gains.sum()) <= threshold:
         return False
     typical = float(np.quantile(np.abs(gains), settings.typical_quantile))
-    far = settings.outlier_factor * typical
-    clipped = np.clip(gains, -far, far)
+    bound = settings.outlier_factor * typical
+    clipped = np.clip(gains, -bound, bound)
     total, scatter = float(clipped.sum()), float(np.sqrt(np.sum(clipped**2)))
     return total > settings.kept_share * threshold and total > settings.consistency * scatter
 
 
-def is_needed(evaluator: Evaluator, with_term: FittedModel, without_term: FittedModel) -> bool:
+def is_needed(evaluator: Evaluator, full: FittedModel, reduced: FittedModel) -> bool:
     """Whether both training and held-out breaths ask for a term.
 
     Where the training breaths ask for it clearly and the held-out breaths are too few to tell, the
@@ -187,26 +187,24 @@ def is_needed(evaluator: Evaluator, with_term: FittedModel, without_term: Fitted
 
     Args:
         evaluator: evaluator of the recording.
-        with_term: a hypothesis.
-        without_term: the hypothesis without the term, at the same noise.
+        full: a hypothesis with the term.
+        reduced: the hypothesis without the term, at the same noise.
     """
     settings = evaluator.settings.held_out_test
-    gained = evaluator.criterion(without_term) - evaluator.criterion(with_term)
+    gained = evaluator.criterion(reduced) - evaluator.criterion(full)
     if gained < 0:
         return False
-    held_out = evaluator.held_out_log_likelihood(with_term)
-    if passes_heldout_test(held_out - evaluator.held_out_log_likelihood(without_term), settings):
+    held_out = evaluator.held_out_log_likelihood(full)
+    if passes_heldout_test(held_out - evaluator.held_out_log_likelihood(reduced), settings):
         return True
     return gained > settings.clear_criterion and passes_heldout_test(
-        cross_validated_gain(evaluator, with_term, without_term),
+        cross_validated_gain(evaluator, full, reduced),
         settings,
         settings.cross_validation_factor * settings.threshold,
     )
 
 
-def is_negligible(
-    evaluator: Evaluator, with_term: FittedModel, without_term: FittedModel, name: str
-) -> bool:
+def is_negligible(evaluator: Evaluator, full: FittedModel, reduced: FittedModel, name: str) -> bool:
     """Whether a term is implausible, or far weaker than a mild one and explains little.
 
     A tiny effect of almost any kind can reduce an error of the integrator, or of another term's
@@ -215,22 +213,20 @@ def is_negligible(
 
     Args:
         evaluator: evaluator of the recording.
-        with_term: a hypothesis.
-        without_term: the hypothesis without the term, at the same noise.
+        full: a hypothesis with the term.
+        reduced: the hypothesis without the term, at the same noise.
         name: name of the term.
     """
-    if not is_plausible(with_term, name, evaluator.settings.plausibility):
+    if not is_plausible(full, name, evaluator.settings.plausibility):
         return True
     settings = evaluator.settings.held_out_test
-    about = mechanism(name).description.strength
-    beyond = with_term.column(f"{name}.{about.name}") - about.neutral
+    strength = mechanism(name).description.strength
+    beyond = full.column(f"{name}.{strength.name}") - strength.neutral
     if varies_by_breath(name) or not is_weak(name, beyond, settings.negligible_strength):
         return False
-    criterion = evaluator.criterion(with_term)
-    base = evaluator.criterion(evaluator.fit(Hypothesis(), with_term.noise, with_term))
-    return evaluator.criterion(without_term) - criterion < settings.negligible_share * (
-        base - criterion
-    )
+    criterion = evaluator.criterion(full)
+    base = evaluator.criterion(evaluator.fit(Hypothesis(), full.noise, full))
+    return evaluator.criterion(reduced) - criterion < settings.negligible_share * (base - criterion)
 
 
 def drop_redundant_terms(
@@ -244,10 +240,10 @@ def drop_redundant_terms(
         names: the terms to judge.
     """
     for name in names:
-        without = evaluator.fit(current.hypothesis.without(name), current.noise, current)
-        needed = is_needed(evaluator, current, without)
-        if not needed or is_negligible(evaluator, current, without, name):
-            current = without
+        reduced = evaluator.fit(current.hypothesis.minus(name), current.noise, current)
+        needed = is_needed(evaluator, current, reduced)
+        if not needed or is_negligible(evaluator, current, reduced, name):
+            current = reduced
     return current
 
 
@@ -277,18 +273,18 @@ def detection_limits(evaluator: Evaluator, fitted: FittedModel) -> dict[str, flo
 
 def _limit(linear: Linearisation, name: str, share: float) -> float:
     """Strength at which the testing breaths gain enough, by the secant from two strengths."""
-    about = mechanism(name).description
-    strength, predictor = about.strength, linear.problem.predictor
+    description = mechanism(name).description
+    strength, predictor = description.strength, linear.problem.predictor
     column = predictor.names.index(strength_path(name))
     largest = abs(strength.high - strength.neutral)
     distance = abs(strength.mild - strength.neutral)
-    others = [p for p in about.parameters[1:] if not p.shape]
+    secondary = [p for p in description.parameters[1:] if not p.shape]
     limit = np.inf
     for _ in range(_ROUNDS):
         trial = linear.values.copy()
         trial[:, column] = strength.neutral + distance
-        for other in others:
-            trial[:, predictor.names.index(f"{name}.{other.name}")] = other.mild
+        for parameter in secondary:
+            trial[:, predictor.names.index(f"{name}.{parameter.name}")] = parameter.mild
         template = linear.template(predictor.predict(trial))
         nats = 0.5 * share * float(np.sum(template**2))
         if not nats > 0.0:
@@ -297,7 +293,7 @@ def _limit(linear: Linearisation, name: str, share: float) -> float:
         if limit > largest and distance >= largest:
             return np.inf
         distance = float(np.clip(limit, 0.2 * distance, largest))
-    return max(limit, about.least) if limit <= largest else np.inf
+    return max(limit, description.least) if limit <= largest else np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,10 +345,10 @@ def check_residuals(
     rest = error - np.einsum("ntk,nk->nt", signals, sizes)
     size = np.sqrt(_mean_square(rest, usable))
     of_start = signals[..., 2] * sizes[:, 2:]
-    own_gain = signals[..., 0] * sizes[:, :1] if gains_scatter else 0.0
+    of_gain = signals[..., 0] * sizes[:, :1] if gains_scatter else 0.0
     regions = locate(
         breaths,
-        simulated + of_start + own_gain,
+        simulated + of_start + of_gain,
         noise_sd,
         flow,
         volume,
@@ -365,28 +361,28 @@ def check_residuals(
         "zero": sizes[:, 1],
         "error": size,
     }
-    own = signals[..., [2, 0]] if gains_scatter else signals[..., [2]]
-    of_breath = np.einsum("ntk,nk->nt", own, amplitudes(error, usable, own))
+    breath_signals = signals[..., [2, 0]] if gains_scatter else signals[..., [2]]
+    of_breath = np.einsum("ntk,nk->nt", breath_signals, amplitudes(error, usable, breath_signals))
     shared = excess_over_noise(error - of_breath, usable, quiet_samples(breaths))
-    p = [order_p_value(each, lungs, settings) for each in series.values()]
+    p = [order_p_value(values, lungs, settings) for values in series.values()]
     p.append(min((region.p_value for region in regions), default=1.0))
     p += [shared.p_value, 1.0 if judged is None else judged.p_value]
     significant = passes_fdr(np.array(p), settings.veto_level)
-    whole = _mean_square(error - of_start, usable)
+    total = _mean_square(error - of_start, usable)
     # The simulator's own gain in units of the sensitivity, which may be that of another lung.
-    gain_here = np.median(amplitudes(np.where(usable, simulated, 0.0), usable, signals)[:, 0])
-    offsets = {"gain": max(float(gain_here), 0.1), "error": 0.0}
+    simulator_gain = np.median(amplitudes(np.where(usable, simulated, 0.0), usable, signals)[:, 0])
+    offsets = {"gain": max(float(simulator_gain), 0.1), "error": 0.0}
     changes = []
-    for k, (name, each) in enumerate(series.items()):
+    for k, (name, values) in enumerate(series.items()):
         if not significant[k]:
             continue
-        first, fitted, drifts = _step_or_line(each, lungs)
+        first, fitted, drifts = _step_or_line(values, lungs)
         low, high = fitted[0], fitted[-1]
         if name == "error":
             worth = abs(high - low)
         else:
             mended = error - of_start - signals[..., k] * (fitted - fitted.mean())[:, None]
-            worth = _root(whole) - _root(_mean_square(mended, usable))
+            worth = _root(total) - _root(_mean_square(mended, usable))
         how_much = high - low
         if name != "zero":
             how_much = (offsets[name] + high) / max(offsets[name] + low, 1e-6)
@@ -414,15 +410,15 @@ def order_p_value(
     if n < settings.min_breaths:
         return 1.0
     rng = np.random.default_rng(0)
-    drawn = np.zeros((settings.flips + 1, n), np.float32)  # as recorded, then permuted
+    permuted = np.zeros((settings.flips + 1, n), np.float32)  # as recorded, then permuted
     for group in np.unique(groups):
-        own = np.flatnonzero(groups == group)
-        ranks = np.argsort(np.argsort(values[own])) - 0.5 * (len(own) - 1)
+        members = np.flatnonzero(groups == group)
+        ranks = np.argsort(np.argsort(values[members])) - 0.5 * (len(members) - 1)
         ranks = ranks / max(float(np.std(ranks)), 1e-12)
-        drawn[0, own] = ranks
-        drawn[1:, own] = rng.permuted(np.tile(ranks, (settings.flips, 1)), axis=1)
+        permuted[0, members] = ranks
+        permuted[1:, members] = rng.permuted(np.tile(ranks, (settings.flips, 1)), axis=1)
     k = np.arange(1, n)
-    largest = np.abs(np.cumsum(drawn, axis=1)[:, :-1] / np.sqrt(k * (n - k))).max(axis=1)
+    largest = np.abs(np.cumsum(permuted, axis=1)[:, :-1] / np.sqrt(k * (n - k))).max(axis=1)
     return float(np.mean(largest >= largest[0] * (1.0 - 1e-5)))
 
 
@@ -437,7 +433,7 @@ def passes_fdr(p_values: Floats, level: float) -> Bools:
 def _step_or_line(values: Floats, groups: Ints) -> tuple[int, Floats, bool]:
     """First breath after the best step, the values of the step or line, and whether it is a line.
 
-    Both are fitted by least squares to the values less each lung's mean; the better one is told.
+    Both are fitted by least squares to the values less each lung's mean; the better one counts.
     """
     centred = values.copy()
     for group in np.unique(groups):

@@ -16,19 +16,19 @@ def test_every_mechanism_has_one_that_vanishes_with_its_strength(name: str) -> N
     strong = {about.strength.name: about.strength.strong}
     shown = characteristic(name, {"R": 10.0, "C": 30.0} | strong)
     assert shown is not None
-    assert shown.x.shape == shown.without.shape == shown.acting.shape
-    assert np.isfinite([shown.x, shown.without, shown.acting]).all()
-    assert np.max(np.abs(shown.acting - shown.without)) > 1e-3
+    assert shown.x.shape == shown.baseline.shape == shown.acting.shape
+    assert np.isfinite([shown.x, shown.baseline, shown.acting]).all()
+    assert np.max(np.abs(shown.acting - shown.baseline)) > 1e-3
     off = characteristic(name, {"R": 10.0, "C": 30.0, about.strength.name: about.strength.neutral})
     if off is not None:
         later = off.x > 0  # a step has two values at zero
-        np.testing.assert_allclose(off.acting[later], off.without[later], atol=1e-6)
+        np.testing.assert_allclose(off.acting[later], off.baseline[later], atol=1e-6)
 
 
 def test_they_are_the_formulas() -> None:
     drop = characteristic("turbulent_resistance", {"R": 5.0, "quadratic": 8.0})
     assert drop is not None
-    np.testing.assert_allclose(drop.without, 5.0 * drop.x)
+    np.testing.assert_allclose(drop.baseline, 5.0 * drop.x)
     np.testing.assert_allclose(drop.acting, 5.0 * drop.x + 8.0 * drop.x * np.abs(drop.x))
     leak = characteristic("leak", {"conductance": 6.0, "exponent": 1.0})
     assert leak is not None
@@ -50,14 +50,14 @@ def test_they_are_the_formulas() -> None:
     assert late.x[np.argmax(late.acting > 0)] == pytest.approx(30.0, abs=0.5)
     stiff = characteristic("nonlinear_compliance", {"C": 40.0, "stiffening": 0.02})
     assert stiff is not None
-    np.testing.assert_allclose(stiff.without, stiff.x / 40.0, rtol=1e-9)
+    np.testing.assert_allclose(stiff.baseline, stiff.x / 40.0, rtol=1e-9)
     np.testing.assert_allclose(
         stiff.acting, -np.log(1.0 - 0.02 * stiff.x / 40.0) / 0.02, rtol=1e-6, atol=1e-9
     )
     relaxing = characteristic("viscoelasticity", {"C": 40.0, "ratio": 0.5, "time": 0.5})
     assert relaxing is not None
     held = relaxing.x > 0.2  # s: the stress of a lung that is held fades at its own time
-    stress = relaxing.acting[held] - relaxing.without[held]
+    stress = relaxing.acting[held] - relaxing.baseline[held]
     np.testing.assert_allclose(
         np.polyfit(relaxing.x[held], np.log(stress), 1)[0], -1.0 / 0.5, rtol=0.03
     )

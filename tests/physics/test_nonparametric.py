@@ -186,7 +186,7 @@ def drawn(name, values):
     shown = characteristic(name, {path.rpartition(".")[2]: x for path, x in values.items()})
     assert shown is not None
     seen = (shown.x >= SEEN[name][0]) & (shown.x <= SEEN[name][1])
-    x, y = shown.x[seen], (shown.acting - shown.without)[seen]
+    x, y = shown.x[seen], (shown.acting - shown.baseline)[seen]
     term = basis_terms()[name]
     assert isinstance(term, BasisTerm)
     if term.absorbed:

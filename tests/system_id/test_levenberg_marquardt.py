@@ -102,7 +102,7 @@ def test_a_search_that_goes_on_does_not_ask_again_where_it_starts():
     low, high = np.zeros(3), np.full(3, 9.0)
     first = minimise(cost, normal, np.array([1.0, 0.1, 0.0]), low, high, iterations=3)
     asked.clear()
-    other = minimise(cost, normal, first.x, low, high, known=first)
+    other = minimise(cost, normal, first.x, low, high, warm_start=first)
     assert not any(np.array_equal(x, first.x) for x in asked)
     again = minimise(cost, normal, first.x, low, high)
     np.testing.assert_array_equal(other.x, again.x)

@@ -323,7 +323,7 @@ def _curve(full: FittedModel, element: str) -> tuple[Floats, Floats, str, str]:
     curve = characteristic(element, values)
     if curve is None:  # it acts beyond what is drawn
         return np.linspace(0.0, 1.0, 2), np.zeros(2), "share of the range", "no change"
-    added = curve.acting - curve.without
+    added = curve.acting - curve.baseline
     assert isinstance(term, BasisTerm)
     if term.absorbed:
         powers = np.stack([curve.x**power for power in term.absorbed], axis=1)

@@ -170,7 +170,7 @@ class Evaluator:
                 high,
                 tolerance=settings.tolerance,
                 iterations=iterations,
-                known=previous,
+                warm_start=previous,
             )
 
         minimum = search(x, _reusable_minimum(problem, x, warm_start))

@@ -43,8 +43,8 @@ def extended(*added: Mechanism) -> Iterator[None]:
 
 def _forget() -> None:
     """Make the library anew when it is next asked for."""
-    for made in (library, everything, paths):
-        made.cache_clear()
+    for cached in (library, everything, paths):
+        cached.cache_clear()
 
 
 @cache
@@ -79,8 +79,8 @@ def events() -> dict[str, Mechanism]:
 
 def intermittent() -> tuple[str, ...]:
     """Events whose strength differs from breath to breath: those that act in some breaths."""
-    found = ((name, event.description.strength) for name, event in events().items())
-    return tuple(name for name, strength in found if strength.scope == "breath")
+    strengths = ((name, event.description.strength) for name, event in events().items())
+    return tuple(name for name, strength in strengths if strength.scope == "breath")
 
 
 @cache
@@ -103,8 +103,10 @@ def mechanism(name: str) -> Mechanism:
 
 def special_cases(term: str) -> tuple[str, ...]:
     """Mechanisms of the library that a basis term contains, exactly or nearly."""
-    described = (mechanism.description for mechanism in library().values())
-    return tuple(about.name for about in described if term in about.special_case_of)
+    descriptions = (mechanism.description for mechanism in library().values())
+    return tuple(
+        description.name for description in descriptions if term in description.special_case_of
+    )
 
 
 def parameter(path: str) -> Parameter:
@@ -118,8 +120,8 @@ def parameter(path: str) -> Parameter:
     for candidate in among:
         if candidate.name == short:
             return candidate
-    known = ", ".join(candidate.name for candidate in among)
-    raise InputError(f"no parameter {path!r}; {owner or 'the base'} has {known}")
+    choices = ", ".join(candidate.name for candidate in among)
+    raise InputError(f"no parameter {path!r}; {owner or 'the base'} has {choices}")
 
 
 @lru_cache
@@ -128,12 +130,12 @@ def paths(names: tuple[str, ...] | None = None) -> tuple[str, ...]:
 
     ``paths((*library(), *basis_terms()))`` has those of the basis terms as well.
     """
-    own = [
+    inner = [
         f"{name}.{parameter.name}"
         for name in (library() if names is None else names)
         for parameter in mechanism(name).description.parameters
     ]
-    return (*(parameter.name for parameter in BASE_PARAMETERS), *own)
+    return (*(parameter.name for parameter in BASE_PARAMETERS), *inner)
 
 
 def strength_path(name: str) -> str:
@@ -146,13 +148,13 @@ def _of(home: ModuleType) -> dict[str, Mechanism]:
 
     They are the described classes that it defines, and what it lists in ``MECHANISMS``.
     """
-    found: dict[str, Mechanism] = {}
+    catalogue: dict[str, Mechanism] = {}
     for module in _modules(home):
-        own = [x() for x in vars(module).values() if _is_described(x, module.__name__)]
-        for each in (*own, *getattr(module, "MECHANISMS", ())):
-            if found.setdefault(each.description.name, each) is not each:
-                raise ValueError(f"two mechanisms have the name {each.description.name!r}")
-    return dict(sorted(found.items()))
+        defined = [x() for x in vars(module).values() if _is_described(x, module.__name__)]
+        for instance in (*defined, *getattr(module, "MECHANISMS", ())):
+            if catalogue.setdefault(instance.description.name, instance) is not instance:
+                raise ValueError(f"two mechanisms have the name {instance.description.name!r}")
+    return dict(sorted(catalogue.items()))
 
 
 def _modules(home: ModuleType) -> list[ModuleType]:

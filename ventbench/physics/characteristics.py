@@ -1,4 +1,4 @@
-"""Characteristic of a mechanism: what it does to its own quantity, without the rest of the rig.
+"""Characteristic of a mechanism: the quantity that it acts on, without the rest of the rig.
 
 A valve is shown by the flow that it gives for a command, a leak by its flow at a pressure, a lag by
 its response to a step. Which curve it is follows from the methods that the mechanism overrides, so
@@ -40,10 +40,10 @@ _TINY = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Characteristic:
-    """A quantity of one part of the rig without and with a mechanism."""
+    """A quantity of one part of the rig, as the baseline and with a mechanism."""
 
     x: Floats  #: what the quantity depends on, ``(k,)``.
-    without: Floats  #: the quantity without the mechanism, ``(k,)``.
+    baseline: Floats  #: the quantity without the mechanism, ``(k,)``.
     acting: Floats  #: the quantity with the mechanism, ``(k,)``.
     x_label: str  #: name and unit of ``x``.
     y_label: str  #: name and unit of the quantity.
@@ -60,43 +60,45 @@ def characteristic(
             neutral.
         largest_command: where the curve of a command ends at most, %.
     """
-    shown = mechanism(name)
-    about = shown.description.parameters
+    effect = mechanism(name)
+    parameters = effect.description.parameters
     with float64():
-        own = {p.name: jnp.asarray(float(values.get(p.name, p.neutral))) for p in about}
+        acting = {p.name: jnp.asarray(float(values.get(p.name, p.neutral))) for p in parameters}
         base = {p.name: float(values.get(p.name, p.neutral)) for p in BASE_PARAMETERS}
-        neutral = {p.name: jnp.asarray(float(p.neutral)) for p in about}
-        times = [float(own[p.name]) for p in about if p.unit == "s"]
-        times += shown.taus if isinstance(shown, FilterBank) else ()
+        neutral = {p.name: jnp.asarray(float(p.neutral)) for p in parameters}
+        times = [float(acting[p.name]) for p in parameters if p.unit == "s"]
+        times += effect.taus if isinstance(effect, FilterBank) else ()
         end = float(np.clip(_TIMES * max(times, default=0.0), _SHORTEST, _LONGEST))
-        if shown.has("of_breath"):
-            return _in_session(shown, own, base)
-        if shown.has("command") or shown.has("driven"):
-            return _command(shown, own, largest_command)
-        if shown.has("dead_time"):
-            return _late(float(jnp.asarray(shown.dead_time(own, jnp.asarray(1.0)))), end)
-        opens = shown.stateful and shown.description.site == "expiratory valve"
-        if opens or shown.has("outlet_dead_time"):
-            return _late_outlet(shown, own, base, end)
-        if shown.has("inflow"):
-            return _response(shown, own, shown.inflow, end, 0.0, _FLOW, "flow of the valve, L/s")
-        if shown.has("reading"):
-            if not shown.stateful:
-                return _tapped(shown, own)
+        if effect.has("of_breath"):
+            return _in_session(effect, acting, base)
+        if effect.has("command") or effect.has("driven"):
+            return _command(effect, acting, largest_command)
+        if effect.has("dead_time"):
+            return _late(float(jnp.asarray(effect.dead_time(acting, jnp.asarray(1.0)))), end)
+        opens = effect.stateful and effect.description.site == "expiratory valve"
+        if opens or effect.has("outlet_dead_time"):
+            return _late_outlet(effect, acting, base, end)
+        if effect.has("inflow"):
+            return _response(
+                effect, acting, effect.inflow, end, 0.0, _FLOW, "flow of the valve, L/s"
+            )
+        if effect.has("reading"):
+            if not effect.stateful:
+                return _tapped(effect, acting)
 
-            def shows(own: Values, pressure: Array, state: Array, length: Array) -> Pair:
-                if shown.begins == "stage":  # of the two of a substep
-                    _, state = shown.reading(own, pressure, 0.0 * pressure, state, 0.5 * length)
-                return shown.reading(own, pressure, 0.0 * pressure, state, length)
+            def shows(acting: Values, pressure: Array, state: Array, length: Array) -> Pair:
+                if effect.begins == "stage":  # of the two of a substep
+                    _, state = effect.reading(acting, pressure, 0.0 * pressure, state, 0.5 * length)
+                return effect.reading(acting, pressure, 0.0 * pressure, state, length)
 
             label = "reading of the sensor, cmH2O"
-            return _response(shown, own, shows, end, _LOW, _HIGH, label)
-        if shown.has("sensor_output"):
-            return _sensor(shown, own)
-        if shown.has("network"):
-            if shown.stateful:
-                return _hold(shown, own, base, end)
-            return _network(shown, own, neutral, base)
+            return _response(effect, acting, shows, end, _LOW, _HIGH, label)
+        if effect.has("sensor_output"):
+            return _sensor(effect, acting)
+        if effect.has("network"):
+            if effect.stateful:
+                return _hold(effect, acting, base, end)
+            return _network(effect, acting, neutral, base)
     return None
 
 
@@ -113,28 +115,30 @@ _OF_BREATH = {
 }
 
 
-def _in_session(shown: Mechanism, own: Values, base: Mapping[str, float]) -> Characteristic | None:
+def _in_session(
+    effect: Mechanism, values: Values, base: Mapping[str, float]
+) -> Characteristic | None:
     """The base parameter that a mechanism changes, over the recording."""
     x = np.linspace(0.0, 1.0, _STATIC)
     before = {name: jnp.full_like(x, value) for name, value in base.items()}
     before["position"] = jnp.asarray(x)
-    after = shown.of_breath(own, before)
+    after = effect.of_breath(values, before)
     for name, label in _OF_BREATH.items():
-        without, acting = _floats(before[name]), _floats(after[name])
-        if np.max(np.abs(acting - without)) > _TINY:
-            return Characteristic(100 * x, without, acting, "share of the recording, %", label)
+        baseline, acting = _floats(before[name]), _floats(after[name])
+        if np.max(np.abs(acting - baseline)) > _TINY:
+            return Characteristic(100 * x, baseline, acting, "share of the recording, %", label)
     return None
 
 
-def _command(shown: Mechanism, own: Values, largest: float) -> Characteristic:
+def _command(effect: Mechanism, values: Values, largest: float) -> Characteristic:
     """The command that takes effect, as it rises and, if the mechanism remembers, falls again."""
 
     def step(u_in: Array, memory: Array) -> tuple[Array, Array]:
-        return shown.command(own, shown.driven(own, u_in), memory)
+        return effect.command(values, effect.driven(values, u_in), memory)
 
     def effective(top: float) -> tuple[Floats, Floats]:
         rising = np.linspace(0.0, top, _STATIC)
-        if not shown.has_memory:
+        if not effect.has_memory:
             return rising, _floats(step(jnp.asarray(rising), jnp.asarray(rising))[0])
         both = np.concatenate([rising[::2], rising[::-2]])
         memory, after = jnp.asarray(0.0), []
@@ -153,37 +157,39 @@ def _command(shown: Mechanism, own: Values, largest: float) -> Characteristic:
 def _late(delay: float, end: float) -> Characteristic:
     """Flow after the command of the inspiratory valve steps from 0 to 20 %."""
     x = np.linspace(-0.2 * end, end, 4 * _STATIC)
-    told, done = (np.where(x >= begin, 20.0, 0.0) for begin in (0.0, delay))
-    return Characteristic(x * 1e3, told, done, "time since the command, ms", "valve opening, %")
+    command, position = (np.where(x >= begin, 20.0, 0.0) for begin in (0.0, delay))
+    return Characteristic(
+        x * 1e3, command, position, "time since the command, ms", "valve opening, %"
+    )
 
 
 def _late_outlet(
-    shown: Mechanism, own: Values, base: Mapping[str, float], end: float
+    effect: Mechanism, values: Values, base: Mapping[str, float], end: float
 ) -> Characteristic:
-    """Expiratory valve that is told to open, and later to close."""
+    """Position of the expiratory valve after commands to open and to close."""
     x = np.linspace(-0.2 * end, 2.2 * end, 2 * _STATIC)
     opening, closing = (
-        float(jnp.asarray(shown.outlet_dead_time(own, jnp.asarray(u_out), jnp.asarray(1.0))))
+        float(jnp.asarray(effect.outlet_dead_time(values, jnp.asarray(u_out), jnp.asarray(1.0))))
         for u_out in (1.0, 0.0)
     )
-    told = (x >= 0) & (x < end)
-    done = ((x >= opening) & (x < end + closing)).astype(np.float64)
+    command = (x >= 0) & (x < end)
+    delayed = ((x >= opening) & (x < end + closing)).astype(np.float64)
     zero, length = jnp.asarray(0.0), jnp.asarray(x[1] - x[0])
 
-    def step(state: Array, far: Array) -> tuple[Array, Array]:
-        view, network = _view(base, state, length=length, opened=far)
-        opened = shown.network(own, network, view).outlet / view.outlet
-        return shown.next_state(own, state, zero, view), opened
+    def step(state: Array, target: Array) -> tuple[Array, Array]:
+        view, network = _view(base, state, length=length, opened=target)
+        opened = effect.network(values, network, view).outlet / view.outlet
+        return effect.next_state(values, state, zero, view), opened
 
-    shut = 0.0 * shown.initial_state(own, zero, zero)
-    done = _floats(jax.lax.scan(step, shut, jnp.asarray(done))[1])
+    shut = 0.0 * effect.initial_state(values, zero, zero)
+    delayed = _floats(jax.lax.scan(step, shut, jnp.asarray(delayed))[1])
     labels = ("time since it is told to open, ms", "expiratory valve, 1 open")
-    return Characteristic(x * 1e3, told.astype(np.float64), done, *labels)
+    return Characteristic(x * 1e3, command.astype(np.float64), delayed, *labels)
 
 
 def _response(
-    shown: Mechanism,
-    own: Values,
+    effect: Mechanism,
+    values: Values,
     hook: Callable[..., Pair],
     end: float,
     low: float,
@@ -192,38 +198,38 @@ def _response(
 ) -> Characteristic:
     """Response to a step from ``low`` to ``high`` at time zero, with the edge as a vertical."""
     state, after = jnp.asarray(low), []
-    if shown.stateful:
-        state = shown.initial_state(own, jnp.asarray(0.0), state)
+    if effect.stateful:
+        state = effect.initial_state(values, jnp.asarray(0.0), state)
     for _ in range(_STEPS):
-        now, state = hook(own, jnp.asarray(high), state, jnp.asarray(end / _STEPS))
+        now, state = hook(values, jnp.asarray(high), state, jnp.asarray(end / _STEPS))
         after.append(float(now))
     x = np.concatenate([[-0.1 * end, 0.0, 0.0], end / _STEPS * np.arange(1, _STEPS + 1)])
     step = np.concatenate([[low, low], np.full(_STEPS + 1, high)])
     return _in_time(x, step, np.concatenate([[low, low, low], after]), y_label)
 
 
-def _in_time(x: Floats, without: Floats, acting: Floats, y_label: str) -> Characteristic:
+def _in_time(x: Floats, baseline: Floats, acting: Floats, y_label: str) -> Characteristic:
     """A response in ms or, if it is long, in s."""
     if x[-1] > 0.6:
-        return Characteristic(x, without, acting, "time since the step, s", y_label)
-    return Characteristic(x * 1e3, without, acting, "time since the step, ms", y_label)
+        return Characteristic(x, baseline, acting, "time since the step, s", y_label)
+    return Characteristic(x * 1e3, baseline, acting, "time since the step, ms", y_label)
 
 
-def _tapped(shown: Mechanism, own: Values) -> Characteristic:
+def _tapped(effect: Mechanism, values: Values) -> Characteristic:
     """Reading at one pressure over the flow that passes the tap."""
     flow = jnp.linspace(-_AIRWAY_FLOW, _AIRWAY_FLOW, _STATIC)
     pressure = jnp.full_like(flow, _HIGH)
-    after, _ = shown.reading(own, pressure, flow, 0.0 * flow, jnp.asarray(1e-3))
+    after, _ = effect.reading(values, pressure, flow, 0.0 * flow, jnp.asarray(1e-3))
     labels = ("flow into the lung, L/s", f"reading at {_HIGH:.0f} cmH2O")
     return Characteristic(_floats(flow), _floats(pressure), _floats(after), *labels)
 
 
-def _sensor(shown: Mechanism, own: Values) -> Characteristic:
+def _sensor(effect: Mechanism, values: Values) -> Characteristic:
     """Reading over the recording, or error of the reading over the pressure."""
-    if shown.uses_position:
+    if effect.uses_position:
         x = np.linspace(0.0, 1.0, _STATIC)
         true = np.full_like(x, _HIGH)
-        after = shown.sensor_output(own, jnp.asarray(true), jnp.asarray(x))
+        after = effect.sensor_output(values, jnp.asarray(true), jnp.asarray(x))
         return Characteristic(
             100 * x,
             true,
@@ -232,7 +238,7 @@ def _sensor(shown: Mechanism, own: Values) -> Characteristic:
             f"reading at {_HIGH:.0f} cmH2O",
         )
     x = np.linspace(0.0, _PRESSURE, _STATIC)
-    after = shown.sensor_output(own, jnp.asarray(x), jnp.asarray(0.0))
+    after = effect.sensor_output(values, jnp.asarray(x), jnp.asarray(0.0))
     return Characteristic(
         x, np.zeros_like(x), _floats(after) - x, "pressure, cmH2O", "reading less pressure, cmH2O"
     )
@@ -276,18 +282,18 @@ def _view(
 
 
 def _network(
-    shown: Mechanism, own: Values, neutral: Values, base: Mapping[str, float]
+    effect: Mechanism, values: Values, neutral: Values, base: Mapping[str, float]
 ) -> Characteristic | None:
     """The first quantity of circuit, airway and lung that a mechanism without a state changes."""
 
     def both(**changed: Array) -> tuple[Network, Network]:
         view, network = _view(base, **changed)
-        return shown.network(neutral, network, view), shown.network(own, network, view)
+        return effect.network(neutral, network, view), effect.network(values, network, view)
 
     def curve(
-        x: Floats, without: Array, acting: Array, x_label: str, y_label: str
+        x: Floats, baseline: Array, acting: Array, x_label: str, y_label: str
     ) -> Characteristic | None:
-        a, b = (np.broadcast_to(_floats(y), x.shape) for y in (without, acting))
+        a, b = (np.broadcast_to(_floats(y), x.shape) for y in (baseline, acting))
         if not np.max(np.abs(a - b)) > _TINY:
             return None
         return Characteristic(x, a, b, x_label, y_label)
@@ -295,11 +301,15 @@ def _network(
     pressure = np.linspace(0.0, _PRESSURE, _STATIC)
     a, b = both(pressure=jnp.asarray(pressure))
     p_label = "airway pressure, cmH2O"
-    given, left = (n.inflow - n.leak * pressure - n.leak_flow for n in (a, b))
+    net_neutral, net_acting = (n.inflow - n.leak * pressure - n.leak_flow for n in (a, b))
     if np.max(np.abs(_floats(b.inflow - a.inflow))) > _TINY:
-        return curve(pressure, given, left, p_label, "flow of the valve, L/s")
+        return curve(pressure, net_neutral, net_acting, p_label, "flow of the valve, L/s")
     leaking = curve(
-        pressure, 1e3 * (_FLOW - given), 1e3 * (_FLOW - left), p_label, "flow that escapes, mL/s"
+        pressure,
+        1e3 * (_FLOW - net_neutral),
+        1e3 * (_FLOW - net_acting),
+        p_label,
+        "flow that escapes, mL/s",
     )
     if leaking is not None:
         return leaking
@@ -351,14 +361,14 @@ def _network(
 
 
 def _hold(
-    shown: Mechanism, own: Values, base: Mapping[str, float], end: float
+    effect: Mechanism, values: Values, base: Mapping[str, float], end: float
 ) -> Characteristic | None:
     """Pressure that a lung takes which is inflated by 10 cmH2O in 0.1 s and then held."""
     length, inflating = end / _STEPS, 0.1
     count = max(1, round(inflating / length))
     flow = np.zeros(_STEPS)
     flow[:count] = 10.0 * base["C"] * 1e-3 / (count * length)
-    state, volume = shown.initial_state(own, jnp.asarray(0.0), jnp.asarray(0.0)), 0.0
+    state, volume = effect.initial_state(values, jnp.asarray(0.0), jnp.asarray(0.0)), 0.0
     linear, acting = [0.0], [0.0]
     for now in flow:
         view, network = _view(
@@ -368,12 +378,12 @@ def _hold(
             length=jnp.asarray(length),
             flow=jnp.asarray(now),
         )
-        after = shown.network(own, network, view)
+        after = effect.network(values, network, view)
         linear.append(float(network.recoil + network.elastance * length * now))
         resistance = after.resistance - network.resistance
         acting.append(float(after.recoil + (after.elastance * length + resistance) * now))
-        state = shown.next_state(own, state, jnp.asarray(now), view)
+        state = effect.next_state(values, state, jnp.asarray(now), view)
         volume += now * length
     x = np.linspace(0.0, end, _STEPS + 1)
-    of = "recoil of the lung" if shown.description.site == "alveolus" else "pressure it takes"
+    of = "recoil of the lung" if effect.description.site == "alveolus" else "pressure it takes"
     return _in_time(x, np.array(linear), np.array(acting), f"{of}, cmH2O")

@@ -49,9 +49,9 @@ def resolution_of(dt: Floats) -> tuple[int, int]:
     passed = np.cumsum(dt, axis=1)
     for row in passed:
         reaches = np.searchsorted(row, row + LONGEST_DEAD_TIME)
-        whole = reaches < len(row)
-        if whole.any():
-            memory = max(memory, int((reaches - np.arange(len(row)))[whole].max()) + 1)
+        complete = reaches < len(row)
+        if complete.any():
+            memory = max(memory, int((reaches - np.arange(len(row)))[complete].max()) + 1)
     return substeps, memory
 
 
@@ -112,24 +112,24 @@ def substep_lengths(
     free = [jnp.ones_like(dt, bool) for _ in cuts]
     least_apart, edges = _APART * dt, [zero, room]  # both are ends of substeps in any case
     for delay in dead_times[: count - 2]:
-        edge, found = zero, jnp.zeros_like(dt, bool)
+        edge, pending = zero, jnp.zeros_like(dt, bool)
         for begin in _begins(past):
             arrives = delay + begin + zero
-            inside = (arrives > 0.0) & (arrives < room) & ~found
-            edge, found = jnp.where(inside, arrives, edge), found | inside
-        for other in edges:
-            found = found & (jnp.abs(edge - other) > least_apart)
+            inside = (arrives > 0.0) & (arrives < room) & ~pending
+            edge, pending = jnp.where(inside, arrives, edge), pending | inside
+        for occupied in edges:
+            pending = pending & (jnp.abs(edge - occupied) > least_apart)
         edges.append(edge)
-        away = [
+        distances = [
             jnp.where(is_free, jnp.abs(cut - edge), jnp.inf)
             for cut, is_free in zip(cuts, free, strict=True)
         ]
         # With a tolerance: compilers may round a difference in two ways, and no cut would match.
-        least = reduce(jnp.minimum, away) + 1e-9 * dt
-        for k, distance in enumerate(away):
-            nearest = found & (distance <= least)
+        least = reduce(jnp.minimum, distances) + 1e-9 * dt
+        for k, distance in enumerate(distances):
+            nearest = pending & (distance <= least)
             cuts[k], free[k] = jnp.where(nearest, edge, cuts[k]), free[k] & ~nearest
-            found = found & ~nearest
+            pending = pending & ~nearest
     ends = [zero, *_sorted(cuts), room, dt]
     # Two cuts may coincide; nothing may be divided by zero.
     return tuple(jnp.maximum(end - begin, 1e-6 * dt) for begin, end in pairwise(ends))

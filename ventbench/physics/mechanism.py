@@ -443,8 +443,8 @@ def is_active(mechanism: Mechanism, values: Values) -> Array:
 
     All parameters count: the strength of a basis term is the set of its coefficients.
     """
-    moved = [jnp.any(values[p.name] != p.neutral) for p in mechanism.description.parameters]
-    return jnp.any(jnp.stack(moved))
+    differs = [jnp.any(values[p.name] != p.neutral) for p in mechanism.description.parameters]
+    return jnp.any(jnp.stack(differs))
 
 
 def apply_if_active(
@@ -469,21 +469,21 @@ def apply_if_active(
     if not replaced:
         return before
 
-    def changed(*given: Array) -> tuple[Array, ...]:
+    def changed(*operands: Array) -> tuple[Array, ...]:
         current = list(leaves)
-        for k, leaf in zip(replaced, given, strict=True):
+        for k, leaf in zip(replaced, operands, strict=True):
             current[k] = leaf
         after = jax.tree.leaves(change(jax.tree.unflatten(tree, current)))
         return tuple(after[k] for k in replaced)
 
-    given = [leaves[k] for k in replaced]
-    for k, leaf in zip(replaced, jax.lax.cond(active, changed, _same, *given), strict=True):
+    operands = [leaves[k] for k in replaced]
+    for k, leaf in zip(replaced, jax.lax.cond(active, changed, _same, *operands), strict=True):
         leaves[k] = leaf
     return jax.tree.unflatten(tree, leaves)
 
 
-def _same(*given: Array) -> tuple[Array, ...]:
-    return given
+def _same(*operands: Array) -> tuple[Array, ...]:
+    return operands
 
 
 _NEUTRAL_BASE = {parameter.name: parameter.neutral for parameter in BASE_PARAMETERS}
@@ -499,11 +499,13 @@ class Assembly:
     #: whether each of them is active; empty if inactive ones are computed as well.
     active: dict[str, Array]
 
-    def change(self, name: str, hook: Callable[..., Before], before: Before, *seen: Any) -> Before:
-        """Return ``hook(mechanism, its values, before, *seen)``, or ``before`` if inactive."""
+    def change(
+        self, name: str, hook: Callable[..., Before], before: Before, *arguments: Any
+    ) -> Before:
+        """Return ``hook(mechanism, its values, before, *arguments)``, or ``before`` if inactive."""
 
         def changed(before: Before) -> Before:
-            return hook(self.mechanisms[name], self.values[name], before, *seen)
+            return hook(self.mechanisms[name], self.values[name], before, *arguments)
 
         return apply_if_active(self.active.get(name), changed, before)
 
@@ -522,14 +524,14 @@ def assemble(
     named = {path: jnp.asarray(value) for path, value in named.items()}
     owners = {path.rpartition(".")[0] for path in named}
     chosen = sorted((n for n in library if n in owners), key=lambda n: (library[n].rank, n))
-    own = {}
+    values = {}
     for name in chosen:
         parameters = library[name].description.parameters
-        own[name] = {
+        values[name] = {
             p.name: named.get(f"{name}.{p.name}", jnp.asarray(p.neutral)) for p in parameters
         }
-    given = {name: named.get(name, jnp.asarray(value)) for name, value in _NEUTRAL_BASE.items()}
+    base = {name: named.get(name, jnp.asarray(value)) for name, value in _NEUTRAL_BASE.items()}
     for name in chosen:
-        given = dict(library[name].of_breath(own[name], given))
-    active = {name: is_active(library[name], own[name]) for name in chosen if skip_idle}
-    return Assembly(given, {name: library[name] for name in chosen}, own, active)
+        base = dict(library[name].of_breath(values[name], base))
+    active = {name: is_active(library[name], values[name]) for name in chosen if skip_idle}
+    return Assembly(base, {name: library[name] for name in chosen}, values, active)

@@ -95,17 +95,17 @@ class Physics:
         assembly = self._assembly()
         pressure = jnp.asarray(pressure) * 1.0
         shape = jnp.broadcast_shapes(pressure.shape, *(jnp.shape(v) for v in self.values))
-        shown = jnp.broadcast_to(pressure, shape)
+        recorded = jnp.broadcast_to(pressure, shape)
         if peep is None:
-            own = assembly.base["PEEP"] if "PEEP" in self.names else jnp.nan
-            peep = jnp.where(jnp.isnan(own), shown, own)
-        u_in = assembly.base["rest"] + 0.0 * shown
+            base_peep = assembly.base["PEEP"] if "PEEP" in self.names else jnp.nan
+            peep = jnp.where(jnp.isnan(base_peep), recorded, base_peep)
+        u_in = assembly.base["rest"] + 0.0 * recorded
         memory = {
             name: u_in for name, mechanism in assembly.mechanisms.items() if mechanism.has_memory
         }
         # Inactive mechanisms as well, because the memories get their shapes here.
         flow, memory = _commanded(replace(assembly, active={}), u_in, memory)
-        rest, ones = _at_rest(assembly, shown, flow), jnp.ones_like(flow)
+        rest, ones = _at_rest(assembly, recorded, flow), jnp.ones_like(flow)
         state = PhysicsState(
             rest,
             memory,
@@ -116,7 +116,7 @@ class Physics:
             rest.volume,
             peep * ones,
         )
-        return state, Signals(shown, rest.pressure, 1000.0 * rest.flow, 0.0 * ones)
+        return state, Signals(recorded, rest.pressure, 1000.0 * rest.flow, 0.0 * ones)
 
     def step(
         self,
@@ -138,9 +138,9 @@ class Physics:
         commanded = (flow, *state.commanded)
         opened = (u_out + zero, *state.opened)
         time = state.time
-        delay = assembly.total(lambda mechanism, own: mechanism.dead_time(own, time))
+        delay = assembly.total(lambda mechanism, values: mechanism.dead_time(values, time))
         outlet_delay = assembly.total(
-            lambda mechanism, own: mechanism.outlet_dead_time(own, u_out, time)
+            lambda mechanism, values: mechanism.outlet_dead_time(values, u_out, time)
         )
         lengths, open_for, commanded_flow = dead_time.windows(
             dt,
@@ -186,12 +186,12 @@ class Physics:
         """Return the model with scaled resistance, compliance and gain of the valve."""
         scales = {"R": r_scale, "C": c_scale, "gain": gain}
         unscaled = isinstance(gain, float) and gain == 1.0
-        own = self if unscaled else self.having(gain=self.get("gain"))
+        model = self if unscaled else self.having(gain=self.get("gain"))
         varied = [
             value * scales.get(parameter(name).follows or name, 1.0)
-            for name, value in zip(own.names, own.values, strict=True)
+            for name, value in zip(model.names, model.values, strict=True)
         ]
-        return own.replace(values=tuple(varied))  # type: ignore[attr-defined]
+        return model.replace(values=tuple(varied))  # type: ignore[attr-defined]
 
     def parameters(self) -> dict[str, Array]:
         """Its own by path; see :class:`~ventbench.task.interfaces.Plant`."""
@@ -235,8 +235,10 @@ def physics(
     Raises:
         InputError: if there is no such mechanism or parameter.
     """
-    own = {f"{m}.{p}": x for m, given in (mechanisms or {}).items() for p, x in given.items()}
-    return Physics((), ()).having(R=lung.R, C=lung.C, **base, **own)
+    parameters = {
+        f"{m}.{p}": x for m, values in (mechanisms or {}).items() for p, x in values.items()
+    }
+    return Physics((), ()).having(R=lung.R, C=lung.C, **base, **parameters)
 
 
 def _commanded(
@@ -246,10 +248,10 @@ def _commanded(
     memory = dict(memory)
     for name, mechanism in assembly.mechanisms.items():
         if mechanism.has("driven"):
-            u_in = assembly.change(name, lambda m, own, u: m.driven(own, u), u_in)
+            u_in = assembly.change(name, lambda m, values, u: m.driven(values, u), u_in)
     for name, mechanism in assembly.mechanisms.items():
         before = (u_in, memory.get(name, u_in))
-        u_in, new_memory = assembly.change(name, lambda m, own, x: m.command(own, *x), before)
+        u_in, new_memory = assembly.change(name, lambda m, values, x: m.command(values, *x), before)
         if mechanism.has_memory:
             memory[name] = new_memory
     return assembly.base["gain"] * 1e-3 * u_in, memory
@@ -427,20 +429,20 @@ def _view(
 
 
 def _inflow(
-    mechanism: Mechanism, own: Values, before: Pair, state: Callable[[], Array], length: Array
+    mechanism: Mechanism, values: Values, before: Pair, state: Callable[[], Array], length: Array
 ) -> Pair:
-    return mechanism.inflow(own, before[0], state() if mechanism.stateful else before[1], length)
+    return mechanism.inflow(values, before[0], state() if mechanism.stateful else before[1], length)
 
 
 def _joined(
-    mechanism: Mechanism, own: Values, network: Network, state: Callable[[], Array], view: View
+    mechanism: Mechanism, values: Values, network: Network, state: Callable[[], Array], view: View
 ) -> Network:
-    return mechanism.network(own, network, view.replace(state=state()))  # type: ignore[attr-defined]
+    return mechanism.network(values, network, view.replace(state=state()))  # type: ignore[attr-defined]
 
 
 def _after(
     mechanism: Mechanism,
-    own: Values,
+    values: Values,
     before: Pair,
     state: Callable[[], Array] | None,
     flow: Array,
@@ -450,8 +452,8 @@ def _after(
     reading, new_state = before
     if mechanism.stateful and state is not None:
         new_state = state()
-    reading, new_state = mechanism.reading(own, reading, flow, new_state, passed)
+    reading, new_state = mechanism.reading(values, reading, flow, new_state, passed)
     view = view.replace(state=new_state)  # type: ignore[attr-defined]
     return reading, mechanism.next_state(
-        own, new_state, flow, view
+        values, new_state, flow, view
     ) if mechanism.stateful else new_state

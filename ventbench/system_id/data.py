@@ -91,8 +91,8 @@ def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | Non
         position = np.linspace(0.0, 1.0, len(breaths)) if len(breaths) > 1 else np.zeros(1)
     names = ("u_in", "u_out", "dt", "R", "C")
     plain = {name: getattr(breaths, name).astype(float) for name in names}
-    known = np.where(weight > 0, measured, 0.0)
-    return Data(measured=known, weight=weight, position=np.asarray(position, float), **plain)
+    masked = np.where(weight > 0, measured, 0.0)
+    return Data(measured=masked, weight=weight, position=np.asarray(position, float), **plain)
 
 
 @dataclass(frozen=True)
@@ -121,16 +121,16 @@ class Noise:
             residual: ``(n, ..., c, T)``.
             weight: ``(n, c, T)``.
         """
-        ar, kept, scale = self._filter(weight)
+        ar, kalman_gain, scale = self._filter(weight)
         between = (slice(None),) + (None,) * (residual.ndim - weight.ndim)
-        each = np.moveaxis(residual, -1, 0).copy()  # sample first, as the filter runs
+        innovations = np.moveaxis(residual, -1, 0).copy()  # sample first, as the filter runs
         if np.any(ar):
-            gain = np.moveaxis((ar * kept)[between], -1, 0)
-            expected = np.zeros(each.shape[1:])
-            for k, now in enumerate(each):
+            gain = np.moveaxis((ar * kalman_gain)[between], -1, 0)
+            expected = np.zeros(innovations.shape[1:])
+            for k, now in enumerate(innovations):
                 now -= expected
                 expected = ar[:, 0] * expected + gain[k] * now
-        return weight[between] * np.moveaxis(each, 0, -1) / scale[between]
+        return weight[between] * np.moveaxis(innovations, 0, -1) / scale[between]
 
     def loss(self, white: Floats) -> Floats:
         """Negative log density of whitened residuals, without :meth:`log_norm`."""
@@ -165,8 +165,8 @@ class Noise:
         Shapes ``(c, 1)`` and twice ``(n, c, T)``.
         """
         channels = weight.shape[1]
-        own = (x[:channels] for x in (self.sigma, self.ar, self.slow))
-        return _kalman(*own, weight.shape, weight.astype(float).tobytes())
+        per_channel = (x[:channels] for x in (self.sigma, self.ar, self.slow))
+        return _kalman(*per_channel, weight.shape, weight.astype(float).tobytes())
 
 
 #: Filters that are kept: fits ask for the same one at each of their steps.
@@ -182,15 +182,15 @@ def _kalman(
     weight: bytes,
 ) -> tuple[Floats, Floats, Floats]:
     """What :meth:`Noise._filter` returns, for the weights of a shape."""
-    seen = np.frombuffer(weight).reshape(shape)
+    weights = np.frombuffer(weight).reshape(shape)
     scale, share, slow_share = (np.asarray(x, float)[:, None] for x in (sigma, ar, slow))
     gain, spread = np.empty(shape), np.empty(shape)
     variance = slow_share[:, 0] + np.zeros(shape[:-1])  # of the discrepancy, as expected
     for k in range(shape[-1]):
         spread[..., k] = variance + 1.0 - slow_share[:, 0]
-        gain[..., k] = seen[..., k] * variance / spread[..., k]
-        left = variance * (1.0 - gain[..., k])
-        variance = slow_share[:, 0] + share[:, 0] ** 2 * (left - slow_share[:, 0])
+        gain[..., k] = weights[..., k] * variance / spread[..., k]
+        posterior = variance * (1.0 - gain[..., k])
+        variance = slow_share[:, 0] + share[:, 0] ** 2 * (posterior - slow_share[:, 0])
     return share, gain, scale * np.sqrt(spread)
 
 
@@ -207,18 +207,18 @@ def robust_noise(residual: Floats, weight: Floats) -> Noise:
         r, w = residual[:, channel], weight[:, channel] > 0
         size = 1.4826 * np.median(np.abs(r[w])) if w.any() else 0.0
         # Those of the median breath, as some breaths err as a whole.
-        clipped, seen = np.clip(r, -3.0 * size, 3.0 * size) * w, []
+        clipped, autocorrelations = np.clip(r, -3.0 * size, 3.0 * size) * w, []
         lags = np.arange(1, min(_LAGS, r.shape[1] - 1) + 1)
         for lag in lags:
             both = w[:, lag:] & w[:, :-lag]
             ahead, behind = clipped[:, lag:] * both, clipped[:, :-lag] * both
             power = np.sum(ahead**2 + behind**2, axis=1)
-            alike = 2.0 * np.sum(ahead * behind, axis=1)[power > 0] / power[power > 0]
-            seen.append(float(np.median(alike)) if alike.size else 0.0)
+            ratios = 2.0 * np.sum(ahead * behind, axis=1)[power > 0] / power[power > 0]
+            autocorrelations.append(float(np.median(ratios)) if ratios.size else 0.0)
         powers = _CORRELATIONS[:, None] ** lags
-        fitted = powers @ np.array(seen)
+        fitted = powers @ np.array(autocorrelations)
         share = np.clip(fitted / np.sum(powers**2, axis=1), 0.0, 1.0)
-        best = int(np.argmin(np.sum((share[:, None] * powers - seen) ** 2, axis=1)))
+        best = int(np.argmin(np.sum((share[:, None] * powers - autocorrelations) ** 2, axis=1)))
         sigma.append(max(float(size), LEAST_SIGMA * (20.0 if channel else 1.0)))
         ar.append(float(_CORRELATIONS[best]) if share[best] > 0.0 else 0.0)
         slow.append(float(share[best]))

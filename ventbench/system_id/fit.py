@@ -33,7 +33,7 @@ from ventbench.system_id.problem import (
 _FIRST_STEPS, _ROUNDS, _BETTER = 8, 3, 1.0
 
 #: Breaths in excess of the shared unknowns from which on the sandwich covariance is used.
-_ENOUGH = 10
+_SANDWICH_EXCESS = 10
 
 #: Fewest degrees of freedom of an interval.
 _LEAST_FREEDOM = 4
@@ -82,12 +82,12 @@ class Fit:
         hessian, index = self.minimum.hessian, self.problem.unknowns.index
         floor = 1e-9 * np.maximum(np.diag(hessian), 1e-9)
         bread = inverse(hessian + np.diag(floor))
-        own = np.array([len(np.unique(column)) == len(index) for column in index.T])
-        common = np.unique(index[:, ~own])
-        if len(index) - len(common) < _ENOUGH:
+        per_breath = np.array([len(np.unique(column)) == len(index) for column in index.T])
+        common = np.unique(index[:, ~per_breath])
+        if len(index) - len(common) < _SANDWICH_EXCESS:
             return bread
         inner = bread[np.ix_(common, common)]
-        sandwich = _sandwich(self.problem, self.minimum, own, common, inner)
+        sandwich = _sandwich(self.problem, self.minimum, per_breath, common, inner)
         grown = np.ones(len(bread))
         grown[common] = np.sqrt(np.maximum(sandwich / np.diag(bread)[common], 1.0))
         return np.asarray(bread * np.outer(grown, grown), np.float64)
@@ -96,8 +96,8 @@ class Fit:
     def freedom(self) -> int:
         """Degrees of freedom of intervals: breaths in excess of the shared unknowns."""
         layout = self.problem.unknowns
-        own = [len(np.unique(column)) == len(column) > 1 for column in layout.index.T]
-        by_breath = np.array(own, bool)[layout.path_of]  # such as a gain of each breath
+        separate = [len(np.unique(column)) == len(column) > 1 for column in layout.index.T]
+        by_breath = np.array(separate, bool)[layout.path_of]  # such as a gain of each breath
         shared = int((layout.shared & ~by_breath).sum())
         return max(len(self.problem.data) - shared, _LEAST_FREEDOM)
 
@@ -184,21 +184,25 @@ def _search(problem: Problem, start: Mapping[str, ArrayLike], iterations: int) -
     The search continues from a value that is better. Paths whose start is given are not scanned.
     """
     free = {path: parameter_of(path) for path in problem.unknowns.paths if path not in start}
-    scanned = [path for path, about in free.items() if about.scan and about.scope == "shared"]
+    scanned = [
+        path
+        for path, definition in free.items()
+        if definition.scan and definition.scope == "shared"
+    ]
     minimum = _descend(problem, problem.start(start), _FIRST_STEPS if scanned else iterations)
     for _ in range(_ROUNDS if scanned else 0):
         better = problem.best_of_scan(minimum, scanned, _BETTER)
         if better is None:
             break
         minimum = _descend(problem, better, iterations)
-    moved = problem.at_likeliest_changes(minimum.x, _BETTER)
-    if moved is None and minimum.converged:
+    relocated = problem.at_likeliest_changes(minimum.x, _BETTER)
+    if relocated is None and minimum.converged:
         return minimum
-    return _descend(problem, minimum.x if moved is None else moved, iterations)
+    return _descend(problem, minimum.x if relocated is None else relocated, iterations)
 
 
 def _sandwich(
-    problem: Problem, minimum: Minimum, own: np.ndarray, common: np.ndarray, bread: Floats
+    problem: Problem, minimum: Minimum, per_breath: np.ndarray, common: np.ndarray, bread: Floats
 ) -> Floats:
     """Sandwich variances of the shared unknowns, from the spread between breaths, ``(s,)``.
 
@@ -207,27 +211,33 @@ def _sandwich(
     """
     _, gradients, curvatures = problem.scores(minimum.x)
     layout = problem.unknowns
-    if own.any():  # eliminate the unknowns of single breaths (Schur complement)
-        known = problem.precision[layout.index[:, own]][:, :, None] * np.eye(int(own.sum()))
-        inner = curvatures[:, own][:, :, own] + known
+    if per_breath.any():  # eliminate the unknowns of single breaths (Schur complement)
+        prior_precision = problem.precision[layout.index[:, per_breath]][:, :, None] * np.eye(
+            int(per_breath.sum())
+        )
+        inner = curvatures[:, per_breath][:, :, per_breath] + prior_precision
         inner = inner + 1e-9 * np.maximum(inner.max(axis=(1, 2), keepdims=True), 1e-9) * np.eye(
             inner.shape[1]
         )
-        across = solve(inner, curvatures[:, own][:, :, ~own]).swapaxes(1, 2)
+        across = solve(inner, curvatures[:, per_breath][:, :, ~per_breath]).swapaxes(1, 2)
         gradients, curvatures = (
-            gradients[:, ~own] - np.matmul(across, gradients[:, own, None])[:, :, 0],
-            curvatures[:, ~own][:, :, ~own] - np.matmul(across, curvatures[:, own][:, :, ~own]),
+            gradients[:, ~per_breath] - np.matmul(across, gradients[:, per_breath, None])[:, :, 0],
+            curvatures[:, ~per_breath][:, :, ~per_breath]
+            - np.matmul(across, curvatures[:, per_breath][:, :, ~per_breath]),
         )
     else:
-        gradients, curvatures = gradients[:, ~own], curvatures[:, ~own][:, :, ~own]
-    rows, place = np.arange(len(gradients)), np.searchsorted(common, layout.index[:, ~own])
+        gradients, curvatures = (
+            gradients[:, ~per_breath],
+            curvatures[:, ~per_breath][:, :, ~per_breath],
+        )
+    rows, place = np.arange(len(gradients)), np.searchsorted(common, layout.index[:, ~per_breath])
     forces = np.zeros((len(rows), len(common)))
     np.add.at(forces, (rows[:, None], place), gradients)
     shares = np.zeros((len(rows), len(common), len(common)))
     np.add.at(shares, (rows[:, None, None], place[:, :, None], place[:, None, :]), curvatures)
     forces -= forces.mean(axis=0)
-    left = np.eye(len(common)) - _LEVERAGE * np.matmul(shares, bread)
-    spread = solve(left, forces[:, :, None])[:, :, 0] @ bread
+    residual_maker = np.eye(len(common)) - _LEVERAGE * np.matmul(shares, bread)
+    spread = solve(residual_maker, forces[:, :, None])[:, :, 0] @ bread
     return np.asarray(np.sum(spread**2, axis=0) * (1.0 - 1.0 / len(rows)), np.float64)
 
 
@@ -254,7 +264,7 @@ _FIRST, _STRIDE = 1.1, 0.01
 
 #: Points of the grid over a plateau, nats below which the plateau ends, and depth of a dip, in
 #: nats, that the noise of a single sample may cause.
-_GRID, _FAR, _DIP = 101, 6.0, 8.0
+_GRID, _CUTOFF, _DIP = 101, 6.0, 8.0
 
 #: Nats by which a place of a change is left out of its interval: odds of 20 to one.
 _UNLIKELY = 3.0
@@ -335,7 +345,7 @@ def _plateau(fit: Fit, path: str, group: int) -> ConfidenceInterval | None:
         for k in side:
             costs[k], point = _pinned(fit, point, unknown, float(parameter.coordinate(grid[k])))
             beyond = (
-                beyond + 1 if costs[k] > min(costs.min(), fit.minimum.cost + _DIP) + _FAR else 0
+                beyond + 1 if costs[k] > min(costs.min(), fit.minimum.cost + _DIP) + _CUTOFF else 0
             )
             if beyond == 2:
                 break
@@ -358,17 +368,17 @@ def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
     low, high = fit.problem.unknowns.bounds()
     bound = low[unknown] if stride < 0 else high[unknown]
     inside, point = float(fit.minimum.x[unknown]), fit.minimum.x
-    wanted = float(np.sqrt(allowed - fit.minimum.cost))
-    known = {inside: -wanted}
+    target = float(np.sqrt(allowed - fit.minimum.cost))
+    roots = {inside: -target}
 
     def beyond(x: float) -> float:
-        """Root of the cost, which a parabola makes linear, beyond the wanted one."""
+        """Root of the cost, which a parabola makes linear, beyond the target."""
         nonlocal point
-        if x not in known:
+        if x not in roots:
             cost, end = _pinned(fit, point, unknown, x)
             point = end if cost <= allowed else point
-            known[x] = float(np.sqrt(max(cost - fit.minimum.cost, 0.0))) - wanted
-        return known[x]
+            roots[x] = float(np.sqrt(max(cost - fit.minimum.cost, 0.0))) - target
+        return roots[x]
 
     for _ in range(_BRACKETING):
         trial = float(np.clip(inside + stride, low[unknown], high[unknown]))
@@ -397,9 +407,9 @@ def _pinned(fit: Fit, x: Floats, unknown: int, value: float) -> tuple[float, Flo
     """
     problem, hessian = fit.problem, fit.minimum.hessian
     low, high = problem.unknowns.bounds()
-    others = np.arange(len(x)) != unknown
+    free = np.arange(len(x)) != unknown
     ahead, x = np.zeros_like(x), x.copy()
-    ahead[others] = -solve(hessian[np.ix_(others, others)], hessian[others, unknown])
+    ahead[free] = -solve(hessian[np.ix_(free, free)], hessian[free, unknown])
     there = np.clip(x + ahead * (value - x[unknown]), low, high)
     x[unknown] = there[unknown] = low[unknown] = high[unknown] = value
     start = np.stack([x, there])

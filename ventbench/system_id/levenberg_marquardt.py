@@ -42,7 +42,7 @@ def minimise(
     *,
     tolerance: float = 1e-3,
     iterations: int = 40,
-    known: Minimum | None = None,
+    warm_start: Minimum | None = None,
 ) -> Minimum:
     """Search for a local minimum within bounds, starting from ``x``.
 
@@ -63,18 +63,23 @@ def minimise(
             the cost is a negative log-likelihood), or after four steps that each gain less than ten
             times the tolerance.
         iterations: most evaluations of ``normal``.
-        known: where an earlier search for the same cost ended, if this one starts there; it need
-            not be evaluated again.
+        warm_start: where an earlier search for the same cost ended, if this one starts there; it
+            need not be evaluated again.
     """
-    if known is None:
+    if warm_start is None:
         x = np.clip(x, low, high)
         value, gradient, hessian = normal(x)
     else:
-        x, value, gradient, hessian = known.x, known.cost, known.gradient, known.hessian
+        x, value, gradient, hessian = (
+            warm_start.x,
+            warm_start.cost,
+            warm_start.gradient,
+            warm_start.hessian,
+        )
     damping, slow = 1e-3, 0
     for iteration in range(1, iterations):
         pinned = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
-        moved, rejected = False, False
+        accepted, rejected = False, False
         while damping < 1e10:
             step = _step(gradient, hessian, damping, pinned, low - x, high - x)
             trial = np.clip(x + step, low, high)
@@ -85,11 +90,11 @@ def minimise(
             if reached < value:
                 gain = (value - reached) / max(expected, 1e-12)
                 damping = max(damping * (0.1 if gain > 0.5 else 1.0 if gain > 0.1 else 3.0), 1e-9)
-                moved = True
+                accepted = True
                 break
             damping *= 8.0
             rejected = True
-        if not moved:  # no smaller value within rounding errors
+        if not accepted:  # no smaller value within rounding errors
             return Minimum(x, value, gradient, hessian, iteration, True)
         slow = slow + 1 if value - reached < 10.0 * tolerance else 0
         x, value = trial, reached

@@ -88,14 +88,14 @@ def _run(
     )
 
     def step(state: object, command: tuple[Array, Array, Array]) -> tuple[object, Array]:
-        state, seen = plant.step(state, *command, divisions)  # type: ignore[arg-type]
-        return state, jnp.stack([seen.reading, seen.flow] if flow else [seen.reading])
+        state, signals = plant.step(state, *command, divisions)  # type: ignore[arg-type]
+        return state, jnp.stack([signals.reading, signals.flow] if flow else [signals.reading])
 
     start = values[..., -1]
     held = jax.tree.map(lambda x: jnp.moveaxis(x[:, :-1], 1, 0), commands)
-    _, seen = jax.lax.scan(step, plant.init(start)[0], held)
+    _, samples = jax.lax.scan(step, plant.init(start)[0], held)
     first = jnp.stack([start, 0.0 * start] if flow else [start])
-    return jnp.moveaxis(jnp.concatenate([first[None], seen]), (0, 1), (-1, -2))
+    return jnp.moveaxis(jnp.concatenate([first[None], samples]), (0, 1), (-1, -2))
 
 
 @partial(jax.jit, static_argnames=_STATIC, compiler_options=_COMPILER)
@@ -144,10 +144,10 @@ class Predictor:
         self.names = names
         self._large_steps = False
         self._size = next((size for size in sizes if size >= len(data)), sizes[-1])
-        enough, memory = resolution_of(data.dt)
+        resolved, memory = resolution_of(data.dt)
         if not any(_has_dead_time(name) for name in names):
             memory = 1
-        self.substeps, self.memory = substeps or enough, memory
+        self.substeps, self.memory = substeps or resolved, memory
         flow = data.measured.shape[1] > 1
         self._static = {
             "names": names,
@@ -163,17 +163,17 @@ class Predictor:
 
     def of(self, data: Data) -> Predictor:
         """The same for other breaths, by the functions that are compiled where they suffice."""
-        other = Predictor(data, self.names, self.substeps, (self._size,))
-        other.memory = max(self.memory, other.memory)
-        other._static["memory"] = other.memory
-        return other
+        predictor = Predictor(data, self.names, self.substeps, (self._size,))
+        predictor.memory = max(self.memory, predictor.memory)
+        predictor._static["memory"] = predictor.memory
+        return predictor
 
     @property
     def with_large_steps(self) -> Predictor:
         """The same with one step of the integrator in each substep, whatever acts."""
-        other = copy(self)
-        other._large_steps = True
-        return other
+        predictor = copy(self)
+        predictor._large_steps = True
+        return predictor
 
     def predict(self, values: Floats) -> Floats:
         """Predicted measurements, ``(n, c, T)``, at physical values ``(n, P + 1)``."""
@@ -186,10 +186,10 @@ class Predictor:
         divisions = np.repeat(self._divisions(points), breaths)
         work = []
         for steps in np.unique(divisions):
-            alike = np.flatnonzero(divisions == steps)
+            same_steps = np.flatnonzero(divisions == steps)
             work += [
-                (alike[first:last], size, int(steps))
-                for first, last, size in _blocks(len(alike), self._size)
+                (same_steps[first:last], size, int(steps))
+                for first, last, size in _blocks(len(same_steps), self._size)
             ]
 
         def predicted(block: tuple[Ints, int, int]) -> Floats:
@@ -200,12 +200,12 @@ class Predictor:
                 # The compiled function takes NumPy's arrays as they are; making JAX's of them first
                 # took a tenth of a diagnosis.
                 commands = tuple(command[breath] for command in self._commands)
-                seen = _predict(lanes[filled], commands, np.asarray(steps), **self._static)
-                return np.asarray(seen)[: len(where)]
+                simulated = _predict(lanes[filled], commands, np.asarray(steps), **self._static)
+                return np.asarray(simulated)[: len(where)]
 
-        seen = parallel_map(predicted, work)
-        answers = np.empty((len(lanes), *seen[0].shape[1:]))
-        for rows, (where, _, _) in zip(seen, work, strict=True):
+        simulated = parallel_map(predicted, work)
+        answers = np.empty((len(lanes), *simulated[0].shape[1:]))
+        for rows, (where, _, _) in zip(simulated, work, strict=True):
             answers[where] = rows
         return answers.reshape(count, breaths, *answers.shape[1:])
 
@@ -234,11 +234,11 @@ class Predictor:
         for point, k in zip(points[1 + len(columns) :], off, strict=True):
             point[:, columns[k]] -= moves[k]
         split = [1, 1 + len(columns)]
-        seen, ahead, behind = np.split(self.predict_all(points), split)
-        changes = ahead - seen
+        centre, ahead, behind = np.split(self.predict_all(points), split)
+        changes = ahead - centre
         changes[off] = 0.5 * (ahead[off] - behind)
-        changes[~np.isfinite(changes) & np.isfinite(seen)] = 0.0
-        return seen[0], np.moveaxis(changes / moves[:, :, None, None], 0, 1)
+        changes[~np.isfinite(changes) & np.isfinite(centre)] = 0.0
+        return centre[0], np.moveaxis(changes / moves[:, :, None, None], 0, 1)
 
     def _divisions(self, points: Floats) -> Ints:
         """Steps of the integrator in a substep that each point needs, ``(m,)``."""

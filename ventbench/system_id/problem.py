@@ -36,13 +36,13 @@ def parameter_of(path: str) -> Parameter:
 
 def free_paths(mechanisms: Iterable[str]) -> tuple[str, ...]:
     """Paths that a hypothesis frees: R, C, R_ex, PEEP, parameters of its mechanisms, the starts."""
-    own = [
+    inner = [
         f"{name}.{parameter.name}"
         for name in dict.fromkeys(mechanisms)
         for parameter in mechanism(name).description.parameters
         if not parameter.shape
     ]
-    return (*REFITTED, *own, START)
+    return (*REFITTED, *inner, START)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,8 @@ class Unknowns:
     @property
     def shared(self) -> Bools:
         """Whether each unknown is shared by breaths, ``(U,)``."""
-        own = np.array([parameter.scope == "breath" for parameter in self.parameters])
-        return ~own[self.path_of]
+        breath_scope = np.array([parameter.scope == "breath" for parameter in self.parameters])
+        return ~breath_scope[self.path_of]
 
     def of(self, path: str) -> Ints:
         """Unknowns of a parameter, in the order of their groups."""
@@ -197,9 +197,11 @@ class Problem:
         Column ``j`` of breath ``i`` belongs to the unknown ``unknowns.index[i, j]``.
         """
         values = self.values(x)
-        seen, slopes = self.predictor.derivatives(values, self.columns)
+        predicted, slopes = self.predictor.derivatives(values, self.columns)
         chain = self.unknowns.slopes(values[:, list(self.columns)])
-        return self._residual(seen), slopes * (chain[:, :, None, None] * self.data.weight[:, None])
+        return self._residual(predicted), slopes * (
+            chain[:, :, None, None] * self.data.weight[:, None]
+        )
 
     def log_likelihood(self, x: Floats) -> Floats:
         """Log-likelihood of each breath, without the prior, ``(n,)``."""
@@ -211,8 +213,8 @@ class Problem:
 
     def costs(self, points: Floats) -> Floats:
         """Costs at several points ``(m, U)``, simulated together, ``(m,)``."""
-        seen = self.predictor.predict_all(np.stack([self.values(x) for x in points]))
-        pairs = zip(seen, points, strict=True)
+        predicted = self.predictor.predict_all(np.stack([self.values(x) for x in points]))
+        pairs = zip(predicted, points, strict=True)
         return np.array([self._cost(self._white(self._residual(s)), x) for s, x in pairs])
 
     def scores(self, x: Floats) -> tuple[float, Floats, Floats]:
@@ -241,14 +243,14 @@ class Problem:
         np.add.at(hessian, (index[:, :, None], index[:, None, :]), curvature)
         return cost, gradient, hessian
 
-    def start(self, given: Mapping[str, ArrayLike]) -> Floats:
+    def start(self, initial: Mapping[str, ArrayLike]) -> Floats:
         """Unknowns to start a search from, ``(U,)``.
 
         Mechanisms start at their mild strength, because some have little slope at zero. Of two
         parameters of a mechanism that may change places, the larger comes first.
 
         Args:
-            given: physical values to start from instead, by path, a number or one for each breath;
+            initial: physical values to start from instead, by path, one number or one a breath;
                 paths that are not free are passed over.
         """
         paths = self.unknowns.paths
@@ -256,12 +258,14 @@ class Problem:
             path: parameter_of(path).mild if "." in path else self.fixed[:, column]
             for path, column in zip(paths, self.columns, strict=True)
         }
-        first |= {path: value for path, value in given.items() if path in first}
+        first |= {path: value for path, value in initial.items() if path in first}
         for name in dict.fromkeys(path.rpartition(".")[0] for path in paths if "." in path):
             for pair in mechanism(name).description.interchangeable:
-                one, other = (f"{name}.{short}" for short in pair)
-                if {one, other} <= first.keys() and np.all(np.less(first[one], first[other])):
-                    first[one], first[other] = first[other], first[one]
+                larger, smaller = (f"{name}.{short}" for short in pair)
+                if {larger, smaller} <= first.keys() and np.all(
+                    np.less(first[larger], first[smaller])
+                ):
+                    first[larger], first[smaller] = first[smaller], first[larger]
         return self.unknowns.pack(first)
 
     def best_of_scan(self, minimum: Minimum, paths: Iterable[str], least: float) -> Floats | None:
@@ -277,9 +281,9 @@ class Problem:
         """
         best, lowest = None, minimum.cost - least
         for path in paths:
-            about = parameter_of(path)
-            trials = np.repeat(minimum.x[None], len(about.scan), axis=0)
-            trials[:, self.unknowns.of(path)] = about.coordinate(about.scan)[:, None]
+            definition = parameter_of(path)
+            trials = np.repeat(minimum.x[None], len(definition.scan), axis=0)
+            trials[:, self.unknowns.of(path)] = definition.coordinate(definition.scan)[:, None]
             for trial, cost in zip(trials, self.costs(trials), strict=True):
                 if cost < lowest:
                     best, lowest = trial, float(cost)
@@ -297,10 +301,10 @@ class Problem:
             return x
         smooth = replace(self, predictor=self.predictor.with_large_steps)
         low, high = self.unknowns.bounds()
-        other = minimise(
+        smoothed = minimise(
             smooth.cost, smooth.normal, x, low, high, tolerance=tolerance, iterations=iterations
         ).x
-        return other if self.cost(other) < self.cost(x) else x
+        return smoothed if self.cost(smoothed) < self.cost(x) else x
 
     def change_costs(
         self, x: Floats, path: str, after: Floats | None = None
@@ -321,8 +325,8 @@ class Problem:
         """
         both = np.stack([self.values(x), self.values(x if after is None else after)])
         both[:, :, self.predictor.names.index(path)] = np.array([[2.0], [-1.0]])
-        seen = self.predictor.predict_all(both)
-        white = np.stack([self._white(self._residual(each)) for each in seen])
+        predicted = self.predictor.predict_all(both)
+        white = np.stack([self._white(self._residual(prediction)) for prediction in predicted])
         earlier, later = np.sum(self.noise.loss(white), axis=(2, 3))
         order = np.argsort(self.data.position)
         places, first = np.unique(self.data.position[order], return_index=True)
@@ -337,22 +341,22 @@ class Problem:
 
         Another place must be likelier by ``least`` nats; None if no change moves.
         """
-        moved = None
+        relocated = None
         for path in self.unknowns.paths:
             if not parameter_of(path).change_point:
                 continue
-            own, point = self.unknowns.of(path), x if moved is None else moved
+            unknowns, point = self.unknowns.of(path), x if relocated is None else relocated
             places, costs = self.change_costs(point, path)
             if not len(places):
                 continue
-            here = int(np.argmin(np.abs(places - point[own])))
-            if costs.min() < costs[here] - least:
-                moved = point.copy()
-                moved[own] = places[int(np.argmin(costs))]
-        return moved
+            current = int(np.argmin(np.abs(places - point[unknowns])))
+            if costs.min() < costs[current] - least:
+                relocated = point.copy()
+                relocated[unknowns] = places[int(np.argmin(costs))]
+        return relocated
 
-    def _residual(self, seen: Floats) -> Floats:
-        return np.where(self.data.weight > 0, seen - self.data.measured, 0.0)
+    def _residual(self, predicted: Floats) -> Floats:
+        return np.where(self.data.weight > 0, predicted - self.data.measured, 0.0)
 
     def _white(self, residual: Floats) -> Floats:
         return self.noise.whiten(residual, self.data.weight)
@@ -393,7 +397,9 @@ def make_problem(
     return Problem(data, partition.predictor, layout, values, noise, mean, precision)
 
 
-def parameter_values(data: Data, names: tuple[str, ...], given: Mapping[str, ArrayLike]) -> Floats:
+def parameter_values(
+    data: Data, names: tuple[str, ...], overrides: Mapping[str, ArrayLike]
+) -> Floats:
     """Physical values of all columns of a predictor, ``(n, P + 1)``.
 
     R, C, positions and starting pressures are those of the data, unless they are given by path as
@@ -403,16 +409,18 @@ def parameter_values(data: Data, names: tuple[str, ...], given: Mapping[str, Arr
         InputError: if a name is unknown or a value outside its bounds.
     """
     first = np.where(data.weight[:, 0, 0] > 0, data.measured[:, 0, 0], _DEFAULT_START)
-    known = {"R": data.R, "C": data.C, "position": data.position, START: first} | dict(given)
+    remaining = {"R": data.R, "C": data.C, "position": data.position, START: first} | dict(
+        overrides
+    )
     columns = []
     for name in (*names, START):
-        value = np.asarray(known.pop(name, None if name == START else parameter(name).neutral))
+        value = np.asarray(remaining.pop(name, None if name == START else parameter(name).neutral))
         if name != START:
             definition = parameter(name)
             if not np.all((value >= definition.low) & (value <= definition.high)):
                 bounds = f"{definition.low}..{definition.high} {definition.unit}"
                 raise InputError(f"{name} = {value} is outside {bounds}")
         columns.append(np.broadcast_to(value, (len(data),)).astype(float))
-    if known:
-        raise InputError(f"no parameter {sorted(known)} here; choose of {', '.join(paths())}")
+    if remaining:
+        raise InputError(f"no parameter {sorted(remaining)} here; choose of {', '.join(paths())}")
     return np.stack(columns, axis=1)

@@ -90,12 +90,12 @@ class SupplyDroop(Mechanism):
     def inflow(self, values: Values, flow: Array, state: Array, length: Array) -> Pair:
         """Flow that the supply can give; recent flow is predicted, then corrected."""
         time = values["recovery"]
-        ahead = (time * state + _given(values, length * flow, state)) / (time + length)
-        given = _given(values, flow, ahead)
-        return given, (time * state + length * given) / (time + length)
+        ahead = (time * state + _delivered(values, length * flow, state)) / (time + length)
+        delivered = _delivered(values, flow, ahead)
+        return delivered, (time * state + length * delivered) / (time + length)
 
 
-def _given(values: Values, flow: Array, recent: Array) -> Array:
+def _delivered(values: Values, flow: Array, recent: Array) -> Array:
     """What a supply gives of a flow, L/s, after a recent flow, L/s."""
     drop, linear = values["drop"], values["linear"]
     levelling = flow / (1.0 + drop / (1.0 - drop) / _DROOP_FLOW * recent)

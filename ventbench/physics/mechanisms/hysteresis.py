@@ -34,12 +34,12 @@ def _radii(like: Array) -> Array:
     return jnp.asarray(RADII, like.dtype).reshape(-1, *(1,) * like.ndim)
 
 
-def _begun(like: Array) -> Array:
+def _initial_stops(like: Array) -> Array:
     """The input, cmH2O, and all stops at their lower end, ``(4, ...)``."""
     return jnp.stack([like, *[0.0 * like - 1.0] * len(RADII)])
 
 
-def _moved(state: Array, like: Array) -> Array:
+def _stop_operator(state: Array, like: Array) -> Array:
     """State after the input has gone to another value, cmH2O."""
     stops = jnp.clip(state[1:] + (like - state[0]) / _radii(like), -1.0, 1.0)
     return jnp.concatenate([like[None], stops])
@@ -75,12 +75,12 @@ class LungHysteresis(Mechanism):
 
         It begins above all recoils, from where it comes to rest on the branch of expirations.
         """
-        return _begun(pressure + 0.0 * flow + _ABOVE_ALL)
+        return _initial_stops(pressure + 0.0 * flow + _ABOVE_ALL)
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Add the loop's pressure, and its slope where stops move, around the last flow."""
         change = view.elastance * view.flow * view.length
-        stops = _moved(view.state, view.elastance * view.volume + change)[1:]
+        stops = _stop_operator(view.state, view.elastance * view.volume + change)[1:]
         slope = jnp.mean((jnp.abs(stops) < 1.0) / _radii(change), axis=0)
         half = 0.5 * values["height"]
         return network.plus(
@@ -90,7 +90,7 @@ class LungHysteresis(Mechanism):
 
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
         """Stops after the step."""
-        return _moved(state, view.elastance * (view.volume + flow * view.length))
+        return _stop_operator(state, view.elastance * (view.volume + flow * view.length))
 
 
 class SensorHysteresis(Mechanism):
@@ -120,11 +120,11 @@ class SensorHysteresis(Mechanism):
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """The pressure, cmH2O, and all stops at their lower end, ``(4, ...)``."""
-        return _begun(pressure + 0.0 * flow)
+        return _initial_stops(pressure + 0.0 * flow)
 
     def reading(
         self, values: Values, pressure: Array, flow: Array, state: Array, length: Array
     ) -> Pair:
         """The reading on its branch."""
-        after = _moved(state, pressure)
+        after = _stop_operator(state, pressure)
         return pressure - 0.5 * values["width"] * (1.0 + jnp.mean(after[1:], axis=0)), after

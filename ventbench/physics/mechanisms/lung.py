@@ -255,9 +255,9 @@ class Viscoelasticity(Mechanism):
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Stress after the step: the relaxed stress and what the flow adds."""
-        left = 1.0 / (1.0 + view.length / values["time"])
-        elastance = values["ratio"] * view.elastance * left
-        return network.plus(recoil=view.state * left, elastance=elastance)
+        decay = 1.0 / (1.0 + view.length / values["time"])
+        elastance = values["ratio"] * view.elastance * decay
+        return network.plus(recoil=view.state * decay, elastance=elastance)
 
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
         """Stress, cmH2O."""
@@ -373,9 +373,9 @@ class PatientEffort(Mechanism):
         return network.plus(recoil=-values["amplitude"] * course)
 
 
-#: Time in which a plug gives way, s: a sample, as faster is not seen. Width of its threshold,
+#: Time in which a plug opens, s: a sample, as faster cannot be resolved. Width of its threshold,
 #: cmH2O: a slope by which a fit finds it.
-_GIVES_WAY, _WIDTH = 0.03, 0.5
+_OPENING_TIME, _WIDTH = 0.03, 0.5
 
 
 class AirwayOpening(Mechanism):
@@ -436,4 +436,4 @@ class AirwayOpening(Mechanism):
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
         """Share that is still closed, by the last pressure."""
         above = jnp.clip(0.5 + (view.pressure - values["opening"]) / _WIDTH, 0.0, 1.0)
-        return state / (1.0 + view.length * above / _GIVES_WAY)
+        return state / (1.0 + view.length * above / _OPENING_TIME)

@@ -110,15 +110,15 @@ class SensorCurve(Mechanism):
         slope = 1.0 + steepness * (1.0 - 2.0 * inside / SPAN)
         return inside + steepness * inside * (1.0 - inside / SPAN) + slope * (pressure - inside)
 
-    def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
+    def sensor_input(self, values: Values, recorded: Array, position: Array) -> Array:
         """True pressure of a reading, by Newton's method, which the tangents make safe."""
         steepness = 4.0 * values["bend"] / SPAN
         low, high = _rising(steepness)
-        pressure = shown
+        pressure = recorded
         for _ in range(8):
             inside = jnp.clip(pressure, low, high)
             slope = 1.0 + steepness * (1.0 - 2.0 * inside / SPAN)
-            off = self.sensor_output(values, pressure, position) - shown
+            off = self.sensor_output(values, pressure, position) - recorded
             pressure = pressure - off / slope
         return pressure
 

@@ -131,8 +131,8 @@ class BasisTerm(Mechanism):
 
     def stacked(self, values: Values, state: Array) -> Array:
         """Coefficients in the shape of several states, ``(K, ...)``."""
-        own = self.coefficients(values)[: len(state)]
-        return jnp.stack([jnp.broadcast_to(c, state.shape[1:]) for c in own])
+        weights = self.coefficients(values)[: len(state)]
+        return jnp.stack([jnp.broadcast_to(c, state.shape[1:]) for c in weights])
 
 
 class Lines(BasisTerm):

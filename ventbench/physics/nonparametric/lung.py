@@ -236,10 +236,10 @@ class RecoilMemory(FilterBank):
 
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Stresses after the step: what is left of them, and what the flow adds."""
-        left = 1.0 / (1.0 + view.length / per_state(_MEMORY_TAUS, view.state))
-        added = jnp.sum(self.stacked(values, view.state) * left, axis=0)
+        decay = 1.0 / (1.0 + view.length / per_state(_MEMORY_TAUS, view.state))
+        added = jnp.sum(self.stacked(values, view.state) * decay, axis=0)
         return network.plus(
-            recoil=jnp.sum(view.state * left, axis=0), elastance=view.elastance * added
+            recoil=jnp.sum(view.state * decay, axis=0), elastance=view.elastance * added
         )
 
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:

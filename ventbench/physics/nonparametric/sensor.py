@@ -49,16 +49,16 @@ class SensorShape(Lines):
         """Add the error."""
         return pressure + self.curve(values, pressure)
 
-    def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
+    def sensor_input(self, values: Values, recorded: Array, position: Array) -> Array:
         """Pressure of a reading, by Newton's method."""
 
         def nearer(pressure: Array, _: None) -> tuple[Array, None]:
             slope = jnp.maximum(1.0 + self.slope(values, pressure), _SENSOR_LEAST)
-            off = pressure + self.curve(values, pressure) - shown
+            off = pressure + self.curve(values, pressure) - recorded
             return pressure - off / slope, None
 
         # In the shape that the steps have.
-        first = shown + sum(0.0 * x for x in self.at_knots(values))
+        first = recorded + sum(0.0 * x for x in self.at_knots(values))
         return jax.lax.scan(nearer, first, None, length=_SENSOR_STEPS)[0]
 
 
@@ -134,6 +134,6 @@ class DriftShape(Lines):
         """Add the offset."""
         return pressure + self.curve(values, position)
 
-    def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
+    def sensor_input(self, values: Values, recorded: Array, position: Array) -> Array:
         """Take it away."""
-        return shown - self.curve(values, position)
+        return recorded - self.curve(values, position)

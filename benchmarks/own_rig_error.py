@@ -157,7 +157,7 @@ def judged(recordings: RigRecordings, simulators: frozen.Frozen) -> Judged:
     chosen = np.flatnonzero(lung >= 0)
     breaths = breaths.select(chosen)
     data = inspirations(breaths, simulators.sessions, recordings.labels)
-    member = np.maximum(simulators.seen.folds(breaths), 0)
+    member = np.maximum(simulators.training_breaths.folds(breaths), 0)
     return Judged(data, lung[chosen], session[chosen], chosen, member)
 
 

@@ -30,7 +30,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench.base import compilation
-from ventbench.plants.catalog import Given
+from ventbench.plants.catalog import SimulatorLike
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.train.plants import plants_to_train_on
@@ -69,7 +69,7 @@ def _pack(trees: Any) -> Array:
     return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(trees)])
 
 
-def _without_noise(episode: environment.Episode) -> tuple[environment.Episode, Array]:
+def _split_noise(episode: environment.Episode) -> tuple[environment.Episode, Array]:
     """What stays the same in an episode but for its noise, and the noise.
 
     A step reads one row of the noise: packed with the rest, all of it would be copied.
@@ -91,11 +91,11 @@ def _reset(
     """
     keys = jax.random.split(jax.random.key(seed), lung.shape[0])
     reset = partial(environment.reset, lungs=lungs, vary=vary)
-    states, seen = jax.vmap(lambda key, lung, pip: reset(key, lung=lung, pip=pip), out_axes=-1)(
-        keys, lung, pip
-    )
-    rest, noise = _without_noise(states.episode)
-    return (_pack(rest), noise), _pack(states.progress), states.episode.cell.pip, seen.T
+    states, observation = jax.vmap(
+        lambda key, lung, pip: reset(key, lung=lung, pip=pip), out_axes=-1
+    )(keys, lung, pip)
+    rest, noise = _split_noise(states.episode)
+    return (_pack(rest), noise), _pack(states.progress), states.episode.cell.pip, observation.T
 
 
 @lru_cache
@@ -111,20 +111,20 @@ def _program(fixed: _Layout, changing: _Layout) -> Callable[..., tuple[Array, Ar
         episode: environment.Episode, progress: environment.Progress, count: Array, action: Array
     ) -> tuple[environment.Progress, Array]:
         state = environment.State(episode, progress, count)
-        state, seen, reward, _ = environment.step(state, action)
+        state, observation, reward, _ = environment.step(state, action)
         after = state.progress
         further = jnp.stack([reward, after.loop.signals.scored, after.error])
-        return after, jnp.concatenate([seen, further])
+        return after, jnp.concatenate([observation, further])
 
     def step(
         constant: tuple[Array, Array], progress: Array, count: Array, actions: Array
     ) -> tuple[Array, Array, Array]:
         rest = fixed.unpack(constant[0])
         episodes = rest.replace(cell=rest.cell.replace(noise=constant[1]))
-        each = (-1, -1, None, -1)
+        axes = (-1, -1, None, -1)
         states = (episodes, changing.unpack(progress), count, actions.reshape(-1))
-        after, seen = jax.vmap(advance, in_axes=each, out_axes=-1)(*states)
-        return _pack(after), count + 1, seen
+        after, observation = jax.vmap(advance, in_axes=axes, out_axes=-1)(*states)
+        return _pack(after), count + 1, observation
 
     return jax.jit(step, donate_argnums=(1, 2))
 
@@ -171,7 +171,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         pip: float | None = None,
         rigs: Literal["training", "reference"] = "training",
         noise: bool = True,
-        simulator: Given = "frozen",
+        simulator: SimulatorLike = "frozen",
     ):
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}; it must be at least 1")
@@ -183,12 +183,12 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         self.single_observation_space = spaces.Box(-limit, limit, dtype=np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        known = self.lungs = plants_to_train_on(simulator).names
-        if lung is not None and parse_lung(lung).id not in known:
-            raise InputError(f"{lung} is not a lung of the simulators: {', '.join(known)}")
-        chosen = range(len(known)) if lung is None else [known.index(parse_lung(lung).id)]
+        lung_names = self.lungs = plants_to_train_on(simulator).names
+        if lung is not None and parse_lung(lung).id not in lung_names:
+            raise InputError(f"{lung} is not a lung of the simulators: {', '.join(lung_names)}")
+        chosen = range(len(lung_names)) if lung is None else [lung_names.index(parse_lung(lung).id)]
         self._lung = np.resize(np.array(chosen), num_envs)
-        self._names = np.array(known, object)[self._lung]
+        self._names = np.array(lung_names, object)[self._lung]
         # Each lung gets each PIP before the first PIP comes again.
         turn = np.arange(num_envs) // len(chosen) % len(protocol.PIPS)
         pips = np.asarray(protocol.PIPS, np.float32)[turn]
@@ -197,7 +197,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         self._rigs, self._noise = environment.load_lungs(simulator, rigs=rigs), noise
         with compilation.float32():
             state, _ = jax.eval_shape(environment.reset, jax.random.key(0), self._rigs)
-            rest, _ = jax.eval_shape(_without_noise, state.episode)
+            rest, _ = jax.eval_shape(_split_noise, state.episode)
         self._advance = _program(_Layout.of(rest), _Layout.of(state.progress))
         self._count = STEPS + 1
 
@@ -210,14 +210,14 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
         shift = int(self.np_random.integers(len(protocol.PIPS))) * self._turn
         number = np.uint32(self.np_random.integers(2**32))
         with compilation.float32():
-            self._constant, self._progress, pip, seen = _reset(
+            self._constant, self._progress, pip, observation = _reset(
                 number, self._rigs, self._lung, np.roll(self._pips, shift), vary=self._noise
             )
             self._steps = jnp.zeros((), jnp.int32)
         self._count = 0
         everywhere = np.ones(self.num_envs, bool)
         info = {"lung": self._names, "pip": np.asarray(pip)}
-        return np.array(seen), info | {f"_{name}": everywhere for name in info}
+        return np.array(observation), info | {f"_{name}": everywhere for name in info}
 
     def step(
         self, actions: Floats
@@ -234,25 +234,25 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
             raise InputError("no episode is under way: call reset() first")
         nothing = np.zeros(self.num_envs, bool)
         if self._count == STEPS:
-            seen, info = self.reset()
-            return seen, np.zeros(self.num_envs, np.float32), nothing, nothing.copy(), info
+            observation, info = self.reset()
+            return observation, np.zeros(self.num_envs, np.float32), nothing, nothing.copy(), info
         values = np.asarray(actions, np.float32)
         if not math.isfinite(values.sum()):
             at = int(np.argmin(np.isfinite(values.reshape(self.num_envs))))
             raise InputError(f"action {at} is {values[at, 0]}; it must be a number from -1 to 1")
         with compilation.float32():
-            self._progress, self._steps, shown = self._advance(
+            self._progress, self._steps, packed = self._advance(
                 self._constant, self._progress, self._steps, values
             )
         self._count += 1
-        rows = np.asarray(shown)
+        rows = np.asarray(packed)
         self.pressure = rows[_PRESSURE]
-        ended, info = np.full(self.num_envs, self._count == STEPS), {}
+        terminated, info = np.full(self.num_envs, self._count == STEPS), {}
         if self._count == STEPS:
-            info = {"error": rows[_ERROR] / environment.SCORED_STEPS, "_error": ended}
+            info = {"error": rows[_ERROR] / environment.SCORED_STEPS, "_error": terminated}
         # Copies, which may be written to, as learners expect.
-        seen = np.array(rows[: environment.OBSERVATION].T, order="C")
-        return seen, rows[_REWARD].copy(), ended, nothing, info
+        observation = np.array(rows[: environment.OBSERVATION].T, order="C")
+        return observation, rows[_REWARD].copy(), terminated, nothing, info
 
 
 class Ventilator(gymnasium.Env[Floats, Floats]):
@@ -279,7 +279,7 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         pip: float | None = None,
         rigs: Literal["training", "reference"] = "training",
         noise: bool = True,
-        simulator: Given = "frozen",
+        simulator: SimulatorLike = "frozen",
     ):
         self._one = VentilatorVector(1, lung, pip, rigs, noise, simulator)
         self._any = () if lung is not None else self._one.lungs
@@ -293,15 +293,15 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode; see :meth:`gymnasium.Env.reset`. No options are known."""
         super().reset(seed=seed)
-        one, draw = self._one, self.np_random
+        vector, draw = self._one, self.np_random
         if self._any:
             at = int(draw.integers(len(self._any)))
-            one._lung, one._names = np.array([at]), np.array([self._any[at]], object)
+            vector._lung, vector._names = np.array([at]), np.array([self._any[at]], object)
         if not self._fixed:
-            one._pips = draw.choice(np.asarray(protocol.PIPS, np.float32), 1)
-        seen, info = one.reset(seed=int(draw.integers(2**31)))
+            vector._pips = draw.choice(np.asarray(protocol.PIPS, np.float32), 1)
+        observation, info = vector.reset(seed=int(draw.integers(2**31)))
         self._info = {"lung": str(info["lung"][0]), "pip": float(info["pip"][0])}
-        return seen[0], {**self._info, "pressure": 40.0 * float(seen[0, 0])}
+        return observation[0], {**self._info, "pressure": 40.0 * float(observation[0, 0])}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Apply a command; see :meth:`gymnasium.Env.step`.
@@ -311,11 +311,13 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         """
         if self._one._count >= STEPS:
             raise InputError("no episode is under way: call reset() first")
-        seen, reward, ended, _, last = self._one.step(np.asarray(action, np.float32).reshape(1, 1))
+        observation, reward, terminated, _, last = self._one.step(
+            np.asarray(action, np.float32).reshape(1, 1)
+        )
         info = {**self._info, "pressure": float(self._one.pressure[0])}
-        if ended[0]:
+        if terminated[0]:
             info["error"] = float(last["error"][0])
-        return seen[0], float(reward[0]), bool(ended[0]), False, info
+        return observation[0], float(reward[0]), bool(terminated[0]), False, info
 
 
 def register() -> None:

@@ -20,7 +20,7 @@ from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.base.text import number
 from ventbench.plants import frozen
-from ventbench.plants.catalog import Given, load_simulators, names
+from ventbench.plants.catalog import SimulatorLike, load_simulators, names
 from ventbench.plants.stacking import PlantsFor, open_loop_breaths
 from ventbench.recordings import Breaths, load
 from ventbench.task import protocol
@@ -102,7 +102,7 @@ def simulate(
     controls: Controls | Path | str | ArrayLike,
     *,
     lung: str = "R20C50",
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     start: float = protocol.PEEP,
 ) -> Simulation:
     """Answer valve commands with pressures.
@@ -145,7 +145,7 @@ def simulate_breaths(
     table: Path | str | pd.DataFrame,
     *,
     lung: str | None = None,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     start: float = protocol.PEEP,
 ) -> Breaths:
     """Answer the commands of many breaths with pressures.
@@ -187,14 +187,14 @@ def simulate_breaths(
     if lung is None and not {"R", "C"} <= {*table}:
         raise InputError("the table has no columns R and C: name the lung of all its breaths")
     sample = table.groupby("breath_id").cumcount()
-    whole = table.assign(id=range(1, len(table) + 1), pressure=float(start))
+    complete = table.assign(id=range(1, len(table) + 1), pressure=float(start))
     if lung is not None:
         label = parse_lung(lung)
-        whole = whole.assign(R=label.R, C=label.C)
+        complete = complete.assign(R=label.R, C=label.C)
     for name, values in (("u_out", 0), ("time_step", protocol.DT * sample)):
-        whole = whole if name in whole else whole.assign(**{name: values})
+        complete = complete if name in complete else complete.assign(**{name: values})
     needed = ["id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure"]
-    breaths = load(pd.DataFrame(whole[needed]), pad=True)
+    breaths = load(pd.DataFrame(complete[needed]), pad=True)
     return replace(breaths, pressure=load_simulators(simulator).pressures(breaths))
 
 
@@ -202,8 +202,8 @@ def _controls(u_in: ArrayLike) -> Controls:
     try:
         values = np.asarray(u_in, float)
     except (TypeError, ValueError):
-        wanted = "u_in, %, one number a sample, a CSV file, or ventbench.simulation.Controls"
-        raise InputTypeError("controls", u_in, wanted) from None
+        expected = "u_in, %, one number a sample, a CSV file, or ventbench.simulation.Controls"
+        raise InputTypeError("controls", u_in, expected) from None
     if values.ndim != 1 or not values.size:
         raise InputError(f"u_in has shape {values.shape}; give one command a sample, shape (T,)")
     wrong = ~((values >= 0) & (values <= protocol.U_MAX))
@@ -363,7 +363,7 @@ class OpenLoopReport:
 
 def open_loop(
     breaths: Breaths | Path | str | pd.DataFrame,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     *,
     progress: Callable[[int, int], object] | None = None,
 ) -> OpenLoopReport:
@@ -393,13 +393,13 @@ def open_loop(
     """
     breaths = load(breaths)
     tested = load_simulators(simulator, breaths=breaths)
-    done = 0
+    finished = 0
 
     def count(simulated: int) -> None:
-        nonlocal done
-        done += simulated
+        nonlocal finished
+        finished += simulated
         if progress is not None:
-            progress(done, 2 * len(breaths))
+            progress(finished, 2 * len(breaths))
 
     error = mean_errors(tested.pressures(breaths, progress=count), breaths)
     crossed = mean_errors(tested.pressures(breaths, cross_fitted=True, progress=count), breaths)

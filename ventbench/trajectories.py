@@ -21,7 +21,7 @@ from ventbench.task.metrics.score import run_error
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ventbench.plants.catalog import Given
+    from ventbench.plants.catalog import SimulatorLike
     from ventbench.task.interfaces import Controller, Plant
 
 
@@ -132,7 +132,7 @@ def end_to_end(
 def rollout(
     controller: Controller,
     *,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     lungs: Sequence[str] | None = None,
     pips: Sequence[float] = protocol.PIPS,
 ) -> Trajectories:

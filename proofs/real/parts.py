@@ -20,7 +20,7 @@ from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
-from ventbench.plants.catalog import Given
+from ventbench.plants.catalog import SimulatorLike
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import load_plants
 from ventbench.plants.two_balloon import two_balloon
@@ -41,7 +41,7 @@ class Setting:
     """Input of a diagnosis."""
 
     breaths: Breaths  #: recorded breaths, perhaps with an injected effect.
-    plant: Given  #: simulator to diagnose.
+    plant: SimulatorLike  #: simulator to diagnose.
     plant_name: str  #: name of the simulator in reports.
     wanted: str | None = None  #: mechanism that must be named, or None.
     #: JSON values: what was injected or removed.

@@ -35,7 +35,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.resume import Checkpoint, fingerprint
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, save_weights, untrained
-from ventbench.plants.catalog import Given
+from ventbench.plants.catalog import SimulatorLike
 from ventbench.plants.stacking import take
 from ventbench.task import draws, protocol, rollouts
 from ventbench.task import environment as env
@@ -339,7 +339,7 @@ def train(
     config: ResidualConfig | None = None,
     seeds: Sequence[int] = (0,),
     gains: Floats | None = None,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train corrections of the best PIDs by differentiating through simulators.

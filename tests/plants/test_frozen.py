@@ -15,10 +15,10 @@ from ventbench.base import files
 from ventbench.base.compilation import float64
 from ventbench.base.errors import InputError
 from ventbench.plants import frozen
-from ventbench.plants.frozen import BY_ALL, seen
+from ventbench.plants.frozen import BY_ALL, training_list
 from ventbench.task.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
 
-NAMES = (frozen.MEMBERS, frozen.SEEN)
+NAMES = (frozen.MEMBERS, frozen.TRAINING_LIST)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_every_file_is_what_the_manifest_says(official):
     assert files.sha256(folder / frozen.ROLES) == frozen.ROLES_SHA256
     hashes = {name: files.sha256(folder / name) for name in NAMES}
     assert manifest["files"][frozen.MEMBERS]["sha256"] == hashes[frozen.MEMBERS]
-    assert hashes[frozen.SEEN] == frozen.SEEN_SHA256
+    assert hashes[frozen.TRAINING_LIST] == frozen.TRAINING_LIST_SHA256
     about = official.about()
     assert about == {
         "version": 2,
@@ -173,7 +173,9 @@ def test_an_unknown_lung_is_refused_with_the_known_ones(official, make_recording
 def test_who_has_seen_a_breath_decides_who_judges_it(official, make_recording):
     breaths = make_recording(["R5C10"] * 7)
     folds = np.array([1, 2, 3, 4, 5, BY_ALL])  # of the first six; the last is new
-    simulators = replace(official, seen=seen(breaths.select(np.arange(6)), folds))
+    simulators = replace(
+        official, training_breaths=training_list(breaths.select(np.arange(6)), folds)
+    )
     assert simulators.held_out(breaths).tolist() == [True] * 5 + [False, True]
     assert simulators.unseen(breaths).tolist() == [False] * 6 + [True]
     judges = [1, 2, 3, 4, 5, 0, 0]

@@ -55,7 +55,7 @@ def trained_on(official, public_recordings):
 def test_are_those_of_the_training(official, trained_on):
     assert official.manifest["recordings"] == trained_on.sources
     assert official.manifest["skipped"] == list(trained_on.skipped)
-    stored, again = official.seen.prints, fingerprints(trained_on.breaths)
+    stored, again = official.training_breaths.prints, fingerprints(trained_on.breaths)
     order = np.argsort(again.commands[:, 0])
     np.testing.assert_array_equal(stored.commands, again.commands[order])
     np.testing.assert_array_equal(stored.pressures, again.pressures[order])
@@ -63,7 +63,7 @@ def test_are_those_of_the_training(official, trained_on):
 
 def test_each_measured_breath_is_judged_by_the_member_without_it(official, trained_on):
     measured, member = trained_on.measured_breaths, trained_on.fold + 1
-    np.testing.assert_array_equal(official.seen.folds(measured), member)
+    np.testing.assert_array_equal(official.training_breaths.folds(measured), member)
     assert official.held_out(measured).all()
     assert not official.unseen(measured).any()  # member 0 is fitted to all
     at = official.sessions.assign(measured)
@@ -76,7 +76,7 @@ def test_a_changed_command_makes_a_breath_new(official, measured):
     u_in = measured.u_in.copy()
     u_in[7, 3] += 0.06
     other = replace(measured, u_in=u_in)
-    assert official.seen.folds(other)[7] == BY_NONE
+    assert official.training_breaths.folds(other)[7] == BY_NONE
     assert official.held_out(other).all()
     assert official.unseen(other)[7]
     with float64():

@@ -25,8 +25,8 @@ class InputError(ValueError):
 class InputTypeError(InputError, TypeError):
     """What was given is of a type that is not taken; the message says what is wanted instead."""
 
-    def __init__(self, what: str, given: object, wanted: str):
-        super().__init__(f"{what} is of type {type(given).__name__}; give {wanted}")
+    def __init__(self, what: str, given: object, expected: str):
+        super().__init__(f"{what} is of type {type(given).__name__}; give {expected}")
 
 
 #: What values of an annotation are, in words.

@@ -74,7 +74,7 @@ def executor(workers: int = 0, scheduler: str | None = None) -> Iterator[futures
     if workers == 0:
         yield InProcess()
         return
-    others = set(multiprocessing.active_children())
+    earlier = set(multiprocessing.active_children())
     # Not forked: JAX has threads, whose locks a fork would leave closed.
     pool = futures.ProcessPoolExecutor(
         workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent
@@ -83,7 +83,7 @@ def executor(workers: int = 0, scheduler: str | None = None) -> Iterator[futures
         yield pool
     except KeyboardInterrupt:
         # An interrupt may reach this process alone, and a job may run for minutes.
-        for worker in set(multiprocessing.active_children()) - others:
+        for worker in set(multiprocessing.active_children()) - earlier:
             worker.terminate()
         raise
     finally:
@@ -159,13 +159,13 @@ def in_order(
 
     ``progress`` is called with the number of jobs that are done and the number of all.
     """
-    jobs = {str(index): own for index, own in enumerate(arguments)}
-    kept: dict[str, ResultT] = {}
+    jobs = {str(index): job for index, job in enumerate(arguments)}
+    outcomes: dict[str, ResultT] = {}
     for name, result in results(pool, function, jobs):
-        kept[name] = result
+        outcomes[name] = result
         if progress is not None:
-            progress(len(kept), len(jobs))
-    return [kept[name] for name in jobs]
+            progress(len(outcomes), len(jobs))
+    return [outcomes[name] for name in jobs]
 
 
 def parallel_map(
@@ -192,8 +192,8 @@ def parallel_map(
 
 def thread_count() -> int:
     """Number of threads that :func:`parallel_map` uses, at least one."""
-    given = os.environ.get(THREADS, "")
-    if given.isdigit() and int(given) > 0:
-        return int(given)
+    setting = os.environ.get(THREADS, "")
+    if setting.isdigit() and int(setting) > 0:
+        return int(setting)
     can = getattr(os, "sched_getaffinity", None)
     return min(_MOST, len(can(0)) if can else os.cpu_count() or 1)

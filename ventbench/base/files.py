@@ -37,7 +37,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         OSError: if the folder or file cannot be written; it names the target, whose old content
             stays.
     """
-    given, path = path, Path(os.path.realpath(path))
+    unresolved, path = path, Path(os.path.realpath(path))
     try:
         if path.exists() and not path.is_file():
             _write_directly(path, write)
@@ -49,7 +49,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         # names no file at all.
         nameless = error.errno is not None and error.filename is None
         if nameless or Path(str(error.filename)).name.startswith(f".{path.name}."):
-            error.filename = str(given)
+            error.filename = str(unresolved)
         raise
 
 
@@ -206,6 +206,6 @@ def example(name: str) -> Path:
     folder = data_path("examples")
     path = folder / (name if "." in name else f"{name}.csv")
     if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in folder.glob("*.csv")))
-        raise InputError(f"there is no example {name!r}; choose one of {known}")
+        examples = ", ".join(sorted(file.stem for file in folder.glob("*.csv")))
+        raise InputError(f"there is no example {name!r}; choose one of {examples}")
     return path

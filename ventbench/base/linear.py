@@ -34,8 +34,8 @@ def inverse(matrix: Floats) -> Floats:
         return np.asarray(np.linalg.inv(matrix), np.float64)
     except np.linalg.LinAlgError:
         finite = np.isfinite(matrix).all(axis=(-2, -1), keepdims=True)
-        found = np.linalg.pinv(np.where(finite, matrix, 0.0))
-        return np.where(finite, found, np.nan)
+        pseudoinverse = np.linalg.pinv(np.where(finite, matrix, 0.0))
+        return np.where(finite, pseudoinverse, np.nan)
 
 
 def cholesky(matrix: Floats) -> NDArray[np.float64]:
@@ -47,8 +47,8 @@ def cholesky(matrix: Floats) -> NDArray[np.float64]:
     try:
         return np.asarray(np.linalg.cholesky(matrix), np.float64)
     except np.linalg.LinAlgError:
-        known = np.nan_to_num(matrix, nan=0.0, posinf=0.0, neginf=0.0)
-        values, vectors = np.linalg.eigh(0.5 * (known + known.T))
+        symmetric = np.nan_to_num(matrix, nan=0.0, posinf=0.0, neginf=0.0)
+        values, vectors = np.linalg.eigh(0.5 * (symmetric + symmetric.T))
         values = np.maximum(values, max(_LEAST * float(values.max(initial=0.0)), _LEAST))
         upper = np.asarray(np.linalg.qr((vectors * np.sqrt(values)).T, mode="r"), np.float64)
         return (upper * np.sign(np.diag(upper))[:, None]).T

@@ -78,11 +78,11 @@ class WorkFolder:
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder = folder
-        path, wanted = folder / SETTINGS, _plain(settings)
+        path, expected = folder / SETTINGS, _plain(settings)
         if path.exists():
-            _check(folder, _read(path, JSON), wanted)
+            _check(folder, _read(path, JSON), expected)
         else:
-            files.write_json(path, wanted)
+            files.write_json(path, expected)
         _opened[folder] = None
 
     def get(self, name: str, compute: Callable[[], Any], format: Format = JSON) -> Any:
@@ -232,15 +232,15 @@ def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(dict(settings), sort_keys=True))
 
 
-def _check(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
+def _check(path: Path, stored: dict[str, Any], expected: dict[str, Any]) -> None:
     """Refuse work of other settings, naming those that differ."""
-    if stored == wanted:
+    if stored == expected:
         return
     absent = object()
     names = sorted(
         name
-        for name in stored.keys() | wanted.keys()
-        if stored.get(name, absent) != wanted.get(name, absent)
+        for name in stored.keys() | expected.keys()
+        if stored.get(name, absent) != expected.get(name, absent)
     )
     raise InputError(
         f"{path} holds work with other settings ({', '.join(names)}); delete it to start anew, or "

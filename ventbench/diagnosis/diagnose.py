@@ -48,7 +48,7 @@ from ventbench.diagnosis.unknown import explained, preference, unplaced_gain
 from ventbench.diagnosis.validation import check_residuals, detection_limits, explained_share
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import mechanism, parameter
-from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.catalog import SimulatorLike, load_simulators
 from ventbench.plants.python_simulators import PythonSimulators
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.bad_samples import notable
@@ -79,7 +79,7 @@ _MOST_INTERMITTENT = 2
 def diagnose(
     breaths: Breaths | str | Path | pd.DataFrame,
     *,
-    simulator: Given = "physics",
+    simulator: SimulatorLike = "physics",
     lung: str | None = None,
     patient: bool = False,
     drive: Drive = "auto",
@@ -522,7 +522,7 @@ def _of_lung(breaths: Breaths, lung: str) -> Breaths:
     return breaths.select(by_lung[lung])
 
 
-def _name(given: Given, simulators: Simulators) -> str:
+def _name(given: SimulatorLike, simulators: Simulators) -> str:
     """Name of a simulator in reports."""
     if isinstance(given, str | Path | Simulators) or isinstance(simulators, PythonSimulators):
         return simulators.name

@@ -31,7 +31,7 @@ from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.runs import number
 from ventbench.entries.scoring import enter
 from ventbench.physics.catalogue import parameter
-from ventbench.plants.catalog import Given
+from ventbench.plants.catalog import SimulatorLike
 from ventbench.plants.corrected import stressed_plants
 from ventbench.plants.hybrid import NAMES, from_vector
 from ventbench.plants.rigs import Rigs, load_rigs
@@ -238,7 +238,7 @@ class Critical:
 def adversary(
     submission: Any,
     *,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     track: str | None = None,
     lungs: Sequence[str] = (),
     stressors: Sequence[str] = (),

@@ -29,7 +29,7 @@ from ventbench.entries.runs import pip_columns
 from ventbench.plants.corrected import Stressed, stressed_plants
 from ventbench.plants.rigs import Rigs
 from ventbench.sandbox.child.cell import Cell, Failed, Failure, controller_class
-from ventbench.sandbox.pipes import Asked
+from ventbench.sandbox.pipes import PolledControllers
 from ventbench.task import draws as draw_tables
 from ventbench.task import environment as env
 from ventbench.task import protocol
@@ -186,7 +186,7 @@ class ControllerSession(Interface):
         ...
 
     def act(self, observations: Floats) -> Floats:
-        """Ask every controller and wait for all, see :class:`ventbench.sandbox.pipes.Asked`."""
+        """Ask every controller and wait; see ``sandbox.pipes.PolledControllers``."""
         ...
 
     def processor_time(self) -> float:
@@ -234,7 +234,7 @@ def pack(observation: Observation) -> Floats:
     return rows.reshape(-1, rows.shape[-1])
 
 
-class InProcessSession(Asked):
+class InProcessSession(PolledControllers):
     """Controllers of all cells in this process; :class:`InProcessRunner` starts them."""
 
     def __init__(self, submission: Submission, tasks: Sequence[Task]):

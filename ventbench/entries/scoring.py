@@ -28,7 +28,7 @@ from ventbench.entries.manifest import TRACKS
 from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
 from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure, Runs, number
-from ventbench.plants.catalog import Given
+from ventbench.plants.catalog import SimulatorLike
 from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.task import draws, protocol
@@ -55,7 +55,7 @@ Progress = Callable[[int, int], None]
 def score(
     submission: Any,
     *,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     track: str | None = None,
     draws: int = 0,
     stress: int = 0,

@@ -68,14 +68,14 @@ class Stepping(Protocol):
 
 
 #: Simulators in plain Python, alone or by lung id; also plants by lung id.
-PythonGiven: TypeAlias = "Stepping | Mapping[str, Any] | Callable[..., Any]"
+PythonSimulatorLike: TypeAlias = "Stepping | Mapping[str, Any] | Callable[..., Any]"
 
-_WANTED = (
+_ACCEPTED = (
     "a name, a file, a plant, plants by lung id, a function of commands or an array of pressures"
 )
 
 #: All that :func:`load_simulators` takes.
-Given: TypeAlias = "str | Path | Simulators | Plant | PythonGiven | ArrayLike"
+SimulatorLike: TypeAlias = "str | Path | Simulators | Plant | PythonSimulatorLike | ArrayLike"
 
 
 def names() -> tuple[str, ...]:
@@ -83,11 +83,13 @@ def names() -> tuple[str, ...]:
     return tuple(_named())
 
 
-def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) -> Simulators:
+def load_simulators(
+    simulator: SimulatorLike = "frozen", *, breaths: Breaths | None = None
+) -> Simulators:
     """Simulators by whatever stands for them; see the table of this module.
 
     Args:
-        given: a name, a path, ``"module:name"``, a plant, plants by lung id, a function of
+        simulator: a name, a path, ``"module:name"``, a plant, plants by lung id, a function of
             commands or an array of simulated pressures. What is :class:`Simulators` already is
             returned as it is.
         breaths: the recording that an array answers to, row by row; only for arrays.
@@ -103,23 +105,23 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
         >>> load_simulators("physics").plant("R20C50").get("C").item()
         50.0
     """
-    if isinstance(given, Simulators):
-        return given
-    if given is None or isinstance(given, bool | int | float | Breaths):
-        raise InputTypeError("simulator", given, _WANTED)
-    if isinstance(given, str | Path):
-        return _by_text(str(given))
-    if isinstance(given, Mapping):
-        if any(_is_python(value) for value in given.values()):
-            return _python_by_lung(given, "the given simulators")
-        digest = _leaves_sha256(given)
-        return _plants(dict(given), "the given plants", _about("plants", digest), digest)
-    if _is_python(given):
-        name = getattr(given, "__qualname__", type(given).__name__)
-        return _of_function(given, name)
-    if isinstance(given, Plant):
-        return _single(given, type(given).__name__, _leaves_sha256(given))
-    return _of_array(given, breaths)
+    if isinstance(simulator, Simulators):
+        return simulator
+    if simulator is None or isinstance(simulator, bool | int | float | Breaths):
+        raise InputTypeError("simulator", simulator, _ACCEPTED)
+    if isinstance(simulator, str | Path):
+        return _by_text(str(simulator))
+    if isinstance(simulator, Mapping):
+        if any(_is_python(value) for value in simulator.values()):
+            return _python_by_lung(simulator, "the given simulators")
+        digest = _leaves_sha256(simulator)
+        return _plants(dict(simulator), "the given plants", _provenance("plants", digest), digest)
+    if _is_python(simulator):
+        name = getattr(simulator, "__qualname__", type(simulator).__name__)
+        return _of_function(simulator, name)
+    if isinstance(simulator, Plant):
+        return _single(simulator, type(simulator).__name__, _leaves_sha256(simulator))
+    return _of_array(simulator, breaths)
 
 
 def _is_python(value: Any) -> bool:
@@ -132,10 +134,10 @@ def _is_python(value: Any) -> bool:
     return callable(value) or hasattr(value, "step")
 
 
-def _python_by_lung(given: Mapping[str, Any], name: str, sha256: str | None = None) -> Simulators:
+def _python_by_lung(by_id: Mapping[str, Any], name: str, sha256: str | None = None) -> Simulators:
     """Simulators in plain Python by lung id."""
     by_lung = {}
-    for key, value in given.items():
+    for key, value in by_id.items():
         if not _is_python(value):
             raise InputError(
                 f"{name}, lung {key}: a {type(value).__name__} beside functions and classes; give "
@@ -147,15 +149,15 @@ def _python_by_lung(given: Mapping[str, Any], name: str, sha256: str | None = No
     def run(arguments: Mapping[str, Any]) -> ArrayLike:
         label = arguments["R"], arguments["C"]
         if label not in by_lung:
-            known = ", ".join(lung(key).id for key in given)
-            raise InputError(f"{name} have no such lung; they have {known}")
+            available = ", ".join(lung(key).id for key in by_id)
+            raise InputError(f"{name} have no such lung; they have {available}")
         return by_lung[label](arguments)
 
-    about = _about("function", sha256, function=name, lungs=sorted(given))
-    return PythonSimulators(name=name, about=about, sha256=sha256, function=run)
+    provenance = _provenance("function", sha256, function=name, lungs=sorted(by_id))
+    return PythonSimulators(name=name, about=provenance, sha256=sha256, function=run)
 
 
-def _about(kind: str, sha256: str | None, **more: Any) -> dict[str, Any]:
+def _provenance(kind: str, sha256: str | None, **more: Any) -> dict[str, Any]:
     """What results keep of simulators."""
     return {"kind": kind, **more} | ({} if sha256 is None else {"sha256": sha256})
 
@@ -256,7 +258,7 @@ def _named() -> dict[str, Callable[[], Simulators]]:
 
 
 def _plants(
-    plants: dict[str, Plant], name: str, about: Mapping[str, Any], sha256: str | None = None
+    plants: dict[str, Plant], name: str, provenance: Mapping[str, Any], sha256: str | None = None
 ) -> Simulators:
     if not plants:
         raise InputError(f"{name}: there is no plant in it")
@@ -278,7 +280,7 @@ def _plants(
 
     return PlantSimulators(
         name=name,
-        about=about,
+        about=provenance,
         lungs=tuple(lung(key) for key in plants),
         sha256=sha256,
         stack=lambda: stack_heterogeneous(list(plants.values())),
@@ -292,7 +294,7 @@ def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
 
     return PlantSimulators(
         name=name,
-        about=_about("plant", sha256, plant=name),
+        about=_provenance("plant", sha256, plant=name),
         lungs=LUNGS,
         sha256=sha256,
         stack=partial(repeated, len(LUNGS)),
@@ -302,14 +304,17 @@ def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
 
 def _plant_file(path: Path) -> Simulators:
     digest = files.sha256(path)
-    about = _about("file", digest, file=path.name)
+    provenance = _provenance("file", digest, file=path.name)
     plants, origin = load_plants(path)
-    return replace(_plants(plants, path.name, about, digest), origin=origin)
+    return replace(_plants(plants, path.name, provenance, digest), origin=origin)
 
 
 def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:
-    adapted, about = python_simulator(function, name), _about("function", sha256, function=name)
-    return PythonSimulators(name=name, about=about, sha256=sha256, function=adapted)
+    adapted, provenance = (
+        python_simulator(function, name),
+        _provenance("function", sha256, function=name),
+    )
+    return PythonSimulators(name=name, about=provenance, sha256=sha256, function=adapted)
 
 
 def _imported(module: str, attribute: str) -> Simulators:
@@ -341,15 +346,15 @@ def _imported(module: str, attribute: str) -> Simulators:
     )
 
 
-def _of_array(given: Any, breaths: Breaths | None) -> Simulators:
+def _of_array(values: Any, breaths: Breaths | None) -> Simulators:
     try:
-        pressures = np.asarray(given, float)
+        pressures = np.asarray(values, float)
     except (TypeError, ValueError) as error:
-        raise InputTypeError("simulator", given, _WANTED) from error
+        raise InputTypeError("simulator", values, _ACCEPTED) from error
     if breaths is None or pressures.shape != breaths.pressure.shape:
-        wanted = "the breaths it answers to" if breaths is None else str(breaths.pressure.shape)
+        expected = "the breaths it answers to" if breaths is None else str(breaths.pressure.shape)
         raise InputError(
-            f"an array of simulated pressures, shape {pressures.shape}, needs {wanted}"
+            f"an array of simulated pressures, shape {pressures.shape}, needs {expected}"
         )
     columns = {name: getattr(breaths, name) for name in ("breath_id", "R", "C")}
     table = {name: np.repeat(x, breaths.valid.sum(axis=1)) for name, x in columns.items()}
@@ -360,6 +365,6 @@ def _of_array(given: Any, breaths: Breaths | None) -> Simulators:
 def _of_table(
     table: Mapping[str, np.ndarray], name: str, file: str, sha256: str | None = None
 ) -> Simulators:
-    about = _about("pressures", sha256, **({} if sha256 is None else {"file": name}))
+    provenance = _provenance("pressures", sha256, **({} if sha256 is None else {"file": name}))
     answers = partial(simulated_pressures, table, file, sha256=sha256)
-    return SimulatedPressures(name=name, about=about, sha256=sha256, answers=answers)
+    return SimulatedPressures(name=name, about=provenance, sha256=sha256, answers=answers)

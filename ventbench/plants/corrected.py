@@ -54,10 +54,10 @@ class Corrected:
         self, state: tuple[Any, Any, Any], u_in: Array, u_out: Array, dt: Array
     ) -> tuple[tuple[Any, Any, Any], Signals]:
         """Hold one command; see :class:`~ventbench.task.interfaces.Plant`."""
-        simulator, shown = self.simulator.step(state[0], u_in, u_out, dt)
-        wanted, more = self.with_mechanisms.step(state[1], u_in, u_out, dt)
-        own, less = self.without_mechanisms.step(state[2], u_in, u_out, dt)
-        return (simulator, wanted, own), corrected_signals(shown, more, less)
+        simulator, base = self.simulator.step(state[0], u_in, u_out, dt)
+        more_state, more = self.with_mechanisms.step(state[1], u_in, u_out, dt)
+        less_state, less = self.without_mechanisms.step(state[2], u_in, u_out, dt)
+        return (simulator, more_state, less_state), corrected_signals(base, more, less)
 
     def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Corrected:
         """Return the same lung with another resistance, compliance and gain."""
@@ -100,21 +100,21 @@ class Stressed:
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[tuple[Any, Any], Signals]:
         """Lung at rest at a true pressure; see :class:`~ventbench.task.interfaces.Plant`."""
         behind = pressure if peep is None else peep
-        shown = self.physics.reading_of(jnp.stack([pressure, pressure]))
-        state, _ = self.physics.init(shown, behind)
-        simulator, seen = self.simulator.init(pressure, behind)
-        flow = None if seen.flow is None else 0.0 * seen.flow
-        signals = Signals(shown[0] + 0.0 * pressure, pressure, flow, 0.0 * pressure)
+        reading = self.physics.reading_of(jnp.stack([pressure, pressure]))
+        state, _ = self.physics.init(reading, behind)
+        simulator, unstressed = self.simulator.init(pressure, behind)
+        flow = None if unstressed.flow is None else 0.0 * unstressed.flow
+        signals = Signals(reading[0] + 0.0 * pressure, pressure, flow, 0.0 * pressure)
         return (simulator, state), signals
 
     def step(
         self, state: tuple[Any, Any], u_in: Array, u_out: Array, dt: Array
     ) -> tuple[tuple[Any, Any], Signals]:
         """Hold one command; the volume is that of the physics with the stressor."""
-        simulator, seen = self.simulator.step(state[0], u_in, u_out, dt)
+        simulator, unstressed = self.simulator.step(state[0], u_in, u_out, dt)
         physics, both = self.physics.step(state[1], u_in, u_out, dt)
         more, less = (jax.tree.map(lambda leaf, k=k: leaf[k], both) for k in (0, 1))
-        signals = corrected_signals(seen, more, less)._replace(volume=more.volume)
+        signals = corrected_signals(unstressed, more, less)._replace(volume=more.volume)
         return (simulator, physics), signals
 
     def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Stressed:
@@ -134,9 +134,9 @@ def reference_physics(plant: Plant, lungs: Sequence[Lung]) -> dict[str, Floats]:
     labels, shape ``(L,)``.
     """
     wide: Any = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), plant)
-    known = wide.parameters()
-    if known is not None:
-        return {path: np.asarray(value) for path, value in known.items()}
+    parameters = wide.parameters()
+    if parameters is not None:
+        return {path: np.asarray(value) for path, value in parameters.items()}
     return {
         "R": np.array([lung.R for lung in lungs]),
         "C": np.array([lung.C for lung in lungs]),
@@ -176,9 +176,9 @@ def stressed_plants(
     for index, condition in enumerate(conditions):
         shares = condition.shares or (1.0,) * len(condition.stressors)
         for name, share in zip(condition.stressors, shares, strict=True):
-            own = {path: value[:, index] for path, value in after.items()}
+            parameters = {path: value[:, index] for path, value in after.items()}
             if share:
-                _apply(stressor(name), condition.severity or "mild", share, own, labels)
+                _apply(stressor(name), condition.severity or "mild", share, parameters, labels)
 
     both: Any = tuple(
         np.stack([x[name].reshape(protocol.BREATHS, -1).T for x in (after, before)], axis=-1)
@@ -195,7 +195,7 @@ def stressed_plants(
 
 
 def _apply(
-    line: Stressor, severity: Severity, part: float, own: dict[str, Floats], labels: Floats
+    line: Stressor, severity: Severity, part: float, parameters: dict[str, Floats], labels: Floats
 ) -> None:
     """Change parameters ``(BREATHS, L, n)`` of one condition in place, by a share of the strength.
 
@@ -203,16 +203,16 @@ def _apply(
     """
     strength, share = line.at(severity), part * np.reshape(line.breaths, (-1, 1, 1))
     if line.rule == "add":
-        own[line.strength] += share * strength
+        parameters[line.strength] += share * strength
     else:
         factor = np.array(strength)
         if line.rule == "label":
             factor = strength / labels[:, 0 if line.strength == "R" else 1]
-        for name, value in own.items():
+        for name, value in parameters.items():
             if name == line.strength or parameter(name).follows == line.strength:
                 value *= factor**share
     for name, value in line.settings(severity).items():
-        own[name][:] = np.reshape(value, (-1, 1, 1))
+        parameters[name][:] = np.reshape(value, (-1, 1, 1))
 
 
 def _parameters(base: dict[str, Floats], conditions: Sequence[Condition]) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ from ventbench.recordings.identity import Fingerprints, fingerprints, match, rep
 #: Format of the manifest.
 FORMAT = "ventbench-simulators-2"
 ROLES_FORMAT = "ventbench-population-1"
-MANIFEST, MEMBERS, SEEN = "manifest.toml", "hybrid.npz", "seen.npz"
+MANIFEST, MEMBERS, TRAINING_LIST = "manifest.toml", "hybrid.npz", "seen.npz"
 POPULATION = "population.npz"
 
 #: What rounds draw rigs from, and the rigs that are held out: beside the manifest, whose hash every
@@ -46,14 +46,14 @@ MANIFEST_SHA256 = "e4b214dd47b9233918260c0576bf76ce15eb1629309be0ae05cf04394fe36
 
 #: SHA-256 of the official list of training breaths. No score depends on the list, so it may be
 #: another than the manifest's, which every score names.
-SEEN_SHA256 = "8c66a6c3822b18cbf24b0e8a2e8b2ad7bbdeae969dc4329eb15b72cc68b2039a"
+TRAINING_LIST_SHA256 = "8c66a6c3822b18cbf24b0e8a2e8b2ad7bbdeae969dc4329eb15b72cc68b2039a"
 
 #: Fold of a breath that every member has seen, and of one that none has.
 BY_ALL, BY_NONE = -1, -2
 
 
 @dataclass(frozen=True)
-class Seen:
+class TrainingBreaths:
     """The breaths of the training."""
 
     prints: Fingerprints  #: their fingerprints, of k breaths.
@@ -64,8 +64,8 @@ class Seen:
 
         What is perhaps a copy counts as one.
         """
-        known = match(breaths, self.prints).known
-        return np.where(known >= 0, self.fold[known].astype(np.int64), BY_NONE)
+        index = match(breaths, self.prints).known
+        return np.where(index >= 0, self.fold[index].astype(np.int64), BY_NONE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class Frozen:
     manifest_sha256: str  #: SHA-256 of the manifest.
     sessions: Sessions  #: what a breath's clock is compared with.
     members: Hybrid  #: float64 leaves ``(members, sessions, ...)``.
-    seen: Seen  #: the breaths of the training.
+    training_breaths: TrainingBreaths  #: the breaths of the training.
     #: that rigs of each lung are drawn from; None where none was fitted.
     population: RigPopulation | None = None
 
@@ -95,7 +95,7 @@ class Frozen:
 
     @property
     def _references(self) -> Ints:
-        return np.array([about["session"] for about in self.manifest["lungs"].values()])
+        return np.array([entry["session"] for entry in self.manifest["lungs"].values()])
 
     @property
     def rigs(self) -> tuple[tuple[int, ...], ...]:
@@ -104,7 +104,7 @@ class Frozen:
         They passed the test of their label. The first is the lung's reference rig, whose plant is
         in :attr:`plants`.
         """
-        return tuple(tuple(about["rigs"]) for about in self.manifest["lungs"].values())
+        return tuple(tuple(entry["rigs"]) for entry in self.manifest["lungs"].values())
 
     @property
     def held_out_rigs(self) -> tuple[tuple[int, ...], ...]:
@@ -125,10 +125,10 @@ class Frozen:
         """Rigs that are held out and seen, by lung, as :data:`ROLES` holds them."""
         keys = ("held_out_rigs", "seen_rigs")
         lungs = self.manifest["lungs"].items()
-        return {lung: {key: about[key] for key in keys if key in about} for lung, about in lungs}
+        return {lung: {key: entry[key] for key in keys if key in entry} for lung, entry in lungs}
 
     def _of_lungs(self, key: str) -> tuple[tuple[int, ...], ...]:
-        return tuple(tuple(about.get(key, ())) for about in self.manifest["lungs"].values())
+        return tuple(tuple(entry.get(key, ())) for entry in self.manifest["lungs"].values())
 
     @property
     def training_rigs(self) -> tuple[tuple[int, ...], ...]:
@@ -169,20 +169,20 @@ class Frozen:
 
     def cross_fitted(self, breaths: Breaths) -> Hybrid:
         """Plants of the member that has not seen each breath; of member 0 if all have seen it."""
-        return self._of(breaths, np.maximum(self.seen.folds(breaths), 0))
+        return self._of(breaths, np.maximum(self.training_breaths.folds(breaths), 0))
 
     def held_out(self, breaths: Breaths) -> Bools:
         """Whether some member has not seen the breath, so that it can be judged by it, ``(n,)``."""
-        return self.seen.folds(breaths) != BY_ALL
+        return self.training_breaths.folds(breaths) != BY_ALL
 
     def unseen(self, breaths: Breaths) -> Bools:
         """Whether the official simulators, member 0, have not seen the breath, ``(n,)``."""
-        return self.seen.folds(breaths) == BY_NONE
+        return self.training_breaths.folds(breaths) == BY_NONE
 
     def perhaps_copies(self, breaths: Breaths) -> Bools:
         """Whether the breath may be one of the training, but blank pressures do not tell, (n,)."""
-        found = match(breaths, self.seen.prints)
-        return (found.known >= 0) & ~found.certain
+        matches = match(breaths, self.training_breaths.prints)
+        return (matches.known >= 0) & ~matches.certain
 
     def _of(self, breaths: Breaths, member: Ints) -> Hybrid:
         at = self.sessions.assign(breaths)
@@ -190,23 +190,23 @@ class Frozen:
 
     def lungs(self) -> dict[str, dict[str, Any]]:
         """Settings and held-out errors of the lungs, by id."""
-        return {name: dict(about) for name, about in self.manifest["lungs"].items()}
+        return {name: dict(entry) for name, entry in self.manifest["lungs"].items()}
 
     def about(self) -> dict[str, Any]:
         """Version and hashes that a score states of its simulators."""
-        hashes = {name: self.manifest["files"][name]["sha256"] for name in (MEMBERS, SEEN)}
+        hashes = {name: self.manifest["files"][name]["sha256"] for name in (MEMBERS, TRAINING_LIST)}
         about = {key: self.manifest[key] for key in ("version", "kind")}
         return {**about, "manifest_sha256": self.manifest_sha256, "files": hashes}
 
 
-def seen(breaths: Breaths, fold: Ints) -> Seen:
+def training_list(breaths: Breaths, fold: Ints) -> TrainingBreaths:
     """Make the list; a breath of which there are copies in several folds was seen by all."""
     copy, _ = repetitions(breaths)
     folds = fold.astype(np.int8)
     folds[copy[folds != folds[copy]]] = BY_ALL
-    prints, kept = fingerprints(breaths), np.flatnonzero(copy == np.arange(len(copy)))
-    kept = kept[np.argsort(prints.commands[kept, 0])]  # not in the order of the recordings
-    return Seen(prints.select(kept), folds[kept])
+    prints, first = fingerprints(breaths), np.flatnonzero(copy == np.arange(len(copy)))
+    first = first[np.argsort(prints.commands[first, 0])]  # not in the order of the recordings
+    return TrainingBreaths(prints.select(first), folds[first])
 
 
 def folder() -> Path:
@@ -225,27 +225,29 @@ def load(path: Path | None = None) -> Frozen:
     path = path or folder()
     manifest = _manifest(path)
     members = load_plant(_checked(path, MEMBERS, manifest))
-    with np.load(_checked(path, SEEN, manifest), allow_pickle=False) as arrays:
+    with np.load(_checked(path, TRAINING_LIST, manifest), allow_pickle=False) as arrays:
         if "commands" not in arrays:
             raise InputError(
-                f"{path / SEEN} is of an older version, which did not know copies with fewer "
-                "digits; train the simulators again"
+                f"{path / TRAINING_LIST} is of an older version, which did not know copies with "
+                "fewer digits; train the simulators again"
             )
         names = [field.name for field in fields(Fingerprints)]
-        known = Seen(Fingerprints(*(arrays[name] for name in names)), arrays["fold"])
+        training = TrainingBreaths(Fingerprints(*(arrays[name] for name in names)), arrays["fold"])
     table = Sessions.from_list(manifest["sessions"])
-    drawn = None
+    population = None
     if POPULATION in manifest["files"]:
-        drawn = load_population(_checked(path, POPULATION, manifest))
-    return Frozen(path, manifest, files.sha256(path / MANIFEST), table, members, known, drawn)
+        population = load_population(_checked(path, POPULATION, manifest))
+    return Frozen(
+        path, manifest, files.sha256(path / MANIFEST), table, members, training, population
+    )
 
 
 def _manifest(path: Path) -> dict[str, Any]:
     manifest = _toml(path / MANIFEST, FORMAT)
     if (path / ROLES).is_file():
         roles = _toml(path / ROLES, ROLES_FORMAT)
-        for lung, own in roles.get("lungs", {}).items():
-            manifest["lungs"][lung] |= own
+        for lung, settings in roles.get("lungs", {}).items():
+            manifest["lungs"][lung] |= settings
         manifest["files"] |= roles["files"]
         manifest["population"] = roles["population"]
     return manifest
@@ -269,7 +271,7 @@ def _checked(path: Path, name: str, manifest: dict[str, Any]) -> Path:
         digest, expected = files.sha256(path / name), manifest["files"][name]["sha256"]
     except (OSError, KeyError) as error:
         raise InputError(f"{path / name} is missing, or the manifest lacks it: {error}") from error
-    if digest != expected and (name, digest) != (SEEN, SEEN_SHA256):
+    if digest != expected and (name, digest) != (TRAINING_LIST, TRAINING_LIST_SHA256):
         raise InputError(
             f"{path / name} has SHA-256 {digest[:16]}..., the manifest says {expected[:16]}...; "
             "it is damaged or changed: restore it, or reinstall ventbench"

@@ -183,11 +183,11 @@ class Hybrid:
         h = dt / SUBSTEPS
         lag, smooth = jnp.exp(-h / self.valve_lag), jnp.exp(-h / self.sensor_lag)
         open_or_close = u_out * self.opening_delay + (1.0 - u_out) * self.closing_delay
-        wanteds = _delayed(commanded, state.past, self.valve_delay, h)
+        targets = _delayed(commanded, state.past, self.valve_delay, h)
         wides = _delayed(opened, state.past, open_or_close, h)
-        for wanted, wide in zip(wanteds, wides, strict=True):
-            inflow = wanted + (flow - wanted) * self.valve_lag / h * (1.0 - lag)  # mean over h
-            flow = wanted + (flow - wanted) * lag
+        for target, wide in zip(targets, wides, strict=True):
+            inflow = target + (flow - target) * self.valve_lag / h * (1.0 - lag)  # mean over h
+            flow = target + (flow - target) * lag
             if self.closing_lag is not None:
                 # It opens with a spring and closes against the pressure.
                 wide = jnp.maximum(wide, jnp.asarray(opening) * jnp.exp(-h / self.closing_lag))
@@ -428,8 +428,8 @@ class RigPopulation:
         numbers = uniforms(seed, f"population 1, lung {lung}", (count, len(NAMES)))
         normal = np.round(np.vectorize(NormalDist().inv_cdf, otypes=[float])(numbers), 4)
         vector = self.mean[lung] + (self.factor[lung] @ normal[..., None])[..., 0]
-        drawn = from_vector(vector, np)
-        return jax.tree.map(_rounded, drawn)
+        rigs = from_vector(vector, np)
+        return jax.tree.map(_rounded, rigs)
 
 
 def _rounded(value: Floats) -> Floats:
@@ -454,9 +454,11 @@ def load_population(path: Path) -> RigPopulation:
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            found = RigPopulation(arrays["mean"], arrays["factor"])
+            population = RigPopulation(arrays["mean"], arrays["factor"])
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path} is not a population of rigs: {error}") from error
-    if found.mean.shape[1:] != (len(NAMES),):
-        raise InputError(f"{path} holds rigs of {found.mean.shape[1:]} numbers, not {len(NAMES)}")
-    return found
+    if population.mean.shape[1:] != (len(NAMES),):
+        raise InputError(
+            f"{path} holds rigs of {population.mean.shape[1:]} numbers, not {len(NAMES)}"
+        )
+    return population

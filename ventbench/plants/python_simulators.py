@@ -64,8 +64,8 @@ class PythonSimulators(Simulators):
                 columns = (breaths.u_in, breaths.u_out, breaths.dt)
                 u_in, u_out, dt = (x[i, samples] for x in columns)
                 flow = None if breaths.flow is None else breaths.flow[i, samples].copy()
-                what = f"breath {breaths.breath_id[i]}"
-                answer = self._call(u_in, u_out, dt, label, start, what, flow)
+                place = f"breath {breaths.breath_id[i]}"
+                answer = self._call(u_in, u_out, dt, label, start, place, flow)
                 answers[i, samples], answers[i, ~samples] = answer, answer[-1]
             if progress is not None:
                 progress(1)
@@ -84,28 +84,30 @@ class PythonSimulators(Simulators):
         dt: Floats,
         label: Lung,
         start: float,
-        what: str,
+        place: str,
         flow: Floats | None = None,
     ) -> Floats:
         commands = {"u_in": u_in, "u_out": u_out, "dt": dt}
-        given: dict[str, Any] = {key: np.array(column, float) for key, column in commands.items()}
-        given |= {"R": label.R, "C": label.C, "initial_pressure": float(start), "flow": flow}
-        given["time"] = np.concatenate([[0.0], np.cumsum(given["dt"])[:-1]])
+        arguments: dict[str, Any] = {
+            key: np.array(column, float) for key, column in commands.items()
+        }
+        arguments |= {"R": label.R, "C": label.C, "initial_pressure": float(start), "flow": flow}
+        arguments["time"] = np.concatenate([[0.0], np.cumsum(arguments["dt"])[:-1]])
         try:
-            pressure = np.asarray(self.function(given), float)
+            pressure = np.asarray(self.function(arguments), float)
         except InputError as error:
-            raise InputError(f"{what} of lung {label}: {error}") from error
+            raise InputError(f"{place} of lung {label}: {error}") from error
         except Exception as error:
             raise InputError(
-                f"{self.name} raised {type(error).__name__} at {what} of lung {label}: {error}"
+                f"{self.name} raised {type(error).__name__} at {place} of lung {label}: {error}"
             ) from error
         if pressure.shape != np.shape(u_in):
             raise InputError(
-                f"{self.name} answered to {what} with shape {pressure.shape}; a pressure for each "
+                f"{self.name} answered to {place} with shape {pressure.shape}; a pressure for each "
                 f"of the {np.size(u_in)} samples is wanted, shape {np.shape(u_in)}"
             )
         if not np.all(np.isfinite(pressure)):
-            raise InputError(f"{self.name} answered to {what} with a pressure that is not finite")
+            raise InputError(f"{self.name} answered to {place} with a pressure that is not finite")
         return pressure
 
 
@@ -152,17 +154,21 @@ def _call_of(function: Callable[..., Any], name: str) -> PythonSimulator:
             f"called as {_SIGNATURE}, by these names, and may also ask for time (s) and flow (mL/s)"
         )
 
-    def call(given: Mapping[str, Any]) -> Any:
-        if "flow" in needed and given["flow"] is None:
+    def call(arguments: Mapping[str, Any]) -> Any:
+        if "flow" in needed and arguments["flow"] is None:
             raise InputError(f"{name} asks for flow, which the recording does not have")
-        return function(**{key: given[key] for key in names})
+        return function(**{key: arguments[key] for key in names})
 
     return call
 
 
 def _stepping(value: Any, name: str) -> PythonSimulator:
     """Return how to run a simulator sample by sample."""
-    make = _call_with_labels(value, f"{name}()") if isinstance(value, type) else lambda given: value
+    make = (
+        _call_with_labels(value, f"{name}()")
+        if isinstance(value, type)
+        else lambda arguments: value
+    )
     owner = value if isinstance(value, type) else type(value)
     has_init = hasattr(value, "init")
     wanted = "step(state, u_in, u_out, dt)" if has_init else "step(u_in, u_out, dt)"
@@ -175,12 +181,15 @@ def _stepping(value: Any, name: str) -> PythonSimulator:
             "breath; give it reset(initial_pressure), or give the class"
         )
 
-    def run(given: Mapping[str, Any]) -> Floats:
-        simulator = make(given)
-        pressures = np.empty(len(given["u_in"]))
-        pressures[0] = start = given["initial_pressure"]
+    def run(arguments: Mapping[str, Any]) -> Floats:
+        simulator = make(arguments)
+        pressures = np.empty(len(arguments["u_in"]))
+        pressures[0] = start = arguments["initial_pressure"]
         commands = zip(
-            given["u_in"].tolist(), given["u_out"].tolist(), given["dt"].tolist(), strict=True
+            arguments["u_in"].tolist(),
+            arguments["u_out"].tolist(),
+            arguments["dt"].tolist(),
+            strict=True,
         )
         if has_init:
             state = simulator.init(start)
@@ -191,7 +200,7 @@ def _stepping(value: Any, name: str) -> PythonSimulator:
                 state, pressures[k] = answer[0], _number(answer[1], name)
             return pressures
         if hasattr(simulator, "reset"):
-            _call_with_labels(simulator.reset, f"{name}.reset")(given)
+            _call_with_labels(simulator.reset, f"{name}.reset")(arguments)
         for k, command in zip(range(1, len(pressures)), commands, strict=False):
             pressures[k] = _number(simulator.step(*command), name)
         return pressures
@@ -233,7 +242,9 @@ def _call_with_labels(
             f"{name} needs {', '.join(unknown)}; a diagnosis gives R, C and initial_pressure by "
             "name"
         )
-    return lambda given: function(**{own: given[key] for own, key in keys.items()})
+    return lambda arguments: function(
+        **{argument: arguments[key] for argument, key in keys.items()}
+    )
 
 
 def _number(value: Any, name: str) -> float:

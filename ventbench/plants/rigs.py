@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from ventbench.plants import frozen
-from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.catalog import SimulatorLike, load_simulators
 from ventbench.plants.hybrid import RigPopulation
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
@@ -60,15 +60,15 @@ class Rigs:
             return draw_tables.build(sessions, self.members, seed=seed, name=name, pips=pips).first(
                 n
             )
-        each = [
+        by_lung = [
             self.population.rigs(seed, lung, draw_tables.COUNT) for lung in range(len(sessions))
         ]
-        drawn = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+        population = jax.tree.map(lambda *leaves: np.stack(leaves), *by_lung)
         return draw_tables.build(
             sessions,
             self.members,
             held_out=self.held_out,
-            drawn=drawn,
+            drawn=population,
             seed=seed,
             name=name,
             pips=pips,
@@ -80,30 +80,34 @@ class Rigs:
         if self.sessions is None or not self.held_out:
             return self
         pairs = zip(self.sessions, self.held_out, strict=True)
-        sessions = tuple(tuple(rig for rig in own if rig not in apart) for own, apart in pairs)
+        sessions = tuple(
+            tuple(rig for rig in scored if rig not in apart) for scored, apart in pairs
+        )
         return replace(self, sessions=sessions, held_out=(), population=None)
 
-    def plants_of(self, drawn: Draws) -> Plant:
+    def plants_of(self, draws: Draws) -> Plant:
         """Plants of draws, leaves ``(L, n, 1, ...)``, or ``(L, ...)`` with one rig a lung."""
         if self.sessions is None:
             return self.plants
-        return draw_tables.plants_of(self.plants, drawn.rig, drawn.member, drawn.drawn)
+        return draw_tables.plants_of(self.plants, draws.rig, draws.member, draws.drawn)
 
-    def cells(self, drawn: Draws | None, pips: Sequence[float]) -> tuple[Plant, Scenario]:
+    def cells(self, draws: Draws | None, pips: Sequence[float]) -> tuple[Plant, Scenario]:
         """Nominal cells in front of K draws, and their plants, at P PIPs, cmH2O.
 
         Plants have leaves ``(L, 1 + K, 1, ...)``, or ``(L, ...)`` where each lung has one rig;
         cells the batch shape ``(L, 1 + K, P)``.
         """
-        reference = [own[0] for own in self.sessions] if self.sessions else [0] * len(self.lungs)
-        cells, rig, member = draw_tables.with_nominal(drawn, reference, pips)
+        reference = (
+            [scored[0] for scored in self.sessions] if self.sessions else [0] * len(self.lungs)
+        )
+        cells, rig, member = draw_tables.with_nominal(draws, reference, pips)
         if self.sessions is None:
             return self.plants, cells
-        anew = None if drawn is None else drawn.drawn
+        anew = None if draws is None else draws.drawn
         return draw_tables.plants_of(self.plants, rig, member, anew), cells
 
 
-def load_rigs(simulator: Given = "frozen") -> Rigs:
+def load_rigs(simulator: SimulatorLike = "frozen") -> Rigs:
     """Load the official rigs, or of other simulators one rig a lung.
 
     Raises:

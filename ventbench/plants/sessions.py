@@ -29,7 +29,7 @@ _LATE_MS, _SPIKY_SHARE = 0.5, 0.03
 # Sessions differ in interval by at least this gap, ms; smaller groups join the nearest one.
 _GAP_MS, _SMALLEST = 0.25, 5
 # Distances to a session: one unit is this many ms, one sample of inspiration, or part of a spike.
-_UNIT_MS, _SPIKE_UNITS, _FAR_SAMPLES = 0.2, 1.5, 2.0
+_UNIT_MS, _SPIKE_UNITS, _MOST_SAMPLES = 0.2, 1.5, 2.0
 
 
 @dataclass(frozen=True)
@@ -87,28 +87,28 @@ class Sessions:
         Raises:
             InputError: if no session has a breath's lung.
         """
-        seen = sample_timing(breaths)
+        timing = sample_timing(breaths)
         out = np.empty(len(breaths), np.int64)
         for lung, index in breaths.by_lung_index.items():
             candidates = [i for i, session in enumerate(self.table) if session.lung == lung]
             if not candidates:
-                known = ", ".join(dict.fromkeys(session.lung for session in self.table))
+                lungs = ", ".join(dict.fromkeys(session.lung for session in self.table))
                 raise InputError(
                     f"breath {breaths.breath_id[index[0]]} is of lung {lung}, for which there is "
-                    f"no simulator; known are {known}"
+                    f"no simulator; known are {lungs}"
                 )
-            far = np.stack([self._distance(seen, index, self.table[i]) for i in candidates])
-            out[index] = np.array(candidates)[np.argmin(far, axis=0)]
+            distances = np.stack([self._distance(timing, index, self.table[i]) for i in candidates])
+            out[index] = np.array(candidates)[np.argmin(distances, axis=0)]
         return out
 
     @staticmethod
-    def _distance(seen: SampleTiming, index: Ints, to: Session) -> Floats:
-        samples = np.abs(seen.inspiratory[index] - to.inspiratory)
-        spike = (seen.spiky[index] != to.spiky) & seen.known[index]
+    def _distance(timing: SampleTiming, index: Ints, to: Session) -> Floats:
+        samples = np.abs(timing.inspiratory[index] - to.inspiratory)
+        spike = (timing.spiky[index] != to.spiky) & timing.known[index]
         return (
-            np.abs(seen.interval_ms[index] - to.interval_ms) / _UNIT_MS
+            np.abs(timing.interval_ms[index] - to.interval_ms) / _UNIT_MS
             # The number of samples of a spiky rig varies by itself.
-            + np.minimum(samples, _FAR_SAMPLES) * (0.5 if to.spiky else 1.0)
+            + np.minimum(samples, _MOST_SAMPLES) * (0.5 if to.spiky else 1.0)
             + spike * _SPIKE_UNITS
         )
 
@@ -139,26 +139,26 @@ def find(breaths: Breaths) -> Sessions:
     Breaths of one lung belong together if their rigs are of one kind, their intervals leave no gap
     and, on rigs that are not spiky, they have equally many inspiratory samples.
     """
-    seen = sample_timing(breaths)
+    timing = sample_timing(breaths)
     rows: list[Session] = []
     for lung, index in breaths.by_lung_index.items():
-        groups = _groups(seen, index)
+        groups = _groups(timing, index)
         large = [group for group in groups if len(group) >= _SMALLEST]
         for group in large or [index]:
-            counts = np.bincount(seen.inspiratory[group])
-            interval = round(float(np.median(seen.interval_ms[group])), 3)
-            spiky = bool(np.mean(seen.spiky[group]) > 0.5)
+            counts = np.bincount(timing.inspiratory[group])
+            interval = round(float(np.median(timing.interval_ms[group])), 3)
+            spiky = bool(np.mean(timing.spiky[group]) > 0.5)
             rows.append(Session(lung, interval, spiky, int(counts.argmax()), len(group)))
     return Sessions(tuple(rows))
 
 
-def _groups(seen: SampleTiming, index: Ints) -> list[Ints]:
+def _groups(timing: SampleTiming, index: Ints) -> list[Ints]:
     groups = []
     for spiky in (False, True):
-        some = index[seen.spiky[index] == spiky]
-        some = some[np.argsort(seen.interval_ms[some], kind="stable")]
-        cuts = np.flatnonzero(np.diff(seen.interval_ms[some]) > _GAP_MS) + 1
+        some = index[timing.spiky[index] == spiky]
+        some = some[np.argsort(timing.interval_ms[some], kind="stable")]
+        cuts = np.flatnonzero(np.diff(timing.interval_ms[some]) > _GAP_MS) + 1
         for part in np.split(some, cuts):
-            kinds = [0] if spiky else np.unique(seen.inspiratory[part]).tolist()
-            groups += [part[seen.inspiratory[part] == k] if k else part for k in kinds]
+            kinds = [0] if spiky else np.unique(timing.inspiratory[part]).tolist()
+            groups += [part[timing.inspiratory[part] == k] if k else part for k in kinds]
     return [group for group in groups if group.size]

@@ -80,11 +80,11 @@ class Simulators(ABC):
         Raises:
             InputError: if there is none.
         """
-        wanted = lung(lung_id).id
+        requested = lung(lung_id).id
         stacked, ids = self.stacked, [entry.id for entry in self.lungs]
-        if wanted not in ids:
+        if requested not in ids:
             raise InputError(f"--lung {lung_id}: the simulators {self.name} have {', '.join(ids)}")
-        return take(stacked, ids.index(wanted))
+        return take(stacked, ids.index(requested))
 
     def for_breaths(self, breaths: Breaths) -> Plant:
         """Plants of n recorded breaths, by lung and, where it matters, by rig; leaves ``(n, ...)``.

@@ -68,7 +68,7 @@ class Budget:
     processor: float = 0.0  #: processor time that was taken, s.
 
     @property
-    def left(self) -> float:
+    def remaining_s(self) -> float:
         """What is left of the scarcer one, s."""
         return self.seconds - max(self.clock, self.processor)
 
@@ -148,7 +148,7 @@ GATHERED_S = 0.05
 Outcome = Reply | WireError | None
 
 
-class Asked:
+class PolledControllers:
     """Controllers that are asked each by itself; none waits for another."""
 
     def ask(self, cells: Ints, observations: Floats) -> None:
@@ -209,11 +209,11 @@ class Pipes:
         Raises:
             OSError: if there are not enough descriptors.
         """
-        far, observations = os.pipe()
+        child_reader, observations = os.pipe()
         try:
-            replies, away = os.pipe()
+            replies, child_writer = os.pipe()
         except OSError:
-            os.close(far)
+            os.close(child_reader)
             os.close(observations)
             raise
         os.set_blocking(observations, False)
@@ -221,10 +221,10 @@ class Pipes:
         self._ends[cell] = observations, replies
         self._selector.register(replies, selectors.EVENT_READ, cell)
         try:
-            start([far, away])
+            start([child_reader, child_writer])
         finally:
-            os.close(far)
-            os.close(away)
+            os.close(child_reader)
+            os.close(child_writer)
 
     def close(self, cell: int) -> None:
         """Close the pipes of a cell if they are open; it then ends by itself."""
@@ -281,10 +281,10 @@ class Pipes:
             By cell, what came.
         """
         outcomes: dict[int, Outcome] = {}
-        progress, asked, gathered = self._clock.now(), len(due), float("inf")
+        progress, requested, gathered = self._clock.now(), len(due), float("inf")
         while due:
             wait = min(progress + patience_s, deadline, gathered) - self._clock.now()
-            if some and 2 * len(outcomes) >= asked:
+            if some and 2 * len(outcomes) >= requested:
                 wait = 0.0
             events = self._clock.wait(self._selector, max(wait, 0.0), due, kind)
             if not events and wait <= 0:
@@ -341,13 +341,13 @@ class ZygoteClient:
     def __init__(self, config: dict[str, Any]):
         config = {**config, "site": [SITE]}
         self._tokens: dict[int, bytes] = {}  # of each cell
-        self._ended: dict[bytes, int] = {}
+        self._exit_status: dict[bytes, int] = {}
         self._used: dict[bytes, float] = {}  # processor time when last reported, s
         self._data = b""
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
         self._control, theirs = socket.socketpair()
-        told = (str(theirs.fileno()), ROOT, "apart" if namespaces_work() else "")
-        command = [sys.executable, *OPTIONS, "-c", _BOOT, *told]
+        arguments = (str(theirs.fileno()), ROOT, "apart" if namespaces_work() else "")
+        command = [sys.executable, *OPTIONS, "-c", _BOOT, *arguments]
         try:
             self._process = subprocess.Popen(
                 command,
@@ -378,9 +378,9 @@ class ZygoteClient:
             self._process.kill()
             self._process.wait()
             self._stderr.seek(0)
-            said = self._stderr.read()[-2000:].decode(errors="replace").strip()
+            message = self._stderr.read()[-2000:].decode(errors="replace").strip()
             self.close()
-            raise SandboxError(f"the sandbox's process ended before it was ready: {said}")
+            raise SandboxError(f"the sandbox's process ended before it was ready: {message}")
 
     def prefer(self, level: int, longest_s: float) -> None:
         """Let cells run before ordinary work, where it is granted; the kernel ends those in a loop.
@@ -400,10 +400,10 @@ class ZygoteClient:
         Those may be closed afterwards; without a task it only locks itself down.
         """
         self._tokens[cell] = secrets.token_bytes(TOKEN)
-        told = b"" if task is None else json.dumps(task).encode()
-        if len(told) > _TASK:
-            raise SandboxError(f"a task of {len(told)} bytes, at most {_TASK} are possible")
-        self._ask(START, cell, told, pipes)
+        payload = b"" if task is None else json.dumps(task).encode()
+        if len(payload) > _TASK:
+            raise SandboxError(f"a task of {len(payload)} bytes, at most {_TASK} are possible")
+        self._ask(START, cell, payload, pipes)
 
     def interrupt(self, cell: int) -> None:
         """Ask a cell to say where it is and end."""
@@ -413,15 +413,17 @@ class ZygoteClient:
         """End a cell."""
         self._ask(KILL, cell)
 
-    def _ask(self, what: bytes, cell: int, told: bytes = b"", pipes: Sequence[int] = ()) -> None:
-        request = REQUEST.pack(what, self._tokens[cell], told.ljust(_TASK))
+    def _ask(
+        self, operation: bytes, cell: int, payload: bytes = b"", pipes: Sequence[int] = ()
+    ) -> None:
+        request = REQUEST.pack(operation, self._tokens[cell], payload.ljust(_TASK))
         socket.send_fds(self._control, [request], pipes)
 
     def status(self, cell: int, timeout_s: float) -> int | None:
         """How a cell ended: exit code, or minus the signal's number; None if not within a time."""
         token = self._tokens[cell]
-        self._hear(lambda: token in self._ended, timeout_s)
-        return self._ended.get(token)
+        self._hear(lambda: token in self._exit_status, timeout_s)
+        return self._exit_status.get(token)
 
     def processor_time(self, cells: Iterable[int]) -> dict[int, float]:
         """Processor time of cells since they were started, s, as the kernel counts it.
@@ -429,14 +431,14 @@ class ZygoteClient:
         Raises:
             SandboxError: if the zygote does not answer.
         """
-        asked = {cell: self._tokens[cell] for cell in cells}
-        for cell, token in asked.items():
-            if token not in self._ended:
+        tokens = {cell: self._tokens[cell] for cell in cells}
+        for cell, token in tokens.items():
+            if token not in self._exit_status:
                 self._used.pop(token, None)
                 self._ask(CLOCK, cell)
-        if not self._hear(lambda: set(asked.values()) <= self._used.keys(), _CLOCK_S):
+        if not self._hear(lambda: set(tokens.values()) <= self._used.keys(), _CLOCK_S):
             raise SandboxError("the sandbox's process does not say how long cells have computed")
-        return {cell: self._used[token] for cell, token in asked.items()}
+        return {cell: self._used[token] for cell, token in tokens.items()}
 
     def _hear(self, heard: Callable[[], bool], timeout_s: float) -> bool:
         """Take reports until what is waited for was heard; say whether it was in time."""
@@ -455,7 +457,7 @@ class ZygoteClient:
             while len(self._data) >= REPORT.size:
                 token, status, self._used[token] = REPORT.unpack_from(self._data)
                 if status != RUNNING:
-                    self._ended[token] = os.waitstatus_to_exitcode(status)
+                    self._exit_status[token] = os.waitstatus_to_exitcode(status)
                 self._data = self._data[REPORT.size :]
         return True
 

@@ -127,7 +127,7 @@ def read_apart(
     return json.loads(answer)
 
 
-def _why(code: int, cpu_s: int, said: bytes) -> str:
+def _why(code: int, cpu_s: int, message: bytes) -> str:
     if code in (-signal.SIGXCPU, -signal.SIGKILL):
         return f"takes more than {cpu_s} s of processor time to be read"
     if code == OUT_OF_MEMORY:
@@ -136,5 +136,5 @@ def _why(code: int, cpu_s: int, said: bytes) -> str:
         return "is nested too deeply to be read"
     if code < 0:
         return f"cannot be read: the parser was ended by signal {-code}"
-    last = said.decode(errors="replace").strip().rpartition("\n")[2]
+    last = message.decode(errors="replace").strip().rpartition("\n")[2]
     return f"cannot be read: {last[:200] or f'exit code {code}'}"

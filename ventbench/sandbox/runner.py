@@ -30,11 +30,11 @@ from ventbench.sandbox.child.lockdown import FLOOR, OFFICIAL
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.pipes import (
     Allowance,
-    Asked,
     Budget,
     Clock,
     Outcome,
     Pipes,
+    PolledControllers,
     SandboxError,
     ZygoteClient,
     configuration,
@@ -46,7 +46,7 @@ from ventbench.task.interfaces import Task
 _PROBE_S = 30.0
 
 #: What submitted code could do without a line of the floor, and what gives it.
-_WITHOUT = {
+_EXPOSURE = {
     ("empty-root", "landlock"): (
         "read every file of this user",
         "allow user namespaces (docs/security.md) or boot a kernel with Landlock",
@@ -69,32 +69,32 @@ def layers() -> tuple[str, ...]:
     """
     pipes = Pipes()
     with tempfile.TemporaryDirectory() as folder:
-        told = configuration(os.path.realpath(folder), "probe", Allowance())
-        limits = {**dict(told["limits"]), "threads": True}  # type: ignore[call-overload]
-        zygote = ZygoteClient({**told, "limits": limits})
+        settings = configuration(os.path.realpath(folder), "probe", Allowance())
+        limits = {**dict(settings["limits"]), "threads": True}  # type: ignore[call-overload]
+        zygote = ZygoteClient({**settings, "limits": limits})
         try:
-            pipes.open(0, lambda far: zygote.start(0, None, far))
+            pipes.open(0, lambda ends: zygote.start(0, None, ends))
             outcomes = pipes.collect({0}, [0], wire.LOCKED, _PROBE_S, float("inf"))
         finally:
             pipes.close_all()
             zygote.close()
     reply = outcomes.get(0)
     if not isinstance(reply, Reply) or reply.kind != wire.LOCKED:
-        raise SandboxError(f"a submission cannot be locked down here: {said(reply)}")
+        raise SandboxError(f"a submission cannot be locked down here: {lockdown_message(reply)}")
     return lockdown.names(reply.value)
 
 
-def check_floor(shown: Sequence[str]) -> None:
+def check_floor(in_force: Sequence[str]) -> None:
     """Refuse to go on where the layers in force confine too little for any foreign code.
 
     Raises:
         SandboxError: naming the missing layers first.
     """
-    lacking = [line for line in FLOOR if not set(line) & set(shown)]
+    lacking = [line for line in FLOOR if not set(line) & set(in_force)]
     if lacking:
         missing = " and ".join("/".join(line) for line in lacking)
         could, advice = (
-            " and ".join(parts) for parts in zip(*map(_WITHOUT.get, lacking), strict=True)
+            " and ".join(parts) for parts in zip(*map(_EXPOSURE.get, lacking), strict=True)
         )
         raise SandboxError(
             f"{missing} missing on this machine ({platform.system()} {platform.release()}): "
@@ -161,12 +161,12 @@ class SandboxRunner:
         """
         budget, allowance = self._budget, self._allowance
         if budget is not None:
-            if budget.left <= 0.0:
+            if budget.remaining_s <= 0.0:
                 raise SubmissionError(
                     f"{submission.label}: took {budget.clock:.0f} s and {budget.processor:.0f} s "
                     f"of processor time; an entry has {budget.seconds:g} s for all of its runs"
                 )
-            allowance = replace(allowance, total_s=min(allowance.total_s, budget.left))
+            allowance = replace(allowance, total_s=min(allowance.total_s, budget.remaining_s))
         return SandboxSession(submission, tasks, self._layers, allowance, self._clock, budget)
 
 
@@ -192,7 +192,7 @@ class SubmittedFolder(Protocol):
         ...
 
 
-class SandboxSession(Asked):
+class SandboxSession(PolledControllers):
     """Fresh, locked-down controllers, one process each, which must show some layers to be in force.
 
     It is a :class:`ventbench.entries.cells.ControllerSession`, and begins with a task a cell.
@@ -214,10 +214,10 @@ class SandboxSession(Asked):
         self.failures: dict[int, Failure] = {}
         self._count, self._live = len(tasks), set(range(len(tasks)))
         self._allowance, self._sequence = allowance, [0] * len(tasks)
-        self._asked, self._void = set[int](), set[int]()
+        self._pending, self._void = set[int](), set[int]()
         self._clock = clock or Clock()
-        self._begun = self._clock.now()
-        self._deadline = self._begun + allowance.total_s
+        self._started = self._clock.now()
+        self._deadline = self._started + allowance.total_s
         with contextlib.ExitStack() as stack:
             stack.enter_context(descriptors_for(2 * len(tasks)))
             hide_process()
@@ -240,7 +240,7 @@ class SandboxSession(Asked):
 
     def _charge(self, budget: Budget) -> None:
         """Take from a budget what this session has had."""
-        budget.clock += self._clock.now() - self._begun
+        budget.clock += self._clock.now() - self._started
         with contextlib.suppress(SandboxError, KeyError):  # of cells that were never started
             budget.processor += self.processor_time()
 
@@ -248,15 +248,15 @@ class SandboxSession(Asked):
         # In an order that nobody knows: a process's number says nothing about its cell.
         for cell in random.SystemRandom().sample(range(self._count), self._count):
 
-            def start(far: list[int], cell: int = cell) -> None:
-                self._zygote.start(cell, tasks[cell], far)
+            def start(ends: list[int], cell: int = cell) -> None:
+                self._zygote.start(cell, tasks[cell], ends)
 
             self._pipes.open(cell, start)
         due = set(self._live)
         replies, late = self._round(due, wire.LOCKED, self._allowance.start_patience_s)
         for reply in replies.values():
             if not isinstance(reply, Reply) or reply.kind != wire.LOCKED:
-                raise SandboxError(f"a cell could not be locked down: {said(reply)}")
+                raise SandboxError(f"a cell could not be locked down: {lockdown_message(reply)}")
             lacking = set(layers) - set(lockdown.names(reply.value))
             if lacking:
                 raise SandboxError(f"a cell lacks {', '.join(sorted(lacking))}")
@@ -277,30 +277,30 @@ class SandboxSession(Asked):
 
     def ask(self, cells: Ints, observations: Floats) -> None:
         """Ask some controllers for their next commands, as of ``ControllerSession``."""
-        for cell, outcome in self._pipes.early(self._asked).items():
+        for cell, outcome in self._pipes.early(self._pending).items():
             self._judge(cell, outcome)
         rows, frames = np.ascontiguousarray(observations, "<f8"), {}
         for cell, row in zip(cells.tolist(), rows, strict=True):
             self._sequence[cell] += 1
             if cell in self._live:
                 frames[cell] = wire.pack_observation(self._sequence[cell], row.tobytes())
-        self._asked |= frames.keys()
+        self._pending |= frames.keys()
         self._void |= set(cells.tolist()) - frames.keys()
         self._pipes.send(frames)
 
     def answers(self) -> tuple[Ints, Floats]:
         """Take the commands that are there, as of ``ControllerSession``."""
         commands = dict.fromkeys(self._void, 0.0)
-        if self._asked and not self._void:
+        if self._pending and not self._void:
             patience = self._allowance.patience_s
-            replies, late = self._round(set(self._asked), wire.COMMAND, patience, some=True)
+            replies, late = self._round(set(self._pending), wire.COMMAND, patience, some=True)
             for cell, reply in replies.items():
                 failed = self._judge(cell, reply) is not None
-                if cell in self._asked:  # else it wrote what nobody had asked for
+                if cell in self._pending:  # else it wrote what nobody had asked for
                     commands[cell] = 0.0 if failed else reply.value  # type: ignore[union-attr]
-            self._asked -= replies.keys()
+            self._pending -= replies.keys()
             self._give_up(late)
-            self._asked -= late
+            self._pending -= late
             commands |= dict.fromkeys(late, 0.0)
         self._void.clear()
         return np.array(list(commands), np.int64), np.array(list(commands.values()))
@@ -349,7 +349,7 @@ class SandboxSession(Asked):
         if isinstance(outcome, Reply):
             return self._fail(cell, failed(outcome.text, self._sequence[cell]))
         if outcome is None:
-            return self._fail(cell, ended(self._zygote.status(cell, self._clock.status_s)))
+            return self._fail(cell, exit_verdict(self._zygote.status(cell, self._clock.status_s)))
         return self._fail(
             cell, Verdict("wire", "the controller broke the wire's rules", str(outcome))
         )
@@ -359,7 +359,7 @@ class SandboxSession(Asked):
         if not late:
             return
         outcomes: dict[int, Outcome] = {}
-        if not self._asked - late:  # nobody else may answer meanwhile
+        if not self._pending - late:  # nobody else may answer meanwhile
             for cell in late:
                 self._zygote.interrupt(cell)
             deadline = self._clock.now() + _GRACE_S + 0.01 * len(late)
@@ -387,7 +387,7 @@ class SandboxSession(Asked):
         return failure
 
 
-def said(outcome: Outcome) -> str:
+def lockdown_message(outcome: Outcome) -> str:
     """Words of a cell that could not be locked down: before that it runs our code alone."""
     if isinstance(outcome, Reply):
         return outcome.text.decode(errors="replace").replace("\0", " ").strip()
@@ -395,7 +395,7 @@ def said(outcome: Outcome) -> str:
 
 
 #: What else a process has open.
-_OTHER_DESCRIPTORS = 256
+_DESCRIPTOR_RESERVE = 256
 
 
 @contextlib.contextmanager
@@ -406,19 +406,19 @@ def descriptors_for(count: int) -> Iterator[None]:
         SandboxError: if the system's own limit is too low.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = count + _OTHER_DESCRIPTORS
-    enough = soft == resource.RLIM_INFINITY or soft >= wanted
-    if not enough:
-        if hard != resource.RLIM_INFINITY and hard < wanted:
+    needed = count + _DESCRIPTOR_RESERVE
+    sufficient = soft == resource.RLIM_INFINITY or soft >= needed
+    if not sufficient:
+        if hard != resource.RLIM_INFINITY and hard < needed:
             raise SandboxError(
                 f"{count} pipes are needed and the system allows {hard} open files; "
-                f"raise it (ulimit -Hn {wanted}) or score fewer cells at a time"
+                f"raise it (ulimit -Hn {needed}) or score fewer cells at a time"
             )
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
     try:
         yield
     finally:
-        if not enough:
+        if not sufficient:
             with contextlib.suppress(OSError, ValueError):
                 resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
@@ -465,15 +465,15 @@ def failed(text: bytes, sequence: int) -> Verdict:
 
     It was answering the observation of a number; 0 before the first.
     """
-    kind, what, detail, printed = _fields(text)
+    kind, message, detail, printed = _fields(text)
     kinds = _DURING if sequence else _BEFORE
     kind = kind if kind in kinds else kinds[0]
     # An import's problems are one on a line, and each is cut and escaped by itself.
-    what = "\n".join(printable(line) for line in what.splitlines()[:20])
-    return Verdict(kind, what or "the submission ended itself", _with_prints(detail, printed))
+    message = "\n".join(printable(line) for line in message.splitlines()[:20])
+    return Verdict(kind, message or "the submission ended itself", _with_prints(detail, printed))
 
 
-def ended(status: int | None) -> Verdict:
+def exit_verdict(status: int | None) -> Verdict:
     """Verdict on a cell whose pipe closed without an answer, by its exit status, if it has one."""
     if status is None:
         return Verdict("wire", "the controller closed its pipe")
@@ -487,8 +487,8 @@ def ended(status: int | None) -> Verdict:
 def not_answered(outcome: Outcome, limit: str) -> Verdict:
     """Verdict on a cell that was out of time, by what it said when it was asked where it is."""
     _, _, detail, printed = _fields(outcome.text if isinstance(outcome, Reply) else b"")
-    what = f"the controller did not answer within {limit}"
-    return Verdict("timeout", what, _with_prints(detail, printed))
+    message = f"the controller did not answer within {limit}"
+    return Verdict("timeout", message, _with_prints(detail, printed))
 
 
 def _fields(text: bytes) -> list[str]:

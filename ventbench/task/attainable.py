@@ -141,9 +141,9 @@ def attainable(
         miss = pip - pressures(plants, cells, witness)
         slopes = _in_batches(all_slopes, plants, cells, witness)
         programs = LinearPrograms(COMMANDS)
-        near = (miss, slopes, witness, np.full(n, CERTIFICATE_RADIUS))
-        left = [programs.solve(*own)[1] for own in zip(*near, strict=True)]
-        gains = np.mean(np.abs(miss), axis=1) - left
+        linearised = (miss, slopes, witness, np.full(n, CERTIFICATE_RADIUS))
+        optima = [programs.solve(*subproblem)[1] for subproblem in zip(*linearised, strict=True)]
+        gains = np.mean(np.abs(miss), axis=1) - optima
         full = np.full((n, COMMANDS), protocol.U_MAX)
         lower = np.mean(np.maximum(pip - pressures(plants, cells, full), 0.0), axis=1)
     return Attainable(best, lower, gains, witness)
@@ -162,22 +162,26 @@ def _descend(plants: Plant, cells: Scenario, pip: Floats, u_in: Floats) -> Float
         if len(anew):
             some, cell = jax.tree.map(lambda x, i=anew: np.asarray(x)[i], (plants, cells))
             slopes[anew] = _in_batches(all_slopes, some, cell, u_in[anew])
-        tried, predicted = u_in[live].copy(), np.zeros(len(live))
+        trial, predicted = u_in[live].copy(), np.zeros(len(live))
         for at, i in enumerate(live):
             change, value = programs.solve(miss[i], slopes[i], u_in[i], radius[i])
-            tried[at] = np.clip(u_in[i] + change, 0.0, protocol.U_MAX)
+            trial[at] = np.clip(u_in[i] + change, 0.0, protocol.U_MAX)
             predicted[at] = error[i] - value
         some, cell = jax.tree.map(lambda x, i=live: np.asarray(x)[i], (plants, cells))
-        missed = pip[live] - pressures(some, cell, tried)
+        missed = pip[live] - pressures(some, cell, trial)
         reached = np.mean(np.abs(missed), axis=1)
         ratio = (error[live] - reached) / np.maximum(predicted, 1e-15)
-        taken, stale[live] = ratio > ACCEPTED, ratio > ACCEPTED
-        moved = live[taken]
-        u_in[moved], miss[moved], error[moved] = tried[taken], missed[taken], reached[taken]
+        accepted, stale[live] = ratio > ACCEPTED, ratio > ACCEPTED
+        improved = live[accepted]
+        u_in[improved], miss[improved], error[improved] = (
+            trial[accepted],
+            missed[accepted],
+            reached[accepted],
+        )
         radius[live] = np.where(ratio > GOOD, np.minimum(2.0 * radius[live], 100.0), radius[live])
         radius[live] = np.where(ratio < ACCEPTED, 0.25 * radius[live], radius[live])
-        done = (radius[live] < SMALLEST_RADIUS) | (predicted < 1e-9)
-        live = live[~done]
+        converged = (radius[live] < SMALLEST_RADIUS) | (predicted < 1e-9)
+        live = live[~converged]
         if not len(live):
             break
     return error
@@ -276,6 +280,6 @@ def _search(plants: Plant, cells: Scenario, start: Array) -> Array:
         free = jnp.asarray(optax.apply_updates(free, updates))
         return (free, state, jnp.minimum(best, _errors(plants, cells, free))), None
 
-    begun = (start, optimiser.init(start), _errors(plants, cells, start))
-    (_, _, best), _ = jax.lax.scan(iterate, begun, length=ADAM_ITERATIONS)
+    initial = (start, optimiser.init(start), _errors(plants, cells, start))
+    (_, _, best), _ = jax.lax.scan(iterate, initial, length=ADAM_ITERATIONS)
     return best

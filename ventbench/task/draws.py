@@ -232,8 +232,8 @@ def build(
     quantum = np.full(pip.shape, QUANTUM)
     apart = held_out or [()] * len(rigs)
     places = [
-        _places(own, out, drawn is not None, partial(uniform, f"rig {k}"), n)
-        for k, (own, out) in enumerate(zip(rigs, apart, strict=True))
+        _places(scored, out, drawn is not None, partial(uniform, f"rig {k}"), n)
+        for k, (scored, out) in enumerate(zip(rigs, apart, strict=True))
     ]
     rig = np.array(places)
     turns = [_balanced(uniform(f"member {k}", (n + 1,)), members) for k in range(len(rigs))]
@@ -272,7 +272,7 @@ def _places(
     kind[(kind == HELD_OUT) & (not held_out)] = DRAWN if anew else TRAINING
     numbers = uniform((n + 1,))
     rig = FIRST_DRAWN + np.arange(n)
-    training = [own for own in rigs if own not in held_out]
+    training = [session for session in rigs if session not in held_out]
     for value, choices in ((TRAINING, training), (HELD_OUT, held_out)):
         at = np.flatnonzero(kind == value)
         if len(at):
@@ -296,7 +296,7 @@ def _balanced(numbers: Floats, choices: int) -> Ints:
 
 
 def with_nominal(
-    drawn: Draws | None, reference: Sequence[int], pips: Sequence[float]
+    draws: Draws | None, reference: Sequence[int], pips: Sequence[float]
 ) -> tuple[Scenario, Ints, Ints]:
     """Nominal cells, at P PIPs, cmH2O, of the reference rigs in front of n draws of L lungs.
 
@@ -309,20 +309,20 @@ def with_nominal(
         cells = jax.tree.map(np.asarray, nominal_scenario(np.asarray(pips, float)))
     nominal = jax.tree.map(lambda x: np.broadcast_to(x, (count, 1, *x.shape)), cells)
     rig, member = np.asarray(reference)[:, None], np.zeros((count, 1), np.int64)
-    if drawn is None:
+    if draws is None:
         return nominal, rig, member
-    cells = jax.tree.map(lambda *x: np.concatenate(x, axis=1), nominal, drawn.cells)
-    return cells, np.hstack([rig, drawn.rig]), np.hstack([member, drawn.member])
+    cells = jax.tree.map(lambda *x: np.concatenate(x, axis=1), nominal, draws.cells)
+    return cells, np.hstack([rig, draws.rig]), np.hstack([member, draws.member])
 
 
-def plants_of(plants: PlantT, rig: Ints, member: Ints, drawn: PlantT | None = None) -> PlantT:
+def plants_of(plants: PlantT, rig: Ints, member: Ints, population: PlantT | None = None) -> PlantT:
     """Plants of cells.
 
     Args:
         plants: of every member and session, leaves ``(members, sessions, ...)``.
         rig: sessions, or :data:`FIRST_DRAWN` and more, shape ``(L, n)``.
         member: members, shape ``(L, n)``.
-        drawn: of the last draws, leaves ``(L, k, ...)`` with k <= n.
+        population: of the last draws, leaves ``(L, k, ...)`` with k <= n.
 
     Returns:
         Leaves ``(L, n, 1, ...)``, float64: the axis of length 1 stands for the PIPs.
@@ -330,15 +330,15 @@ def plants_of(plants: PlantT, rig: Ints, member: Ints, drawn: PlantT | None = No
     anew = rig >= FIRST_DRAWN
     session = np.where(anew, 0, rig)
     chosen = jax.tree.map(lambda leaf: np.asarray(leaf, float)[member, session], plants)
-    if drawn is not None:
+    if population is not None:
         places = np.nonzero(anew)
-        before = rig.shape[1] - jax.tree.leaves(drawn)[0].shape[1]
+        before = rig.shape[1] - jax.tree.leaves(population)[0].shape[1]
 
         def replaced(leaf: Floats, new: Floats) -> Floats:
             leaf[places] = new[places[0], places[1] - before]
             return leaf
 
-        chosen = jax.tree.map(replaced, chosen, drawn)
+        chosen = jax.tree.map(replaced, chosen, population)
     return jax.tree.map(lambda leaf: leaf[:, :, None], chosen)
 
 
@@ -441,10 +441,16 @@ def deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -
     Deviations are by the keys of :data:`RANGES`, ``(...)``, and ``gain``, ``(..., BREATHS)``.
     """
     peep, start = protocol.PEEP + deviations["peep_shift"], deviations["start_shift"]
-    own = {name: deviations[name] for name in ("r_scale", "c_scale", "delay", "gain")}
+    of_cell = {name: deviations[name] for name in ("r_scale", "c_scale", "delay", "gain")}
     dt = protocol.DT * deviations["dt_scale"]
     return Scenario(
-        pip + deviations["pip_shift"], peep, peep + start, dt, quantum=quantum, noise=noise, **own
+        pip + deviations["pip_shift"],
+        peep,
+        peep + start,
+        dt,
+        quantum=quantum,
+        noise=noise,
+        **of_cell,
     )
 
 

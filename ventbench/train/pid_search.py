@@ -33,7 +33,7 @@ from scipy.optimize import minimize
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Bools, Floats
 from ventbench.controllers.pid import PID
-from ventbench.plants.catalog import Given
+from ventbench.plants.catalog import SimulatorLike
 from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.task import draws as draw_tables
 from ventbench.task import environment as env
@@ -226,7 +226,7 @@ def tune_pid(
     draws: int = draw_tables.COUNT,
     each: bool = True,
     single: bool | None = None,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     progress: Progress | None = None,
 ) -> tuple[PIDGrid, dict[str, Any]]:
     """Run every PID of a grid on simulators without noise, the best on draws, and name the best.
@@ -389,7 +389,7 @@ def tune_beyond(
     draws: int = draw_tables.COUNT,
     each: bool = True,
     single: bool = True,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Tune PIDs as :func:`tune_pid` does, but without a grid's edge.

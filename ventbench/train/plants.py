@@ -21,7 +21,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.entries import reference
 from ventbench.plants import frozen
-from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.catalog import SimulatorLike, load_simulators
 from ventbench.task import protocol
 from ventbench.task.interfaces import Controller, Plant
 from ventbench.task.lungs import LUNG_IDS, LUNGS, Lung, lung, scored_lung
@@ -53,7 +53,7 @@ class TrainingPlants:
         return jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.plants)
 
 
-def plants_to_train_on(simulator: Given = "frozen") -> TrainingPlants:
+def plants_to_train_on(simulator: SimulatorLike = "frozen") -> TrainingPlants:
     """Load plants to train a controller on.
 
     Args:

@@ -165,7 +165,7 @@ def test_progress_and_nothing_left_behind(trained):
     assert {path.name for path in out.iterdir()} == {
         frozen.MANIFEST,
         frozen.MEMBERS,
-        frozen.SEEN,
+        frozen.TRAINING_LIST,
     }
 
 
@@ -180,6 +180,6 @@ def test_an_interrupted_training_goes_on_to_the_same_bytes(tmp_path, folder):
     assert list((tmp_path / "a" / "parts").glob("*.npz"))
     for name in ("a", "b"):
         train_rigs(folder, tmp_path / name, config=CONFIG)
-    for name in (frozen.MANIFEST, frozen.MEMBERS, frozen.SEEN):
+    for name in (frozen.MANIFEST, frozen.MEMBERS, frozen.TRAINING_LIST):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert lung(OWN.id) == OWN

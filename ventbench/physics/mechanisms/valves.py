@@ -63,8 +63,8 @@ class CommandRounding(Mechanism):
 
     def driven(self, values: Values, u_in: Array) -> Array:
         """The command, moved towards a whole number."""
-        whole = jnp.floor(u_in + values["bias"])
-        return u_in + values["amount"] * (whole - u_in)
+        rounded = jnp.floor(u_in + values["bias"])
+        return u_in + values["amount"] * (rounded - u_in)
 
 
 #: Travel in which a stuck seat lets go, as a share of the band: short, but with a slope by which a
@@ -202,8 +202,8 @@ class ValveHysteresis(Mechanism):
         yielding = hard + values["give"] * (soft - hard)
         travel = u_in - before
         full = half * jnp.sign(travel)
-        left = jnp.exp(-jnp.abs(travel) / (half + _THIN))
-        gradual = u_in - full - (before - position - full) * left
+        decay = jnp.exp(-jnp.abs(travel) / (half + _THIN))
+        gradual = u_in - full - (before - position - full) * decay
         position = yielding + values["smooth"] * (gradual - yielding)
         return position, jnp.stack([position, u_in])
 
@@ -540,8 +540,8 @@ class ValveStiction(Mechanism):
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Position of the valve, %, twice."""
         band = values["band"]
-        away = u_in - memory
+        deviation = u_in - memory
         # A short slope instead of a step, by which a fit finds the band.
-        free = jnp.clip(0.5 + (jnp.abs(away) - band) / (_LETS_GO * band + _THIN), 0.0, 1.0)
-        position = memory + free * away
+        free = jnp.clip(0.5 + (jnp.abs(deviation) - band) / (_LETS_GO * band + _THIN), 0.0, 1.0)
+        position = memory + free * deviation
         return position, position

@@ -230,9 +230,13 @@ def _checked(names: Mapping[str, Any], label: str) -> Callable[[], Any]:
     """The class among the names of a module."""
     controller = names.get(CLASS)
     if controller is None:
-        here = names.get("__name__")
-        own = [x.__name__ for x in names.values() if isinstance(x, type) and x.__module__ == here]
-        instead = f", but {', '.join(own[:3])}" if own else ""
+        module_name = names.get("__name__")
+        local = [
+            x.__name__
+            for x in names.values()
+            if isinstance(x, type) and x.__module__ == module_name
+        ]
+        instead = f", but {', '.join(local[:3])}" if local else ""
         raise SubmissionError(f"{label}: {FILE} defines no class {CLASS}{instead}")
     if not callable(controller):
         raise SubmissionError(
@@ -249,11 +253,11 @@ def _checked(names: Mapping[str, Any], label: str) -> Callable[[], Any]:
 @contextlib.contextmanager
 def _search_path(folder: Path) -> Iterator[None]:
     """Let modules of the folder be imported, and forget them afterwards."""
-    own = {path.stem for path in folder.iterdir()}
+    local = {path.stem for path in folder.iterdir()}
 
     def theirs() -> dict[str, types.ModuleType]:
         # A copy of the names: an import in another thread may add some.
-        return {k: v for k, v in list(sys.modules.items()) if k.partition(".")[0] in own}
+        return {k: v for k, v in list(sys.modules.items()) if k.partition(".")[0] in local}
 
     hidden = theirs()
     for name in hidden:

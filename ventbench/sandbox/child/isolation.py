@@ -27,7 +27,7 @@ _NETWORK, _IPC, _HOST_NAME, _USER = 0x40000000, 0x08000000, 0x04000000, kernel.N
 _MOUNT, _PROCESSES = 0x20000, 0x20000000
 _APART = _NETWORK | _IPC | _HOST_NAME | _MOUNT | _PROCESSES
 
-_MOUNT_SETATTR, _HERE, _RECURSIVE = 442, -100, 0x8000
+_MOUNT_SETATTR, _AT_FDCWD, _RECURSIVE = 442, -100, 0x8000
 _READ_ONLY, _NO_SUID, _PRIVATE = 0x1, 0x2, 1 << 18
 _MS_NO_SUID, _MS_NO_DEV, _MS_BIND = 2, 4, 4096
 _DETACH = 2
@@ -99,19 +99,19 @@ class Forks:
         self.is_child, self.parent = False, 0 if apart else os.getpid()
         # The way back, as only one namespace can wait for children at a time.
         flags = os.O_RDONLY | os.O_CLOEXEC
-        self._own = os.open("/proc/self/ns/pid", flags) if apart else None
+        self._namespace = os.open("/proc/self/ns/pid", flags) if apart else None
 
     def fork(self) -> int:
         """Fork: the child's number in this process, 0 in the child; OSError if it is refused."""
-        if self._own is not None:
+        if self._namespace is not None:
             kernel.unshare(_PROCESSES)
         child = os.fork()
         self.is_child = child == 0
-        if self._own is not None:
+        if self._namespace is not None:
             if self.is_child:
-                os.close(self._own)
+                os.close(self._namespace)
             else:
-                kernel.setns(self._own, _PROCESSES)
+                kernel.setns(self._namespace, _PROCESSES)
         return child
 
 
@@ -156,15 +156,15 @@ def change_root(readable: Iterable[str], folder: str) -> bool:
         _close(sources)
         return False
     os.umask(0o022)  # cells of another user must get through
-    done: list[str] = []
+    mounted: list[str] = []
     loaded = _loaded()
     for path, source in sources.items():
-        if source is not None and not any(path.startswith(f"{top}/") for top in done):
+        if source is not None and not any(path.startswith(f"{top}/") for top in mounted):
             if path in (NULL, RANDOM):
                 _bind(source, base + path)
             elif os.path.basename(path) not in _NOT_COPIED:
                 _copy(f"/proc/self/fd/{source}", base + path, loaded)
-            done.append(path)
+            mounted.append(path)
     _close(sources)
     os.makedirs(base + folder, 0o755, exist_ok=True)
     for name, content in copy.items():
@@ -193,10 +193,10 @@ def read_only() -> bool:
 
 
 def _set_attributes(path: str, *, attributes: int = 0, propagation: int = 0) -> None:
-    wanted = _MountAttributes(attributes, 0, propagation, 0)
-    size = ctypes.sizeof(wanted)
+    request = _MountAttributes(attributes, 0, propagation, 0)
+    size = ctypes.sizeof(request)
     name = path.encode()
-    kernel.syscall(_MOUNT_SETATTR, _HERE, name, _RECURSIVE, ctypes.byref(wanted), size)
+    kernel.syscall(_MOUNT_SETATTR, _AT_FDCWD, name, _RECURSIVE, ctypes.byref(request), size)
 
 
 def _opened(path: str) -> int | None:
@@ -241,8 +241,8 @@ def _copy(source: str, target: str, loaded: set[tuple[int, int]]) -> None:
     os.makedirs(target, 0o755, exist_ok=True)
     waiting = [(source, target)]
     while waiting:
-        here, there = waiting.pop()
-        with os.scandir(here) as entries:
+        origin, there = waiting.pop()
+        with os.scandir(origin) as entries:
             for entry in entries:
                 name = entry.name
                 if entry.is_dir(follow_symlinks=False):
@@ -264,12 +264,12 @@ def _copy_file(source: str, target: str, loaded: set[tuple[int, int]]) -> None:
             return
         copy = os.open(target, os.O_CREAT | os.O_WRONLY, 0o644)
         try:
-            left = status.st_size
-            while left > 0:
-                moved = os.sendfile(copy, file.fileno(), None, left)
-                if not moved:
+            remaining = status.st_size
+            while remaining > 0:
+                sent = os.sendfile(copy, file.fileno(), None, remaining)
+                if not sent:
                     break
-                left -= moved
+                remaining -= sent
             os.utime(copy, ns=(status.st_atime_ns, status.st_mtime_ns))
         finally:
             os.close(copy)

@@ -31,7 +31,7 @@ PR_SET_PDEATHSIG, PR_GET_DUMPABLE, PR_SET_DUMPABLE = 1, 3, 4
 PR_CAPBSET_DROP, PR_SET_SECUREBITS, PR_SET_NO_NEW_PRIVS, PR_CAP_AMBIENT = 24, 28, 38, 47
 
 
-def _call(name: str, *arguments: object, what: str = "") -> int:
+def _call(name: str, *arguments: object, operation: str = "") -> int:
     """Call a function of the C library.
 
     Raises:
@@ -42,20 +42,20 @@ def _call(name: str, *arguments: object, what: str = "") -> int:
     result = getattr(_libc, name)(*arguments)
     if result == -1:
         error = ctypes.get_errno()
-        raise OSError(error, f"{what or name}: {os.strerror(error)}")
+        raise OSError(error, f"{operation or name}: {os.strerror(error)}")
     return result
 
 
 def prctl(option: int, *arguments: int) -> int:
     """``prctl(2)``; errors of this and of what follows as of :func:`_call`."""
     padded = (ctypes.c_ulong(a) for a in (*arguments, 0, 0, 0, 0)[:4])
-    return _call("prctl", ctypes.c_int(option), *padded, what=f"prctl {option}")
+    return _call("prctl", ctypes.c_int(option), *padded, operation=f"prctl {option}")
 
 
 def syscall(number: int, *arguments: object) -> int:
     """Raw system call; every integer argument is passed as a long."""
     longs = (ctypes.c_long(a) if isinstance(a, int) else a for a in arguments)
-    return _call("syscall", ctypes.c_long(number), *longs, what=f"system call {number}")
+    return _call("syscall", ctypes.c_long(number), *longs, operation=f"system call {number}")
 
 
 #: A user namespace of one's own.
@@ -74,13 +74,13 @@ def setns(namespace: int, kind: int) -> None:
 
 def mount(source: bytes, target: bytes, kind: bytes, flags: int, options: bytes) -> None:
     """``mount(2)``."""
-    what = f"mount {target.decode(errors='replace')}"
-    _call("mount", source, target, kind, ctypes.c_ulong(flags), options, what=what)
+    operation = f"mount {target.decode(errors='replace')}"
+    _call("mount", source, target, kind, ctypes.c_ulong(flags), options, operation=operation)
 
 
 def umount(target: bytes, flags: int) -> None:
     """``umount2(2)``."""
-    _call("umount2", target, ctypes.c_int(flags), what=f"umount {target.decode()}")
+    _call("umount2", target, ctypes.c_int(flags), operation=f"umount {target.decode()}")
 
 
 _CAPSET = {"x86_64": 126, "aarch64": 91}
@@ -204,11 +204,11 @@ def limit_resources(memory: int | None, cpu_s: int, processes: int | None) -> No
         if kind is not None:  # not every system knows every limit
             # At the soft limit of processor time comes a signal with a name, at the hard one a
             # nameless end: leave a second between them.
-            wanted = (value, value + 1 if name == "CPU" else value)
+            bounds = (value, value + 1 if name == "CPU" else value)
             _, hard = resource.getrlimit(kind)
             if hard != resource.RLIM_INFINITY:
-                wanted = (min(wanted[0], hard), min(wanted[1], hard))
-            resource.setrlimit(kind, wanted)
+                bounds = (min(bounds[0], hard), min(bounds[1], hard))
+            resource.setrlimit(kind, bounds)
 
 
 def address_space() -> int | None:
@@ -272,7 +272,7 @@ def landlock_abi() -> int:
         return 0
 
 
-def taken_away(version: int) -> tuple[int, int, int]:
+def handled_rights(version: int) -> tuple[int, int, int]:
     """File rights, network rights and scopes that an ABI, from 1, can take away: all are taken."""
     files = (1 << _FILE_RIGHTS[min(version, 5)]) - 1
     network = _NET_BIND_AND_CONNECT if version >= 4 else 0
@@ -289,7 +289,7 @@ def ruleset(readable: Iterable[str], listable: Iterable[str] = ()) -> int:
     Raises:
         OSError: if the kernel refuses.
     """
-    attributes = _Ruleset(*taken_away(landlock_abi()))
+    attributes = _Ruleset(*handled_rights(landlock_abi()))
     # Kernels of before a field was added take the larger structure as long as the rest is zero.
     handle = syscall(_CREATE_RULESET, ctypes.byref(attributes), ctypes.sizeof(attributes), 0)
     try:

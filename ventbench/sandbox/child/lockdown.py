@@ -196,14 +196,14 @@ def read(request: str) -> NoReturn:
         request: JSON with ``function`` (``"module:name"``), ``arguments``, ``readable`` folders,
             ``site``, ``memory`` in bytes, ``cpu_s``.
     """
-    told = json.loads(request)
-    sys.path.append(told["site"])
-    module, _, name = told["function"].partition(":")
+    task = json.loads(request)
+    sys.path.append(task["site"])
+    module, _, name = task["function"].partition(":")
     function = getattr(importlib.import_module(module), name)
-    limits = CellLimits(told["memory"], told["cpu_s"], threads=False)
-    Lockdown(told["readable"], []).finish(limits, _READER_END)
+    limits = CellLimits(task["memory"], task["cpu_s"], threads=False)
+    Lockdown(task["readable"], []).finish(limits, _READER_END)
     try:
-        data = json.dumps(function(*told["arguments"])).encode()
+        data = json.dumps(function(*task["arguments"])).encode()
         while data:
             data = data[os.write(1, data) :]
     except MemoryError:

@@ -114,9 +114,11 @@ def _test(condition: Condition, skip: int) -> list[bytes]:
     """Instructions of a condition: fall through if it holds, else jump over ``skip`` more."""
     low = _ARGUMENTS + 8 * condition.argument
     code = [_instruction(_LOAD, low), _instruction(_AND, condition.mask)]
-    for left, value in zip(range(len(condition.values) - 1, -1, -1), condition.values, strict=True):
+    for remaining, value in zip(
+        range(len(condition.values) - 1, -1, -1), condition.values, strict=True
+    ):
         # A match jumps over the other values; the last one that fails leaves the rule.
-        code.append(_instruction(_EQUAL, value, left, 0 if left else skip))
+        code.append(_instruction(_EQUAL, value, remaining, 0 if remaining else skip))
     if condition.whole:
         # Checked first, so that its failure skips the code above too.
         high = [_instruction(_LOAD, low + 4), _instruction(_EQUAL, 0, 0, len(code) + skip)]

@@ -44,8 +44,8 @@ class _Replies:
     def send(self, kind: int, value: float = 0.0) -> None:
         os.write(REPLIES, wire.pack_reply(self.sequence, kind, value))
 
-    def fail(self, kind: str, what: str, detail: str = "") -> NoReturn:
-        fields = (field.replace("\0", "") for field in (kind, what, detail, self._printed.kept))
+    def fail(self, kind: str, message: str, detail: str = "") -> NoReturn:
+        fields = (field.replace("\0", "") for field in (kind, message, detail, self._printed.kept))
         data = "\0".join(fields).encode("utf-8", "backslashreplace")
         os.write(REPLIES, wire.pack_reply(self.sequence, wire.FAILED, 0.0, data))
         os._exit(1)
@@ -72,14 +72,14 @@ class Start(NamedTuple):
     parent: int
 
 
-def run(given: list[tuple[Setup, Lockdown, Start]]) -> NoReturn:
+def run(handover: list[tuple[Setup, Lockdown, Start]]) -> NoReturn:
     """Be a cell; never returns. Call it with nothing of the zygote's left on the stack.
 
     Args:
-        given: what all cells share, what the zygote has prepared, and what is this cell's; taken
+        handover: what all cells share, what the zygote has prepared, and what is this cell's; taken
             out of the list, so that it stays in no caller's variable.
     """
-    setup, prepared, start = given.pop()
+    setup, prepared, start = handover.pop()
     _take_descriptors(start.pipes)
     os.chdir(setup.folder)
     replies = _Replies(setup)
@@ -108,14 +108,14 @@ def run(given: list[tuple[Setup, Lockdown, Start]]) -> NoReturn:
 
 def _take_descriptors(pipes: list[int]) -> None:
     # Away from the numbers they shall have, then there.
-    away = [fcntl.fcntl(pipe, fcntl.F_DUPFD, 16) for pipe in pipes]
+    copies = [fcntl.fcntl(pipe, fcntl.F_DUPFD, 16) for pipe in pipes]
     for number in (0, 1, 2):
         # Each opened anew: an open file that cells share would carry flags between them.
         null = os.open(os.devnull, os.O_RDWR)
         if null != number:
             os.dup2(null, number)
             os.close(null)
-    for source, number in zip(away, (OBSERVATIONS, REPLIES), strict=True):
+    for source, number in zip(copies, (OBSERVATIONS, REPLIES), strict=True):
         os.dup2(source, number)
 
 

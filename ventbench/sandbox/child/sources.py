@@ -29,17 +29,17 @@ def walk(folder: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     """
     waiting = [(Path(folder), 0)]
     while waiting:
-        here, depth = waiting.pop()
+        current, depth = waiting.pop()
         try:
-            with os.scandir(here) as entries:
+            with os.scandir(current) as entries:
                 kinds = {entry.name: entry.is_dir() for entry in entries}
         except OSError:
             continue
         folders = sorted(name for name, is_folder in kinds.items() if is_folder and depth < DEPTH)
         names = sorted(kinds.keys() - set(folders))
-        yield here, folders, names
-        inner = [name for name in folders if not (here / name).is_symlink()]
-        waiting += [(here / name, depth + 1) for name in reversed(inner)]
+        yield current, folders, names
+        inner = [name for name in folders if not (current / name).is_symlink()]
+        waiting += [(current / name, depth + 1) for name in reversed(inner)]
 
 
 def sources(folder: Path) -> list[Path]:
@@ -105,13 +105,13 @@ def imported_packages(folder: str) -> list[str]:
     Words in comments, docstrings and text count for nothing, and neither do sources that the
     controller does not import. A source that is not Python imports nothing.
     """
-    waiting, seen, packages = [CONTROLLER], set(), set()
+    waiting, visited, packages = [CONTROLLER], set(), set()
     while waiting:
         name = waiting.pop()
         path = Path(folder, name)
-        if name in seen or path.is_symlink() or not path.is_file():
+        if name in visited or path.is_symlink() or not path.is_file():
             continue
-        seen.add(name)
+        visited.add(name)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

@@ -113,9 +113,9 @@ def resampled_scores(
             f"values {values.shape}, rigs {rig.shape} and members {member.shape} differ in shape"
         )
     off = (values - values.mean(axis=1, keepdims=True)) / values.size
-    parts = [(own, 1.0) for own in off]
-    for own, of_lung in zip(off, rig, strict=True):
-        parts += _level(own, of_lung)
+    parts = [(deviation, 1.0) for deviation in off]
+    for deviation, of_lung in zip(off, rig, strict=True):
+        parts += _level(deviation, of_lung)
     parts += _level(off.ravel(), member.ravel())
     changes = np.zeros(resamples)
     sizes = tuple(len(sums) for sums, _ in parts)
@@ -151,5 +151,5 @@ def _counts(bits: np.random.PCG64, resamples: int, count: int) -> Floats:
     raw = bits.random_raw((resamples, count)) >> np.uint64(32)
     index = ((raw * np.uint64(count)) >> np.uint64(32)).astype(np.int64)
     flat = np.arange(resamples)[:, None] * count + index
-    taken = np.bincount(flat.ravel(), minlength=resamples * count)
-    return taken.reshape(resamples, count).astype(np.float64)
+    frequencies = np.bincount(flat.ravel(), minlength=resamples * count)
+    return frequencies.reshape(resamples, count).astype(np.float64)

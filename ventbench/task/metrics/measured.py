@@ -23,14 +23,17 @@ MISSING_SHARE, MISSING_IN_A_ROW = 0.1, 2
 
 def _neighbours(pressure: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """The readings before and after each step, itself if it has one, and the share between them."""
-    given = np.asarray(pressure, float)
-    steps = np.arange(given.shape[-1])
-    known = np.isfinite(given)
-    before = np.maximum.accumulate(np.where(known, steps, -1), axis=-1)
-    after = np.minimum.accumulate(np.where(known, steps, len(steps))[..., ::-1], axis=-1)[..., ::-1]
+    measured = np.asarray(pressure, float)
+    steps = np.arange(measured.shape[-1])
+    finite = np.isfinite(measured)
+    before = np.maximum.accumulate(np.where(finite, steps, -1), axis=-1)
+    after = np.minimum.accumulate(np.where(finite, steps, len(steps))[..., ::-1], axis=-1)[
+        ..., ::-1
+    ]
     first, last = np.where(before < 0, after, before), np.where(after == len(steps), before, after)
     low, high = (
-        np.take_along_axis(given, np.clip(at, 0, len(steps) - 1), axis=-1) for at in (first, last)
+        np.take_along_axis(measured, np.clip(at, 0, len(steps) - 1), axis=-1)
+        for at in (first, last)
     )
     return low, high, np.where(last > first, (steps - first) / np.maximum(last - first, 1), 0.0)
 
@@ -81,6 +84,6 @@ def scored(breaths: Sequence[Sequence[float | None]]) -> Floats:
     """
     steps = protocol.INSPIRATION_STEPS
     rows = [breaths[place][:steps] for place in protocol.SCORED_BREATHS if place < len(breaths)]
-    whole = [row if len(row) == steps else [None] * steps for row in rows]
+    complete = [row if len(row) == steps else [None] * steps for row in rows]
     missing = [[None] * steps] * (len(protocol.SCORED_BREATHS) - len(rows))
-    return np.array([*whole, *missing], float)
+    return np.array([*complete, *missing], float)

@@ -30,7 +30,7 @@ from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.base.resume import Format, WorkFolder
 from ventbench.plants import frozen, sessions
-from ventbench.plants.frozen import BY_ALL, seen
+from ventbench.plants.frozen import BY_ALL, training_list
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.plant_files import save_plant
 from ventbench.plants.sessions import Sessions
@@ -401,7 +401,7 @@ def _assess(
     rigs = {name: choose_rigs([t for t in tests if t.lung.id == name], table) for name in listed}
 
     measured = data.measured_breaths
-    known = seen(data.breaths, _seen_by(data))
+    known = training_list(data.breaths, _seen_by(data))
     simulators = frozen.Frozen(out, {}, "", table, members, known)
     cross_fitted_error = simulation.open_loop_errors(simulators.cross_fitted, measured)
     unseen = np.full(data.measured, np.nan)
@@ -541,10 +541,10 @@ def _provenance(
 
 
 def _write(out: Path, manifest: dict[str, Any], members: Hybrid, data: RigRecordings) -> None:
-    unseen = seen(data.breaths, _seen_by(data))
+    unseen = training_list(data.breaths, _seen_by(data))
     save_plant(out / frozen.MEMBERS, members)
     arrays = {**vars(unseen.prints), "fold": unseen.fold}
-    files.write_atomically(out / frozen.SEEN, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
-    names = (frozen.MEMBERS, frozen.SEEN)
+    files.write_atomically(out / frozen.TRAINING_LIST, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
+    names = (frozen.MEMBERS, frozen.TRAINING_LIST)
     hashes = {"files": {name: {"sha256": files.sha256(out / name)} for name in names}}
     files.write_text(out / frozen.MANIFEST, tomli_w.dumps(manifest | hashes))

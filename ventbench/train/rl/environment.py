@@ -25,7 +25,7 @@ from jax import Array
 from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.controllers import residual
-from ventbench.plants.catalog import Given
+from ventbench.plants.catalog import SimulatorLike
 from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
 from ventbench.task.draws import random_scenarios
@@ -230,7 +230,9 @@ class State:
     count: Array  #: commands so far.
 
 
-def load_lungs(simulator: Given = "frozen", *, rigs: Literal["training", "reference"]) -> Lungs:
+def load_lungs(
+    simulator: SimulatorLike = "frozen", *, rigs: Literal["training", "reference"]
+) -> Lungs:
     """Load lungs to learn on, in float32.
 
     Args:

@@ -30,7 +30,7 @@ from ventbench.base.errors import InputError
 from ventbench.base.resume import Checkpoint, fingerprint
 from ventbench.controllers import residual
 from ventbench.controllers.pid import PID
-from ventbench.plants.catalog import Given
+from ventbench.plants.catalog import SimulatorLike
 from ventbench.task import protocol
 from ventbench.task.environment import nominal_scenario
 from ventbench.train.plants import (
@@ -297,7 +297,7 @@ def train_networks(
     *,
     seeds: Sequence[int] = (0, 1),
     steps: int | None = None,
-    simulator: Given = "frozen",
+    simulator: SimulatorLike = "frozen",
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train networks that correct a PID.

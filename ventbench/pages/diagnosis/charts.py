@@ -224,14 +224,14 @@ def characteristic_chart(name: str, curve: Characteristic) -> Chart:
     """What a mechanism does to its own quantity, without it and with it."""
     chart = Chart(
         (float(curve.x.min()), float(curve.x.max())),
-        limits(curve.without, curve.acting),
+        limits(curve.baseline, curve.acting),
         curve.x_label,
         curve.y_label,
         f"{curve.y_label} over {curve.x_label}, without and with {name}.",
         width=360.0,
         height=200.0,
     )
-    chart.line(_WITHOUT, curve.x, curve.without)
+    chart.line(_WITHOUT, curve.x, curve.baseline)
     chart.line(_WITH, curve.x, curve.acting)
     return chart
 

@@ -7,8 +7,8 @@ First breaths are simulated on all training rigs with noise and deviations drawn
 gains that are best for all lungs together.
 """
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
 import jax
@@ -26,7 +26,9 @@ COPIES = 60
 
 
 def main():
-    result = json.loads(Path(sys.argv[1]).read_text("utf-8"))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("best", type=argparse.FileType("rb"), help="best.json of `tune pid`")
+    result = json.load(parser.parse_args().best)
     trained_on = plants_to_train_on("frozen")
     gains = np.array([result["lungs"][name]["gains"] for name in trained_on.names])
     single = np.array(result["single"]["gains"])

@@ -120,6 +120,8 @@ def _textbook(monkeypatch: pytest.MonkeyPatch, simulators: TextbookRigs) -> None
 def _witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
     """No commands attain a tenth of the PID's errors: nobody asks for them here."""
     monkeypatch.setattr(references, "witness_errors", lambda made, *_: made.attainable)
+    monkeypatch.setattr(references, "second_errors", lambda *x: np.full(len(x[-1]), np.inf))
+    monkeypatch.setattr(references, "rise_errors", lambda *x: np.zeros(np.shape(x[-1].pip)))
 
 
 @pytest.fixture(scope="session")

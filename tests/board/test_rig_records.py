@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -22,13 +23,17 @@ from ventbench.board import (
     verify,
 )
 from ventbench.board.replay import run_of
+from ventbench.entries import reference as references
 from ventbench.entries.runs import DRAWS, pip_columns
 from ventbench.entries.scoring import runs_of
 from ventbench.task import draws as draw_tables
-from ventbench.task import environment
+from ventbench.task import environment, protocol
 from ventbench.task.stressors import conditions
 
 from .conftest import KEY, ROUND, accept, derived, opened, put
+
+#: What the tests of the board do without, see `conftest.py`.
+WITNESS, SECOND = references.witness_errors, references.second_errors
 
 
 @pytest.fixture(scope="module")
@@ -236,6 +241,78 @@ def test_a_lowered_bound_is_found(board, simulators, reference, tmp_path):
     gate.sign(folder, path, KEY)
     problems = verify.verify(folder, lambda: simulators).problems
     assert any("its commands or PIDs do not attain its errors" in text for text in problems)
+
+
+def bounded(board, simulators, tmp_path, reference, change):
+    """Verify the board with other bounds, signed by whoever has the key."""
+    folder = shutil.copytree(board, tmp_path / "leaderboard")
+    figures = [x.figures for x in replay.load(board, lambda: simulators).scores]
+    attained = np.stack([x.controllable.swapaxes(0, 1) for x in figures])
+    least = change(reference.attainable.copy(), attained.min(axis=0))
+    forged = dataclasses.replace(reference, attainable=least)
+    own = folder / "rounds" / ROUND
+    result = json.loads((own / rounds.RESULT).read_bytes())
+    result["bounds"] = forged.save(own / rounds.BOUNDS)
+    (own / rounds.RESULT).write_bytes(canonical.canonical(result))
+    gate.sign(folder, own / rounds.RESULT, KEY)
+    return verify.verify(folder, lambda: simulators, recomputed=2).problems
+
+
+def test_no_commands_bound_nothing_where_a_rival_leads(board, simulators, reference, tmp_path):
+    """In three cells the witness is "no commands", and attains its error."""
+    rigs = simulators.scored()
+    plants, cells = rigs.cells(rounds.load(board, ROUND).draws(rigs), protocol.PIPS)
+    nothing = np.zeros((*reference.pid.shape, 2, 33))
+    rest = WITNESS(dataclasses.replace(reference, commands=nothing), plants, cells)
+    where = [(1, 4, 0), (1, 9, 0), (3, 9, 5)]
+
+    def change(attainable, _):
+        for at in where:
+            attainable[at] = rest[at]
+        return attainable
+
+    problems = bounded(board, simulators, tmp_path, reference, change)
+    assert len(problems) == 3, "all but the entry that gives none itself"
+    for problem in problems:
+        assert "less than the bound of a cell" in problem
+        assert problem.endswith(tuple(verify._cell(*at) for at in where))
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_best_entry_bound_nothing(
+    board, simulators, reference, monkeypatch, tmp_path
+):
+    """No entry is below such a bound, and the second optimiser is in whatever cell it looks at."""
+    monkeypatch.setattr(references, "second_errors", SECOND)
+    problems = bounded(board, simulators, tmp_path / "a", reference, lambda *x: x[1])
+    assert len(problems) == 2
+    assert all("and a second optimiser attains" in x for x in problems)
+    assert problems[0] != problems[1]
+    low = bounded(board, simulators, tmp_path / "b", reference, lambda x, _: 0.0 * x)
+    assert low == [], "control"
+
+
+def test_the_beacon_and_the_bounds_choose_the_cells(simulators, own, reference, monkeypatch):
+    chosen = []
+
+    def second(plants, cells, some):
+        chosen.append(some.tolist())
+        return np.full(len(some), np.inf)
+
+    monkeypatch.setattr(references, "second_errors", second)
+    other = dataclasses.replace(own, frozen_sha256="1" * 64)
+    result = msgspec.structs.replace(own.result, bounds="2" * 64)
+    monkeypatch.setattr(rounds.Round, "bounds", lambda _: reference)
+    for one in (own, own, other, dataclasses.replace(own, result=result)):
+        verify._recompute(one, simulators, 40, verify.Report(), {})
+    first, again, *others = chosen
+    assert first == again
+    assert len(set(first)) == 40
+    # The twenty farthest above the lower bound, which is zero here, and twenty others.
+    far = {*np.argsort(-reference.attainable, axis=None)[:20].tolist()}
+    assert all(far < {*x} for x in chosen)
+    assert all({*x} - far != {*first} - far for x in others)
+    assert max(first) > 500, "all of the table"
 
 
 def test_pages_show_both_scores(built):

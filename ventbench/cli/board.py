@@ -200,12 +200,22 @@ def verify(
             metavar="DIR", help="Built pages to compare; default: those in the folder, if any."
         ),
     ] = None,
+    bounds: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="CELLS",
+            help="Cells of each round whose bound a second optimiser computes anew, chosen by the "
+            "beacon; default: two minutes of them; 0: none, in a hurry.",
+        ),
+    ] = None,
     json: JsonFile = None,
 ) -> None:
     """Derive the board anew from frozen lists and signed records, and compare all that is there.
 
     Every entry that was frozen must have a record or a signed failure, every record must replay,
-    and results, ranks, pages, CSV and the README's table must be what follows.
+    and results, ranks, pages, CSV and the README's table must be what follows. No bound of a round
+    may be worse than what a second optimiser finds in cells that its beacon chooses.
 
     With --rerun, the code that each record names by its hashes runs again, and its commands must
     be the recorded ones to 0.001 %. Records whose code is not at hand are listed.
@@ -222,12 +232,20 @@ def verify(
     if records and not rerun:
         raise InputError("records are chosen for --rerun; without it all are verified")
     with bar("replaying records") as replaying:
-        report = verifier.verify(folder, frozen.load, site=site, progress=replaying)
+        report = verifier.verify(
+            folder,
+            frozen.load,
+            site=site,
+            recomputed=verifier.RECOMPUTED if bounds is None else bounds,
+            progress=replaying,
+        )
     if rerun and not report.problems:  # else the records are not what they were
         _rerun(report, folder, records or [], source or [], jobs, scheduler)
     console = written_console(dataclasses.asdict(report), json)
     for note in report.notes:
         console.print(f"note: {plain(note)}")
+    for line in report.bounds:
+        console.print(line, soft_wrap=True)
     for problem in report.problems:
         console.print(plain(problem), style="red", soft_wrap=True)
     _summary(console, report)

@@ -424,63 +424,6 @@ def test_a_bad_request_leaves_itself_out(fresh: Path) -> None:
     assert "there is no folder" in left["absent"]
 
 
-def test_outsiders_return_in_the_next_round_by_the_documented_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two rounds from one checkout: outsiders, one that cannot be opened, one over its limit."""
-    inside = tmp_path / "submissions"
-    monkeypatch.setattr(rounds, "bundled", lambda: sorted(x.name for x in inside.iterdir()))
-    board, chain = tmp_path / "leaderboard", tmp_path / "chain.json"
-    chain.write_bytes(msgspec.json.encode(referee.chain(SECRET)))
-    listed: list[Any] = []
-
-    def command(*arguments: str) -> None:
-        ended = CliRunner().invoke(app, ["round", *arguments, "--folder", str(board)])
-        assert ended.exit_code == 0, ended.output
-
-    def merged(name: str, account: str) -> None:
-        entry_folder(tmp_path / "submissions" / name, "pid_robust", name)
-        asked = FROZEN + timedelta(seconds=len(listed))
-        listed.append({"name": name, "account": account, "asked": asked.isoformat()})
-
-    def froze(name: str) -> dict[str, str]:
-        (tmp_path / "requests.json").write_text(json.dumps(listed))
-        where = ("--submissions", f"{tmp_path}/submissions")
-        command("freeze", name, *where, "--requests", f"{tmp_path}/requests.json")
-        made = rounds.load(board, name).frozen
-        assert made is not None
-        accounts = {entry.name: entry.account for entry in made.entries}
-        return accounts | {x: f"left out: {why}" for x, why in made.left_out.items()}
-
-    def opened_at(name: str, closes: str) -> None:
-        command("open", name, "--closes", closes, "--limit", "2", "--rehearsal", str(chain))
-
-    entry_folder(tmp_path / "submissions/pid_robust", "pid_robust", "pid_robust")
-    opened_at("a", "2020-01-01")
-    merged("one", "eve")
-    merged("two", "mallory")
-    merged("lacking", "mallory")
-    (tmp_path / "submissions/lacking/controller.py").unlink()
-    first = froze("a")
-    assert "controller.py is missing" in first.pop("lacking")
-    assert first == {"pid_robust": "", "one": "eve", "two": "mallory"}
-
-    opened_at("b", "2020-02-01")
-    shutil.rmtree(tmp_path / "submissions/lacking")
-    merged("lacking", "mallory")
-    merged("third", "mallory")
-    merged("new", "carol")
-    second = froze("b")
-    assert "mallory has 2 entries already" in second.pop("third")
-    assert second == {
-        "pid_robust": "",
-        "one": "eve",
-        "two": "mallory",
-        "lacking": "mallory",
-        "new": "carol",
-    }
-
-
 def test_code_that_changed_after_the_freeze_is_not_scored(fresh: Path, simulators) -> None:
     own = freeze(fresh, ask("one", "eve"))
     rounds.draw(fresh, "r2", referee.value(SECRET, own.number))

@@ -519,8 +519,8 @@ def close(
                 gate.sign(leaderboard, path, secret)
             result.records[key] = sha256
             result.seeds.update({x: y for x, y in left.seeds.items() if x == key})
-            of_seeds = {x: y for x, y in left.failed.items() if x.startswith(f"{key}, seed ")}
-            result.failed.update(of_seeds)
+            seeds_failed = (x for x in left.failed if x.startswith(f"{key}, seed "))
+            result.failed.update({x: left.failed[x][: schema.MAX_TEXT] for x in seeds_failed})
         if progress is not None:
             progress("records", done + 1, len(own.frozen.entries))
     files.write_bytes(own.folder / RESULT, canonical.canonical(msgspec.to_builtins(result)))

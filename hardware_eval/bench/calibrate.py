@@ -24,7 +24,6 @@ from hardware_eval.bench.bringup import at_open_tube, vented
 from hardware_eval.bench.drive import Commands, Driven, drive
 from hardware_eval.bench.identity import (
     Baseline,
-    Interval,
     KnownLung,
     identified,
     interval,
@@ -37,6 +36,7 @@ from hardware_eval.wire.client import Correction
 from hardware_eval.wire.messages import Capability
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.base.interval import Interval
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 

@@ -16,6 +16,7 @@ from hardware_eval.bench.drive import Driven
 from hardware_eval.bench.safety import VALVE_GAIN
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.base.interval import Interval
 from ventbench.mechanics import identify
 from ventbench.mechanics.labels import value_text
 from ventbench.recordings.breaths import make_breaths
@@ -36,22 +37,6 @@ _FAR, _APART = 13.8, 2.0
 #: Steps from a command to the sample that its flow is in: at once, and two later as in the
 #: recordings.
 LAGS = (1, 2, 3)
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A value with its 95 % interval; NaN where there is none."""
-
-    value: float
-    low: float = math.nan
-    high: float = math.nan
-
-    def __str__(self) -> str:
-        if math.isnan(self.value):
-            return "–"
-        if math.isnan(self.low):
-            return f"{self.value:.4g}"
-        return f"{self.value:.4g} ({self.low:.4g} to {self.high:.4g})"
 
 
 def interval(mean: Any, error: Any, freedom: Any) -> Interval:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 import ventbench
-from hardware_eval.bench.identity import Interval
 from hardware_eval.bench.plan import Plan, progress
 from hardware_eval.bench.raw_log import LOG, LoggedBreath, breaths, lines
 from hardware_eval.results import record, trial
@@ -23,6 +22,7 @@ from hardware_eval.results.record import plan_of, timing
 from ventbench import palette
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.base.interval import Interval
 from ventbench.base.text import number, page_templates, plain
 from ventbench.pages import panels
 from ventbench.task import protocol, waveform

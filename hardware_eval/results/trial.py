@@ -26,16 +26,17 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from hardware_eval.bench.identity import Interval, interval
+from hardware_eval.bench.identity import interval
 from hardware_eval.bench.plan import complete_runs
 from hardware_eval.bench.raw_log import LOG, lines
 from hardware_eval.results.record import plan_of
 from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.base.interval import Interval
 
 #: Draws of the interval of rank agreement, and their seed.
-DRAWS, SEED = 4000, 0
+DRAWS, SEED = 1000, 0
 
 
 def as_mounted(errors: Floats) -> tuple[Floats, Floats, Floats]:
@@ -57,21 +58,14 @@ def mounted_anew(by_mounting: Floats) -> tuple[Floats, Floats, Floats]:
     return by_mounting.mean(axis=-1), error, np.full(error.shape, count - 1.0)
 
 
-def kendall(simulated: Floats, measured: Floats) -> Floats:
-    """Kendall's tau-b of one order, ``(E,)``, with each of some, ``(..., E)``."""
-    first, second = np.triu_indices(len(simulated), 1)
-    return _cosine(*(np.sign(x[..., first] - x[..., second]) for x in (simulated, measured)))
+#: Rank correlations of two orders, by the names of a trial.
+CORRELATIONS: dict[str, Any] = {"kendall": stats.kendalltau, "spearman": stats.spearmanr}
 
 
-def spearman(simulated: Floats, measured: Floats) -> Floats:
-    """Spearman's rho of one order, ``(E,)``, with each of some, ``(..., E)``."""
-    middle = 0.5 * (len(simulated) + 1)
-    return _cosine(*(stats.rankdata(x, axis=-1) - middle for x in (simulated, measured)))
-
-
-def _cosine(own: Floats, other: Floats) -> Floats:
-    scale = np.sqrt((own**2).sum() * (other**2).sum(axis=-1))
-    return (own * other).sum(axis=-1) / np.maximum(scale, 1e-300)
+def correlation(name: str, simulated: Floats, measured: Floats) -> float:
+    """One of :data:`CORRELATIONS`; 0 where all entries are alike, which has none."""
+    alike = min(np.ptp(simulated), np.ptp(measured)) == 0.0
+    return 0.0 if alike else float(CORRELATIONS[name](simulated, measured).statistic)
 
 
 def agreement(simulated: Floats, measured: Floats, *, draws: int = DRAWS) -> dict[str, Interval]:
@@ -96,9 +90,10 @@ def agreement(simulated: Floats, measured: Floats, *, draws: int = DRAWS) -> dic
         scale = np.sqrt(random.chisquare(mountings - 1, (draws, 1)))
         drawn = means + normal / scale @ off.T
     found = {}
-    for name, measure in (("kendall", kendall), ("spearman", spearman)):
-        ends = np.quantile(measure(own, drawn), (0.025, 0.975)) if mountings > 1 else (np.nan,) * 2
-        found[name] = Interval(float(measure(own, means)), float(ends[0]), float(ends[1]))
+    for name in CORRELATIONS:
+        each = [correlation(name, own, one) for one in drawn]
+        ends = np.quantile(each, (0.025, 0.975)).tolist() if mountings > 1 else ()
+        found[name] = Interval(correlation(name, own, means), *ends)
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ def bic(fitted):
 
 def within(fitted, path, truth, slack=1.0):
     """Whether the interval holds the truth, when stretched by ``slack`` around the value."""
-    value, low, high = interval(fitted, path)
+    value, low, high = astuple(interval(fitted, path))
     return value - slack * (value - low) <= truth <= value + slack * (high - value)
 
 
@@ -63,7 +65,7 @@ def test_dead_time_has_a_profile():
     """Two and a half samples: flat between walls, where the curvature would promise too much."""
     m = cases.strengths("valve_delay")
     found = fit(make_data(cases.recording(BREATHS, m, noise=NOISE, seed=7)), m)
-    value, low, high = interval(found, "valve_delay.delay")
+    value, low, high = astuple(interval(found, "valve_delay.delay"))
     assert low < 0.08 < high
     assert value == pytest.approx(0.08, abs=0.01)
     assert 0.003 < high - low < 0.04

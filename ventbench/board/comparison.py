@@ -28,6 +28,7 @@ import numpy as np
 from scipy import stats
 
 from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.interval import Interval
 from ventbench.task.metrics.score import LEAST_HEADROOM
 
 #: Probability that any pair of entries is called wrongly.
@@ -183,8 +184,8 @@ def _apart(own: Floats, other: Floats) -> Floats:
     return np.sqrt(np.maximum(1.0 - product**2 / (squares[0] * squares[1]), 0.0))
 
 
-def over_seeds(scores: Sequence[float]) -> tuple[float, float, float]:
+def over_seeds(scores: Sequence[float]) -> Interval:
     """Interquartile mean of the scores of seeds, with its 95 % bootstrap interval over seeds."""
     drawn = np.random.default_rng(_SEED).choice(np.sort(scores), (_RESAMPLES, len(scores)))
     low, high = np.quantile(stats.trim_mean(drawn, 0.25, axis=1), (0.025, 0.975))
-    return float(stats.trim_mean(scores, 0.25)), float(low), float(high)
+    return Interval(float(stats.trim_mean(scores, 0.25)), float(low), float(high))

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.base.interval import Interval
 from ventbench.base.text import plain
 from ventbench.board import comparison, pages, ranking, replay
-from ventbench.board.ranking import Interval, Row, Track
+from ventbench.board.ranking import Row, Track
 from ventbench.board.record import Record
 from ventbench.entries.manifest import TRACKS
 from ventbench.task import protocol
@@ -38,7 +39,7 @@ class Column:
 
     #: of its columns in the CSV and in frames: one, or value, low and high end.
     names: tuple[str, ...]
-    #: of an entry: text, a number, None, or an :class:`~ventbench.board.ranking.Interval`.
+    #: of an entry: text, a number, None, or an :class:`~ventbench.base.interval.Interval`.
     value: Callable[[Line], Any]
     about: str  #: what it is, with its unit; on the page as the hint of its heading.
     title: str = ""  #: heading on the page; empty where the page does not show it.
@@ -111,7 +112,7 @@ def _seeds(line: Line) -> Interval | None:
     key += f" ({line.track.name})"
     if not result or result.records.get(key) != line.row.record.sha256 or key not in result.seeds:
         return None
-    return Interval(*comparison.over_seeds(result.seeds[key]))
+    return comparison.over_seeds(result.seeds[key])
 
 
 def _stress(line: Line) -> Interval | None:

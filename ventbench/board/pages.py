@@ -24,8 +24,9 @@ import numpy as np
 
 from ventbench import palette
 from ventbench.base.arrays import Floats
+from ventbench.base.interval import Interval
 from ventbench.base.text import number, page_templates, plain
-from ventbench.board.ranking import HardwareRow, Interval, Row, StressRow
+from ventbench.board.ranking import HardwareRow, Row, StressRow
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor

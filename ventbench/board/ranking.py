@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.base.arrays import Floats, Ints
+from ventbench.base.interval import Interval
 from ventbench.board import comparison, gate, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.comparison import CMH2O, POINTS, Ranks
@@ -54,23 +55,8 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Interval:
-    """A figure with its 95 % interval, cmH2O or points of the normalised score."""
-
-    value: float
-    low: float
-    high: float
-
-    @property
-    def clear(self) -> bool:
-        """Whether zero is outside, by more than rounding."""
-        least = 10.0**-DECIMALS
-        return self.low > least or self.high < -least
-
-
-@dataclass(frozen=True)
 class Comparison:
-    """A score as mean over draws, and differences to others.
+    """A score as mean over draws, and differences to others, cmH2O or points.
 
     There is none to the baseline for the track's PID itself or without one, and none to the entry
     above for the first.
@@ -288,7 +274,8 @@ def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Ro
     if not ordered:
         return []
     records = [entry.record for entry in ordered]
-    made = ranks_of(ordered, [record.figures.ranked_values for record in records])
+    rig = records[0].figures.rig[:, records[0].figures.ranked]
+    made = _ranks(ordered, [record.figures.ranked_values for record in records], rig, POINTS)
     compared = _comparisons(records, _baseline(records, track))
     rows = []
     for i, entry in enumerate(ordered):
@@ -298,13 +285,8 @@ def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Ro
     return rows
 
 
-def ranks_of(entries: Sequence[Entry], values: Sequence[Floats]) -> Ranks:
-    """Ranks of entries by their errors of the ranked draws, ``(L, k)``; less is better."""
-    own = entries[0].record.figures
-    return _ranks(entries, values, own.rig[:, own.ranked], POINTS)
-
-
 def _ranks(entries: Sequence[Entry], values: Sequence[Floats], rig: Ints, matters: float) -> Ranks:
+    """Ranks by values of lungs and draws, ``(L, k)``; see :func:`comparison.ranks`."""
     names = [entry.record.name for entry in entries]
     source = [names.index(x.source) if x.source in names else None for x in entries]
     return comparison.ranks(np.stack(values), rig, source, matters=matters)

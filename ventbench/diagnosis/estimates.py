@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ventbench.base.interval import Interval
 from ventbench.diagnosis.conclusion import Conclusion, Swing, UnnamedEffect
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
@@ -26,7 +27,7 @@ from ventbench.physics.catalogue import (
 )
 from ventbench.physics.characteristics import characteristic
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS, BasisTerm
-from ventbench.system_id import ConfidenceInterval, Fit, fit, interval, profile_interval
+from ventbench.system_id import Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Floats
 from ventbench.system_id.predictor import START
 from ventbench.task.interfaces import Plant
@@ -164,7 +165,7 @@ _INTERVALS = 64
 
 
 @lru_cache(maxsize=_INTERVALS)
-def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
+def _interval(fitted: Fit, path: str, group: int) -> Interval:
     """Interval of a parameter; where it reaches the neutral value, that of the profile likelihood.
 
     A strength and a time of relaxation make up for each other, so that a parabola says little of
@@ -178,7 +179,7 @@ def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
     unclear = path == strength_path(owner) or exchanged
     if not unclear or spec.kinked or not ends.low <= spec.neutral <= ends.high:
         return ends
-    return ConfidenceInterval(ends.value, *profile_interval(fitted, path, group))
+    return Interval(ends.value, *profile_interval(fitted, path, group))
 
 
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:

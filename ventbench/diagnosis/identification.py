@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
+from ventbench.base.interval import Interval
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import (
     Conclusion,
@@ -25,7 +26,7 @@ from ventbench.diagnosis.hypothesis import (
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.validation import excludes_neutral, is_weak
 from ventbench.physics.catalogue import mechanism, special_cases
-from ventbench.system_id import START, ConfidenceInterval, Fit, likely_places
+from ventbench.system_id import START, Fit, likely_places
 from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.problem import make_problem, parameter_of
@@ -147,9 +148,7 @@ def _with_changes_of(conclusion: Conclusion, fit: Fit) -> Conclusion:
     return replace(conclusion, full=changed, named=changed if named is full else named)
 
 
-def place_of_change(
-    evaluator: Evaluator, fitted: FittedModel, data: Data, path: str
-) -> ConfidenceInterval:
+def place_of_change(evaluator: Evaluator, fitted: FittedModel, data: Data, path: str) -> Interval:
     """Where a change is by all breaths of a recording, 0..1, with the rest as fitted.
 
     A fit leaves some breaths out, and the first affected one may be among them: a judging breath

@@ -4,7 +4,6 @@ from ventbench.system_id.data import Data as Data
 from ventbench.system_id.data import Noise as Noise
 from ventbench.system_id.data import make_data as make_data
 from ventbench.system_id.data import robust_noise as robust_noise
-from ventbench.system_id.fit import ConfidenceInterval as ConfidenceInterval
 from ventbench.system_id.fit import Fit as Fit
 from ventbench.system_id.fit import fit as fit
 from ventbench.system_id.fit import interval as interval

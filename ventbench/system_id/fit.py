@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Floats
+from ventbench.base.interval import Interval
 from ventbench.base.linear import inverse, solve
 from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
@@ -292,21 +292,13 @@ def profile_interval(fit: Fit, path: str, group: int = 0) -> tuple[float, float]
     return low, high
 
 
-class ConfidenceInterval(NamedTuple):
-    """An estimate and the ends of its 95 % interval, in physical units."""
-
-    value: float
-    low: float
-    high: float
-
-
-def likely_places(places: Floats, costs: Floats, value: float) -> ConfidenceInterval:
+def likely_places(places: Floats, costs: Floats, value: float) -> Interval:
     """A change at ``value``, and the places that are at most 20 times less likely than the best."""
     likely = [value, *places[costs < costs.min(initial=np.inf) + _UNLIKELY]]
-    return ConfidenceInterval(value, min(likely), max(likely))
+    return Interval(value, min(likely), max(likely))
 
 
-def interval(fit: Fit, path: str, group: int = 0) -> ConfidenceInterval:
+def interval(fit: Fit, path: str, group: int = 0) -> Interval:
     """Estimate and 95 % interval of a free parameter.
 
     In general, these are the minimum and the interval of the covariance. For a dead time, they are
@@ -321,19 +313,19 @@ def interval(fit: Fit, path: str, group: int = 0) -> ConfidenceInterval:
         return likely_places(places, costs, float(fit.value(path)[group]))
     if parameter.kinked:
         value = float(fit.value(path)[group])
-        estimate = _plateau(fit, path, group) or ConfidenceInterval(
+        estimate = _plateau(fit, path, group) or Interval(
             value, *profile_interval(fit, path, group)
         )
         # The predictor smooths an edge over a substep, and resolves its time to half of it.
         reach = 0.5 * float(np.median(fit.problem.data.dt)) / fit.problem.predictor.substeps
         reach *= parameter.unit == "s"
         ends = np.clip([estimate.low - reach, estimate.high + reach], parameter.low, parameter.high)
-        return ConfidenceInterval(estimate.value, float(ends[0]), float(ends[1]))
+        return Interval(estimate.value, float(ends[0]), float(ends[1]))
     low, high = fit.ci95(path)[group]
-    return ConfidenceInterval(float(fit.value(path)[group]), float(low), float(high))
+    return Interval(float(fit.value(path)[group]), float(low), float(high))
 
 
-def _plateau(fit: Fit, path: str, group: int) -> ConfidenceInterval | None:
+def _plateau(fit: Fit, path: str, group: int) -> Interval | None:
     """Mean and quantiles of the profile likelihood on a grid; None if it is narrower than that."""
     unknown, parameter = int(fit.problem.unknowns.of(path)[group]), parameter_of(path)
     grid = np.linspace(parameter.low, parameter.high, _GRID)
@@ -358,7 +350,7 @@ def _plateau(fit: Fit, path: str, group: int) -> ConfidenceInterval | None:
     half = 0.5 * (grid[1] - grid[0])
     edges = np.clip(np.concatenate([grid - half, [grid[-1] + half]]), parameter.low, parameter.high)
     low, high = np.interp([0.025, 0.975], share, edges)
-    return ConfidenceInterval(float(weight @ grid / weight.sum()), float(low), float(high))
+    return Interval(float(weight @ grid / weight.sum()), float(low), float(high))
 
 
 def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:

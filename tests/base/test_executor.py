@@ -121,6 +121,17 @@ def _slowly(plant, gains):
     return np.full((len(gains), len(protocol.PIPS)), gains.sum(), np.float32)
 
 
+def test_a_job_with_which_workers_of_a_cluster_died_is_named():
+    class KilledWorker(Exception):
+        """What Dask raises."""
+
+    def job():
+        raise KilledWorker
+
+    with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="died.* with heavy"):
+        list(results(pool, job, {"heavy": ()}))
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of Dask's own, about ports and closing
 def test_a_dask_worker_that_is_killed_loses_nothing_and_counts_nothing_twice(tmp_path):

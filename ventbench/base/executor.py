@@ -139,6 +139,7 @@ def results(
         return
     running = {pool.submit(function, *arguments): name for name, arguments in jobs.items()}
     for future in futures.as_completed(running):
+        name = running.pop(future)
         try:
             result = future.result()
         except futures.BrokenExecutor as error:
@@ -146,7 +147,15 @@ def results(
                 "a worker process died (out of memory?); what was finished is kept: run the same "
                 "command again, with fewer --workers"
             ) from error
-        yield running.pop(future), result
+        except Exception as error:
+            if type(error).__name__ != "KilledWorker":  # of Dask, which need not be installed
+                raise
+            raise InputError(
+                f"the cluster's workers died, one after the other, with {name} (out of memory?); "
+                "what was finished is kept: run the same command again, without it or with more "
+                "memory"
+            ) from error
+        yield name, result
 
 
 def in_order(

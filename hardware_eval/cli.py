@@ -20,7 +20,6 @@ from hardware_eval.commands import (
     Lung,
     Port,
     Yes,
-    baseline_of,
     bench_on,
     bringup,
     calibrate,
@@ -120,12 +119,14 @@ def run(
 
     with bench_on(port, yes=yes, control=control, kept=out) as (line, _, person):
         calibrated = calibration_of(line, calibration)
-        masked = Blind(person, planned)
+        masked = Blind(planned)
+        if how.blind:
+            person.hidden = masked.hidden
         done = ev.evaluate(
             entries,
             line,
             out,
-            masked if how.blind else person,
+            person,
             plan=planned,
             how=how,
             shows=[masked.hiding(show) for show in shows] if how.blind else shows,
@@ -202,8 +203,8 @@ def selftest(
     label, simulators = scored_lung(lung).id, load_simulators(plant)
     left_out = chosen_parts(skip or ())
     with bench_on(port, yes=True) as (line, bench, _):
-        known = baseline_of(calibration_of(line, calibration))
-        sheet = run_selftest(bench, label, simulator=simulators, skip=left_out, **known)
+        baseline = calibration_of(line, calibration).baseline()
+        sheet = run_selftest(bench, label, simulator=simulators, baseline=baseline, skip=left_out)
     emit(sheet.as_dict(), json)
     print(sheet, file=told(json))
     if not sheet.go:

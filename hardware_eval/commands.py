@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
@@ -241,8 +241,8 @@ def bringup(
         raise typer.Exit(1)
 
 
-def calibration_of(line: Line, path: Path | None) -> Calibration | None:
-    """The calibration that a command is given; the line's readings are corrected from here on.
+def calibration_of(line: Line, path: Path | None) -> Calibration:
+    """The calibration that a command is given, or one without parts; it corrects readings now.
 
     Raises:
         InputError: if it is stale, was changed, or is of another device than the line's.
@@ -251,16 +251,11 @@ def calibration_of(line: Line, path: Path | None) -> Calibration | None:
     from hardware_eval.bench.dated import device_of
 
     if path is None:
-        return None
+        return calibration.Calibration({}, {})
     found = calibration.load(path, device_of(line.client))
     line.client.calibrate(found.correction())
     print(f"calibrated by {path}: {found.correction()}", file=sys.stderr)
     return found
-
-
-def baseline_of(calibration: Calibration | None) -> dict[str, Any]:
-    """What a calibration tells a self-test."""
-    return {} if calibration is None else {"baseline": calibration.baseline()}
 
 
 def numbers(option: str, text: str | None) -> list[float]:

@@ -272,19 +272,41 @@ def test_every_slow_test_exists() -> None:
         assert f"def {name.rpartition('::')[2]}(" in (ROOT / file).read_text("utf-8"), line
 
 
+#: What a walk through the bench manual replaces. Machine and real time, for which a busy computer
+#: is no bench, by lungs on a virtual clock; persons with instruments; hours. The emulator on a
+#: terminal and the demo have tests of their own.
+AT_THE_BENCH = {
+    r"^.*(ventbench-hardware (calibrate|demo|emulate)|--only).*\n": "",
+    r"\./lung": "virtual:R20C10",
+    r"/dev/ttyACM0": "virtual:R20C50",
+    r"(ventbench-hardware (?:run mine|collect))": r"\1 --yes",
+    r"--breaths 600": "--breaths 12",
+    r"(ventbench-hardware run mine)": r"\1 --pips 10 --repeats 1",
+}
+
+
 @pytest.mark.slow
-def test_the_readme_runs_from_top_to_bottom(wheel: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("manual", "replaced", "blocks"),
+    [("README.md", {}, 5), ("hardware_eval/README.md", AT_THE_BENCH, 6)],
+    ids=["readme", "bench manual"],
+)
+def test_a_manual_runs_from_top_to_bottom(
+    manual: str, replaced: dict[str, str], blocks: int, wheel: Path, tmp_path: Path
+) -> None:
     """Every block, in order, in one empty folder, from the wheel; its packages are here already."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "wheel")
     folder = tmp_path / "folder"
     folder.mkdir()
-    text = (ROOT / "README.md").read_text("utf-8")
+    text = (ROOT / manual).read_text("utf-8")
     ran = 0
     for language, block in re.findall(r"^```(sh|python)\n(.*?)^```", text, re.M | re.S):
         if "make " in block:  # how a contributor runs the tests, this one among them
             continue
-        source = re.sub(r"^pip install .*", "", block, flags=re.M)
+        source = block
+        for pattern, instead in {r"^pip install .*": "", **replaced}.items():
+            source = re.sub(pattern, instead, source, flags=re.M)
         command = (
             [sys.executable, "-c"] if language == "python" else ["bash", "-euo", "pipefail", "-c"]
         )
@@ -301,4 +323,4 @@ def test_the_readme_runs_from_top_to_bottom(wheel: Path, tmp_path: Path) -> None
         )
         assert done.returncode == 0, f"{block}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
         ran += 1
-    assert ran == 5
+    assert ran == blocks

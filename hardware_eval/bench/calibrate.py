@@ -91,18 +91,15 @@ def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit
         error: standard error of each reading, shape ``(n,)``, above 0.
         above: 1 where the reference was approached from above, else 0, shape ``(n,)``.
     """
-    level = np.ptp(reference) == 0.0
-    columns = [np.ones_like(reference)] if level else [np.ones_like(reference), reference]
-    design = np.column_stack(columns) / error[:, None]
-    solution, *_ = np.linalg.lstsq(design, reading / error, rcond=None)
-    residual = reading - np.column_stack(columns) @ solution
-    freedom = len(reading) - len(columns)
-    scatter = float(np.sum((residual / error) ** 2)) / max(freedom, 1)
-    covariance = np.linalg.inv(design.T @ design) * max(scatter, 1.0)
-    found = [
-        interval(x, math.sqrt(v), freedom)
-        for x, v in zip(solution, np.diag(covariance), strict=True)
-    ]
+    level = int(np.ptp(reference) == 0.0)
+    line, covariance = np.polyfit(reference, reading, 1 - level, w=1.0 / error, cov="unscaled")
+    residual = reading - np.polyval(line, reference)
+    freedom = len(reading) - len(line)
+    scatter = max(float(np.sum((residual / error) ** 2)) / max(freedom, 1), 1.0)
+    *slope, intercept = (
+        interval(x, math.sqrt(scatter * v), freedom)
+        for x, v in zip(line, np.diag(covariance), strict=True)
+    )
     unknown = Interval(math.nan)
     both = [x for x in np.unique(reference) if len(set(above[reference == x])) == 2]
     apart = np.array(
@@ -117,7 +114,7 @@ def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit
         each = float(apart.std(ddof=1)) / math.sqrt(len(apart))
         hysteresis = interval(float(apart.mean()), each, len(apart) - 1)
     spread = math.sqrt(float(residual @ residual) / max(freedom, 1))
-    return Fit(found[0], unknown if level else found[1], hysteresis, spread)
+    return Fit(intercept, slope[0] if slope else unknown, hysteresis, spread)
 
 
 @dataclass(frozen=True)

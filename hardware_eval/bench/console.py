@@ -9,7 +9,7 @@ import os
 import re
 import select
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,9 @@ class ConsoleOperator(Operator):
         control: control socket of an emulator, which then does perturbations by itself.
         device: a device that is emulated in this process, to which the same applies.
         reaction: time after a question was shown in which a key cannot be an answer yet, s.
+
+    Attributes:
+        hidden: what is made of all that is asked and told; see :class:`Blind`.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class ConsoleOperator(Operator):
     ) -> None:
         self._yes, self._control, self._device = yes, control, device
         self._reaction = reaction
+        self.hidden: Callable[[str], str] = str
         self._terminal: int | None = None
 
     @contextlib.contextmanager
@@ -98,7 +102,7 @@ class ConsoleOperator(Operator):
         Raises:
             EmergencyStop: if a key was pressed before the question had been shown.
         """
-        print(f"{question} [y/n] ", end="", flush=True)
+        print(f"{self.hidden(question)} [y/n] ", end="", flush=True)
         if self._yes or self._terminal is None:
             print("y (--yes)" if self._yes else "n (no terminal; give --yes to confirm)")
             return self._yes
@@ -153,7 +157,7 @@ class ConsoleOperator(Operator):
 
     def tell(self, text: str) -> None:
         """Print a line."""
-        print(text, flush=True)
+        print(self.hidden(text), flush=True)
 
     def disturb(self, perturbation: str, on: bool) -> None:
         """Have a leak opened or the tube pinched, by hand or by the emulator."""
@@ -168,14 +172,14 @@ class ConsoleOperator(Operator):
         print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
 
 
-class Blind(Operator):
-    """An operator to whom entries are called by numbers, whatever is asked, told or shown.
+class Blind:
+    """Calls entries by numbers, whatever is asked, told or shown.
 
     Attributes:
         called: what each entry is called, by its name.
     """
 
-    def __init__(self, operator: Operator, plan: Plan) -> None:
+    def __init__(self, plan: Plan) -> None:
         """Draw the numbers from the plan's seed, so that a session that continues keeps them."""
         order = np.random.default_rng([plan.seed, 1]).permutation(len(plan.entries))
         self.called = {
@@ -183,35 +187,14 @@ class Blind(Operator):
         }
         names = "|".join(re.escape(x) for x in sorted(self.called, key=len, reverse=True))
         self._names = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
-        self._operator = operator
 
     def hidden(self, text: str) -> str:
         """A text without names of entries."""
         return self._names.sub(lambda found: self.called[found[0]], text)
 
-    def confirm(self, question: str) -> bool:
-        """Ask."""
-        return self._operator.confirm(self.hidden(question))
-
-    def tell(self, text: str) -> None:
-        """Say something."""
-        self._operator.tell(self.hidden(text))
-
-    def stop(self) -> bool:
-        """Whether the emergency stop has been pressed."""
-        return self._operator.stop()
-
-    def disturb(self, perturbation: str, on: bool) -> None:
-        """Open a leak or pinch the tube now, or undo it."""
-        self._operator.disturb(perturbation, on)
-
     def hiding(self, show: Show) -> Show:
         """What shows breaths, without the names of entries."""
-
-        def shown(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-            show(replace(run, entry=self.hidden(run.entry)), breath, done, total)
-
-        return shown
+        return lambda run, *breath: show(replace(run, entry=self.hidden(run.entry)), *breath)
 
 
 def show_bars(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:

@@ -24,7 +24,6 @@ from hardware_eval.bench.controllers import (
     SubmissionController,
 )
 from hardware_eval.bench.fallback import DEFAULT as FALLBACK
-from hardware_eval.bench.identity import Baseline
 from hardware_eval.bench.loop import Bench, Operator, Show
 from hardware_eval.bench.plan import UNDISTURBED, Plan, PlannedRun, Procedure
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
@@ -271,7 +270,7 @@ def evaluate(
     shows: Sequence[Show] = (),
     sandbox: bool = True,
     operator_name: str = "",
-    calibration: Calibration | None = None,
+    calibration: Calibration = Calibration({}, {}),  # noqa: B008 - it is frozen
 ) -> Evaluation:
     """Run a plan, or what is left of it, and make the records once it is done.
 
@@ -314,7 +313,7 @@ def evaluate(
     device = device_about(line)
     if line.bringup:
         device["about"]["bringup"] = dict(line.bringup)
-    if calibration is not None:
+    if calibration.parts:
         device["about"]["calibration_file"] = calibration.about()
     about = {
         "device": device,
@@ -325,12 +324,11 @@ def evaluate(
         "simulated": simulated,
     }
     bench = Bench(line.client, line.clock, settings, operator, shows, how.rest, fallback)
-    baseline = Baseline() if calibration is None else calibration.baseline()
 
     def tested(lung: str) -> Sheet | None:
         if not how.selftest:
             return None
-        sheet = selftest(bench, lung, baseline=baseline, skip=left_out)
+        sheet = selftest(bench, lung, baseline=calibration.baseline(), skip=left_out)
         files.write_json(out / f"selftest-{lung}.json", sheet.as_dict())
         operator.tell(str(sheet))
         return sheet

@@ -125,32 +125,22 @@ def shown(value: Interval, sign: bool = False) -> str:
 
 def _table(session: Session, analysed: trial.Trial) -> list[dict[str, Any]]:
     """A row for each entry, and under it one for each lung."""
+
+    def row(name: str, error: Interval, simulated: float, gap: Interval, done: str) -> Any:
+        cells = {"error": shown(error), "simulated": shown(Interval(simulated))}
+        ends = {"done": done, "whole": False, "repeats": ""}
+        return {"name": name, **cells, "gap": shown(gap, sign=True), **ends}
+
     rows = []
     for name, entry in analysed.entries.items():
         done, of = (sum(part) for part in zip(*entry.successes.values(), strict=True))
-        whole = {
-            "name": name,
-            "whole": True,
-            "error": shown(entry.score),
-            "simulated": shown(Interval(float(np.mean(list(entry.simulated.values()))))),
-            "gap": shown(entry.gap, sign=True),
-            "done": f"{done} of {of}",
-            "repeats": shown(Interval(entry.repeat_sd)),
-        }
-        rows.append(whole)
+        mean = float(np.mean(list(entry.simulated.values())))
+        whole = row(name, entry.score, mean, entry.gap, f"{done} of {of}")
+        rows.append({**whole, "whole": True, "repeats": shown(Interval(entry.repeat_sd))})
         for lung in session.lungs:
-            gap, (succeeded, every) = entry.gaps[lung], entry.successes[lung]
-            rows.append(
-                {
-                    "name": lung,
-                    "whole": False,
-                    "error": shown(entry.scores[lung]),
-                    "simulated": shown(Interval(entry.simulated[lung])),
-                    "gap": shown(gap, sign=True),
-                    "done": f"{succeeded} of {every}",
-                    "repeats": "",
-                }
-            )
+            score, gap = entry.scores[lung], entry.gaps[lung]
+            done, of = entry.successes[lung]
+            rows.append(row(lung, score, entry.simulated[lung], gap, f"{done} of {of}"))
     return rows
 
 

@@ -172,16 +172,13 @@ def _version(host: Probe) -> None:
 
 
 def _sessions(host: Probe) -> None:
-    other, before = host.random.getrandbits(32), host.counters()
-    for message in (Arm(), Command(1.0, 0, 0), Heartbeat(), Statistics()):
-        host.refused(message, Reason.SESSION, session=other, consumes=False)
-    host.refused(Command(200.0, 0, 0), Reason.SESSION, session=other, consumes=False)
-    equal("counter session", host.counters().session - before.session, 5)
+    other = host.random.getrandbits(32)
+    with host.counting(session=5):
+        for message in (Arm(), Command(1.0, 0, 0), Heartbeat(), Statistics()):
+            host.refused(message, Reason.SESSION, session=other, consumes=False)
+        host.refused(Command(200.0, 0, 0), Reason.SESSION, session=other, consumes=False)
     equal("mode after strangers", host.reading().mode.name, "READY")
-    old, since = host.session, host.arm()
-    command = host.command(30.0, 0)
-    host.in_time(since)
-    host.ask(command, Reading)
+    old, since = host.session, host.inspire()
     host.hello()
     reading = host.reading()
     equal("mode after a second host", reading.mode.name, "READY")
@@ -199,11 +196,10 @@ def _again(host: Probe) -> None:
 
 
 def _numbers(host: Probe) -> None:
-    before = host.counters().sequence
-    for step in (0, -1, WINDOW + 1):
-        for message in (Heartbeat(), Arm(), Statistics(), Command(200.0, 0, 0)):
-            host.refused(message, Reason.SEQUENCE, step=step, consumes=False)
-    equal("counter sequence", host.counters().sequence - before, 12)
+    with host.counting(sequence=12):
+        for step in (0, -1, WINDOW + 1):
+            for message in (Heartbeat(), Arm(), Statistics(), Command(200.0, 0, 0)):
+                host.refused(message, Reason.SEQUENCE, step=step, consumes=False)
     host.ask(Heartbeat(), Reading, step=WINDOW)
     host.ask(Heartbeat(), Reading, step=2)
 
@@ -225,65 +221,62 @@ def _consumed(host: Probe) -> None:
 
 
 def _not_armed(host: Probe) -> None:
-    before = host.counters()
-    host.refused(host.command(10.0, 0), Reason.NOT_ARMED)
-    host.refused(host.command(10.0, 0, age=5000), Reason.NOT_ARMED)
-    equal("counter not armed", host.counters().not_armed - before.not_armed, 2)
+    with host.counting(not_armed=2):
+        host.refused(host.command(10.0, 0), Reason.NOT_ARMED)
+        host.refused(host.command(10.0, 0, age=5000), Reason.NOT_ARMED)
     equal("mode after a command before arming", host.reading().mode.name, "READY")
 
 
 def _commands(host: Probe) -> None:
-    before = host.counters().commands
-    since = host.arm()
-    for u_in, u_out in ((12.34, 0), (0.01, 1), (100.0, 1), (0.0, 0)):
-        sent, command = host.clock.now(), host.command(u_in, u_out)
-        host.in_time(since)
-        reading = host.ask(command, Reading)
-        host.in_time(since)
-        equal("valves", (reading.u_in, reading.u_out), (u_in, u_out))
-        equal("mode", reading.mode.name, "RUNNING")
-        kept = host.reading()
-        equal("valves after a heartbeat", (kept.u_in, kept.u_out), (u_in, u_out))
-        since = sent
-    equal("counter commands", host.counters().commands - before, 4)
+    with host.counting(commands=4):
+        since = host.arm()
+        for u_in, u_out in ((12.34, 0), (0.01, 1), (100.0, 1), (0.0, 0)):
+            sent, command = host.clock.now(), host.command(u_in, u_out)
+            host.in_time(since)
+            reading = host.ask(command, Reading)
+            host.in_time(since)
+            equal("valves", (reading.u_in, reading.u_out), (u_in, u_out))
+            equal("mode", reading.mode.name, "RUNNING")
+            kept = host.reading()
+            equal("valves after a heartbeat", (kept.u_in, kept.u_out), (u_in, u_out))
+            since = sent
 
 
 def _out_of_range(host: Probe) -> None:
-    before = host.counters().out_of_range
-    for armed in (True, False):
-        for u_in, u_out in ((100.01, 0), (655.35, 1), (5.0, 2), (5.0, 255)):
-            host.hello()
-            since = host.arm() if armed else host.clock.now()
-            command = host.command(u_in, u_out, age=0 if armed else 9999)
-            host.in_time(since)
-            refusal = host.refused(command, Reason.OUT_OF_RANGE)
-            host.in_time(since)
-            _vented(refusal, "after a command out of range", Flag.OUT_OF_RANGE)
-            _vented(host.reading(), "after a command out of range", Flag.OUT_OF_RANGE)
-            host.refused(host.command(5.0, 0), Reason.NOT_ARMED)
-    equal("counter out of range", host.counters().out_of_range - before, 8)
+    with host.counting(out_of_range=8):
+        for armed in (True, False):
+            for u_in, u_out in ((100.01, 0), (655.35, 1), (5.0, 2), (5.0, 255)):
+                host.hello()
+                since = host.arm() if armed else host.clock.now()
+                command = host.command(u_in, u_out, age=0 if armed else 9999)
+                host.in_time(since)
+                refusal = host.refused(command, Reason.OUT_OF_RANGE)
+                host.in_time(since)
+                for seen in (refusal, host.reading()):
+                    _vented(seen, "after a command out of range", Flag.OUT_OF_RANGE)
+                host.refused(host.command(5.0, 0), Reason.NOT_ARMED)
 
 
 def _stale(host: Probe) -> None:
-    before, since = host.counters(), host.arm()
-    for age in (101, 5000, 1 << 31, -10_000):
-        stale = host.command(50.0, 0, age)
+    with host.counting(stale=4):
+        since = host.arm()
+        for age in (101, 5000, 1 << 31, -10_000):
+            stale = host.command(50.0, 0, age)
+            host.in_time(since)
+            host.refused(stale, Reason.STALE)
+            host.in_time(since)
+        reading = host.reading()
         host.in_time(since)
-        host.refused(stale, Reason.STALE)
+        equal("valves after stale commands", (reading.u_in, reading.u_out), (0.0, 1))
+        equal("mode after stale commands", reading.mode.name, "RUNNING")
+        asked = host.clock.now()
+        fresh = host.command(50.0, 0, age=50)
         host.in_time(since)
-    reading = host.reading()
-    host.in_time(since)
-    equal("valves after stale commands", (reading.u_in, reading.u_out), (0.0, 1))
-    equal("mode after stale commands", reading.mode.name, "RUNNING")
-    asked = host.clock.now()
-    fresh = host.command(50.0, 0, age=50)
-    host.in_time(since)
-    got = host.raw(host.frame(fresh)).message
-    host.sequence += 1
-    if host.clock.now() - asked > 0.030:
-        raise LateError
-    equal("a command on a reading of 50 ms", told(got), "reading")
-    equal("counter stale", host.counters().stale - before.stale, 4)
+        got = host.raw(host.frame(fresh)).message
+        host.sequence += 1
+        if host.clock.now() - asked > 0.030:
+            raise LateError
+        equal("a command on a reading of 50 ms", told(got), "reading")
 
 
 # Guards.
@@ -291,10 +284,7 @@ def _stale(host: Probe) -> None:
 
 def _vent(host: Probe) -> None:
     for session, step in ((None, 1), (host.session ^ 0x5A5A5A5A, 1), (None, 0)):
-        since = host.arm()
-        command = host.command(30.0, 0)
-        host.in_time(since)
-        host.ask(command, Reading)
+        since = host.inspire()
         own = session is None and step == 1
         reading = host.ask(Vent(), Reading, step=step, session=session, consumes=own)
         host.in_time(since)
@@ -305,11 +295,7 @@ def _vent(host: Probe) -> None:
 
 
 def _rearm(host: Probe) -> None:
-    since = host.arm()
-    command = host.command(30.0, 0)
-    host.in_time(since)
-    host.ask(command, Reading)
-    host.in_time(since)
+    host.in_time(host.inspire())
     reading = host.ask(Arm(), Reading)
     equal("valves after arming again", (reading.u_in, reading.u_out), (0.0, 1))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from random import Random
 from typing import TypeVar
 
@@ -165,6 +167,23 @@ class Probe:
             raise DiffersError(f"arm was answered with {told(got)}")
         equal("mode after arming", got.mode.name, "RUNNING")
         return before
+
+    def inspire(self) -> float:
+        """Arm and open the inspiratory valve; returns when it was armed at the earliest, s."""
+        since = self.arm()
+        command = self.command(30.0, 0)
+        self.in_time(since)
+        self.ask(command, Reading)
+        return since
+
+    @contextlib.contextmanager
+    def counting(self, **more: int) -> Iterator[None]:
+        """Compare how much counters rise meanwhile."""
+        before = self.counters()
+        yield
+        after = self.counters()
+        for name, wanted in more.items():
+            equal(f"counter {name}", getattr(after, name) - getattr(before, name), wanted)
 
     def command(self, u_in: float, u_out: int, age: int = 0) -> Command:
         """A command that rests on the reading of this moment, or on one ``age`` ms older."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +11,10 @@ import typer
 from ventbench.base import files
 from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
+    InProcess,
     JsonFile,
+    OneTrack,
+    PlantName,
     RecordingsDir,
     Workers,
     bar,
@@ -18,6 +22,7 @@ from ventbench.cli.options import (
     claim_out,
     emit,
     recordings_folder,
+    waiting,
     written_console,
 )
 
@@ -205,6 +210,50 @@ def networks(
     title = "Held-out open-loop MAE, cmH2O, and its change from the base, paired by breath"
     values = {"variants": table.to_dict("records")}
     _tell(values, title, table.set_index("variant"), out, json)
+
+
+@app.command()
+def adversary(
+    name: Annotated[
+        str,
+        typer.Argument(metavar="SUBMISSION", help="Folder or name of a bundled submission."),
+    ],
+    lung: Annotated[
+        list[str] | None,
+        typer.Option(help="Lung to search on; may be repeated. Default: all."),
+    ] = None,
+    stressor: Annotated[
+        list[str] | None,
+        typer.Option(help="Stressor that may act; may be repeated. Default: all, and the rig."),
+    ] = None,
+    track: OneTrack = None,
+    plant: PlantName = "frozen",
+    in_process: InProcess = False,
+    json: JsonFile = None,
+) -> None:
+    """Search for the mildest plausible physics that makes a controller unsafe.
+
+    Severity 0 is the rig in the middle of the population, 1 the end of the range: a stressor at its
+    strong strength, or a rig three standard deviations away; what acts together adds as squares.
+    The exit code is 1 if something unsafe was found.
+
+    Example: `python -m proofs study adversary pid_robust --lung R5C10`
+    """
+    from proofs.studies import adversary as work
+
+    with waiting(f"searching for what makes {name} unsafe"):
+        unsafe = work.adversary(
+            name,
+            simulator=plant,
+            track=track,
+            lungs=lung or (),
+            stressors=stressor or (),
+            sandbox=not in_process,
+        )
+    emit({"submission": name, "lungs": [asdict(critical) for critical in unsafe]}, json)
+    text = "\n".join(line for critical in unsafe for line in critical.lines())
+    typer.echo(text, err=str(json) == "-")
+    raise typer.Exit(int(any(critical.severity is not None for critical in unsafe)))
 
 
 def _check(only: list[str] | None, known: dict[str, Any]) -> None:

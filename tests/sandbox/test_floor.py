@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hardware_eval.results.evaluate import make_runner
+from proofs.studies.adversary import adversary
 from ventbench.board import official_runs
 from ventbench.cli import app
 from ventbench.entries import contract
@@ -84,6 +85,7 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
         lambda: contract.assert_ready("pid_best"),
         lambda: make_runner(sandbox=True),
         official_runs.sandboxed,
+        lambda: adversary("pid_robust", simulator="physics"),
         *(
             lambda words=words: CliRunner().invoke(app, words.split(), catch_exceptions=False)
             for words in (
@@ -91,7 +93,6 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
                 "score pid_best --plant physics",
                 "score pid_robust --stress 1",
                 "board transfer pid_best",
-                "adversary pid_robust --plant physics",
             )
         ),
     ],

@@ -29,7 +29,7 @@ listing = typer.Typer(
 
 #: Groups of `ventbench --help`, the commands of each, and where the commands of the groups belong.
 _PANELS = {
-    "Controllers": (score.score, score.new, score.check, score.adversary),
+    "Controllers": (score.score, score.new, score.check),
     "Recordings": (diagnose.diagnose, diagnose.mechanics, diagnose.isolability),
     "Simulators and pictures": (simulators.simulate, simulators.view, simulators.report),
     "This machine": (doctor.doctor,),

@@ -1,7 +1,6 @@
 """``ventbench score``, ``transfer``, ``new``, ``check``: work on submissions; and limits of scores.
 
-The limits are the bounds of any controller (``headroom``), and how little missing physics is too
-much (``stressors``, ``adversary``).
+The limits are the bounds of any controller (``headroom``).
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ventbench.base import files
 from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     Entries,
@@ -25,12 +23,10 @@ from ventbench.cli.options import (
     bar,
     claim_out,
     complete_entries,
-    complete_lungs,
     emit,
     map_entries,
     notes,
     table_of,
-    waiting,
     written_console,
 )
 
@@ -461,72 +457,3 @@ def entries(json: JsonFile = None) -> None:
     written_console({"entries": values}, json).print(
         table_of("Submissions that come with ventbench", columns, rows, left=columns)
     )
-
-
-def adversary(
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="SUBMISSION",
-            help="Folder or name of a bundled submission.",
-            autocompletion=complete_entries,
-        ),
-    ],
-    lung: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Lung to search on; may be repeated. Default: all.", autocompletion=complete_lungs
-        ),
-    ] = None,
-    stressor: Annotated[
-        list[str] | None,
-        typer.Option(help="Stressor that may act; may be repeated. Default: all, and the rig."),
-    ] = None,
-    track: OneTrack = None,
-    plant: PlantName = "frozen",
-    in_process: InProcess = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", callback=claim_out, help="Write adversary.json and adversary.txt here."
-        ),
-    ] = None,
-    json: JsonFile = None,
-) -> None:
-    """Search for the mildest plausible physics that makes a controller unsafe.
-
-    Severity 0 is the rig in the middle of the population, 1 the end of the range: a stressor at its
-    strong strength, or a rig three standard deviations away; what acts together adds as squares.
-    The exit code is 1 if something unsafe was found.
-
-    Example: `ventbench adversary pid_robust --lung R5C10`
-    """
-    from dataclasses import asdict
-
-    from ventbench.base import compilation
-    from ventbench.entries.adversary import adversary as search
-
-    compilation.keep()
-    with waiting(f"searching for what makes {name} unsafe"):
-        adversaries = search(
-            name,
-            simulator=plant,
-            track=track,
-            lungs=lung or (),
-            stressors=stressor or (),
-            sandbox=not in_process,
-        )
-    values = {
-        "submission": name,
-        "lungs": [asdict(adversary_of_lung) for adversary_of_lung in adversaries],
-    }
-    text = "\n".join(
-        line for adversary_of_lung in adversaries for line in adversary_of_lung.lines()
-    )
-    emit(values, json)
-    typer.echo(text, err=str(json) == "-")
-    if out is not None:
-        files.write_json(out / "adversary.json", values)
-        files.write_text(out / "adversary.txt", text + "\n")
-    if any(adversary_of_lung.severity is not None for adversary_of_lung in adversaries):
-        raise typer.Exit(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ventbench.entries.adversary import Found, Space, mildest
+from proofs.studies.adversary import Found, Space, mildest
 
 #: Coordinates: of the first two only one may act, the last two are correlated and have a sign.
 SIZE, CORRELATION = 12, 0.5

@@ -262,13 +262,6 @@ def adversary(
         SubmissionError: if there is no such submission, or it cannot be run on the track.
         SandboxError: if this machine cannot run submissions apart.
         InputError: if there are no such simulators, lungs or stressors.
-
-    Examples:
-        >>> from ventbench.entries.adversary import adversary
-        >>> (found,) = adversary(lambda o: 30.0, simulator="physics", lungs=["R20C10"],
-        ...                      stressors=["supply_high"])
-        >>> found.severity
-        0.0
     """
     entry, rigs = as_submission(submission), load_rigs(simulator)
     lines = tuple(stressor(name) for name in stressors) or STRESSORS

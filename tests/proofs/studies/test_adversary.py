@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from proofs.__main__ import app
+from proofs.studies.adversary import EDGE, RIG, _Bench, adversary
 from ventbench.base.errors import InputError
-from ventbench.cli import app
-from ventbench.entries.adversary import EDGE, RIG, _Bench, adversary
 from ventbench.entries.cells import InProcessRunner, PlantError, ProtocolRun
 from ventbench.entries.folder import as_submission
 from ventbench.physics.mechanism import VALVE_GAIN
@@ -28,19 +28,15 @@ R, C, PIP, LIMIT = 20.0, 50.0, 10.0, 25.0
 SEVERITY = 0.3
 
 
-def test_a_held_valve_is_unsafe_at_the_supply_that_algebra_says(
-    make, tmp_path, monkeypatch
-) -> None:
+def test_a_held_valve_is_unsafe_at_the_supply_that_algebra_says(make, monkeypatch) -> None:
     """A held flow Q gives PEEP + Q (R + t / C); the gate needs four samples, from t = 0.93 s on."""
-    monkeypatch.setattr(
-        "ventbench.entries.adversary.ROUNDS", 2
-    )  # one coordinate has no combinations
+    monkeypatch.setattr("proofs.studies.adversary.ROUNDS", 2)  # one coordinate has no combinations
     flow = (LIMIT - 5.0) / (R / 1e3 + 31 * 0.03 / C)
     u_in = flow / stressor("supply_high").strong ** SEVERITY / VALVE_GAIN
     entry = make(act=f"return {u_in!r}")
-    arguments = ["adversary", str(entry), "--lung", "R20C50", "--lung", "R5C50", "--plant"]
+    arguments = ["study", "adversary", str(entry), "--lung", "R20C50", "--lung", "R5C50", "--plant"]
     arguments += ["physics", "--stressor", "supply_high", "--in-process", "--json", "-"]
-    result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 1, result.output
     values = json.loads(result.stdout)
     unsafe, safe = (
@@ -54,10 +50,8 @@ def test_a_held_valve_is_unsafe_at_the_supply_that_algebra_says(
     highest = 5.0 + 1.5 * u_in * VALVE_GAIN * (5.0 / 1e3 + 0.93 / C)
     assert safe["severity"] is None
     assert safe["excess"] == pytest.approx(highest - LIMIT, abs=0.1)
-    text = (tmp_path / "out" / "adversary.txt").read_text()
-    assert "R5C50: nothing unsafe up to severity 1" in text
-    assert "  supply_high: gain x 1.1" in text
-    assert json.loads((tmp_path / "out" / "adversary.json").read_text()) == values
+    assert "R5C50: nothing unsafe up to severity 1" in result.stderr
+    assert "  supply_high: gain x 1.1" in result.stderr
 
 
 def test_rigs_are_as_far_from_the_middle_as_their_severity_says() -> None:
@@ -110,13 +104,13 @@ def test_physics_that_cannot_be_is_left_out(monkeypatch) -> None:
         failed, none = {(6,): Failure("act", "x")}, zero[..., :0]
         return ProtocolRun(pressure, zero, zero, none, None, failed, np.ones(1))
 
-    monkeypatch.setattr("ventbench.entries.adversary.step_through", run)
+    monkeypatch.setattr("proofs.studies.adversary.step_through", run)
     excess = bench._batch(points, pip).ravel()
     expected = np.full(12, 5.0 - LIMIT)
     expected[[2, 6, 11]] = 4.0, np.inf, -np.inf
     np.testing.assert_allclose(excess, expected)
     monkeypatch.setattr(
-        "ventbench.entries.adversary.step_through", lambda *_, **__: _raise(PlantError(3))
+        "proofs.studies.adversary.step_through", lambda *_, **__: _raise(PlantError(3))
     )
     with pytest.raises(PlantError):
         bench._batch(0.0 * points, pip)

@@ -94,7 +94,7 @@ def test_outside_a_checkout_the_last_rounds_board_is_shown(
     found = RUN.invoke(app, ["board", "show"])
     assert "no folder leaderboard here; the board of the last round, which came" in found.stderr
     assert "identify_plan" in found.stdout
-    assert "rehearsal-5: scored" in RUN.invoke(app, ["round", "show"]).stdout
+    assert "rehearsal-6: scored" in RUN.invoke(app, ["round", "show"]).stdout
     assert "there is no such folder; the published leaderboard" in run("verify", code=2)
     (tmp_path / "leaderboard").mkdir()
     assert "leaderboard holds no record" in run("show", code=2)

@@ -1,1 +1,0 @@
-{"key":"774ae618be6fad2e","record":"dda2cfaeeeef5088c32ee46ef37deaa8d4feaeb96847cf94c3dad7e8f981af3c","signature":"608ce61cacd5cc1f44e456aae69ea975365a7a0e4fb8b83ea8f17d08436324b8c7447d91803aa89f002cd3e58acb2731d3dc5d268311eb91e850bdcb0355070c"}

@@ -125,10 +125,10 @@ def mutations(folder: Path) -> Iterator[Mutation]:
 def test_every_mutation_of_a_published_board_is_named(
     published: Path, simulators, tmp_path: Path
 ) -> None:
-    kept: dict[Any, Any] = {}
+    memo: dict[Any, Any] = {}
 
     def problems(folder: Path) -> list[str]:
-        return verify(folder, lambda: simulators, kept=kept).problems
+        return verify(folder, lambda: simulators, memo=memo).problems
 
     copy = shutil.copytree(published, tmp_path / "leaderboard")
     assert problems(copy) == [], "control"

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MAX_FAILURES = 12
 
 #: Columns of the page's tables.
-SHOWN = [column for column in frames.COLUMNS if column.title]
+PAGE_COLUMNS = [column for column in frames.COLUMNS if column.title]
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,10 @@ def content(leaderboard: Store) -> dict[str, bytes]:
         canonical.CSV: frames.csv_text(tracks).encode(),
         canonical.INDEX: _index(environment, leaderboard, ranking.newest(tracks), "").encode(),
     }
-    for own in leaderboard.rounds:
-        of_round = [track for track in tracks if track.draws == own.name]
-        page = _index(environment, leaderboard, of_round, "../", own)
-        built[f"{canonical.ROUNDS}/{own.name}.html"] = page.encode()
+    for round_ in leaderboard.rounds:
+        of_round = [track for track in tracks if track.draws == round_.name]
+        page = _index(environment, leaderboard, of_round, "../", round_)
+        built[f"{canonical.ROUNDS}/{round_.name}.html"] = page.encode()
     for track in tracks:
         built.update(_entry_pages(environment, track, leaderboard.evidence))
     return built
@@ -95,13 +95,13 @@ def _index(
     leaderboard: Store,
     tracks: Sequence[Track],
     root: str,
-    own: Round | None = None,
+    round_: Round | None = None,
 ) -> str:
     """Return the page of the board, or that of a round; ``root`` leads to the page of the board."""
     lines = frames.lines(tracks)
     columns = _telling(lines)
     first = lines[0].row.record.figures if lines else None
-    shown = own or next((track.round for track in tracks if track.round), None)
+    page_round = round_ or next((track.round for track in tracks if track.round), None)
     header = lines[0].row.record.header if lines else None
     # Under missing physics, practice is shown only where nothing is ranked.
     of_first = [track for track in tracks if track.draws == tracks[0].draws] if tracks else []
@@ -115,16 +115,16 @@ def _index(
         aside=[_aside(line) for line in lines if line.status not in ("ranked", "practice")],
         simulators=flatten(header.simulators) if header else [],
         draws=header.draws if header else None,
-        stress=[pages.stress_shown(row) for row in stressed],
+        stress=[pages.stress_context(row) for row in stressed],
         chart=pages.stress_chart(stressed),
         records=len(leaderboard.records),
         hardware=[
-            {**pages.hardware_shown(row), "track": track.name}
+            {**pages.hardware_context(row), "track": track.name}
             for track in tracks
             for row in track.hardware
         ],
         protocol=protocol,
-        round=None if shown is None else _round(shown),
+        round=None if page_round is None else _round(page_round),
         rounds=[_round(x) for x in leaderboard.rounds],
         root=root,
     )
@@ -132,32 +132,33 @@ def _index(
 
 def _telling(lines: Sequence[Line]) -> list[Column]:
     """Columns of the page that do not say the same of every entry that is shown in its tables."""
-    shown = [line for line in lines if line.status in ("ranked", "practice")]
-    cells = {one.names[0]: [one.cell(line) for line in shown] for one in SHOWN}
+    listed = [line for line in lines if line.status in ("ranked", "practice")]
+    cells = {column.names[0]: [column.cell(line) for line in listed] for column in PAGE_COLUMNS}
     return [
-        one
-        for one in SHOWN
-        if len(shown) < 2 or any(cell != cells[one.names[0]][0] for cell in cells[one.names[0]])
+        column
+        for column in PAGE_COLUMNS
+        if len(listed) < 2
+        or any(cell != cells[column.names[0]][0] for cell in cells[column.names[0]])
     ]
 
 
-def _round(own: Round) -> dict[str, Any]:
+def _round(round_: Round) -> dict[str, Any]:
     """A round for the templates."""
-    frozen, result = own.frozen, own.result
+    frozen, result = round_.frozen, round_.result
     return {
-        "name": own.name,
-        "path": f"{canonical.ROUNDS}/{own.name}.html",
-        "state": own.state,
-        "rehearsal": own.opened.rehearsal,
-        "closes": f"{own.opened.closes:%Y-%m-%d %H:%M} UTC",
+        "name": round_.name,
+        "path": f"{canonical.ROUNDS}/{round_.name}.html",
+        "state": round_.state,
+        "rehearsal": round_.opened.rehearsal,
+        "closes": f"{round_.opened.closes:%Y-%m-%d %H:%M} UTC",
         "frozen": f"{frozen.frozen:%Y-%m-%d %H:%M:%S} UTC" if frozen else "",
-        "frozen_sha256": own.frozen_sha256,
-        "number": own.number if frozen else None,
-        "randomness": own.value.randomness if own.value else "",
+        "frozen_sha256": round_.frozen_sha256,
+        "number": round_.number if frozen else None,
+        "randomness": round_.value.randomness if round_.value else "",
         "entries": frozen.entries if frozen else [],
         "left_out": sorted(frozen.left_out.items()) if frozen else [],
         "failed": sorted(result.failed.items()) if result else [],
-        "notes": list(own.notes().items()),
+        "notes": list(round_.notes().items()),
     }
 
 
@@ -174,7 +175,7 @@ def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
                 "path": pages.address(row.record),
                 "baseline": row.record.name == BASELINES[track.name],
                 "plot": pages.interval_plot(row, low, high),
-                "hardware": None if measured is None else pages.hardware_shown(measured),
+                "hardware": None if measured is None else pages.hardware_context(measured),
             }
         )
     return {
@@ -204,30 +205,32 @@ def _entry_pages(
     """Return the pages of all entries of a track by their paths."""
     template = environment.get_template("entry.html.j2")
     base = track.baseline
-    other = None if base is None else pages.paths(base)
-    made: dict[str, bytes] = {}
+    baseline_paths = None if base is None else pages.paths(base)
+    rendered: dict[str, bytes] = {}
     for status, row in track.rows:
         name = row.record.name
         path = pages.address(row.record)
         same = base is not None and row.record.sha256 == base.sha256
         values = _values(Line(track, status, row), None if same else base, evidence)
-        drawn = pages.panels(pages.paths(row.record), None if same else other)
-        values["panels"] = [[pages.trusted(panel) for panel in lung] for lung in drawn]
-        measured = (own for own in track.hardware if own.record.name == name)
-        values["hardware"] = [pages.hardware_shown(own) for own in measured]
-        stressed = [own for own in track.stress if own.name == name]
-        values["stress"] = pages.stress_shown(stressed[0]) if stressed else None
+        panels = pages.panels(pages.paths(row.record), None if same else baseline_paths)
+        values["panels"] = [[pages.trusted(panel) for panel in lung] for lung in panels]
+        measured = (
+            hardware_row for hardware_row in track.hardware if hardware_row.record.name == name
+        )
+        values["hardware"] = [pages.hardware_context(hardware_row) for hardware_row in measured]
+        stressed = [stress_row for stress_row in track.stress if stress_row.name == name]
+        values["stress"] = pages.stress_context(stressed[0]) if stressed else None
         values["worst"] = pages.stress_order(stressed[0]) if stressed else []
         values["chart"] = pages.stress_chart(stressed)
         values["root"] = "../" * path.count("/")
-        made[path] = template.render(values).encode()
-    return made
+        rendered[path] = template.render(values).encode()
+    return rendered
 
 
 def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, Any]:
     track, status, row = line
     record, header, figures = row.record, row.record.header, row.record.figures
-    cells = {column.names[0]: column.cell(line) for column in SHOWN}
+    cells = {column.names[0]: column.cell(line) for column in PAGE_COLUMNS}
     return {
         "record": record,
         "content": header,
@@ -241,7 +244,7 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
         "cells": cells,
         "figures": [
             (column.title, cells[column.names[0]])
-            for column in SHOWN
+            for column in PAGE_COLUMNS
             if column.names[0] not in ("rank", "name", "normalised")
         ],
         "scaled": pages.heat_map(_ranking(figures, figures.normalised), pages.NORMALISED_LIMITS, 0),
@@ -267,14 +270,14 @@ def _ranking(figures: Figures, values: Floats) -> Floats:
 
 def _safety(record: Record) -> list[dict[str, Any]]:
     """A row a lung: highest pressure, longest time above the limit, whether the gate is passed."""
-    own = record.figures
-    highest, steps = own.peak.max(axis=(0, 2)), own.steps_above.max(axis=(0, 2))
+    figures = record.figures
+    highest, steps = figures.peak.max(axis=(0, 2)), figures.steps_above.max(axis=(0, 2))
     return [
         {
             "name": name,
             "peak": pages.figure(float(highest[i]), 1),
             "above": int(steps[i]),
-            "safe": bool(own.safe[i]),
+            "safe": bool(figures.safe[i]),
         }
         for i, name in enumerate(LUNG_IDS)
     ]
@@ -287,7 +290,7 @@ def _provenance(header: ScoreContent) -> list[tuple[str, list[tuple[str, str]]]]
         ("Where it came from", header.provenance),
         ("Files of the submission, SHA-256", submission.files),
         ("Simulators", header.simulators),
-        ("Draws", header.draws.about()),
+        ("Draws", header.draws.to_json()),
         ("Sandbox", header.sandbox or {"layers": "none: scored in the scorer's process"}),
         ("Machine", header.machine),
         ("Versions", header.versions),

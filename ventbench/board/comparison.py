@@ -160,32 +160,35 @@ def sources(commands: Sequence[Floats]) -> list[int | None]:
     if not commands:
         return []
     # A few runs tell most pairs apart; the others are looked at in full.
-    few = np.stack([own[:: max(1, len(own) // _FEW)] for own in commands])
-    found: list[int | None] = []
-    for k, own in enumerate(commands):
-        likely = np.mean(_apart(few[k], few[:k]) <= 2.0 * DISTANCE, axis=-1) >= 0.5 * FOLLOWING
+    few = np.stack([runs[:: max(1, len(runs) // _FEW)] for runs in commands])
+    indices: list[int | None] = []
+    for k, runs in enumerate(commands):
+        likely = (
+            np.mean(_relative_residual(few[k], few[:k]) <= 2.0 * DISTANCE, axis=-1)
+            >= 0.5 * FOLLOWING
+        )
         follows = (
             j
             for j in np.flatnonzero(likely).tolist()
-            if np.mean(_apart(own, commands[j]) <= DISTANCE) >= FOLLOWING
+            if np.mean(_relative_residual(runs, commands[j]) <= DISTANCE) >= FOLLOWING
         )
-        found.append(next(follows, None))
-    return found
+        indices.append(next(follows, None))
+    return indices
 
 
-def _apart(own: Floats, other: Floats) -> Floats:
-    """What is left of each run when another, times the factor that fits best, is taken off.
+def _relative_residual(commands: Floats, reference: Floats) -> Floats:
+    """What is left of commands less those of a reference, times the factor that fits best.
 
     Root mean square over that of the run, shape ``(..., runs)``, of ``(runs, steps)`` and
     ``(..., runs, steps)``.
     """
-    squares = [np.maximum((x**2).sum(axis=-1), _ROUNDING) for x in (own, other)]
-    product = np.einsum("rs,...rs->...r", own, other)
+    squares = [np.maximum((x**2).sum(axis=-1), _ROUNDING) for x in (commands, reference)]
+    product = np.einsum("rs,...rs->...r", commands, reference)
     return np.sqrt(np.maximum(1.0 - product**2 / (squares[0] * squares[1]), 0.0))
 
 
 def over_seeds(scores: Sequence[float]) -> Interval:
     """Interquartile mean of the scores of seeds, with its 95 % bootstrap interval over seeds."""
-    drawn = np.random.default_rng(_SEED).choice(np.sort(scores), (_RESAMPLES, len(scores)))
-    low, high = np.quantile(stats.trim_mean(drawn, 0.25, axis=1), (0.025, 0.975))
+    resamples = np.random.default_rng(_SEED).choice(np.sort(scores), (_RESAMPLES, len(scores)))
+    low, high = np.quantile(stats.trim_mean(resamples, 0.25, axis=1), (0.025, 0.975))
     return Interval(float(stats.trim_mean(scores, 0.25)), float(low), float(high))

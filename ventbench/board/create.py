@@ -93,8 +93,8 @@ def create(
     requested = [np.asarray(x) for x in of_runs]
     commands = tuple(map(store.encode, requested))
     described = [
-        {"sha256": canonical.digest(own), "bytes": len(own), "shape": list(x.shape)}
-        for own, x in zip(commands, requested, strict=True)
+        {"sha256": canonical.digest(encoded), "bytes": len(encoded), "shape": list(x.shape)}
+        for encoded, x in zip(commands, requested, strict=True)
     ]
     stress = None
     if stressed is not None:
@@ -127,47 +127,47 @@ def create(
         "timing": dict(score.timing),
     }
     draft = Draft(canonical.canonical(content), commands)
-    made = record.from_bytes(draft.content, f"the record of {label}")
-    assert isinstance(made, record.Record)
-    _require_replay(made, draft, score, simulators)
+    parsed = record.from_bytes(draft.content, f"the record of {label}")
+    assert isinstance(parsed, record.Record)
+    _require_replay(parsed, draft, score, simulators)
     return draft
 
 
 def _require_replay(
-    made: record.Record, draft: Draft, score: Score, simulators: ReplayPlants
+    parsed: record.Record, draft: Draft, score: Score, simulators: ReplayPlants
 ) -> None:
     """Refuse a record whose commands do not give the errors of the score again."""
-    label, header = score.submission.label, made.header
+    label, header = score.submission.label, parsed.header
     decoded = [
-        store.decode(content, own.shape, label)
-        for content, own in zip(draft.commands, made.commands, strict=True)
+        store.decode(content, commands.shape, label)
+        for content, commands in zip(draft.commands, parsed.commands, strict=True)
     ]
     under_stress = decoded[1] if len(decoded) > 1 else None
-    found = figures_of(header, decoded[0], under_stress, score.protocol, simulators)
-    if made.track == "robustness" and found.leak:
-        raise InputError(f"{label}, key commands: {found.leak}")
-    pairs = [("errors", np.concatenate([score.nominal[None], score.drawn]), found.error)]
-    if score.stressed is not None and found.stressed is not None:
-        pairs.append(("errors under stress", score.stressed.error, found.stressed.error))
-    for what, scored, replayed in pairs:
+    figures = figures_of(header, decoded[0], under_stress, score.protocol, simulators)
+    if parsed.track == "robustness" and figures.leak:
+        raise InputError(f"{label}, key commands: {figures.leak}")
+    pairs = [("errors", np.concatenate([score.nominal[None], score.drawn]), figures.error)]
+    if score.stressed is not None and figures.stressed is not None:
+        pairs.append(("errors under stress", score.stressed.error, figures.stressed.error))
+    for quantity, scored, replayed in pairs:
         off = np.abs(scored - replayed)
         if np.any(np.isnan(scored) != np.isnan(replayed)) or np.nanmax(off, initial=0) > TOLERANCE:
             raise InputError(
-                f"{label}: the score does not replay: its {what} differ by up to "
+                f"{label}: the score does not replay: its {quantity} differ by up to "
                 f"{np.nanmax(off, initial=0):.1e} cmH2O from those of its commands"
             )
 
 
 def versions() -> dict[str, str]:
     """Versions of Python and packages, and the hash of the lock file where there is one."""
-    known = package_versions()
+    installed = package_versions()
     for name in _PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
-            known[name] = metadata.version(name)
+            installed[name] = metadata.version(name)
     lock = Path(files.__file__).parent.resolve().parent.parent / "requirements.lock"
     if lock.is_file():
-        known["requirements.lock"] = files.sha256(lock)
-    return known
+        installed["requirements.lock"] = files.sha256(lock)
+    return installed
 
 
 def machine() -> dict[str, Any]:

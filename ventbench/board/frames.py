@@ -41,7 +41,7 @@ class Column:
     names: tuple[str, ...]
     #: of an entry: text, a number, None, or an :class:`~ventbench.base.interval.Interval`.
     value: Callable[[Line], Any]
-    about: str  #: what it is, with its unit; on the page as the hint of its heading.
+    description: str  #: what it is, with its unit; on the page as the hint of its heading.
     title: str = ""  #: heading on the page; empty where the page does not show it.
     digits: int = 3  #: that page and terminal show.
     #: whether it is a difference to another entry, of which less than zero is better.
@@ -101,9 +101,9 @@ def _compared(name: str) -> Callable[[Line], Interval | None]:
 
 def _held_out_gap(line: Line) -> float:
     """NaN in practice, where draws are on all rigs."""
-    own = line.row.record.figures
-    seen = own.training_values
-    return float(own.ranked_values.mean() - seen.mean()) if seen.size else math.nan
+    figures = line.row.record.figures
+    training = figures.training_values
+    return float(figures.ranked_values.mean() - training.mean()) if training.size else math.nan
 
 
 def _seeds(line: Line) -> Interval | None:
@@ -116,16 +116,20 @@ def _seeds(line: Line) -> Interval | None:
 
 
 def _stress(line: Line) -> Interval | None:
-    own = line.row.record.figures.stressed
-    return None if own is None else Interval(own.score, *own.interval(own.by_lung_and_draw))
+    stressed = line.row.record.figures.stressed
+    return (
+        None
+        if stressed is None
+        else Interval(stressed.score, *stressed.interval(stressed.by_lung_and_draw))
+    )
 
 
 def _of_stress(figure: Callable[[Any], Any], missing: Any = math.nan) -> Callable[[Line], Any]:
     """A figure of the stressed runs; ``missing`` where there are none."""
 
     def value(line: Line) -> Any:
-        own = line.row.record.figures.stressed
-        return missing if own is None else figure(own)
+        stressed = line.row.record.figures.stressed
+        return missing if stressed is None else figure(stressed)
 
     return value
 
@@ -348,9 +352,9 @@ def load_tracks(folder: Path | str | None = None, *, track: str | None = None) -
     return [tracks for tracks in ranking.board(leaderboard) if track in (None, tracks.name)]
 
 
-def folder_of(given: Path | str | None) -> Path:
+def folder_of(folder: Path | str | None) -> Path:
     """Folder of a leaderboard; for want of the usual one, that of the last round in the package."""
-    path = Path(given or FOLDER)
+    path = Path(folder or FOLDER)
     return files.leaderboard_folder() if path == FOLDER and not path.is_dir() else path
 
 
@@ -373,23 +377,23 @@ def markdown(tracks: Sequence[Track]) -> str:
     performance = ["performance", "rank", "error"]
     robustness = ["robustness", "rank", "stress", "runs survived"]
     titles = ["entry", *performance, *robustness]
-    shown = [line for line in lines(tracks) if line.status in ("ranked", "practice")]
+    listed = [line for line in lines(tracks) if line.status in ("ranked", "practice")]
     cells: dict[str, dict[str, list[str]]] = {}
-    for line in (x for x in shown if x.track.draws == shown[0].track.draws):
+    for line in (x for x in listed if x.track.draws == listed[0].track.draws):
         track, status, row = line
         ranks = f"{row.rank}" if status == "ranked" else status
         if several := _ranks(line):
             ranks += f" ({several})"
         stress, score = _stress(line), row.normalised and row.normalised.score
         if track.name == "performance":
-            told = [f"{row.error.value:.3f}" if row.error else ""]
+            secondary = [f"{row.error.value:.3f}" if row.error else ""]
         elif stress:
             survived = _of_stress(lambda t: t.survived_share)(line)
-            told = [f"{stress.value:.2f}", f"{100 * survived:.0f} %"]
+            secondary = [f"{stress.value:.2f}", f"{100 * survived:.0f} %"]
         else:
-            told = ["", ""]
+            secondary = ["", ""]
         text = f"**{score.value:.1f}** [{score.low:.1f}, {score.high:.1f}]" if score else ""
-        cells.setdefault(row.record.name, {})[track.name] = [text, ranks, *told]
+        cells.setdefault(row.record.name, {})[track.name] = [text, ranks, *secondary]
     table = [titles, ["---"] * len(titles)]
     table += [
         [

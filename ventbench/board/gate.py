@@ -79,13 +79,13 @@ def simulated(record: Record, evidence: Evidence) -> tuple[str, ...]:
         why.insert(0, "not official: its sandbox lacked a layer, or there was none")
     elif not evidence.official(record):
         why.insert(0, UNATTESTED)
-    own = evidence.rounds.get(record.header.draws.season)
-    if own is None:
+    round_ = evidence.rounds.get(record.header.draws.season)
+    if round_ is None:
         why.append(PRACTICE)
-    elif own.commitment != record.header.draws.sha256:
-        why.append(f"its draws are not those of round {own.name}")
-    elif not own.entered(record.name, record.track, record.header.submission.sha256):
-        why.append(f"its code was not frozen in round {own.name}")
+    elif round_.commitment != record.header.draws.sha256:
+        why.append(f"its draws are not those of round {round_.name}")
+    elif not round_.entered(record.name, record.track, record.header.submission.sha256):
+        why.append(f"its code was not frozen in round {round_.name}")
     return tuple(why)
 
 
@@ -244,8 +244,8 @@ def attested(folder: Path, records: Mapping[str, str | None]) -> tuple[frozenset
 
 def statements(folder: Path) -> list[Path]:
     """Files of a leaderboard that nothing binds but a signature: lists, results and notes."""
-    made = (path for name in canonical.SIGNED for path in sorted(folder.glob(name)))
-    plain = (path for path in made if path.is_file() and not path.is_symlink())
+    matches = (path for name in canonical.SIGNED for path in sorted(folder.glob(name)))
+    plain = (path for path in matches if path.is_file() and not path.is_symlink())
     return [path for path in plain if path.stat().st_size <= schema.MAX_BYTES]
 
 
@@ -281,13 +281,13 @@ def sign(folder: Path, signed: Path, secret: str) -> Path:
     private = _private(secret)
     public = private.public_key().public_bytes_raw()
     keys = {key.id: key for key in read_list(folder).keys}
-    own = keys.get(key_id(public))
-    if own is None or own.public != public.hex():
+    key = keys.get(key_id(public))
+    if key is None or key.public != public.hex():
         where = folder / ATTESTATIONS
         raise InputError(f"the public key of {SECRET}, {key_id(public)}, is not in {where}")
     sha256 = files.sha256(signed)
     signature = private.sign(_message(sha256)).hex()
-    content = canonical.canonical({"key": own.id, "record": sha256, "signature": signature})
+    content = canonical.canonical({"key": key.id, "record": sha256, "signature": signature})
     path = signature_path(signed)
     files.write_bytes(path, content)
     return path

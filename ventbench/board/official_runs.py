@@ -125,7 +125,7 @@ def rerun(
     board = store.load(folder)
     chosen = {store.find_record(board, sha256, Record).sha256 for sha256 in records}
     scores = [score for score in board.scores if not chosen or score.sha256 in chosen]
-    about = canonical.through_json(load().about())
+    identity = canonical.through_json(load().about())
     outcomes: dict[str, Outcome] = {}
     todo: dict[str, tuple[Any, ...]] = {}
 
@@ -136,7 +136,7 @@ def rerun(
 
     available = list(folders([folder.parent / "submissions", *sources]))
     for score in scores:
-        code, why = _code_of(score, available, about)
+        code, why = _code_of(score, available, identity)
         if code is None:
             note(Outcome(score.sha256, score.name, score.track, NOT_RERUN, why))
         else:
@@ -163,10 +163,10 @@ def _code_of(
     """Find the code that a record names by its hashes; else why it cannot be run again."""
     if score.header.simulators != simulators:
         return None, "it was scored on other simulators than those of this ventbench"
-    wanted = score.header.submission.files
+    hashes = score.header.submission.files
     for folder in available:
         # By its files first: hashing every folder for every record would take long.
-        if all((folder / name).is_file() for name in wanted) and file_hashes(folder) == wanted:
+        if all((folder / name).is_file() for name in hashes) and file_hashes(folder) == hashes:
             return folder, ""
     return None, "no folder at hand has the files that it names; give --source DIR"
 
@@ -183,25 +183,25 @@ def _run(
     assert isinstance(score, Record)
     simulators, apart = load(), runner()
     try:
-        own = store.load(folder).evidence.rounds.get(score.header.draws.season)
-        what = protocol_of(score.header, simulators, own)
+        round_ = store.load(folder).evidence.rounds.get(score.header.draws.season)
+        protocol_ = protocol_of(score.header, simulators, round_)
         with TemporaryDirectory() as place:
             result = run_protocol(
                 frozen_copy(code, score.header.submission.sha256, Path(place)),
-                what.rigs,
+                protocol_.rigs,
                 track=score.track,
                 stress=0 if score.header.stress is None else DRAWS,
                 runner=apart,
-                drawn=what.drawn,
+                drawn=protocol_.drawn,
             )
         runs = [(result.requested, result.failures, score.header.failures)]
         if (stress := score.header.stress) is not None and result.stressed is not None:
             again = result.stressed
             runs.append((np.asarray(again.requested), tuple(again.failures), stress.failures))
         detail, closest = "", []
-        for commands, (asked, failures, named) in zip(score.commands, runs, strict=True):
+        for commands, (requested, failures, named) in zip(score.commands, runs, strict=True):
             recorded = store.load_commands(commands, folder / RECORDS)
-            again = environment.resolved(asked)
+            again = environment.resolved(requested)
             detail = detail or difference(recorded, again)
             closest.append(_closeness(recorded, again))
             failed, before = (
@@ -253,39 +253,39 @@ SECONDS = {"performance": 13.0, "robustness": 58.0}
 Progress = Callable[[str, int, int], None]
 
 
-def plan(own: Round) -> list[tuple[str, str]]:
+def plan(round_: Round) -> list[tuple[str, str]]:
     """Name and track of every run of a round that has draws.
 
     Raises:
         InputError: if it is not drawn, or is scored already.
     """
-    if own.state != "drawn" or own.frozen is None:
-        raise InputError(f"round {own.name} is {own.state}; it is scored once it is drawn")
-    return [(entry.name, track) for entry in own.frozen.entries for track in entry.tracks]
+    if round_.state != "drawn" or round_.frozen is None:
+        raise InputError(f"round {round_.name} is {round_.state}; it is scored once it is drawn")
+    return [(entry.name, track) for entry in round_.frozen.entries for track in entry.tracks]
 
 
-def code_of(own: Round, places: Iterable[Path]) -> dict[str, Path]:
+def code_of(round_: Round, places: Iterable[Path]) -> dict[str, Path]:
     """Find the folder of every frozen entry by its hash.
 
     Raises:
         InputError: naming the entries whose code is not at hand.
     """
-    assert own.frozen is not None
-    wanted = {entry.name: entry.sha256 for entry in own.frozen.entries}
-    found: dict[str, Path] = {}
+    assert round_.frozen is not None
+    hashes = {entry.name: entry.sha256 for entry in round_.frozen.entries}
+    code: dict[str, Path] = {}
     for folder in folders(list(places)):
-        sha256 = wanted.get(folder.name)
+        sha256 = hashes.get(folder.name)
         if sha256 is not None and combined_hash(file_hashes(folder)) == sha256:
-            found.setdefault(folder.name, folder.resolve())
-    if missing := sorted(set(wanted) - set(found)):
+            code.setdefault(folder.name, folder.resolve())
+    if missing := sorted(set(hashes) - set(code)):
         raise InputError(
             f"the code of {', '.join(missing)}, as it was frozen, is not at hand; give --source DIR"
         )
-    return found
+    return code
 
 
 def bounds_of(
-    own: Round,
+    round_: Round,
     simulators: ReplayPlants,
     pool: Executor,
     folder: Path,
@@ -295,14 +295,14 @@ def bounds_of(
 ) -> Reference:
     """Best attainable and best PID of the draws of a round, with the PIDs of the protocol."""
     rigs = rigs_of(simulators)
-    drawn = own.draws(rigs)
-    plants, cells = rigs.cells(drawn, protocol.PIPS)
-    about = references.settings(rigs.about, drawn.about())
+    draws = round_.draws(rigs)
+    plants, cells = rigs.cells(draws, protocol.PIPS)
+    settings = references.settings(rigs.about, draws.about())
     return references.compute(
         plants,
         cells,
         np.array(references.PID_GAINS),
-        about,
+        settings,
         folder=folder,
         starts=starts,
         pool=pool,
@@ -335,15 +335,17 @@ def bound(
         InputError: if the round cannot be scored, or its bounds are of other draws.
         OSError: if a file cannot be read or written.
     """
-    own, simulators = _drawn(leaderboard, name), load()
-    if different := rounds.protocol_differences(own, simulators.about()):
+    round_, simulators = _load_scorable(leaderboard, name), load()
+    if different := rounds.protocol_differences(round_, simulators.about()):
         raise InputError(f"round {name} has another protocol: {', '.join(different)}")
-    if not (path := own.folder / BOUNDS).exists():
-        made = bounds_of(own, simulators, pool, work / "bounds", starts=starts, progress=progress)
-        made.save(path)
+    if not (path := round_.folder / BOUNDS).exists():
+        bounds = bounds_of(
+            round_, simulators, pool, work / "bounds", starts=starts, progress=progress
+        )
+        bounds.save(path)
     rigs = rigs_of(simulators)
-    references.reference_of(rigs.about, own.draws(rigs).about(), own.bounds())
-    return own
+    references.reference_of(rigs.about, round_.draws(rigs).about(), round_.bounds())
+    return round_
 
 
 def score(
@@ -381,28 +383,32 @@ def score(
             round.
         OSError: if a file cannot be read or written.
     """
-    tell = progress or (lambda what, done, count: None)
-    code = code_of(_drawn(leaderboard, name), list(places))
-    told = functools.partial(tell, "bounds of the draws")
-    own = bound(leaderboard, name, pool, work, load=load, starts=starts, progress=told)
-    bounds = files.sha256(own.folder / BOUNDS)
+    tell = progress or (lambda stage, completed, count: None)
+    code = code_of(_load_scorable(leaderboard, name), list(places))
+    bounds_progress = functools.partial(tell, "bounds of the draws")
+    round_ = bound(
+        leaderboard, name, pool, work, load=load, starts=starts, progress=bounds_progress
+    )
+    bounds = files.sha256(round_.folder / BOUNDS)
     chosen = sorted(set(code) & set(only or code))
     jobs = {
         entry: (leaderboard.resolve(), name, code[entry], work.resolve(), load, runner)
         for entry in chosen
-        if not (kept := _job(work, entry) / RESULT).exists() or not _left(kept, bounds)
+        if not (path := _job(work, entry) / RESULT).exists() or not _job_result(path, bounds)
     }
     count = len(chosen) - len(jobs)
     tell("entries and their seeds", count, len(chosen))
-    for done, _ in enumerate(results(pool, _score_entry, jobs), count + 1):
-        tell("entries and their seeds", done, len(chosen))
-    return own if only else close(leaderboard, name, work, load=load, secret=secret, progress=tell)
+    for completed, _ in enumerate(results(pool, _score_entry, jobs), count + 1):
+        tell("entries and their seeds", completed, len(chosen))
+    return (
+        round_ if only else close(leaderboard, name, work, load=load, secret=secret, progress=tell)
+    )
 
 
-def _drawn(leaderboard: Path, name: str) -> Round:
-    own = rounds.load(leaderboard, name)
-    plan(own)
-    return own
+def _load_scorable(leaderboard: Path, name: str) -> Round:
+    round_ = rounds.load(leaderboard, name)
+    plan(round_)
+    return round_
 
 
 def _job(work: Path, entry: str) -> Path:
@@ -410,14 +416,14 @@ def _job(work: Path, entry: str) -> Path:
     return work / f"entry-{entry}"
 
 
-def _left(path: Path, bounds: str) -> Result:
+def _job_result(path: Path, bounds: str) -> Result:
     """Read the result that the job of an entry has left; InputError if it is of other bounds."""
     if path.is_symlink():
         raise InputError(f"{path} is a link")
-    left = schema.read_canonical(rounds.RESULT_DECODER, path)
-    if left.bounds != bounds:
+    result = schema.read_canonical(rounds.RESULT_DECODER, path)
+    if result.bounds != bounds:
         raise InputError(f"{path} is of other draws or bounds; remove the folder")
-    return left
+    return result
 
 
 def _score_entry(
@@ -432,12 +438,12 @@ def _score_entry(
 
     Leaves its records, and its part of the result, in a folder of its own.
     """
-    own, simulators = rounds.load(leaderboard, name), load()
+    round_, simulators = rounds.load(leaderboard, name), load()
     rigs = rigs_of(simulators)
-    entry = next(x for x in own.frozen.entries if x.name == code.name) if own.frozen else None
+    entry = next(x for x in round_.frozen.entries if x.name == code.name) if round_.frozen else None
     assert entry is not None
-    drawn, bounds, apart = own.draws(rigs), own.bounds(), runner()
-    left, folder = Result(files.sha256(own.folder / BOUNDS), {}), _job(work, entry.name)
+    draws, bounds, apart = round_.draws(rigs), round_.bounds(), runner()
+    job_result, folder = Result(files.sha256(round_.folder / BOUNDS), {}), _job(work, entry.name)
     with TemporaryDirectory() as place:
         for track, seed in itertools.product(entry.tracks, ["", *(x.name for x in seeds(code))]):
             key = f"{entry.name} ({track})"
@@ -450,21 +456,21 @@ def _score_entry(
                     submission,
                     rigs,
                     track=track,
-                    drawn=drawn,
+                    drawn=draws,
                     reference=bounds,
                     stress=DRAWS if track == "robustness" and not seed else 0,
                     runner=apart,
                 )
                 if seed:
-                    left.seeds.setdefault(key, []).append(_of_seed(result))
+                    job_result.seeds.setdefault(key, []).append(_of_seed(result))
                     continue
-                about: Mapping[str, Any] = {"round": name, "frozen": own.frozen_sha256}
-                draft = create.create(result, simulators, source=about)
-                left.records[key] = draft.save(folder).stem
+                provenance: Mapping[str, Any] = {"round": name, "frozen": round_.frozen_sha256}
+                draft = create.create(result, simulators, source=provenance)
+                job_result.records[key] = draft.save(folder).stem
             except (InputError, FloatingPointError, OSError) as error:
                 why = str(error)[: schema.MAX_TEXT]
-                left.failed[f"{key}, seed {seed}" if seed else key] = why
-    files.write_bytes(folder / RESULT, canonical.canonical(msgspec.to_builtins(left)))
+                job_result.failed[f"{key}, seed {seed}" if seed else key] = why
+    files.write_bytes(folder / RESULT, canonical.canonical(msgspec.to_builtins(job_result)))
 
 
 def _of_seed(result: Score) -> float:
@@ -501,31 +507,31 @@ def close(
         InputError: if the round is not drawn, or the key is none of the leaderboard's.
         OSError: if a file cannot be written.
     """
-    own, simulators = _drawn(leaderboard, name), load()
-    assert own.frozen is not None
-    result = Result(files.sha256(own.folder / BOUNDS), {})
-    for done, entry in enumerate(own.frozen.entries):
+    round_, simulators = _load_scorable(leaderboard, name), load()
+    assert round_.frozen is not None
+    result = Result(files.sha256(round_.folder / BOUNDS), {})
+    for index, entry in enumerate(round_.frozen.entries):
         for track in entry.tracks:
             key, folder = f"{entry.name} ({track})", _job(work, entry.name)
             try:
-                left = _left(folder / RESULT, result.bounds)
-                if (sha256 := left.records.get(key)) is None:
-                    raise InputError(left.failed.get(key, "its job left no record"))
-                path = _take(leaderboard, folder, sha256, own, entry, track, simulators)
+                job_result = _job_result(folder / RESULT, result.bounds)
+                if (sha256 := job_result.records.get(key)) is None:
+                    raise InputError(job_result.failed.get(key, "its job left no record"))
+                path = _take(leaderboard, folder, sha256, round_, entry, track, simulators)
             except (InputError, OSError) as error:
                 result.failed[key] = str(error)[: schema.MAX_TEXT]
                 continue
             if secret:
                 gate.sign(leaderboard, path, secret)
             result.records[key] = sha256
-            result.seeds.update({x: y for x, y in left.seeds.items() if x == key})
-            seeds_failed = (x for x in left.failed if x.startswith(f"{key}, seed "))
-            result.failed.update({x: left.failed[x][: schema.MAX_TEXT] for x in seeds_failed})
+            result.seeds.update({x: y for x, y in job_result.seeds.items() if x == key})
+            seeds_failed = (x for x in job_result.failed if x.startswith(f"{key}, seed "))
+            result.failed.update({x: job_result.failed[x][: schema.MAX_TEXT] for x in seeds_failed})
         if progress is not None:
-            progress("records", done + 1, len(own.frozen.entries))
-    files.write_bytes(own.folder / RESULT, canonical.canonical(msgspec.to_builtins(result)))
+            progress("records", index + 1, len(round_.frozen.entries))
+    files.write_bytes(round_.folder / RESULT, canonical.canonical(msgspec.to_builtins(result)))
     if secret:
-        gate.sign(leaderboard, own.folder / RESULT, secret)
+        gate.sign(leaderboard, round_.folder / RESULT, secret)
     return rounds.load(leaderboard, name)
 
 
@@ -533,23 +539,23 @@ def _take(
     leaderboard: Path,
     folder: Path,
     sha256: str,
-    own: Round,
+    round_: Round,
     entry: Entered,
     track: str,
     simulators: ReplayPlants,
 ) -> Path:
     """Add the record that a job left, unless it is there; InputError if it is of anything else."""
     path = store.path_of(leaderboard, sha256)
-    left = path if path.exists() else folder / path.name
-    found = record.load(left)
-    if not isinstance(found, Record) or (
-        found.sha256,
-        found.name,
-        found.track,
-        found.header.submission.sha256,
-        found.header.draws.sha256,
-    ) != (sha256, entry.name, track, entry.sha256, own.commitment):
-        raise InputError(f"{left.name} is not the record of {entry.name} ({track}) in this round")
-    if left != path:
-        store.add(leaderboard, left, functools.partial(require_replay, simulators))
+    source = path if path.exists() else folder / path.name
+    candidate = record.load(source)
+    if not isinstance(candidate, Record) or (
+        candidate.sha256,
+        candidate.name,
+        candidate.track,
+        candidate.header.submission.sha256,
+        candidate.header.draws.sha256,
+    ) != (sha256, entry.name, track, entry.sha256, round_.commitment):
+        raise InputError(f"{source.name} is not the record of {entry.name} ({track}) in this round")
+    if source != path:
+        store.add(leaderboard, source, functools.partial(require_replay, simulators))
     return path

@@ -52,9 +52,9 @@ def environment() -> jinja2.Environment:
     Raises:
         InputError: if jinja2 is not installed.
     """
-    made = page_templates("ventbench.board", shown=_shown)
+    templates = page_templates("ventbench.board", shown=_printable)
     style, script = palette.css() + _asset("board.css"), _asset("board.js")
-    made.globals.update(
+    templates.globals.update(
         style=trusted(style),
         script=trusted(script),
         policy=(
@@ -62,7 +62,7 @@ def environment() -> jinja2.Environment:
             f"script-src 'sha256-{_hash(script)}'; base-uri 'none'; form-action 'none'"
         ),
     )
-    return made
+    return templates
 
 
 def address(record: Record) -> str:
@@ -86,7 +86,7 @@ def trusted(content: str) -> Any:
     return Markup(content)
 
 
-def _shown(value: Any) -> Any:
+def _printable(value: Any) -> Any:
     """A template's value in which nothing is invisible; escaping is the template's."""
     return plain(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
 
@@ -128,13 +128,13 @@ def step_time(timing: Mapping[str, Any]) -> float:
     return float(value) if good else math.nan  # type: ignore[arg-type]
 
 
-def hardware_of(made: Sequence[HardwareRow], name: str) -> HardwareRow | None:
+def hardware_of(rows: Sequence[HardwareRow], name: str) -> HardwareRow | None:
     """The row that stands for an entry: attested ones first, a physical lung before an emulator."""
-    counting = [row for row in made if row.newest and row.record.name == name]
+    counting = [row for row in rows if row.newest and row.record.name == name]
     return min(counting, key=lambda row: (bool(row.reasons), row.record.emulated), default=None)
 
 
-def hardware_shown(row: HardwareRow) -> dict[str, Any]:
+def hardware_context(row: HardwareRow) -> dict[str, Any]:
     """A hardware record for the templates."""
     record, header = row.record, row.record.header
     kind = "emulator" if record.emulated else header.device.name
@@ -181,7 +181,7 @@ def hardware_shown(row: HardwareRow) -> dict[str, Any]:
     }
 
 
-def stress_shown(row: StressRow) -> dict[str, Any]:
+def stress_context(row: StressRow) -> dict[str, Any]:
     """A row of the stress track for the templates."""
     figures = row.tables.headline()
     return {
@@ -210,34 +210,34 @@ def stress_order(row: StressRow) -> list[dict[str, str]]:
     Each has a ``title``, the ``rise`` with its 95 % interval ``small``, cmH2O, and the share of the
     runs that it leaves, ``survived``, %. A condition in which a run failed comes first.
     """
-    each = row.tables.by_condition[1:]
+    by_condition = row.tables.by_condition[1:]
 
-    def rise(own: dict[str, Any]) -> float:
-        return math.inf if own["rise_cmH2O"] is None else own["rise_cmH2O"]
+    def rise(figures: dict[str, Any]) -> float:
+        return math.inf if figures["rise_cmH2O"] is None else figures["rise_cmH2O"]
 
     lines = []
-    for own in sorted(each, key=rise, reverse=True)[:WORST]:
-        low, high = (_float(limit) for limit in own["rise_ci95"])
+    for figures in sorted(by_condition, key=rise, reverse=True)[:WORST]:
+        low, high = (_float(limit) for limit in figures["rise_ci95"])
         lines.append(
             {
-                "title": title_of(own["condition"]),
-                "rise": signed(_float(own["rise_cmH2O"]), 2),
+                "title": title_of(figures["condition"]),
+                "rise": signed(_float(figures["rise_cmH2O"]), 2),
                 "small": f"{signed(low, 2)} to {signed(high, 2)}" if math.isfinite(low) else "",
-                "survived": f"{100 * own['survived']:.0f}",
+                "survived": f"{100 * figures['survived']:.0f}",
             }
         )
     return lines
 
 
-def stress_chart(made: Sequence[StressRow]) -> list[dict[str, Any]]:
+def stress_chart(rows: Sequence[StressRow]) -> list[dict[str, Any]]:
     """Stressor by severity: groups of rows, with fields of entries under the same conditions.
 
     A group a category with ``title`` and ``rows``; a row has a ``title`` and ``fields``, for each
     entry one of each severity.
     """
-    if not made:
+    if not rows:
         return []
-    index = {condition: k for k, condition in enumerate(made[0].tables.conditions)}
+    index = {condition: k for k, condition in enumerate(rows[0].tables.conditions)}
     groups = []
     for category in CATEGORIES:
         names = dict.fromkeys(
@@ -247,7 +247,7 @@ def stress_chart(made: Sequence[StressRow]) -> list[dict[str, Any]]:
         )
         lines = [
             _chart_line(
-                stressor(name).title, [(Condition((name,), s), s) for s in SEVERITIES], made, index
+                stressor(name).title, [(Condition((name,), s), s) for s in SEVERITIES], rows, index
             )
             for name in names
         ]
@@ -255,7 +255,7 @@ def stress_chart(made: Sequence[StressRow]) -> list[dict[str, Any]]:
     pairs = [c for c in index if len(c.stressors) > 1]
     titles = [" + ".join(stressor(name).title for name in c.stressors) for c in pairs]
     lines = [
-        _chart_line(title, [(c, "mild"), (None, "")], made, index)
+        _chart_line(title, [(c, "mild"), (None, "")], rows, index)
         for title, c in zip(titles, pairs, strict=True)
     ]
     groups.append({"title": "Two at once, both mild", "rows": lines})
@@ -264,21 +264,21 @@ def stress_chart(made: Sequence[StressRow]) -> list[dict[str, Any]]:
 
 def title_of(condition: str) -> str:
     """A condition's id in words."""
-    for known in conditions():
-        if known.id == condition:
-            titles = " + ".join(stressor(name).title for name in known.stressors)
-            return f"{titles}, {known.severity}" if titles else "without stressor"
+    for candidate in conditions():
+        if candidate.id == condition:
+            titles = " + ".join(stressor(name).title for name in candidate.stressors)
+            return f"{titles}, {candidate.severity}" if titles else "without stressor"
     return condition
 
 
 def _chart_line(
     title: str,
     columns: Sequence[tuple[Condition | None, str]],
-    made: Sequence[StressRow],
+    rows: Sequence[StressRow],
     index: dict[Condition, int],
 ) -> dict[str, Any]:
     fields = []
-    for entry in made:
+    for entry in rows:
         for condition, severity in columns:
             at = None if condition is None else index.get(condition)
             fields.append(None if at is None else _field(entry, at, f"{title}, {severity}"))
@@ -286,9 +286,9 @@ def _chart_line(
 
 
 def _field(entry: StressRow, at: int, title: str) -> dict[str, Any]:
-    own = entry.tables.by_condition[at]
-    share, rise = own["survived"], _float(own["rise_cmH2O"])
-    unsafe = own["unsafe_runs"]
+    figures = entry.tables.by_condition[at]
+    share, rise = figures["survived"], _float(figures["rise_cmH2O"])
+    unsafe = figures["unsafe_runs"]
     return {
         "share": f"{100 * share:.0f}",
         "rise": number(rise, 1, sign=True) if math.isfinite(rise) else NONE,
@@ -387,7 +387,7 @@ def frame(pip: float) -> str:
 
 
 def panels(
-    own: list[list[tuple[str, str]]], pid: list[list[tuple[str, str]]] | None
+    traces: list[list[tuple[str, str]]], pid: list[list[tuple[str, str]]] | None
 ) -> list[list[str]]:
     """What is drawn in each panel, as SVG of numbers only; a template would take ten times as long.
 
@@ -403,7 +403,7 @@ def panels(
             + f'<path class="p own" d="{pressure}"/><path class="u own" d="{valve}"/>'
             for j, (pressure, valve) in enumerate(row)
         ]
-        for i, row in enumerate(own)
+        for i, row in enumerate(traces)
     ]
 
 

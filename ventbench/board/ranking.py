@@ -174,9 +174,9 @@ def board(leaderboard: Store) -> tuple[Track, ...]:
     evidence = leaderboard.evidence
     grouped: dict[tuple[str, str], dict[str, list[Record]]] = defaultdict(dict)
     for record in (x for x in leaderboard.scores if x.derived):
-        drawn = record.header.draws.season
-        own = grouped[drawn if drawn in evidence.rounds else DEVELOPMENT, record.track]
-        own.setdefault(record.name, []).insert(0, record)
+        season = record.header.draws.season
+        histories = grouped[season if season in evidence.rounds else DEVELOPMENT, record.track]
+        histories.setdefault(record.name, []).insert(0, record)
     tracks = [
         _track(leaderboard, draws, name, grouped[draws, name], evidence)
         for draws in (*evidence.rounds, DEVELOPMENT)
@@ -204,7 +204,7 @@ def _track(
     evidence: Evidence,
 ) -> Track:
     """Sort the entries of a track: ranked, not ranked, not official."""
-    own = evidence.rounds.get(draws)
+    round_ = evidence.rounds.get(draws)
     placed: dict[str, list[Entry]] = defaultdict(list)
     for _, history in sorted(histories.items()):
         # The one that is not withdrawn; nobody takes an official one's place.
@@ -212,18 +212,18 @@ def _track(
             history, key=lambda x: (x.sha256 in evidence.withdrawn, not evidence.official(x))
         )
         why = gate.simulated(record, evidence)
-        if own is None:
+        if round_ is None:
             why = tuple(reason for reason in why if reason != gate.PRACTICE)
         kind = "unranked" if why else "ranked"
         kind = kind if evidence.official(record) else "unofficial"
         placed[kind].append(Entry(record, tuple(history), why))
-    ranked = rank(derived(leaderboard, placed["ranked"]), name, ranks=own is not None)
+    ranked = rank(derived(leaderboard, placed["ranked"]), name, ranks=round_ is not None)
     records = [row.record for row in ranked]
     base = _baseline(records, name)
     return Track(
         name=name,
         draws=draws,
-        round=own,
+        round=round_,
         ranked=tuple(ranked),
         unranked=tuple(_unranked_rows(placed["unranked"])),
         unofficial=tuple(_unranked_rows(placed["unofficial"])),
@@ -240,8 +240,8 @@ def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:
     """
     frozen = [x.frozen for x in leaderboard.evidence.rounds.values() if x.frozen]
     first: dict[str, int] = {}
-    for own in sorted(frozen, key=lambda x: x.frozen):
-        for entered in own.entries:
+    for frozen_round in sorted(frozen, key=lambda x: x.frozen):
+        for entered in frozen_round.entries:
             first.setdefault(entered.sha256, len(first))
 
     def place(entry: Entry) -> tuple[bool, int]:
@@ -250,10 +250,10 @@ def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:
         return record.name not in BASELINES.values(), first.get(code, len(first))
 
     order = sorted(entries, key=place)
-    found = comparison.sources([_commands(leaderboard, x.record) for x in order])
+    sources = comparison.sources([_commands(leaderboard, x.record) for x in order])
     return [
         entry if at is None else replace(entry, source=order[at].record.name)
-        for entry, at in zip(order, found, strict=True)
+        for entry, at in zip(order, sources, strict=True)
     ]
 
 
@@ -275,13 +275,13 @@ def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Ro
         return []
     records = [entry.record for entry in ordered]
     rig = records[0].figures.rig[:, records[0].figures.ranked]
-    made = _ranks(ordered, [record.figures.ranked_values for record in records], rig, POINTS)
+    computed = _ranks(ordered, [record.figures.ranked_values for record in records], rig, POINTS)
     compared = _comparisons(records, _baseline(records, track))
     rows = []
     for i, entry in enumerate(ordered):
-        may = (int(made.best[i]), int(made.worst[i]))
-        own = (int(made.rank[i]), may) if ranks else (None, None)
-        rows.append(_row(entry, *own, compared[i]))
+        may = (int(computed.best[i]), int(computed.worst[i]))
+        placement = (int(computed.rank[i]), may) if ranks else (None, None)
+        rows.append(_row(entry, *placement, compared[i]))
     return rows
 
 
@@ -308,13 +308,13 @@ def _comparisons(records: Sequence[Record], base: int | None) -> list[Comparison
     values = [record.figures.ranked_values for record in records]
     means = [_resampled(*pair) for pair in zip(records, values, strict=True)]
     compared = []
-    for i, own in enumerate(values):
+    for i, scores in enumerate(values):
         to_baseline = to_above = None
         if base is not None and base != i:
-            to_baseline = _interval(own - values[base], means[i] - means[base])
+            to_baseline = _interval(scores - values[base], means[i] - means[base])
         if i:
-            to_above = _interval(own - values[i - 1], means[i] - means[i - 1])
-        compared.append(Comparison(_interval(own, means[i]), to_baseline, to_above))
+            to_above = _interval(scores - values[i - 1], means[i] - means[i - 1])
+        compared.append(Comparison(_interval(scores, means[i]), to_baseline, to_above))
     return compared
 
 
@@ -322,9 +322,9 @@ def _unranked_rows(entries: Sequence[Entry]) -> list[Row]:
     """Rows of entries that are not ranked, by name; scores where they exist."""
     rows = []
     for entry in sorted(entries, key=lambda e: e.record.name):
-        whole = np.isfinite(entry.record.figures.drawn).all()
+        complete = np.isfinite(entry.record.figures.drawn).all()
         rows.append(
-            _row(entry, None, None, _comparisons([entry.record], None)[0] if whole else None)
+            _row(entry, None, None, _comparisons([entry.record], None)[0] if complete else None)
         )
     return rows
 
@@ -346,8 +346,8 @@ def worst(record: Record) -> tuple[float, str, float]:
 
 def _resampled(record: Record, values: Floats) -> Floats:
     """Resampled means of values of shape ``(L, k)``: the same ranked draws for every record."""
-    own, some = record.figures, record.figures.ranked
-    return bootstrap.resampled_scores(values, own.rig[:, some], own.member[:, some])
+    figures, some = record.figures, record.figures.ranked
+    return bootstrap.resampled_scores(values, figures.rig[:, some], figures.member[:, some])
 
 
 def _interval(values: Floats, means: Floats) -> Interval:
@@ -356,46 +356,46 @@ def _interval(values: Floats, means: Floats) -> Interval:
 
 def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:
     """Entries that ran under the newest table of stressors, best first; others are left out."""
-    ran = [(row, own) for row in rows if (own := row.record.figures.stressed) is not None]
-    alike = [StressRow(row, own) for row, own in ran]
-    whole = [row for row in alike if math.isfinite(row.tables.score)]
-    if not whole:
-        return alike
-    fit = [row for row in whole if not gate.stressed(row.row.record, evidence)]
+    ran = [(row, runs) for row in rows if (runs := row.record.figures.stressed) is not None]
+    stress_rows = [StressRow(row, runs) for row, runs in ran]
+    complete = [row for row in stress_rows if math.isfinite(row.tables.score)]
+    if not complete:
+        return stress_rows
+    fit = [row for row in complete if not gate.stressed(row.row.record, evidence)]
     ranks = {}
     if fit:
         values = [row.tables.by_lung_and_draw for row in fit]
-        made = _ranks([row.row.entry for row in fit], values, fit[0].tables.rig, CMH2O)
+        computed = _ranks([row.row.entry for row in fit], values, fit[0].tables.rig, CMH2O)
         for i, row in enumerate(fit):
-            ranks[row.name] = int(made.rank[i]), (int(made.best[i]), int(made.worst[i]))
-    shown = []
-    for row in whole:
+            ranks[row.name] = int(computed.rank[i]), (int(computed.best[i]), int(computed.worst[i]))
+    scored = []
+    for row in complete:
         low, high = row.tables.interval(row.tables.by_lung_and_draw)
         score = Interval(row.tables.score, low, high)
-        own, may = ranks.get(row.name, (None, None))
-        shown.append(replace(row, score=score, rank=own, ranks=may))
-    shown.sort(key=lambda row: (row.tables.score, row.name))
-    return shown + [row for row in alike if not math.isfinite(row.tables.score)]
+        place, may = ranks.get(row.name, (None, None))
+        scored.append(replace(row, score=score, rank=place, ranks=may))
+    scored.sort(key=lambda row: (row.tables.score, row.name))
+    return scored + [row for row in stress_rows if not math.isfinite(row.tables.score)]
 
 
 def _hardware_rows(leaderboard: Store, track: Track) -> tuple[HardwareRow, ...]:
     """Rows of a track's hardware records, newest first."""
     evidence = leaderboard.evidence
     simulated = {row.record.name: row for _, row in reversed(track.rows)}
-    made: list[HardwareRow] = []
-    seen: set[tuple[str, bool]] = set()
+    rows: list[HardwareRow] = []
+    vouched_entries: set[tuple[str, bool]] = set()
     for record in reversed(leaderboard.records):
         if not isinstance(record, HardwareRecord) or record.track != track.name:
             continue
         # Nobody takes a vouched-for record's place by one that nobody vouches for.
         key = (record.name, record.emulated)
-        newest = record.sha256 not in evidence.withdrawn and key not in seen
+        newest = record.sha256 not in evidence.withdrawn and key not in vouched_entries
         if newest and record.sha256 in evidence.vouched:
-            seen.add(key)
+            vouched_entries.add(key)
         row = simulated.get(record.name)
         why = gate.measured(record, evidence)
-        made.append(HardwareRow(record, why, newest, row, _nominal(record, row)))
-    return tuple(_hardware_rank(row, made) for row in made)
+        rows.append(HardwareRow(record, why, newest, row, _nominal(record, row)))
+    return tuple(_hardware_rank(row, rows) for row in rows)
 
 
 def _nominal(record: HardwareRecord, row: Row | None) -> float:
@@ -409,9 +409,11 @@ def _nominal(record: HardwareRecord, row: Row | None) -> float:
 
 
 def _hardware_rank(row: HardwareRow, all_rows: Sequence[HardwareRow]) -> HardwareRow:
-    own = row.comparable
-    if own is None:
+    comparable = row.comparable
+    if comparable is None:
         return row
-    scores = [round(x.record.score, _MEASURED_DECIMALS) for x in all_rows if x.comparable == own]
+    scores = [
+        round(x.record.score, _MEASURED_DECIMALS) for x in all_rows if x.comparable == comparable
+    ]
     mine = round(row.record.score, _MEASURED_DECIMALS)
     return replace(row, rank=1 + sum(score < mine for score in scores), count=len(scores))

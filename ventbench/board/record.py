@@ -32,7 +32,7 @@ TRACK = "hardware"
 _ROUNDED = 0.001
 
 #: Most of the way from PEEP to PIP that a lung may be before the first command acts.
-_HALF_WAY = 0.5
+_MAX_INITIAL_SHARE = 0.5
 
 #: Most repetitions of one cell.
 MAX_REPEATS = 100
@@ -85,7 +85,7 @@ class Record(schema.Submitted):
         """Simulators and draws, which its figures depend on besides commands, as canonical text."""
         simulators, draws = (
             canonical.canonical(value).decode()
-            for value in (self.header.simulators, self.header.draws.about())
+            for value in (self.header.simulators, self.header.draws.to_json())
         )
         return simulators, draws
 
@@ -253,8 +253,8 @@ def load(path: Path, *, strict: bool = True) -> AnyRecord:
 
 def withdrawal(withdraws: str, reason: str) -> bytes:
     """Return the bytes of a record that takes another one, named by its SHA-256, back."""
-    about = {"format": schema.FORMAT, "kind": "withdrawal", "created": timestamp()}
-    return canonical.canonical({**about, "withdraws": withdraws, "reason": reason})
+    header = {"format": schema.FORMAT, "kind": "withdrawal", "created": timestamp()}
+    return canonical.canonical({**header, "withdraws": withdraws, "reason": reason})
 
 
 def timestamp(now: datetime | None = None) -> str:
@@ -274,7 +274,7 @@ def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecor
     schema.check_free(content.device.about, f"{label}, key device.about")
     _check_tables(content, label)
     errors, missing = np.array(content.errors, float), set()
-    seen: set[bytes] = set()
+    breath_bytes: set[bytes] = set()
     for at, lung in enumerate(content.lungs):
         highest, safe = -np.inf, True
         for j, k in np.ndindex(*errors.shape[1:]):
@@ -289,26 +289,26 @@ def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecor
             pressure = np.array(run, float) / 1000.0
             if why := measured.too_few(pressure):
                 raise InputError(f"{label}, key trace: {where}: {why}")
-            given = measured.mean_error(pressure, pip)
-            if abs(given - recorded) > _ROUNDED:
+            computed = measured.mean_error(pressure, pip)
+            if abs(computed - recorded) > _ROUNDED:
                 raise InputError(
                     f"{label}, key errors: {where} says {recorded:.4f} cmH2O, its pressures give "
-                    f"{given:.4f}"
+                    f"{computed:.4f}"
                 )
             highest = max(highest, measured.highest(pressure))
             safe &= bool(np.all(measured.is_safe(pressure, pip, protocol.DT)))
             first = float(np.abs(pressure[:, 0] - protocol.PEEP).max())
-            if first > _HALF_WAY * (pip - protocol.PEEP):
+            if first > _MAX_INITIAL_SHARE * (pip - protocol.PEEP):
                 raise InputError(
                     f"{label}, key trace: {where} begins {first:.1f} cmH2O from PEEP, before any "
                     "command acts"
                 )
             for breath in pressure:
-                if breath.tobytes() in seen and not content.device.emulated:
+                if breath.tobytes() in breath_bytes and not content.device.emulated:
                     raise InputError(
                         f"{label}, key trace: {where} repeats a breath to the last digit"
                     )
-                seen.add(breath.tobytes())
+                breath_bytes.add(breath.tobytes())
         if content.peak_pressure_cmH2O[at] < highest - _ROUNDED:
             raise InputError(
                 f"{label}, key peak_pressure_cmH2O: {lung} says "

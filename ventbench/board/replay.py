@@ -74,7 +74,7 @@ class ReplayPlants(Protocol):
 Load = Callable[[], ReplayPlants]
 
 #: What was derived before, by hashes of all that it follows from.
-Kept = dict[Any, Any]
+Memo = dict[Any, Any]
 
 
 @jax.jit
@@ -109,18 +109,20 @@ def run_of(cells: Cells, commands: Floats) -> ProtocolRun:
     with compilation.float64():
         if conditions == 1:
             plants = [as_float64(cells.plants, lungs)] * protocol.BREATHS
-            found = _breaths(plants, cells.scenario, commands[0])
-            parts = [jax.tree.map(lambda x: x[None], found)]
+            phases = _breaths(plants, cells.scenario, commands[0])
+            parts = [jax.tree.map(lambda x: x[None], phases)]
         else:
             for draw in range(len(cells.draw)):
                 plants, scenario = cells.stressed(draw)
-                each = [
+                breath_plants = [
                     jax.tree.map(lambda x, k=k: x[:, k], plants) for k in range(protocol.BREATHS)
                 ]
-                own = commands[:, :, draw, 0].reshape(conditions * lungs, *commands.shape[4:])
-                found = _breaths(each, scenario, own)
+                draw_commands = commands[:, :, draw, 0].reshape(
+                    conditions * lungs, *commands.shape[4:]
+                )
+                phases = _breaths(breath_plants, scenario, draw_commands)
                 parts.append(
-                    jax.tree.map(lambda x: x.reshape(conditions, lungs, 1, 1, *x.shape[1:]), found)
+                    jax.tree.map(lambda x: x.reshape(conditions, lungs, 1, 1, *x.shape[1:]), phases)
                 )
     inspired, expired = jax.tree.map(lambda *x: np.concatenate(x, axis=2), *parts)
     return ProtocolRun(
@@ -166,17 +168,21 @@ def _failed(failures: Sequence[RecordedFailure], cells: Cells) -> list[tuple[int
     """
     conditions = [condition.id for condition in cells.conditions]
     lungs, draws = [lung.id for lung in cells.lungs], cells.draw.tolist()
-    found = []
-    for one in failures:
+    indices = []
+    for failure in failures:
         try:
-            at = conditions.index(one.condition), lungs.index(one.lung), draws.index(one.draw or 0)
-            found.append((*at, cells.pips[at[1], at[2]].tolist().index(one.pip)))
+            at = (
+                conditions.index(failure.condition),
+                lungs.index(failure.lung),
+                draws.index(failure.draw or 0),
+            )
+            indices.append((*at, cells.pips[at[1], at[2]].tolist().index(failure.pip)))
         except ValueError:
             raise InputError(
-                f"key failures: there is no cell {one.condition}, {one.lung}, PIP {one.pip:g}, "
-                f"draw {one.draw}"
+                f"key failures: there is no cell {failure.condition}, {failure.lung}, "
+                f"PIP {failure.pip:g}, draw {failure.draw}"
             ) from None
-    return found
+    return indices
 
 
 def _runs(cells: Cells, commands: Floats, failures: Sequence[RecordedFailure]) -> Any:
@@ -191,7 +197,7 @@ def figures_of(
     content: ScoreContent,
     commands: Floats,
     stressed: Floats | None,
-    what: scored.Protocol,
+    protocol_: scored.Protocol,
     simulators: ReplayPlants,
 ) -> Figures:
     """Derive the figures of a record.
@@ -200,33 +206,33 @@ def figures_of(
         content: of the record.
         commands: %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
         stressed: commands under missing physics, %; None without.
-        what: cells and bounds of its draws.
+        protocol_: cells and bounds of its draws.
         simulators: that they are of.
 
     Raises:
         InputError: if it names a cell that is not there, or there are no bounds of its draws.
     """
-    run, runs = _runs(what.cells, commands, content.failures)
+    run, runs = _runs(protocol_.cells, commands, content.failures)
     under_stress = None
-    if stressed is not None and what.stressed is not None and content.stress is not None:
-        _, under_stress = _runs(what.stressed, stressed, content.stress.failures)
-    if what.reference is None or what.drawn is None:
+    if stressed is not None and protocol_.stressed is not None and content.stress is not None:
+        _, under_stress = _runs(protocol_.stressed, stressed, content.stress.failures)
+    if protocol_.reference is None or protocol_.drawn is None:
         raise InputError("key draws: there are no reference errors of these simulators and draws")
-    size = what.cells.pips.shape
+    size = protocol_.cells.pips.shape
     failed = np.isnan(runs.error[0]).reshape(size)
-    pip = np.asarray(what.cells.scenario.pip)[..., None, None]
+    pip = np.asarray(protocol_.cells.scenario.pip)[..., None, None]
     above = np.sum(run.breaths[0] > safety_limit(pip), axis=-1).max(axis=-1)
 
     def by_draw(values: Any) -> Any:
         return np.moveaxis(np.asarray(values).reshape(size), 1, 0)
 
     controllable = np.where(failed, np.nan, controllable_error(run.pressure[0], pip))
-    disagreement = spread(simulators, what.pips, commands[:, 0])
+    disagreement = spread(simulators, protocol_.pips, commands[:, 0])
     return Figures(
         error=by_draw(runs.error[0]),
         controllable=by_draw(controllable),
-        attainable=by_draw(what.reference.attainable),
-        pid=by_draw(what.reference.pid),
+        attainable=by_draw(protocol_.reference.attainable),
+        pid=by_draw(protocol_.reference.pid),
         peak=by_draw(runs.peak[0]),
         steps_above=by_draw(above),
         safe=runs.safe[0].all(axis=-1),
@@ -234,38 +240,38 @@ def figures_of(
         pressure=run.pressure[0, :, 0, :, TRACE_BREATH],
         u_in=run.u_in[0, :, 0, :, TRACE_BREATH],
         first=np.where(failed[:, 0], np.nan, commands[:, 0, :, 0, 0]),
-        rig=what.drawn.rig,
-        member=what.drawn.member,
+        rig=protocol_.drawn.rig,
+        member=protocol_.drawn.member,
         stressed=under_stress,
     )
 
 
-def draws_of(header: ScoreContent, simulators: ReplayPlants, own: Round | None) -> Draws:
+def draws_of(header: ScoreContent, simulators: ReplayPlants, round_: Round | None) -> Draws:
     """Make the draws that a record names again: the development draws, or those of its round.
 
     Raises:
         InputError: if they are neither.
     """
     rigs = rigs_of(simulators)
-    drawn = rigs.draws(draw_tables.COUNT) if own is None else own.draws(rigs)
-    if drawn.about() != header.draws.about():
+    draws = rigs.draws(draw_tables.COUNT) if round_ is None else round_.draws(rigs)
+    if draws.about() != header.draws.to_json():
         raise InputError("key draws: neither the development draws nor those of a round")
-    return drawn
+    return draws
 
 
 def protocol_of(
-    header: ScoreContent, simulators: ReplayPlants, own: Round | None
+    header: ScoreContent, simulators: ReplayPlants, round_: Round | None
 ) -> scored.Protocol:
     """Cells and bounds of the draws that a record names; arguments as of :func:`draws_of`.
 
     Raises:
         InputError: if there are none.
     """
-    rigs, drawn = rigs_of(simulators), draws_of(header, simulators, own)
+    rigs, draws = rigs_of(simulators), draws_of(header, simulators, round_)
     reference = reference_of(
-        rigs.about, drawn.about(), published() if own is None else own.bounds()
+        rigs.about, draws.about(), published() if round_ is None else round_.bounds()
     )
-    return scored.protocol_of(rigs, drawn=drawn, stress=DRAWS, reference=reference)
+    return scored.protocol_of(rigs, drawn=draws, stress=DRAWS, reference=reference)
 
 
 def with_figures(
@@ -275,7 +281,7 @@ def with_figures(
     *,
     note: Callable[[str], object] = lambda text: None,
     progress: Callable[[int, int], None] | None = None,
-    kept: Kept | None = None,
+    memo: Memo | None = None,
     cached: bool = False,
 ) -> Store:
     """Derive the figures of all records of a leaderboard.
@@ -286,19 +292,19 @@ def with_figures(
         problem: told why a record has none, and of a record whose lung was known.
         note: told whose stressed commands are not at hand.
         progress: called after each record.
-        kept: what earlier calls of this process derived.
+        memo: what earlier calls of this process derived; adds to it.
         cached: read the user's cache, and write to it.
     """
-    kept = {} if kept is None else kept
-    made: dict[str, Record] = {}
+    memo = {} if memo is None else memo
+    replayed: dict[str, Record] = {}
     simulators = loaded(load, problem) if leaderboard.scores else None
     for at, record in enumerate(leaderboard.scores if simulators else ()):
         assert simulators is not None
         path = store.path_of(leaderboard.folder, record.sha256)
         try:
-            own = leaderboard.evidence.rounds.get(record.header.draws.season)
+            round_ = leaderboard.evidence.rounds.get(record.header.draws.season)
             folder = leaderboard.folder / RECORDS
-            derived = derived_of(record, folder, simulators, own, kept, cached=cached)
+            derived = derived_of(record, folder, simulators, round_, memo, cached=cached)
         except (InputError, OSError) as error:
             problem(str(error) if str(error).startswith(str(path.parent)) else f"{path}, {error}")
             continue
@@ -306,10 +312,10 @@ def with_figures(
             problem(f"{path}, key commands: {derived.leak}")
         if record.header.stress is not None and derived.stressed is None:
             note(f"{path}: its stressed commands are not at hand; it has no stress rank")
-        made[record.sha256] = dataclasses.replace(record, derived=derived)
+        replayed[record.sha256] = dataclasses.replace(record, derived=derived)
         if progress is not None:
             progress(at + 1, len(leaderboard.scores))
-    records = tuple(made.get(entry.sha256, entry) for entry in leaderboard.records)
+    records = tuple(replayed.get(entry.sha256, entry) for entry in leaderboard.records)
     return dataclasses.replace(leaderboard, records=records)
 
 
@@ -329,13 +335,13 @@ def load(folder: Path, simulators: Load | None = None) -> Store:
         store.load(folder),
         simulators or frozen.load,
         problem,
-        kept=_KEPT,
+        memo=_MEMO,
         cached=simulators is None,
     )
 
 
 #: Figures of this process.
-_KEPT: Kept = {}
+_MEMO: Memo = {}
 
 
 def loaded(load: Load, problem: Callable[[str], object]) -> ReplayPlants | None:
@@ -357,28 +363,28 @@ def derived_of(
     record: Record,
     folder: Path,
     simulators: ReplayPlants,
-    own: Round | None,
-    kept: Kept,
+    round_: Round | None,
+    memo: Memo,
     *,
     cached: bool = False,
 ) -> Figures:
     """Figures of a record whose commands are in a folder, of a round, or of practice if None.
 
-    What was derived before, and ``cached``, are as of :func:`with_figures`.
+    ``memo`` and ``cached`` are as of :func:`with_figures`.
 
     Raises:
         InputError: if it was scored on other simulators or draws, or commands are missing.
     """
-    header, about = record.header, canonical.through_json(simulators.about())
-    if header.simulators != about:
-        every = {*about, *header.simulators}
-        keys = sorted(k for k in every if about.get(k) != header.simulators.get(k))
+    header, identity = record.header, canonical.through_json(simulators.about())
+    if header.simulators != identity:
+        every = {*identity, *header.simulators}
+        keys = sorted(k for k in every if identity.get(k) != header.simulators.get(k))
         raise InputError(
             "key simulators: those of this ventbench are not those of the record; "
             f"{', '.join(keys)} differ"
         )
-    bounds = "" if own is None or own.result is None else own.result.bounds
-    basis = (canonical.digest(canonical.canonical(about)), own and own.commitment, bounds)
+    bounds = "" if round_ is None or round_.result is None else round_.result.bounds
+    basis = (canonical.digest(canonical.canonical(identity)), round_ and round_.commitment, bounds)
     commands, stressed = store.load_commands(header.commands, folder), None
     stress = header.stress
     if stress is not None and stress.stressors == stressors.VERSION:
@@ -386,14 +392,14 @@ def derived_of(
         stressed = store.load_commands(stress.commands, folder) if at_hand else None
     key = (*basis, record.sha256, stressed is not None)
     place = _place(key) if cached else None
-    if key not in kept and place is not None and place.is_file():
-        kept[key] = _read(place)
-    if key not in kept:
-        what = once(kept, basis, protocol_of, header, simulators, own)
-        kept[key] = figures_of(header, commands, stressed, what, simulators)
+    if key not in memo and place is not None and place.is_file():
+        memo[key] = _read(place)
+    if key not in memo:
+        protocol_ = once(memo, basis, protocol_of, header, simulators, round_)
+        memo[key] = figures_of(header, commands, stressed, protocol_, simulators)
         if place is not None:
-            _write(place, kept[key])
-    return kept[key]
+            _write(place, memo[key])
+    return memo[key]
 
 
 def require_replay(
@@ -404,18 +410,18 @@ def require_replay(
     Raises:
         InputError: if it was scored on other simulators or draws, or cannot be honest.
     """
-    own = leaderboard.evidence.rounds.get(added.header.draws.season)
-    figures = derived_of(added, folder, simulators, own, {})
+    round_ = leaderboard.evidence.rounds.get(added.header.draws.season)
+    figures = derived_of(added, folder, simulators, round_, {})
     if added.track == "robustness" and figures.leak:
         name = store.path_of(folder, added.sha256).name
         raise InputError(f"{name}, key commands: {figures.leak}")
 
 
-def once(kept: Kept, key: Any, make: Callable[..., Any], *of: Any) -> Any:
+def once(memo: Memo, key: Any, make: Callable[..., Any], *of: Any) -> Any:
     """Derive something, if it was not derived before."""
-    if key not in kept:
-        kept[key] = make(*of)
-    return kept[key]
+    if key not in memo:
+        memo[key] = make(*of)
+    return memo[key]
 
 
 #: Code that figures depend on.

@@ -50,7 +50,7 @@ DELAY_S, LIMIT = 600, 3
 _MAX_BYTES = 5_000_000
 
 #: Characters of a name that is none which are shown.
-_SHOWN = 80
+_MAX_NAME = 80
 
 _Name = Annotated[str, schema.matching(canonical.ROUND_NAME)]
 _Account = Annotated[str, schema.matching(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,62}[A-Za-z0-9])?")]
@@ -207,9 +207,9 @@ def load(leaderboard: Path, name: str) -> Round:
     opened = _toml(folder / OPENED, Opened)
     if opened.name != name or name == DEVELOPMENT:
         raise InputError(f"{folder / OPENED}, key name: {opened.name} is not the folder's name")
-    made = Round(folder, opened)
+    round_ = Round(folder, opened)
     if not (folder / FROZEN).exists():
-        return made
+        return round_
     frozen = _toml(folder / FROZEN, Frozen)
     for key, file in (("round", OPENED), ("protocol", PROTOCOL)):
         if getattr(frozen, key) != files.sha256(folder / file):
@@ -219,13 +219,13 @@ def load(leaderboard: Path, name: str) -> Round:
     names = [entry.name for entry in frozen.entries]
     if len(set(names)) < len(names):
         raise InputError(f"{folder / FROZEN}, key entries: names one twice")
-    made = Round(folder, opened, frozen, frozen_sha256=files.sha256(folder / FROZEN))
+    round_ = Round(folder, opened, frozen, frozen_sha256=files.sha256(folder / FROZEN))
     if not (folder / BEACON).exists():
-        return made
+        return round_
     value = schema.read_canonical(beacon.DECODER, folder / BEACON)
-    beacon.check(value, opened.chain, made.number, str(folder / BEACON))
+    beacon.check(value, opened.chain, round_.number, str(folder / BEACON))
     result = schema.read_canonical(RESULT_DECODER, folder / RESULT) if RESULT in there else None
-    return Round(folder, opened, frozen, value, result, made.frozen_sha256)
+    return Round(folder, opened, frozen, value, result, round_.frozen_sha256)
 
 
 def names(leaderboard: Path) -> list[str]:
@@ -235,8 +235,8 @@ def names(leaderboard: Path) -> list[str]:
 
 def load_all(leaderboard: Path) -> tuple[Round, ...]:
     """All rounds, the newest first; arguments and errors as of :func:`load`."""
-    made = [load(leaderboard, name) for name in names(leaderboard)]
-    return tuple(sorted(made, key=lambda x: (x.opened.closes, x.name), reverse=True))
+    all_rounds = [load(leaderboard, name) for name in names(leaderboard)]
+    return tuple(sorted(all_rounds, key=lambda x: (x.opened.closes, x.name), reverse=True))
 
 
 def project_entries(leaderboard: Path) -> list[str]:
@@ -244,8 +244,8 @@ def project_entries(leaderboard: Path) -> list[str]:
 
     What outsiders have sent since then lies among the bundled submissions too, and is theirs.
     """
-    made = load_all(leaderboard)
-    return list(made[0].opened.project) if made else bundled()
+    all_rounds = load_all(leaderboard)
+    return list(all_rounds[0].opened.project) if all_rounds else bundled()
 
 
 def open_round(
@@ -301,50 +301,50 @@ def freeze(
     Raises:
         InputError: if the round is not open or has not closed yet, or nothing can be frozen.
     """
-    own, at = load(leaderboard, name), _seconds(now)
-    if own.state != "open":
-        raise InputError(f"round {name} is {own.state} already")
-    if at < own.opened.closes:
-        raise InputError(f"round {name} closes at {own.opened.closes:%Y-%m-%d %H:%M:%S} UTC")
+    round_, at = load(leaderboard, name), _seconds(now)
+    if round_.state != "open":
+        raise InputError(f"round {name} is {round_.state} already")
+    if at < round_.opened.closes:
+        raise InputError(f"round {name} closes at {round_.opened.closes:%Y-%m-%d %H:%M:%S} UTC")
     before = [r.frozen for r in load_all(leaderboard) if r.frozen]  # the earliest one last
     owners = {x.name: x.account for frozen in before for x in frozen.entries}
     good, bad = _sorted_out(requests)
-    asked: dict[str, Request] = {}
+    requested: dict[str, Request] = {}
     for request in sorted(good, key=lambda x: (x.asked, x.name)):
-        asked.setdefault(request.name, request)
-    order = [*own.opened.project, *(x for x in asked if x not in own.opened.project)]
+        requested.setdefault(request.name, request)
+    order = [*round_.opened.project, *(x for x in requested if x not in round_.opened.project)]
     entries: list[dict[str, Any]] = []
-    left_out: dict[str, str] = {}
+    excluded: dict[str, str] = {}
     count: dict[str, int] = {}
     for entry in order:
-        account = "" if entry in own.opened.project else asked[entry].account.lower()
+        account = "" if entry in round_.opened.project else requested[entry].account.lower()
         try:
             submission = _named(submissions / entry, entry)
             if owners.get(entry, account) != account:
                 raise InputError("the name belongs to another account since an earlier round")
-            if account and count.get(account, 0) >= own.opened.limit:
-                raise InputError(f"account {account} has {own.opened.limit} entries already")
+            if account and count.get(account, 0) >= round_.opened.limit:
+                raise InputError(f"account {account} has {round_.opened.limit} entries already")
         except (InputError, OSError) as error:
-            left_out[entry] = str(error)[: schema.MAX_TEXT]
+            excluded[entry] = str(error)[: schema.MAX_TEXT]
             continue
         count[account] = count.get(account, 0) + 1
         tracks = list(submission.manifest.tracks)
         entries.append(
             {"name": entry, "account": account, "sha256": submission.sha256, "tracks": tracks}
         )
-    left_out |= {x: why for x, why in bad.items() if x not in order}
+    excluded |= {x: why for x, why in bad.items() if x not in order}
     if not entries:
-        raise InputError(f"round {name}: no entry can be frozen; {left_out}")
+        raise InputError(f"round {name}: no entry can be frozen; {excluded}")
     written = canonical.canonical(protocol_of(simulators))
-    files.write_bytes(own.folder / PROTOCOL, written)
+    files.write_bytes(round_.folder / PROTOCOL, written)
     frozen = {
-        "round": files.sha256(own.folder / OPENED),
+        "round": files.sha256(round_.folder / OPENED),
         "protocol": canonical.digest(written),
         "frozen": at,
         "entries": entries,
-        "left_out": left_out,
+        "left_out": excluded,
     }
-    files.write_bytes(own.folder / FROZEN, tomli_w.dumps(frozen).encode())
+    files.write_bytes(round_.folder / FROZEN, tomli_w.dumps(frozen).encode())
     return load(leaderboard, name)
 
 
@@ -353,12 +353,12 @@ def _sorted_out(
 ) -> tuple[list[Request], dict[str, str]]:
     """Requests, and by what they call themselves why others are none."""
     good, bad = [], {}
-    for given in requests:
+    for request in requests:
         try:
-            good.append(msgspec.convert(given, Request, from_attributes=True))
+            good.append(msgspec.convert(request, Request, from_attributes=True))
         except msgspec.ValidationError as error:
-            said = given.get("name") if isinstance(given, Mapping) else None
-            name = plain(str(said or "without a name"))[:_SHOWN]
+            stated_name = request.get("name") if isinstance(request, Mapping) else None
+            name = plain(str(stated_name or "without a name"))[:_MAX_NAME]
             bad[name] = f"is no request: {error}"[: schema.MAX_TEXT]
     return good, bad
 
@@ -385,15 +385,15 @@ def draw(leaderboard: Path, name: str, content: bytes, *, now: datetime | None =
         InputError: if the round is not frozen, the time has not come, or the value is not the one
             that it must take.
     """
-    own = load(leaderboard, name)
-    if own.state != "frozen":
-        raise InputError(f"round {name} is {own.state}; it must be frozen")
-    due = own.opened.chain.time_of(own.number)
+    round_ = load(leaderboard, name)
+    if round_.state != "frozen":
+        raise InputError(f"round {name} is {round_.state}; it must be frozen")
+    due = round_.opened.chain.time_of(round_.number)
     if _seconds(now) < due:
-        raise InputError(f"round {own.number} of the beacon is published at {due:%F %T} UTC")
+        raise InputError(f"round {round_.number} of the beacon is published at {due:%F %T} UTC")
     value = beacon.read(content, "the value of the beacon")
-    beacon.check(value, own.opened.chain, own.number, "the value of the beacon")
-    files.write_bytes(own.folder / BEACON, canonical.canonical(msgspec.structs.asdict(value)))
+    beacon.check(value, round_.opened.chain, round_.number, "the value of the beacon")
+    files.write_bytes(round_.folder / BEACON, canonical.canonical(msgspec.structs.asdict(value)))
     return load(leaderboard, name)
 
 
@@ -414,19 +414,19 @@ def protocol_of(simulators: Mapping[str, Any]) -> dict[str, Any]:
 
 def _constants(module: Any) -> dict[str, Any]:
     """Public constants of a module that JSON can hold."""
-    kept = {}
+    constants = {}
     for key, value in vars(module).items():
         plain = isinstance(value, int | float | str | tuple | list | dict)
         if key.isupper() and not key.startswith("_") and plain:
-            kept[key] = value
-    return kept
+            constants[key] = value
+    return constants
 
 
-def protocol_differences(own: Round, simulators: Mapping[str, Any]) -> list[str]:
+def protocol_differences(round_: Round, simulators: Mapping[str, Any]) -> list[str]:
     """Parts of the protocol of a round that this ventbench does not have."""
-    path = own.folder / PROTOCOL
-    recorded, here = canonical.parse(path.read_bytes(), str(path)), protocol_of(simulators)
-    return [key for key in sorted({*recorded, *here}) if recorded.get(key) != here.get(key)]
+    path = round_.folder / PROTOCOL
+    recorded, current = canonical.parse(path.read_bytes(), str(path)), protocol_of(simulators)
+    return [key for key in sorted({*recorded, *current}) if recorded.get(key) != current.get(key)]
 
 
 def read_requests(path: Path) -> list[Any]:

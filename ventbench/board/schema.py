@@ -64,7 +64,6 @@ def _among(choices: Iterable[str]) -> msgspec.Meta:
 Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
 Sha256 = Annotated[str, matching("[0-9a-f]{64}")]
 Time = Annotated[str, matching(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z")]
-LungName = Annotated[str, matching(r"R[0-9]{1,4}(\.[0-9]{1,3})?C[0-9]{1,4}(\.[0-9]{1,3})?")]
 LungId = Annotated[str, _among(LUNG_IDS)]
 EntryName = Annotated[str, matching(NAME.pattern)]
 Family = Annotated[str, _among(FAMILIES)]
@@ -138,7 +137,7 @@ class Draws(Table, frozen=True):
     version: Count
     season: Annotated[str, matching("[a-z0-9][a-z0-9-]{0,39}")]
 
-    def about(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """As the record has it."""
         return msgspec.structs.asdict(self)
 
@@ -222,12 +221,12 @@ def read(
         InputError: naming the first key that is wrong; ``label`` names the file.
     """
     record = decoded(decoder, content, label)
-    for key, known in (("format", FORMAT), ("protocol", PROTOCOL)):
-        found = getattr(record, key, known)
-        if found != known:
+    for key, expected in (("format", FORMAT), ("protocol", PROTOCOL)):
+        recorded = getattr(record, key, expected)
+        if recorded != expected:
             raise InputError(
-                f"{label}, key {key}: is {found}; this ventbench reads records of {key} {known} "
-                "and no other"
+                f"{label}, key {key}: is {recorded}; this ventbench reads records of {key} "
+                f"{expected} and no other"
             )
     try:
         datetime.strptime(record.created, TIME_FORMAT)

@@ -44,13 +44,13 @@ class Store:
     @property
     def evidence(self) -> Evidence:
         """What stands behind the records."""
-        taken = {
+        withdrawn = {
             x.withdraws: x.reason
             for x in self.records
             if isinstance(x, Withdrawal) and x.sha256 in self.attested
         }
-        drawn = {x.name: x for x in self.rounds if x.value is not None}
-        return Evidence(self.attested, taken, drawn)
+        seeded = {x.name: x for x in self.rounds if x.value is not None}
+        return Evidence(self.attested, withdrawn, seeded)
 
     @property
     def scores(self) -> list[Record]:
@@ -99,10 +99,10 @@ def measured(records: Iterable[AnyRecord]) -> dict[str, str | None]:
 
 def in_order(records: Iterable[AnyRecord]) -> tuple[AnyRecord, ...]:
     """Sort records by their times, withdrawals after what they withdraw."""
-    known = {entry.sha256: entry for entry in records}
+    by_hash = {entry.sha256: entry for entry in records}
     ordered: dict[str, AnyRecord] = {}
-    for entry in sorted(known.values(), key=lambda x: (record.created_of(x), x.sha256)):
-        if isinstance(entry, Withdrawal) and (withdrawn := known.get(entry.withdraws)):
+    for entry in sorted(by_hash.values(), key=lambda x: (record.created_of(x), x.sha256)):
+        if isinstance(entry, Withdrawal) and (withdrawn := by_hash.get(entry.withdraws)):
             ordered.setdefault(withdrawn.sha256, withdrawn)
         ordered.setdefault(entry.sha256, entry)
     return tuple(ordered.values())
@@ -122,13 +122,13 @@ def read_record(path: Path, *, strict: bool = False) -> AnyRecord:
     sha256 = canonical.digest(content)
     if sha256 != path.stem:
         raise InputError(
-            f"{path} has been changed: its SHA-256 is {sha256}{_what_changed(content)}"
+            f"{path} has been changed: its SHA-256 is {sha256}{_content_problem(content)}"
         )
     # Its canonical form was checked when it was added, and no byte has changed since.
     return record.from_bytes(content, str(path), strict=strict)
 
 
-def _what_changed(content: bytes) -> str:
+def _content_problem(content: bytes) -> str:
     """What is wrong inside a changed record, where that can be seen."""
     for strict in (False, True):
         try:
@@ -146,8 +146,8 @@ def find_record(
     Raises:
         InputError: if none or several of the kind begin so.
     """
-    known = [x for x in store.records if isinstance(x, kind or Record | HardwareRecord)]
-    matches = [entry for entry in known if entry.sha256.startswith(sha256)]
+    candidates = [x for x in store.records if isinstance(x, kind or Record | HardwareRecord)]
+    matches = [entry for entry in candidates if entry.sha256.startswith(sha256)]
     if len(matches) != 1 or isinstance(matches[0], Withdrawal):
         raise InputError(f"{store.folder} holds no single record that begins with {sha256!r}")
     return matches[0]
@@ -236,37 +236,37 @@ def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
     sentence for each conflict, with the record's hash.
     """
     sentences: list[str] = []
-    known: dict[str, Record | HardwareRecord] = {}  # by hash
+    by_hash: dict[str, Record | HardwareRecord] = {}
     first: dict[str, Record] = {}  # on each draws, by their name
     counting: dict[tuple[str, str, str], Record] = {}  # of each entry, by draws, track and name
     # Whenever it was withdrawn: a record that was made before may be added after.
-    taken_back = {entry.withdraws for entry in records if isinstance(entry, Withdrawal)}
-    withdrawn: set[str] = set()
+    withdrawn = {entry.withdraws for entry in records if isinstance(entry, Withdrawal)}
+    withdrawn_before: set[str] = set()
     for index, entry in enumerate(records):
-        name, found = f"record {entry.sha256}", list[str]()
+        name, problems = f"record {entry.sha256}", list[str]()
         if isinstance(entry, Withdrawal):
-            if entry.withdraws not in known:
-                found = [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
-            elif entry.withdraws in withdrawn:
-                found = [f"{name} withdraws {entry.withdraws[:12]} once more"]
-            withdrawn.add(entry.withdraws)
+            if entry.withdraws not in by_hash:
+                problems = [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
+            elif entry.withdraws in withdrawn_before:
+                problems = [f"{name} withdraws {entry.withdraws[:12]} once more"]
+            withdrawn_before.add(entry.withdraws)
         else:
-            if entry.sha256 in known:
-                found = [f"{name} is on the leaderboard already"]
+            if entry.sha256 in by_hash:
+                problems = [f"{name} is on the leaderboard already"]
             elif isinstance(entry, Record):
                 common = first.get(entry.header.draws.season)
-                own = None if entry.sha256 in taken_back else counting.get(entry.key)
-                found = _conflicts(entry, common, own)
-            known[entry.sha256] = entry
+                incumbent = None if entry.sha256 in withdrawn else counting.get(entry.key)
+                problems = _conflicts(entry, common, incumbent)
+            by_hash[entry.sha256] = entry
             if isinstance(entry, Record):
                 first.setdefault(entry.header.draws.season, entry)
-                if entry.sha256 not in taken_back:
+                if entry.sha256 not in withdrawn:
                     counting.setdefault(entry.key, entry)
-        sentences += found if index >= start else []
+        sentences += problems if index >= start else []
     return sentences
 
 
-def _conflicts(entry: Record, first: Record | None, counting: Record | None) -> list[str]:
+def _conflicts(entry: Record, first: Record | None, incumbent: Record | None) -> list[str]:
     """Conflicts of a score with the first on its draws, and with the one of its entry."""
     name, sentences = f"record {entry.sha256}", list[str]()
     if first is not None:
@@ -275,12 +275,12 @@ def _conflicts(entry: Record, first: Record | None, counting: Record | None) -> 
         sentences = [
             f"{name} ({entry.name}), key {key}: differs from record {first.sha256[:12]} "
             f"({first.name})"
-            for key, own, common in zip(keys, entry.basis, first.basis, strict=True)
-            if own != common
+            for key, value, common in zip(keys, entry.basis, first.basis, strict=True)
+            if value != common
         ]
-    if counting is not None:
+    if incumbent is not None:
         sentences.append(
-            f"{name} ({entry.name}): the entry has record {counting.sha256[:12]}; withdraw that "
+            f"{name} ({entry.name}): the entry has record {incumbent.sha256[:12]}; withdraw that "
             'first, ventbench board withdraw HASH --reason "why"'
         )
     return sentences

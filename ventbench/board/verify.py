@@ -26,7 +26,7 @@ from ventbench.board import build, canonical, frames, gate, ranking, rounds, sto
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.official_runs import folders
 from ventbench.board.record import AnyRecord, Record, Withdrawal
-from ventbench.board.replay import Kept, Load, ReplayPlants, loaded, once, with_figures
+from ventbench.board.replay import Load, Memo, ReplayPlants, loaded, once, with_figures
 from ventbench.board.rounds import Round
 from ventbench.board.store import Store
 from ventbench.entries import reference as references
@@ -75,7 +75,7 @@ def verify(
     site: Path | None = None,
     recomputed: int = RECOMPUTED,
     progress: Progress | None = None,
-    kept: Kept | None = None,
+    memo: Memo | None = None,
 ) -> Report:
     """Verify a leaderboard.
 
@@ -85,13 +85,13 @@ def verify(
         site: folder of its built pages; the leaderboard's own if pages lie in it.
         recomputed: cells of each round whose bound the second optimiser computes anew.
         progress: called after each record.
-        kept: what earlier calls of this process derived; for many boards that differ little.
+        memo: what earlier calls of this process derived; for many boards that differ little.
 
     Raises:
         InputError: if there is no leaderboard.
         OSError: if a file cannot be read.
     """
-    report, kept = Report(), {} if kept is None else kept
+    report, memo = Report(), {} if memo is None else memo
     paths = store.record_paths(folder)
     if not paths:
         raise InputError(f"{folder} holds no leaderboard: there is no record in {RECORDS}/")
@@ -108,38 +108,38 @@ def verify(
         site = folder
     inputs = {x for x in plain if site != folder or not canonical.BUILT.fullmatch(x)}
     report.problems += [f"{folder / x} is no plain file or folder; remove it" for x in odd]
-    report.problems += _strange_files(folder, inputs, entries, whole=len(entries) == len(paths))
+    report.problems += _strange_files(folder, inputs, entries, complete=len(entries) == len(paths))
     report.problems += store.conflicts(entries)
     vouched, problems = gate.attested(folder, store.measured(entries))
     report.problems += problems if len(entries) == len(paths) else []
-    leaderboard = Store(folder, entries, vouched, tuple(_rounds(folder, load, report, kept)))
+    leaderboard = Store(folder, entries, vouched, tuple(_rounds(folder, load, report, memo)))
     report.problems += [] if problems else _unsigned(leaderboard)
-    for own in leaderboard.rounds:
-        report.problems += _unaccounted(own, leaderboard)
+    for round_ in leaderboard.rounds:
+        report.problems += _unaccounted(round_, leaderboard)
     leaderboard = with_figures(
         leaderboard,
         load,
         report.problems.append,
         note=report.notes.append,
         progress=progress,
-        kept=kept,
+        memo=memo,
     )
     report.replayed = sum(score.derived is not None for score in leaderboard.scores)
     report.problems += _below_bounds(leaderboard)
     if not report.problems:  # else whatever is wrong has been said, and moves ranks and pages
-        report.problems += _check_shown(leaderboard, site, folder.parent / "README.md", kept)
-        for own in leaderboard.rounds:
-            _recompute(own, load(), recomputed, report, kept)
+        report.problems += _check_published(leaderboard, site, folder.parent / "README.md", memo)
+        for round_ in leaderboard.rounds:
+            _recompute(round_, load(), recomputed, report, memo)
     report.problems = list(dict.fromkeys(report.problems))
     return report
 
 
 def _strange_files(
-    folder: Path, plain: set[str], entries: Sequence[AnyRecord], *, whole: bool
+    folder: Path, plain: set[str], entries: Sequence[AnyRecord], *, complete: bool
 ) -> list[str]:
     """Files that belong to no record of the leaderboard: none of them may be published.
 
-    If the entries are not the whole, nobody knows which commands the others name.
+    If the entries are not complete, nobody knows which commands the missing ones name.
     """
     problems = []
     named = {entry.sha256 for entry in entries}
@@ -148,15 +148,15 @@ def _strange_files(
         path = Path(name)
         if not canonical.named(name):
             problems.append(f"{folder / name} is no part of a leaderboard; remove it")
-        elif whole and path.parts[0] == RECORDS and path.suffix != canonical.RECORD_SUFFIX:
+        elif complete and path.parts[0] == RECORDS and path.suffix != canonical.RECORD_SUFFIX:
             of = commands if path.suffix == canonical.ACTIONS_SUFFIX else named
             if path.stem not in of:
                 problems.append(f"{folder / name} belongs to no record; remove it")
     signatures = {gate.signature_path(path) for path in gate.statements(folder)}
-    others = (folder / x for x in sorted(plain) if x.endswith(canonical.SIGNATURE_SUFFIX))
+    signature_files = (folder / x for x in sorted(plain) if x.endswith(canonical.SIGNATURE_SUFFIX))
     return problems + [
         f"{path} signs no file; remove it"
-        for path in others
+        for path in signature_files
         if path not in signatures and path.parent.name != RECORDS
     ]
 
@@ -177,19 +177,19 @@ def _unsigned(leaderboard: Store) -> list[str]:
     ]
 
 
-def _unaccounted(own: Round, leaderboard: Store) -> list[str]:
+def _unaccounted(round_: Round, leaderboard: Store) -> list[str]:
     """Where a round's result is not what its frozen list and the records of its draws give.
 
     Each frozen entry has one record or one failure on each of its tracks, its seeds have a score or
     a failure, and there is no other record of these draws; but a correction, once it is withdrawn.
     """
-    path, result = own.folder / rounds.RESULT, own.result
-    drawn = {x.sha256: x for x in leaderboard.scores if x.header.draws.season == own.name}
+    path, result = round_.folder / rounds.RESULT, round_.result
+    records = {x.sha256: x for x in leaderboard.scores if x.header.draws.season == round_.name}
     if result is None:
-        return [f"{path} is missing: records are of the round's draws"] if drawn else []
+        return [f"{path} is missing: records are of the round's draws"] if records else []
     runs = {
         f"{entry.name} ({track})": (entry, track)
-        for entry in (own.frozen.entries if own.frozen else ())
+        for entry in (round_.frozen.entries if round_.frozen else ())
         for track in entry.tracks
     }
     problems = [
@@ -199,25 +199,25 @@ def _unaccounted(own: Round, leaderboard: Store) -> list[str]:
     ]
     withdrawn, corrected = leaderboard.evidence.withdrawn, set[str]()
     for key, sha256 in result.records.items():
-        found, at = drawn.pop(sha256, None), store.path_of(leaderboard.folder, sha256)
+        record, at = records.pop(sha256, None), store.path_of(leaderboard.folder, sha256)
         if key not in runs:
             problems.append(f"{path}, key records: {key} was not frozen")
-        elif found is None:
-            missing = f"{at} is missing: the record of {key} in round {own.name}"
+        elif record is None:
+            missing = f"{at} is missing: the record of {key} in round {round_.name}"
             problems += [] if at.exists() else [missing]  # what cannot be read was named
-        elif (found.name, found.track, found.header.submission.sha256) != (
+        elif (record.name, record.track, record.header.submission.sha256) != (
             runs[key][0].name,
             runs[key][1],
             runs[key][0].sha256,
         ):
             problems.append(f"{path}, key records: {at} is not of {key} as it was frozen")
-        elif found.official and sha256 not in leaderboard.attested:
-            problems.append(f"{at}, of round {own.name}, is signed by no key of {ATTESTATIONS}")
+        elif record.official and sha256 not in leaderboard.attested:
+            problems.append(f"{at}, of round {round_.name}, is signed by no key of {ATTESTATIONS}")
         if sha256 in withdrawn:
             corrected.add(key)
     problems += [
         f"{store.path_of(leaderboard.folder, x.sha256)} is not in {path}"
-        for x in drawn.values()
+        for x in records.values()
         if f"{x.name} ({x.track})" not in corrected
     ]
     seeds = [key for key in (*result.failed, *result.seeds) if key not in runs]
@@ -231,7 +231,7 @@ def _unaccounted(own: Round, leaderboard: Store) -> list[str]:
     ]
 
 
-def _check_shown(leaderboard: Store, site: Path | None, readme: Path, kept: Kept) -> list[str]:
+def _check_published(leaderboard: Store, site: Path | None, readme: Path, memo: Memo) -> list[str]:
     """Pages, CSV and table of the README that are not what the board gives."""
     problems = []
     there = _TABLE.search(readme.read_text("utf-8")) if readme.is_file() else None
@@ -242,59 +242,63 @@ def _check_shown(leaderboard: Store, site: Path | None, readme: Path, kept: Kept
     plain, _ = canonical.walk(leaderboard.folder)
     inputs = {x: (leaderboard.folder / x).read_bytes() for x in filter(canonical.named, plain)}
     state = tuple(sorted((name, canonical.digest(content)) for name, content in inputs.items()))
-    expected = inputs | once(kept, ("pages", state), build.content, leaderboard)
-    found, odd = canonical.walk(site)
-    for name in sorted({*expected, *found, *odd}):
-        if name not in found:
-            what = "is missing" if name in expected else "is no plain file"
+    expected = inputs | once(memo, ("pages", state), build.content, leaderboard)
+    present, odd = canonical.walk(site)
+    for name in sorted({*expected, *present, *odd}):
+        if name not in present:
+            problem = "is missing" if name in expected else "is no plain file"
         elif name not in expected:
-            what = "is no page of this board; remove it"
+            problem = "is no page of this board; remove it"
         elif (site / name).read_bytes() != expected[name]:
-            what = "is not what the records give; build it again"
+            problem = "is not what the records give; build it again"
         else:
             continue
-        problems.append(f"{site / name} {what}")
+        problems.append(f"{site / name} {problem}")
     return problems
 
 
-def _rounds(folder: Path, load: Load, report: Report, kept: Kept) -> Iterator[Round]:
+def _rounds(folder: Path, load: Load, report: Report, memo: Memo) -> Iterator[Round]:
     """Read the rounds, newest first, and note what is wrong with them.
 
     Entries stay as they were ranked until the next round is open.
     """
-    made: list[Round] = []
+    all_rounds: list[Round] = []
     for name in rounds.names(folder):
         try:
-            own = rounds.load(folder, name)
-            made.append(own)
-            entered = {x.name for x in own.frozen.entries} if own.frozen else set[str]()
+            round_ = rounds.load(folder, name)
+            all_rounds.append(round_)
+            entered = {x.name for x in round_.frozen.entries} if round_.frozen else set[str]()
             report.problems += [
-                f"{own.folder / canonical.NOTES}, key entries: {x} was not frozen"
-                for x in set(own.notes()) - entered
+                f"{round_.folder / canonical.NOTES}, key entries: {x} was not frozen"
+                for x in set(round_.notes()) - entered
             ]
         except (InputError, OSError) as error:
             report.problems.append(str(error))
-    made.sort(key=lambda x: x.opened.closes, reverse=True)
-    for at, own in enumerate(made):
-        yield own
-        if own.frozen is None:
+    all_rounds.sort(key=lambda x: x.opened.closes, reverse=True)
+    for at, round_ in enumerate(all_rounds):
+        yield round_
+        if round_.frozen is None:
             continue
         simulators = loaded(load, report.problems.append)
         if simulators is None:
             return
-        for key in rounds.protocol_differences(own, simulators.about()):
-            report.problems.append(f"{own.folder}: this ventbench has another protocol: {key}")
+        for key in rounds.protocol_differences(round_, simulators.about()):
+            report.problems.append(f"{round_.folder}: this ventbench has another protocol: {key}")
         available = list(folders([folder.parent / "submissions"]))
-        for entry in own.frozen.entries if at == 0 else ():
+        for entry in round_.frozen.entries if at == 0 else ():
             named = [x for x in available if x.name == entry.name]
             if named and all(combined_hash(file_hashes(x)) != entry.sha256 for x in named):
                 report.problems.append(
-                    f"{named[0]} is not what was frozen in round {own.name}, {entry.sha256[:12]}"
+                    f"{named[0]} is not what was frozen in round {round_.name}, {entry.sha256[:12]}"
                 )
-        if own.result is not None:
-            state = (own.commitment, own.result.bounds, files.sha256(own.folder / rounds.BOUNDS))
-            about = canonical.canonical(simulators.about())
-            report.problems += once(kept, (state, about), _wrong_bounds, own, simulators)
+        if round_.result is not None:
+            state = (
+                round_.commitment,
+                round_.result.bounds,
+                files.sha256(round_.folder / rounds.BOUNDS),
+            )
+            identity = canonical.canonical(simulators.about())
+            report.problems += once(memo, (state, identity), _wrong_bounds, round_, simulators)
 
 
 def _below_bounds(leaderboard: Store) -> list[str]:
@@ -316,28 +320,28 @@ def _below_bounds(leaderboard: Store) -> list[str]:
 
 def _cell(lung: Any, draw: Any, pip: Any) -> str:
     """Name a cell by its place in tables whose draws have the nominal one in front."""
-    drawn = f"draw {draw}" if draw else "nominal"
-    return f"{LUNG_IDS[lung]}, {drawn}, PIP {protocol.PIPS[pip]:g}"
+    run = f"draw {draw}" if draw else "nominal"
+    return f"{LUNG_IDS[lung]}, {run}, PIP {protocol.PIPS[pip]:g}"
 
 
-def _wrong_bounds(own: Round, simulators: ReplayPlants) -> list[str]:
+def _wrong_bounds(round_: Round, simulators: ReplayPlants) -> list[str]:
     """Say whether the bounds of a round are what their commands and its PIDs give."""
     rigs = rigs_of(simulators)
     try:
-        drawn, bounds = own.draws(rigs), own.bounds()
-        references.reference_of(rigs.about, drawn.about(), bounds)
+        draws, bounds = round_.draws(rigs), round_.bounds()
+        references.reference_of(rigs.about, draws.about(), bounds)
     except (InputError, OSError) as error:
         return [str(error)]
-    plants, cells = rigs.cells(drawn, protocol.PIPS)
+    plants, cells = rigs.cells(draws, protocol.PIPS)
     attained = references.witness_errors(bounds, plants, cells) - bounds.attainable
     pid = references.pid_errors(plants, cells, bounds.gains) - bounds.pid
     if max(np.abs(attained).max(), np.abs(pid).max()) > BOUNDS_TOLERANCE:
-        return [f"{own.folder / rounds.BOUNDS}: its commands or PIDs do not attain its errors"]
+        return [f"{round_.folder / rounds.BOUNDS}: its commands or PIDs do not attain its errors"]
     return []
 
 
 def _recompute(
-    own: Round, simulators: ReplayPlants, count: int, report: Report, kept: Kept
+    round_: Round, simulators: ReplayPlants, count: int, report: Report, memo: Memo
 ) -> None:
     """Compare bounds with what the second optimiser finds.
 
@@ -345,24 +349,24 @@ def _recompute(
     may be far above the least error. The others the beacon chooses, with the hash of the bounds:
     else whoever makes them would know which.
     """
-    if own.result is None or not count:
+    if round_.result is None or not count:
         return
-    rigs, bounds, sha256 = rigs_of(simulators), own.bounds(), own.result.bounds
-    cells = rigs.cells(own.draws(rigs), protocol.PIPS)
-    key = ("bounds", canonical.canonical(simulators.about()), own.commitment, sha256, count)
-    gap = bounds.attainable - once(kept, ("rise", *key), references.rise_errors, *cells)
-    far = np.argsort(-gap, axis=None)[: count // 2]
-    drawn = np.argsort(uniforms(own.seed, f"bounds {sha256}", gap.size))
-    some = np.concatenate([far, drawn[~np.isin(drawn, far)]])[:count]
-    second = once(kept, key, references.second_errors, *cells, some)
+    rigs, bounds, sha256 = rigs_of(simulators), round_.bounds(), round_.result.bounds
+    cells = rigs.cells(round_.draws(rigs), protocol.PIPS)
+    key = ("bounds", canonical.canonical(simulators.about()), round_.commitment, sha256, count)
+    gap = bounds.attainable - once(memo, ("rise", *key), references.rise_errors, *cells)
+    largest = np.argsort(-gap, axis=None)[: count // 2]
+    shuffled = np.argsort(uniforms(round_.seed, f"bounds {sha256}", gap.size))
+    some = np.concatenate([largest, shuffled[~np.isin(shuffled, largest)]])[:count]
+    second = once(memo, key, references.second_errors, *cells, some)
     lead = bounds.attainable.ravel()[some] - second
     report.bounds.append(
-        f"round {own.name}: a second optimiser attains {lead.max():.3f} cmH2O less than the bound "
-        f"at most, {lead.mean():.3f} on average, in {len(some)} cells"
+        f"round {round_.name}: a second optimiser attains {lead.max():.3f} cmH2O less than the "
+        f"bound at most, {lead.mean():.3f} on average, in {len(some)} cells"
     )
     for k in np.flatnonzero(lead > BOUNDS_LEAD):
         cell = np.unravel_index(some[k], bounds.attainable.shape)
         report.problems.append(
-            f"{own.folder / rounds.BOUNDS}: {_cell(*cell)}: the bound is "
+            f"{round_.folder / rounds.BOUNDS}: {_cell(*cell)}: the bound is "
             f"{lead[k] + second[k]:.3f} cmH2O, and a second optimiser attains {second[k]:.3f}"
         )

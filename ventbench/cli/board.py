@@ -53,7 +53,7 @@ def at_hand(folder: Path) -> Path:
 
 
 #: Characters of a hash that tables show, as `withdraw` and `verify --rerun` take them.
-SHOWN = 8
+HASH_DIGITS = 8
 
 
 @app.command()
@@ -75,14 +75,14 @@ def add(
     from ventbench.board.replay import require_replay
     from ventbench.plants import frozen
 
-    require, done = partial(require_replay, frozen.load()), []
+    require, records = partial(require_replay, frozen.load()), []
     try:
         with bar("replaying records") as replaying:
             for path in paths:
-                done.append(store.add(folder, path, require))
-                replaying(len(done), len(paths))
+                records.append(store.add(folder, path, require))
+                replaying(len(records), len(paths))
     finally:  # also those before one that is refused
-        for added in done:
+        for added in records:
             typer.echo(f"added {added.name} ({added.track}): record {added.sha256}")
     typer.echo("next: ventbench board build")
 
@@ -368,7 +368,7 @@ def _table(track: Track) -> Table:
             cell = column.cell(line)
             values = (cell["text"] if cell["value"] not in ("", None) else "", cell["small"])
             texts += values[: len(column.terminal)]
-        table.add_row(*texts, line.row.record.sha256[:SHOWN])
+        table.add_row(*texts, line.row.record.sha256[:HASH_DIGITS])
     return table
 
 
@@ -376,7 +376,7 @@ def _stress_table(track: Track) -> Table:
     """Entries of the robustness track under missing physics."""
     from ventbench.board import pages
 
-    rows = [pages.stress_shown(row) for row in track.stress]
+    rows = [pages.stress_context(row) for row in track.stress]
     table = _plain_table("stress: mean |airway pressure - PIP|, cmH2O")
     runs = ", ".join(sorted({str(row["runs"]) for row in rows}))
     table.caption = f"survived, unsafe: of {runs} runs; calm: without stressors"

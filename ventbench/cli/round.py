@@ -155,8 +155,8 @@ def bounds(
     from ventbench.board import official_runs, rounds
 
     with bar("bounds of the draws") as progress, executor(workers, scheduler) as pool:
-        own = official_runs.bound(folder, name, pool, out / name, progress=progress)
-    typer.echo(own.folder / rounds.BOUNDS)
+        round_ = official_runs.bound(folder, name, pool, out / name, progress=progress)
+    typer.echo(round_.folder / rounds.BOUNDS)
 
 
 @app.command()

@@ -66,7 +66,7 @@ def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings
         try:
             part = load(path)
         except RecordingError as error:
-            if not _other_schema(error):
+            if not _is_foreign_schema(error):
                 raise
             skipped.append(path.name)
             continue
@@ -129,7 +129,7 @@ def assign_folds(breaths: Breaths, *, count: int = 5, seed: int = 0) -> Ints:
     return fold
 
 
-def _other_schema(error: RecordingError) -> bool:
+def _is_foreign_schema(error: RecordingError) -> bool:
     """Whether a file has another header, which is no mistake in a folder of mixed files."""
     return "column" in str(error).lower() and "missing" in str(error).lower()
 

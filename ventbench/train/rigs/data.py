@@ -211,7 +211,7 @@ def inspirations(
     pressure = _first(breaths.pressure, np.nan, samples)[:, 1:]
     arrays = {
         "start": np.nan_to_num(start),
-        "start_known": np.isfinite(start) * 1.0,
+        "start_measured": np.isfinite(start) * 1.0,
         "u_in": _first(breaths.u_in, 0.0, samples)[:, :-1],
         "dt": _first(breaths.dt, 0.03, samples)[:, :-1],
         "pressure": np.where(counted, pressure, 0.0),

@@ -281,11 +281,11 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         noise: bool = True,
         simulator: SimulatorLike = "frozen",
     ):
-        self._one = VentilatorVector(1, lung, pip, rigs, noise, simulator)
-        self._any = () if lung is not None else self._one.lungs
+        self._vector = VentilatorVector(1, lung, pip, rigs, noise, simulator)
+        self._any = () if lung is not None else self._vector.lungs
         self._fixed = pip is not None
-        self.action_space = self._one.single_action_space
-        self.observation_space = self._one.single_observation_space
+        self.action_space = self._vector.single_action_space
+        self.observation_space = self._vector.single_observation_space
         self._info: dict[str, Any] = {}
 
     def reset(
@@ -293,7 +293,7 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode; see :meth:`gymnasium.Env.reset`. No options are known."""
         super().reset(seed=seed)
-        vector, draw = self._one, self.np_random
+        vector, draw = self._vector, self.np_random
         if self._any:
             at = int(draw.integers(len(self._any)))
             vector._lung, vector._names = np.array([at]), np.array([self._any[at]], object)
@@ -309,12 +309,12 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         Raises:
             InputError: if no episode is under way, or the action is not finite.
         """
-        if self._one._count >= STEPS:
+        if self._vector._count >= STEPS:
             raise InputError("no episode is under way: call reset() first")
-        observation, reward, terminated, _, last = self._one.step(
+        observation, reward, terminated, _, last = self._vector.step(
             np.asarray(action, np.float32).reshape(1, 1)
         )
-        info = {**self._info, "pressure": float(self._one.pressure[0])}
+        info = {**self._info, "pressure": float(self._vector.pressure[0])}
         if terminated[0]:
             info["error"] = float(last["error"][0])
         return observation[0], float(reward[0]), bool(terminated[0]), False, info

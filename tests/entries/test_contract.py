@@ -61,7 +61,7 @@ def test_a_good_one(check):
     report = check(act="return observation.target", apart=True)
     assert report.ok
     assert report.findings == ()
-    assert report.left_out == ()
+    assert report.skipped == ()
     assert report.sandbox is not None
     assert report.act_us == pytest.approx((100.0, 100.0))
 
@@ -192,7 +192,7 @@ def test_an_import_that_fails(check):
     finding = only(report, "run")
     assert (finding.file, finding.line) == ("helper.py", 2)
     assert "ZeroDivisionError while it was imported" in finding.what
-    assert report.left_out == ("repeat", "time")
+    assert report.skipped == ("repeat", "time")
 
 
 @pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
@@ -302,7 +302,7 @@ def test_cheats_meet_the_same_sandbox(check):
 def test_in_process_finds_the_same(check, act):
     report, apart = check(act=act), check(act=act, apart=True)
     assert report.findings == apart.findings != ()
-    assert report.left_out == apart.left_out
+    assert report.skipped == apart.skipped
     assert report.sandbox is None
     assert apart.sandbox is not None
 
@@ -355,7 +355,7 @@ def test_everything_at_once(demo):
     (demo / "controller.py").write_text("from network import x\nclass Controler: pass\n")
     report = contract.check(str(demo))
     assert not report.ok
-    assert report.left_out == ("run", "repeat", "time")
+    assert report.skipped == ("run", "repeat", "time")
     where = {(f.file, f.line, f.group) for f in report.problems}
     assert where == {
         ("README.md", None, "files"),

@@ -35,7 +35,7 @@ def test_a_search_finds_what_it_is_told_of(monkeypatch):
         return np.sum(away**2, axis=-1)[..., None]
 
     monkeypatch.setattr(pid_search, "errors_on_draws", errors)
-    found = pid_search.best_pids(load_rigs(), drawn=load_rigs().of_training.draws(1))
+    found = pid_search.best_pids(load_rigs(), rig_draws=load_rigs().of_training.draws(1))
     assert found.agree.all()
     np.testing.assert_allclose(np.log(found.gains), np.tile(optimum, (6, 1)), atol=0.03)
     result = pid_search.tune_beyond(["R5C10", "R20C50"], draws=1)

@@ -235,10 +235,10 @@ def import_(
     typer.echo(f"wrote {len(imported.breaths)} breaths to {out}{pad}", err=to_stderr)
 
 
-def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
+def _pairs(arguments: list[str] | None, option: str) -> dict[str, str]:
     """Split ``NAME=VALUE``."""
     pairs = {}
-    for text in given or ():
+    for text in arguments or ():
         name, equals, value = text.rpartition("=")
         if not equals or not name or not value:
             raise InputError(f"{option} {text}: NAME=VALUE is wanted, such as Paw=pressure")
@@ -246,9 +246,9 @@ def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
     return pairs
 
 
-def _numbers(given: list[str] | None, option: str) -> dict[str, float]:
+def _numbers(arguments: list[str] | None, option: str) -> dict[str, float]:
     """Numbers of ``NAME=VALUE``."""
-    pairs = _pairs(given, option)
+    pairs = _pairs(arguments, option)
     try:
         return {role: float(value) for role, value in pairs.items()}
     except ValueError as error:

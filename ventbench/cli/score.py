@@ -177,7 +177,7 @@ def _run(
 def _table(results: list[dict[str, Any]]) -> Table:
     """Scores side by side, a row each, with their 95 % intervals; no columns of ``-`` alone."""
 
-    def shown(values: dict[str, Any] | None, digits: int) -> str:
+    def formatted(values: dict[str, Any] | None, digits: int) -> str:
         if values is None:
             return "-"
         if values["score"] is None:
@@ -191,7 +191,12 @@ def _table(results: list[dict[str, Any]]) -> Table:
         normalised, stress = values["normalised"], values["stress"]
         ranked = normalised and (normalised["draws"] or {"score": normalised["nominal"]})
         survived = "-" if stress is None else f"{100 * stress['survived']:.1f} %"
-        scores = (shown(values, 3), shown(values["draws"], 3), shown(ranked, 1), shown(stress, 3))
+        scores = (
+            formatted(values, 3),
+            formatted(values["draws"], 3),
+            formatted(ranked, 1),
+            formatted(stress, 3),
+        )
         rows.append((f"{values['name']}, {values['track']}", *scores, survived))
     names = ("entry", "nominal", "draws", "normalised", "missing physics", "survived")
     some = [k for k in range(len(names)) if any(row[k] != "-" for row in rows)]
@@ -270,9 +275,9 @@ def transfer(
     rows = [
         (
             f"{result['name']}, {result['track']}",
-            *("-" if value is None else f"{value:.3f}" for value in own),
+            *("-" if value is None else f"{value:.3f}" for value in row),
         )
-        for result, own in zip(results, errors, strict=True)
+        for result, row in zip(results, errors, strict=True)
     ]
     title = "Mean |pressure - target| on rigs, cmH2O (lower is better)"
     written_console({"entries": results}, json).print(table_of(title, columns, rows))
@@ -381,7 +386,7 @@ def headroom(
     rigs = load_rigs()
     rig_draws = rigs.draws(draws.COUNT)
     plants, cells = rigs.cells(rig_draws, protocol.PIPS)
-    about = references.settings(rigs.about, rig_draws.about())
+    identity = references.settings(rigs.about, rig_draws.about())
     if check is not None:
         computed = references.load(check)
         references.reference_of(rigs.about, rig_draws.about(), computed)
@@ -397,7 +402,7 @@ def headroom(
         pids = best_pids(rigs, progress=progress)
     with bar("best attainable") as progress, executor(workers, scheduler) as pool:
         computed = references.compute(
-            plants, cells, pids.gains, about, folder=parts, pool=pool, progress=progress
+            plants, cells, pids.gains, identity, folder=parts, pool=pool, progress=progress
         )
     sha256 = computed.save(out)
     shutil.rmtree(parts)  # they are in the file now

@@ -45,8 +45,8 @@ class ResidualState:
     """Memory of the controller."""
 
     pid: PIDState  #: state of the PID.
-    begun: Array  #: 0 before the first breath, then 1, shape ``(...)``.
-    known: Array  #: whether there was a previous breath, 0/1, shape ``(...)``.
+    started: Array  #: 0 before the first breath, then 1, shape ``(...)``.
+    has_previous: Array  #: whether there was a previous breath, 0/1, shape ``(...)``.
     #: errors in the last steps of this breath, the latest first, cmH2O, ``(..., pressures)``.
     errors: Array
     #: commands as applied in the last steps, the latest first, %, ``(..., commands)``.
@@ -127,7 +127,7 @@ class Residual:
             [now, state.errors, state.error_before[..., : self.ahead]], axis=-1
         )
         step = (observation.dt / protocol.DT - 1.0) / STEP + zero
-        rest = [observation.target / TARGET, observation.time + zero, step, state.known]
+        rest = [observation.target / TARGET, observation.time + zero, step, state.has_previous]
         commands = [state.commands, state.command_before[..., : self.ahead]]
         columns = [
             errors / ERROR,
@@ -142,9 +142,9 @@ class Residual:
         )
         return state, features, base
 
-    def _begin(self, state: ResidualState, seen: Observation, error: Array) -> ResidualState:
+    def _begin(self, state: ResidualState, observation: Observation, error: Array) -> ResidualState:
         """Turn the traces of the previous breath into memory at the first step of a breath."""
-        restart = seen.time + jnp.zeros_like(error) == 0
+        restart = observation.time + jnp.zeros_like(error) == 0
         wide = restart[..., None]
         room = jnp.zeros((*error.shape, self.ahead), error.dtype)
 
@@ -152,8 +152,8 @@ class Residual:
             return jnp.where(wide, jnp.concatenate([trace, room], axis=-1), before)
 
         return state.replace(  # type: ignore[attr-defined]
-            begun=jnp.where(restart, 1.0, state.begun),
-            known=jnp.where(restart, state.begun, state.known),
+            started=jnp.where(restart, 1.0, state.started),
+            has_previous=jnp.where(restart, state.started, state.has_previous),
             errors=jnp.where(wide, error[..., None], state.errors),
             commands=jnp.where(wide, waveform.EXPIRATORY_BIAS, state.commands),
             error_before=turned(state.error_trace, state.error_before),
@@ -182,8 +182,8 @@ def untrained(key: Array, like: Residual, widths: tuple[int, ...]) -> Residual:
     sizes = [inputs(like), *widths]
     layers = []
     for number, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-        drawn = jax.random.normal(jax.random.fold_in(key, number), (fan_in, fan_out))
-        layers.append((drawn / np.sqrt(fan_in), jnp.zeros(fan_out)))
+        weights = jax.random.normal(jax.random.fold_in(key, number), (fan_in, fan_out))
+        layers.append((weights / np.sqrt(fan_in), jnp.zeros(fan_out)))
     layers.append((jnp.zeros((sizes[-1], 1)), jnp.zeros(1)))
     return like.replace(layers=tuple(layers))  # type: ignore[attr-defined]
 
@@ -236,8 +236,8 @@ def init_features(shape: tuple[int, ...]) -> ResidualState:
 
 def features(state: ResidualState, observation: Observation) -> tuple[ResidualState, Array, Array]:
     """The next state, the features, ``(..., FEATURES)``, and the clipped command of the PID, %."""
-    state, seen, asked = _RESIDUAL.features(state, observation)
-    return state, seen, jnp.clip(asked, 0.0, protocol.U_MAX)
+    state, values, command = _RESIDUAL.features(state, observation)
+    return state, values, jnp.clip(command, 0.0, protocol.U_MAX)
 
 
 #: Parameters of a network, as flax keeps them.

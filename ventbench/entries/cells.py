@@ -60,8 +60,10 @@ class Cells:
         Plants as of :func:`~ventbench.plants.corrected.stressed_plants`, and cells of batch shape
         ``(S * L,)``; there must be one PIP.
         """
-        one = jax.tree.map(lambda leaf: np.asarray(leaf)[None, :, draw : draw + 1, 0], self.plants)
-        plants = stressed_plants(one, self.lungs, self.conditions)
+        selected = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[None, :, draw : draw + 1, 0], self.plants
+        )
+        plants = stressed_plants(selected, self.lungs, self.conditions)
         scenario = jax.tree.map(
             lambda leaf: np.concatenate([np.asarray(leaf)[:, draw, 0]] * len(self.conditions)),
             self.scenario,
@@ -123,44 +125,44 @@ def protocol_of(
         chosen = tuple(c for c in conditions() if not names or set(c.stressors) <= names)
         every = rigs.draws(draw_tables.COUNT) if drawn is None else drawn
         ranked = every.only(np.flatnonzero(every.ranked)).first(stress)
-        stressed = _under_stress(rigs, ranked, chosen)
+        stressed = _stressed_cells(rigs, ranked, chosen)
     if drawn is None and draws:
         drawn = rigs.draws(draws, pips)
     if pips == protocol.PIPS:
-        about = None if drawn is None else drawn.about()
-        reference = reference_of(rigs.about, about, reference)
-    nominal = _nominal_and_drawn(rigs, drawn, pips)
+        identity = None if drawn is None else drawn.about()
+        reference = reference_of(rigs.about, identity, reference)
+    nominal = _unstressed_cells(rigs, drawn, pips)
     return Protocol(rigs, pips, drawn, nominal, stressed, reference)
 
 
-def _nominal_and_drawn(rigs: Rigs, drawn: Draws | None, pips: tuple[float, ...]) -> Cells:
-    plants, scenario = rigs.cells(drawn, pips)
+def _unstressed_cells(rigs: Rigs, draws: Draws | None, pips: tuple[float, ...]) -> Cells:
+    plants, scenario = rigs.cells(draws, pips)
     shape = np.shape(scenario.pip)
     rig, member = np.zeros(shape[:2], np.int64), np.zeros(shape[:2], np.int64)
     if rigs.sessions is not None:
-        rig[:, 0] = [own[0] for own in rigs.sessions]
-    if drawn is not None:
-        rig[:, 1:], member[:, 1:] = drawn.rig, drawn.member
+        rig[:, 0] = [sessions[0] for sessions in rigs.sessions]
+    if draws is not None:
+        rig[:, 1:], member[:, 1:] = draws.rig, draws.member
     nominal = np.broadcast_to(np.array(pips), shape)
     every = np.arange(shape[1])
     return Cells(rigs.lungs, (Condition(),), plants, scenario, nominal, every, rig, member)
 
 
-def _under_stress(rigs: Rigs, drawn: Draws, chosen: tuple[Condition, ...]) -> Cells:
+def _stressed_cells(rigs: Rigs, draws: Draws, chosen: tuple[Condition, ...]) -> Cells:
     """One PIP of each lung and draw; each lung has each PIP once in six draws."""
-    count, n = len(rigs.lungs), drawn.count
+    count, n = len(rigs.lungs), draws.count
     columns = pip_columns(count, n)
     at = (np.arange(count)[:, None], np.arange(n), columns)
-    scenario = jax.tree.map(lambda leaf: np.asarray(leaf)[at][:, :, None], drawn.cells)
+    scenario = jax.tree.map(lambda leaf: np.asarray(leaf)[at][:, :, None], draws.cells)
     if rigs.sessions is None:
         plants = jax.tree.map(
             lambda leaf: np.repeat(np.asarray(leaf)[:, None, None], n, axis=1), rigs.plants
         )
     else:
-        plants = rigs.plants_of(drawn)
+        plants = rigs.plants_of(draws)
     nominal = np.asarray(protocol.PIPS)[columns][:, :, None]
     every = np.arange(1, n + 1)
-    return Cells(rigs.lungs, chosen, plants, scenario, nominal, every, drawn.rig, drawn.member)
+    return Cells(rigs.lungs, chosen, plants, scenario, nominal, every, draws.rig, draws.member)
 
 
 class ControllerSession(Interface):
@@ -264,8 +266,8 @@ class InProcessSession(PolledControllers):
 
     def answers(self) -> tuple[Ints, Floats]:
         """Take the commands; see :class:`ControllerSession`."""
-        given, self._answers = self._answers, {}
-        return np.array(list(given), np.int64), np.array(list(given.values()))
+        commands, self._answers = self._answers, {}
+        return np.array(list(commands), np.int64), np.array(list(commands.values()))
 
     def processor_time(self) -> float:
         """Processor time of this process, s; see :class:`ControllerSession`."""
@@ -370,11 +372,11 @@ _observe = jax.jit(env.observe)
 
 @jax.jit
 def _inspire(
-    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array, which: Array
+    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array, active: Array
 ) -> tuple[env.LoopState, Array]:
     """Apply commands to some cells; the others wait."""
     after, applied = _strong(jax.vmap(env.inspire)(plants, scenario, loop, u_in))
-    return _where(which, after, loop), applied
+    return _select(active, after, loop), applied
 
 
 @jax.jit
@@ -385,14 +387,14 @@ def _expire(plants: Plant, scenario: Scenario, loop: env.LoopState) -> Array:
 
 
 @jax.jit
-def _where(which: Array, one: Any, other: Any) -> Any:
-    """Take one state in some cells and the other in the rest, ``which`` of the batch shape."""
+def _select(mask: Array, new: Any, old: Any) -> Any:
+    """Take the new state in some cells and the old one in the rest, mask of the batch shape."""
 
     def choose(x: Array, y: Array) -> Array:
-        shape = which.shape + (1,) * (x.ndim - which.ndim)
-        return jnp.where(which.reshape(shape), x, y)
+        shape = mask.shape + (1,) * (x.ndim - mask.ndim)
+        return jnp.where(mask.reshape(shape), x, y)
 
-    return jax.tree.map(choose, one, other)
+    return jax.tree.map(choose, new, old)
 
 
 def _of_cells(values: Array, batch: tuple[int, ...]) -> Floats:
@@ -437,57 +439,59 @@ def step_through(
     cells, steps = int(np.prod(batch)), protocol.INSPIRATION_STEPS
     total = protocol.BREATHS * steps
     pressure, requested, applied, volume = (np.zeros((cells, total)) for _ in range(4))
-    each = [task for task in tasks for _ in range(cells // len(tasks))]
+    cell_tasks = [task for task in tasks for _ in range(cells // len(tasks))]
     breaths = range(protocol.BREATHS)
     parts = [jax.tree.map(lambda x, k=k: x[:, k], plants) if changing else plants for k in breaths]
-    begun = [_begin(part, scenario, k) for k, part in enumerate(parts)]
-    loop, seconds = begun[0][1], []
-    ends = [rest for _, rest in begun]
+    initial = [_begin(part, scenario, k) for k, part in enumerate(parts)]
+    loop, seconds = initial[0][1], []
+    ends = [rest for _, rest in initial]
     has_volume = loop.signals.volume is not None
     # Cells go on by themselves: what one takes, no other one waits for.
-    given, ready = np.zeros(cells, np.int64), np.arange(cells)
+    answered, ready = np.zeros(cells, np.int64), np.arange(cells)
     with compilation.float32():  # a submission that uses JAX finds it as it is elsewhere
-        session = runner.start(submission, each)
+        session = runner.start(submission, cell_tasks)
     try:
-        while (given < total).any():
-            at = np.minimum(given, total - 1).reshape(batch)
+        while (answered < total).any():
+            at = np.minimum(answered, total - 1).reshape(batch)
             rows = pack(_observe(scenario, loop, at // steps, at % steps))
-            pressure[ready, given[ready]] = _of_cells(loop.signals.scored, batch)[ready]
+            pressure[ready, answered[ready]] = _of_cells(loop.signals.scored, batch)[ready]
             if has_volume:
-                volume[ready, given[ready]] = _of_cells(loop.signals.volume, batch)[ready]
+                volume[ready, answered[ready]] = _of_cells(loop.signals.volume, batch)[ready]
             start = time.perf_counter()
             with compilation.float32():
                 session.ask(ready, rows[ready])
                 ready, commands = session.answers()
             seconds.append((time.perf_counter() - start) / max(1, len(ready)))
-            requested[ready, given[ready]] = commands
-            u_in, moved = np.zeros(cells), np.zeros(cells, bool)
-            u_in[ready], moved[ready] = env.resolved(commands), True
-            for k, (varied, _) in enumerate(begun):
-                own = moved & (given // steps == k)
-                if own.any():
+            requested[ready, answered[ready]] = commands
+            u_in, updated = np.zeros(cells), np.zeros(cells, bool)
+            u_in[ready], updated[ready] = env.resolved(commands), True
+            for k, (varied, _) in enumerate(initial):
+                active = updated & (answered // steps == k)
+                if active.any():
                     loop, now = _inspire(
-                        varied, scenario, loop, u_in.reshape(batch), own.reshape(batch)
+                        varied, scenario, loop, u_in.reshape(batch), active.reshape(batch)
                     )
-                    applied[own, given[own]] = _of_cells(now, batch)[own]
-            rounds = given.min()
-            given[ready] += 1
-            for _ in range(given.min() - rounds):
+                    applied[active, answered[active]] = _of_cells(now, batch)[active]
+            rounds = answered.min()
+            answered[ready] += 1
+            for _ in range(answered.min() - rounds):
                 count()
-            over = moved & (given % steps == 0)
+            over = updated & (answered % steps == 0)
             for k in breaths:
-                own = (over & (given // steps == k + 1)).reshape(batch)
-                if own.any():
-                    ends[k] = _where(own, loop, ends[k])
-                    loop = _where(own, begun[k + 1][1], loop) if k + 1 < len(begun) else loop
-            ready = ready[given[ready] < total]
+                finished = (over & (answered // steps == k + 1)).reshape(batch)
+                if finished.any():
+                    ends[k] = _select(finished, loop, ends[k])
+                    loop = (
+                        _select(finished, initial[k + 1][1], loop) if k + 1 < len(initial) else loop
+                    )
+            ready = ready[answered[ready] < total]
         failures = dict(session.failures)
     finally:
         session.close()
     expired = np.stack(
         [
             np.asarray(_expire(varied, scenario, end))
-            for (varied, _), end in zip(begun, ends, strict=True)
+            for (varied, _), end in zip(initial, ends, strict=True)
         ],
         axis=-2,
     )
@@ -499,8 +503,10 @@ def step_through(
     pressure, requested, applied, volume = (
         x.reshape(shape) for x in (pressure, requested, applied, volume)
     )
-    kept = volume if has_volume else None
-    return ProtocolRun(pressure, requested, applied, expired, kept, by_cell, np.array(seconds))
+    recorded_volume = volume if has_volume else None
+    return ProtocolRun(
+        pressure, requested, applied, expired, recorded_volume, by_cell, np.array(seconds)
+    )
 
 
 def run_cells(
@@ -523,10 +529,10 @@ def run_cells(
     runs = []
     for draw in range(len(cells.draw)):
         plants, scenario = cells.stressed(draw)
-        each = list(tasks) * conditions
+        condition_tasks = list(tasks) * conditions
         try:
             run = step_through(
-                plants, scenario, runner, submission, each, changing=True, count=count
+                plants, scenario, runner, submission, condition_tasks, changing=True, count=count
             )
         except PlantError as error:
             name = cells.conditions[error.index // lungs].id

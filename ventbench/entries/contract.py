@@ -71,23 +71,26 @@ def plain(tracks: Sequence[str]) -> list[ContractRun]:
     return runs
 
 
-def unusual(told: Task) -> list[ContractRun]:
+def unusual(run_task: Task) -> list[ContractRun]:
     """Short runs with inputs at and beyond the edge of what a bench gives."""
     random = np.random.default_rng(0)
     steps = protocol.INSPIRATION_STEPS
     wild = random.uniform(-20.0, 80.0, steps)
     uneven = random.uniform(0.005, 0.1, steps)
     inputs = {
-        "a control step of 10 ms": _played(dt=0.01),
-        "a control step of 60 ms": _played(dt=0.06),
-        "uneven control steps": _played(dt=uneven),
-        "a pressure of -20 cmH2O": _played(pressure=-20.0),
-        "a pressure of 120 cmH2O": _played(pressure=120.0),
-        "a very noisy pressure": _played(pressure=wild),
-        "a pressure and a target of 0 cmH2O": _played(pressure=0.0, target=0.0),
-        "a target of 60 cmH2O": _played(target=60.0),
+        "a control step of 10 ms": _open_loop(dt=0.01),
+        "a control step of 60 ms": _open_loop(dt=0.06),
+        "uneven control steps": _open_loop(dt=uneven),
+        "a pressure of -20 cmH2O": _open_loop(pressure=-20.0),
+        "a pressure of 120 cmH2O": _open_loop(pressure=120.0),
+        "a very noisy pressure": _open_loop(pressure=wild),
+        "a pressure and a target of 0 cmH2O": _open_loop(pressure=0.0, target=0.0),
+        "a target of 60 cmH2O": _open_loop(target=60.0),
     }
-    return [ContractRun(told, script, f"with {what}") for what, script in inputs.items()]
+    return [
+        ContractRun(run_task, script, f"with {description}")
+        for description, script in inputs.items()
+    ]
 
 
 def task(track: str, lung: str | None) -> Task:
@@ -103,11 +106,11 @@ def breaths() -> Script:
             elapsed = step * protocol.DT
             answer = yield _row(elapsed, protocol.DT, pressure, _target(elapsed), command)
             command = min(max(answer, 0.0), protocol.U_MAX)
-            rest = protocol.PEEP + _FULL * command / protocol.U_MAX
-            pressure += (rest - pressure) * protocol.DT / _TIME_CONSTANT
+            equilibrium = protocol.PEEP + _FULL * command / protocol.U_MAX
+            pressure += (equilibrium - pressure) * protocol.DT / _TIME_CONSTANT
 
 
-def _played(
+def _open_loop(
     dt: float | np.ndarray = protocol.DT,
     pressure: float | np.ndarray = 20.0,
     target: float = _PIP,
@@ -192,8 +195,8 @@ def run_all(
                     waiting.remove(k)
     finally:
         session.close()
-    kept = tuple(np.array(values) for values in commands)
-    return Answers(kept, failures, np.array(seconds[_WARM_UP:]))
+    arrays = tuple(np.array(values) for values in commands)
+    return Answers(arrays, failures, np.array(seconds[_WARM_UP:]))
 
 
 #: Calls of ``act`` in a run of all draws, in one under every condition, and the longest that those
@@ -216,7 +219,7 @@ _ADVICE = {
 }
 _IMPORT_ADVICE = "it must be possible to import it with what the sandbox has"
 _CLASS_ADVICE = "write a class Controller with reset(self, task) and act(self, observation)"
-_OTHER_ADVICE = "see the limits of the sandbox in docs/submitting.md"
+_GENERAL_ADVICE = "see the limits of the sandbox in docs/submitting.md"
 _TO_RUN: tuple[Group, ...] = ("run", "repeat", "time")
 
 
@@ -226,7 +229,7 @@ class CheckReport:
 
     label: str  #: the submission, as the person named it.
     findings: tuple[Finding, ...]  #: all of them, in the order of :data:`GROUPS`.
-    left_out: tuple[Group, ...] = ()  #: groups that could not be looked at because of the problems.
+    skipped: tuple[Group, ...] = ()  #: groups that could not be looked at because of the problems.
     #: layers that the dry run had; None if it ran in this process, or did not run.
     sandbox: dict[str, Any] | None = None
     #: mean and largest time of an ``act``, microseconds; None if it did not run.
@@ -252,8 +255,8 @@ class CheckReport:
         label = printable(self.label)
         for finding in (*self.problems, *self.notes):
             yield from finding.message(label).split("\n")
-        if self.left_out:
-            yield f"{label}: not looked at yet: {', '.join(self.left_out)}; mend the above first"
+        if self.skipped:
+            yield f"{label}: not looked at yet: {', '.join(self.skipped)}; mend the above first"
         if self.act_us is not None:
             mean, largest = self.act_us
             yield f"{label}: act takes {mean:.0f} us on average, {largest:.0f} us at most"
@@ -271,7 +274,7 @@ class CheckReport:
             "ok": self.ok,
             "problems": [finding.to_json() for finding in self.problems],
             "notes": [finding.to_json() for finding in self.notes],
-            "left_out": list(self.left_out),
+            "left_out": list(self.skipped),
             "sandbox": self.sandbox,
             "act_us": timing,
         }
@@ -313,14 +316,14 @@ def check(
     with contextlib.suppress(SubmissionError):  # the checks have said why
         opened = open_submission(name)
     if opened is None or any(f.problem for f in findings if f.group == "source"):
-        return _report(name, findings, left_out=_TO_RUN)
-    done = 0
+        return _report(name, findings, skipped=_TO_RUN)
+    completed = 0
 
     def count() -> None:
-        nonlocal done
-        done += 1
+        nonlocal completed
+        completed += 1
         if progress is not None:
-            progress(done, _ROUNDS)
+            progress(completed, _ROUNDS)
 
     return _ran(opened, runner, findings, clock, count)
 
@@ -345,8 +348,8 @@ def _ran(
 ) -> CheckReport:
     name, tracks = submission.label, submission.manifest.tracks
     plain_runs = plain(tracks)
-    told = plain_runs[0].task
-    runs = [*plain_runs, ContractRun(told, breaths()), *unusual(told)]
+    run_task = plain_runs[0].task
+    runs = [*plain_runs, ContractRun(run_task, breaths()), *unusual(run_task)]
     sandbox = None if runner.sandbox is None else dict(runner.sandbox)
     try:
         answers = run_all(submission, runs, runner, clock, count)
@@ -358,12 +361,12 @@ def _ran(
         for problem in str(error).split("\n"):
             advice = _IMPORT_ADVICE if "while it was imported" in problem else _CLASS_ADVICE
             findings.append(_placed("run", problem.removeprefix(f"{name}: "), advice))
-        return _report(name, findings, left_out=_TO_RUN[1:], sandbox=sandbox)
+        return _report(name, findings, skipped=_TO_RUN[1:], sandbox=sandbox)
     findings += _failure_findings(runs, answers) or _failure_findings([timed_run], timed_answers)
     findings += _clipping_notes(answers.commands[: len(plain_runs)])
     repeats = (0, len(plain_runs))
     if timed_answers.failures or set(repeats) & set(answers.failures):
-        return _report(name, findings, left_out=_TO_RUN[1:], sandbox=sandbox)
+        return _report(name, findings, skipped=_TO_RUN[1:], sandbox=sandbox)
     findings += repetition_findings(*(answers.commands[k] for k in repeats))
     findings += _seed_findings(submission, plain_runs, runner, clock)
     acts = ACTS * len(tracks) * (1 + len(seeds(submission.folder)))
@@ -384,38 +387,38 @@ def _seed_findings(
 ) -> Iterator[Finding]:
     """What fails with the weights of a seed, in the first of some runs."""
     for seed in seeds(submission.folder):
-        with TemporaryDirectory() as place:
-            other = with_seed(submission, seed.name, Path(place))
+        with TemporaryDirectory() as folder:
+            seeded = with_seed(submission, seed.name, Path(folder))
             run = runs[0]._replace(script=breaths())
             try:
-                found = _failure_findings([run], run_all(other, [run], runner, clock))
+                findings = _failure_findings([run], run_all(seeded, [run], runner, clock))
             except SubmissionError as error:
-                found = [Finding("run", CONTROLLER, str(error), _IMPORT_ADVICE)]
-        for finding in found:
+                findings = [Finding("run", CONTROLLER, str(error), _IMPORT_ADVICE)]
+        for finding in findings:
             yield replace(finding, what=f"with the weights of {SEEDS}/{seed.name} {finding.what}")
 
 
-def _report(name: str, findings: list[Finding], **others: object) -> CheckReport:
+def _report(name: str, findings: list[Finding], **fields: object) -> CheckReport:
     order = sorted(findings, key=lambda finding: GROUPS.index(finding.group))
-    return CheckReport(name, tuple(order), **others)  # type: ignore[arg-type]
+    return CheckReport(name, tuple(order), **fields)  # type: ignore[arg-type]
 
 
 def _failure_findings(runs: Sequence[ContractRun], answers: Answers) -> list[Finding]:
     """Return one finding for each different failure."""
-    seen: dict[tuple[str, str], list[int]] = {}
+    by_failure: dict[tuple[str, str], list[int]] = {}
     for k in sorted(answers.failures):
         failure = answers.failures[k]
-        seen.setdefault((failure.what, failure.detail), []).append(k)
-    return [_failure(runs[same[0]], answers, same) for same in seen.values()]
+        by_failure.setdefault((failure.what, failure.detail), []).append(k)
+    return [_failure(runs[indices[0]], answers, indices) for indices in by_failure.values()]
 
 
-def _failure(run: ContractRun, answers: Answers, same: list[int]) -> Finding:
-    failure = answers.failures[same[0]]
+def _failure(run: ContractRun, answers: Answers, indices: list[int]) -> Finding:
+    failure = answers.failures[indices[0]]
     detail = f": {failure.detail}" if failure.detail else ""
-    when = _when(run, failure, len(answers.commands[same[0]]))
-    more = f" (and in {len(same) - 1} other runs)" if len(same) > 1 else ""
-    what = f"{failure.what}{when}{detail}{more}"
-    return _placed("run", what, _ADVICE.get(failure.kind, _OTHER_ADVICE))
+    circumstances = _when(run, failure, len(answers.commands[indices[0]]))
+    more = f" (and in {len(indices) - 1} other runs)" if len(indices) > 1 else ""
+    message = f"{failure.what}{circumstances}{detail}{more}"
+    return _placed("run", message, _ADVICE.get(failure.kind, _GENERAL_ADVICE))
 
 
 def _when(run: ContractRun, failure: Failure, answered: int) -> str:
@@ -438,30 +441,32 @@ def _clipping_notes(commands: Sequence[Floats]) -> Iterator[Finding]:
     values = np.concatenate(commands)
     outside = np.sum((values < 0.0) | (values > protocol.U_MAX))
     if outside:
-        what = (
+        message = (
             f"asked for {values.min():.4g} to {values.max():.4g} %, "
             f"outside of 0 to 100 % at {outside} of {values.size} steps"
         )
         advice = "that is clipped, and the board says how often; harmless if it is meant"
-        yield Finding("run", CONTROLLER, what, advice, problem=False)
+        yield Finding("run", CONTROLLER, message, advice, problem=False)
 
 
-def repetition_findings(first: Floats, again: Floats) -> Iterator[Finding]:
+def repetition_findings(first: Floats, repeated: Floats) -> Iterator[Finding]:
     """A finding if commands of a run, %, are others in another process."""
-    if different := _differ(first, again):
-        what = f"the same run in another process gave {different}"
+    if difference := _first_difference(first, repeated):
+        message = f"the same run in another process gave {difference}"
         advice = "give every random generator a fixed seed; do not look at the clock"
-        yield Finding("repeat", CONTROLLER, what, advice)
+        yield Finding("repeat", CONTROLLER, message, advice)
 
 
-def _differ(first: Floats, other: Floats) -> str:
+def _first_difference(first: Floats, second: Floats) -> str:
     """Where two runs differ first; empty if nowhere."""
-    different = np.flatnonzero(first != other)
-    if not different.size:
+    differing = np.flatnonzero(first != second)
+    if not differing.size:
         return ""
-    k = different[0]
+    k = differing[0]
     breath, step = divmod(int(k), protocol.INSPIRATION_STEPS)
-    return f"{other[k]:.9g} % instead of {first[k]:.9g} % at step {step + 1} of breath {breath + 1}"
+    return (
+        f"{second[k]:.9g} % instead of {first[k]:.9g} % at step {step + 1} of breath {breath + 1}"
+    )
 
 
 def time_findings(act_seconds: Floats, acts: int = ACTS) -> Iterator[Finding]:
@@ -469,10 +474,10 @@ def time_findings(act_seconds: Floats, acts: int = ACTS) -> Iterator[Finding]:
     mean = float(act_seconds.mean())
     total = mean * acts
     score = f"the {acts} calls of a round {total:.0f} s"
-    what = f"act takes {1e3 * mean:.3g} ms of processor time on average, {score}"
+    message = f"act takes {1e3 * mean:.3g} ms of processor time on average, {score}"
     if total > LONGEST_S:
         advice = f"make it {total / LONGEST_S:.1f} times faster: {LONGEST_S:g} s are the limit"
-        yield Finding("time", CONTROLLER, what, advice)
+        yield Finding("time", CONTROLLER, message, advice)
     elif mean > 0.1 * protocol.DT:
         advice = f"at a bench it has {1e3 * protocol.DT:g} ms with everything else"
-        yield Finding("time", CONTROLLER, what, advice, problem=False)
+        yield Finding("time", CONTROLLER, message, advice, problem=False)

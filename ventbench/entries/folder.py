@@ -136,17 +136,17 @@ def _manifest(folder: Path, label: str) -> Manifest:
     return msgspec.convert(answer["manifest"], Manifest)
 
 
-def as_submission(given: Any) -> Submission:
+def as_submission(source: Any) -> Submission:
     """Take a folder, the name of a bundled submission, a class or a function as a submission.
 
     Raises:
         SubmissionError: if there is no such submission, or it is of no such kind.
     """
-    if isinstance(given, Submission):
-        return given
-    if isinstance(given, str | Path):
-        return open_submission(str(given))
-    return submission_of(given)
+    if isinstance(source, Submission):
+        return source
+    if isinstance(source, str | Path):
+        return open_submission(str(source))
+    return submission_of(source)
 
 
 def submission_of(controller: Any) -> Submission:
@@ -166,8 +166,10 @@ def submission_of(controller: Any) -> Submission:
         if lacks:
             raise SubmissionError(f"class {name} has no method {' and no method '.join(lacks)}")
         _check_calls(f"class {name}", controller, "nothing to make one")
-        for method, given in (("reset", "a task"), ("act", "an observation")):
-            _check_calls(f"{name}.{method}", getattr(controller, method), given, "self", given)
+        for method, expected in (("reset", "a task"), ("act", "an observation")):
+            _check_calls(
+                f"{name}.{method}", getattr(controller, method), expected, "self", expected
+            )
         make, tracks = controller, TRACKS
     elif callable(getattr(controller, "act", None)):
         raise SubmissionError(f"give the class {name}, not an instance: each run needs a new one")
@@ -192,7 +194,7 @@ def submission_of(controller: Any) -> Submission:
     return Submission(name, folder, manifest, None, make)
 
 
-def _check_calls(name: str, function: Any, given: str, *arguments: str) -> None:
+def _check_calls(name: str, function: Any, expected: str, *arguments: str) -> None:
     """Check that a function takes as many arguments as it will be given."""
     try:
         signature = inspect.signature(function)
@@ -201,7 +203,7 @@ def _check_calls(name: str, function: Any, given: str, *arguments: str) -> None:
     try:
         signature.bind(*arguments)
     except TypeError as error:
-        raise SubmissionError(f"{name}{signature} must take {given}: {error}") from None
+        raise SubmissionError(f"{name}{signature} must take {expected}: {error}") from None
 
 
 class _Stateless:
@@ -260,16 +262,16 @@ def frozen_copy(folder: Path, sha256: str, place: Path) -> Submission:
 
 def with_seed(submission: Submission, seed: str, place: Path) -> Submission:
     """Copy a submission with the weights of one of its seeds in the place of its own."""
-    other = place / submission.folder.name
-    shutil.copytree(submission.folder, other, ignore=shutil.ignore_patterns(SEEDS))
-    shutil.copytree(submission.folder / SEEDS / seed, other, dirs_exist_ok=True)
-    return open_submission(str(other))
+    copy = place / submission.folder.name
+    shutil.copytree(submission.folder, copy, ignore=shutil.ignore_patterns(SEEDS))
+    shutil.copytree(submission.folder / SEEDS / seed, copy, dirs_exist_ok=True)
+    return open_submission(str(copy))
 
 
 def _seed_problems(folder: Path) -> list[str]:
     """Files of seeds that are no weights of the submission, and seeds that are too many."""
-    own, problems = seeds(folder), []
-    if len(own) > MAX_SEEDS:
+    seed_folders, problems = seeds(folder), []
+    if len(seed_folders) > MAX_SEEDS:
         problems.append(f"{SEEDS} has more than {MAX_SEEDS} folders")
     inside = [path for path in _walk(folder / SEEDS) if (folder / SEEDS).is_dir()]
     for path in inside:
@@ -317,27 +319,27 @@ def check_files(folder: Path) -> list[Finding]:
             findings.append(_irregular(name, status.st_mode))
     findings += _size(sizes)
     advice = "put there only what another seed of the training changes"
-    findings += [_problem(SEEDS, what, advice) for what in _seed_problems(folder)]
+    findings += [_problem(SEEDS, message, advice) for message in _seed_problems(folder)]
     for first, second in collisions(sizes):
-        what = f"differs from {first} only in upper and lower case"
-        findings.append(_problem(second, what, "rename one of them"))
+        message = f"differs from {first} only in upper and lower case"
+        findings.append(_problem(second, message, "rename one of them"))
     return findings + list(_required(folder))
 
 
-def _problem(file: str, what: str, advice: str) -> Finding:
-    return Finding("files", file, what, advice)
+def _problem(file: str, message: str, advice: str) -> Finding:
+    return Finding("files", file, message, advice)
 
 
-def _note(file: str, what: str, advice: str) -> Finding:
-    return Finding("files", file, what, advice, problem=False)
+def _note(file: str, message: str, advice: str) -> Finding:
+    return Finding("files", file, message, advice, problem=False)
 
 
 def _members(folder: Path) -> Iterator[Path]:
     """Files, links, and hidden folders as one each; what Python caches is left out."""
-    for here, folders, names in walk(folder):
-        closed = [n for n in folders if (here / n).is_symlink() or n.startswith(".")]
+    for parent, folders, names in walk(folder):
+        closed = [n for n in folders if (parent / n).is_symlink() or n.startswith(".")]
         folders[:] = sorted(set(folders) - {"__pycache__"} - set(closed))
-        yield from (here / name for name in sorted((*closed, *names)))
+        yield from (parent / name for name in sorted((*closed, *names)))
 
 
 def _irregular(name: str, mode: int) -> Finding:
@@ -376,8 +378,8 @@ def _content(path: Path, name: str) -> Iterator[Finding]:
         advice = "commit the file itself, without LFS"
         yield _problem(name, "is a pointer of git LFS, not the file", advice)
     elif ending(name) in ARRAYS:
-        for what in weights_problems(path):
-            yield _problem(name, what, WEIGHTS_ADVICE[ending(name)])
+        for message in weights_problems(path):
+            yield _problem(name, message, WEIGHTS_ADVICE[ending(name)])
     elif ending(name) not in PICTURES:
         yield from _text(content, name)
 
@@ -432,7 +434,7 @@ _CODE = "compiled code is not reviewed and not run; submit the Python source"
 _PICKLE = "pickles run code when they are read; save arrays as .npz or .safetensors"
 _ARCHIVE = "archives are not reviewed; put the files themselves there"
 _SCRIPT = "scripts of that kind are never run"
-_OTHER_KIND = (
+_UNSUPPORTED_KIND = (
     "leave it out: only Python sources, text, pictures (.png, .jpg, .svg) "
     "and weights (.npz, .npy, .safetensors) are accepted"
 )
@@ -483,20 +485,20 @@ def kind_problem(path: str) -> str | None:
     kind = ending(path)
     if kind in TEXT | ARRAYS | PICTURES or path.rpartition("/")[2] in TEXT_NAMES:
         return None
-    return _KIND_ADVICE.get(kind, _OTHER_KIND)
+    return _KIND_ADVICE.get(kind, _UNSUPPORTED_KIND)
 
 
 def collisions(paths: Iterable[str]) -> list[tuple[str, str]]:
     """Pairs of files or folders, by the paths of all files, that are one where case is ignored."""
-    seen: dict[str, str] = {}
+    spellings: dict[str, str] = {}
     pairs = []
     for path in sorted(paths):
         names = path.split("/")
         for depth in range(1, len(names) + 1):
             part = "/".join(names[:depth])
-            other = seen.setdefault(part.casefold(), part)
-            if other != part:
-                pairs.append((other, part))
+            first = spellings.setdefault(part.casefold(), part)
+            if first != part:
+                pairs.append((first, part))
     return sorted(set(pairs))
 
 
@@ -533,9 +535,9 @@ def _npz(path: Path) -> list[str]:
         return [f"unpacks to {unpacked / 1e6:.0f} MB; {limit}"]
     if len(set(names)) < len(names):
         return ["holds two arrays of one name"]
-    other = [name for name in names if not name.endswith(".npy")]
-    if other:
-        return [f"holds {other[0]!r}, which is no array"]
+    non_arrays = [name for name in names if not name.endswith(".npy")]
+    if non_arrays:
+        return [f"holds {non_arrays[0]!r}, which is no array"]
     with np.load(path, allow_pickle=False) as file:
         return _numbers({f"array {key!r}": file[key] for key in file.files})
 
@@ -557,11 +559,11 @@ def _safetensors(path: Path) -> list[str]:
         return ["is not a safetensors file"]
     header = json.loads(content[8 : 8 + size])
     data, problems = content[8 + size :], []
-    for name, about in header.items():
+    for name, descriptor in header.items():
         if name == "__metadata__":
             continue
-        begin, end = about["data_offsets"]
-        kind, count = about["dtype"], math.prod(about["shape"])
+        begin, end = descriptor["data_offsets"]
+        kind, count = descriptor["dtype"], math.prod(descriptor["shape"])
         if not 0 <= begin <= end <= len(data):
             problems.append(f"array {name!r} lies outside of the file")
         elif kind in _FLOATS:

@@ -37,7 +37,7 @@ TRACKS = ("performance", "robustness")
 
 _MAX_BYTES = 64_000
 _MAX_TEXT = 2000
-_MAX_SHOWN = 120
+_MAX_QUOTED = 120
 _MAX_SEED = 1 << 64
 
 #: Names that an entry may have, and the rule in words.
@@ -77,13 +77,13 @@ class Manifest:
     training: Training = field(default_factory=Training)  #: see :class:`Training`.
 
 
-def _shown(value: Any) -> str:
+def _quoted(value: Any) -> str:
     """Return a value of a hostile file for a message: short, and never an error itself."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits; a deep list
         return f"such a {type(value).__name__}"
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
 
 
 #: Values that keys may have.
@@ -96,26 +96,26 @@ def _value(key: str, kind: Any, value: Any) -> Any:
     Raises:
         ValueError: with what is wrong, or msgspec.ValidationError.
     """
-    kept = msgspec.convert(value, kind)
-    entries = kept if isinstance(kept, tuple) else (kept,)
+    converted = msgspec.convert(value, kind)
+    entries = converted if isinstance(converted, tuple) else (converted,)
     for entry in entries:
         if isinstance(entry, str):
             _check_text(entry)
             if key == "name" and not NAME.fullmatch(entry):
-                raise ValueError(f"{_shown(entry)} {NAME_RULE}")
+                raise ValueError(f"{_quoted(entry)} {NAME_RULE}")
         elif abs(entry) >= _MAX_SEED:
             raise ValueError("must be an integer of at most 64 bits")
         choices = _CHOICES.get(key, (entry,))
         if entry not in choices:
             hint = _hint(entry, choices)
-            raise ValueError(f"{_shown(entry)} is not one of {', '.join(choices)}{hint}")
-    if key == "api_version" and kept != API_VERSION:
+            raise ValueError(f"{_quoted(entry)} is not one of {', '.join(choices)}{hint}")
+    if key == "api_version" and converted != API_VERSION:
         speaks = f"this ventbench speaks version {API_VERSION}"
-        raise ValueError(f"{_shown(kept)} is not supported; {speaks}")
+        raise ValueError(f"{_quoted(converted)} is not supported; {speaks}")
     clean = tuple(entry.strip() if isinstance(entry, str) else entry for entry in entries)
     if len(set(clean)) < len(clean):
         raise ValueError("contains something twice")
-    return clean if isinstance(kept, tuple) else clean[0]
+    return clean if isinstance(converted, tuple) else clean[0]
 
 
 def _check_text(text: str) -> None:
@@ -128,7 +128,7 @@ def _check_text(text: str) -> None:
 
 
 def _hint(value: Any, choices: tuple[str, ...]) -> str:
-    text = value[:_MAX_SHOWN] if isinstance(value, str) else ""
+    text = value[:_MAX_QUOTED] if isinstance(value, str) else ""
     close = difflib.get_close_matches(text, choices, n=1)
     return f"; did you mean {close[0]}?" if close else ""
 
@@ -140,17 +140,17 @@ _UNKNOWN = "is not known"
 def _checked(
     table: dict[str, Any], kinds: dict[str, Any], where: str, problems: list[_Problem]
 ) -> dict[str, Any]:
-    kept = {}
+    values = {}
     for key, value in table.items():
         if key not in kinds:
-            problems.append((f"{where}{_shown(key)}", f"{_UNKNOWN}{_hint(key, tuple(kinds))}"))
+            problems.append((f"{where}{_quoted(key)}", f"{_UNKNOWN}{_hint(key, tuple(kinds))}"))
             continue
         try:
-            kept[key] = _value(key, kinds[key], value)
+            values[key] = _value(key, kinds[key], value)
         except (ValueError, msgspec.ValidationError) as error:
-            what = str(error)
-            problems.append((f"{where}{key}", what[0].lower() + what[1:]))
-    return kept
+            message = str(error)
+            problems.append((f"{where}{key}", message[0].lower() + message[1:]))
+    return values
 
 
 def read_manifest(path: Path, label: str | None = None) -> Manifest:
@@ -163,9 +163,9 @@ def read_manifest(path: Path, label: str | None = None) -> Manifest:
     if isinstance(read, Manifest):
         return read
     texts = []
-    for key, what in read:
-        between = " " if what.startswith(_UNKNOWN) else ": "
-        texts.append(f"{label}, key {key}{between}{what}" if key else f"{label}: {what}")
+    for key, message in read:
+        between = " " if message.startswith(_UNKNOWN) else ": "
+        texts.append(f"{label}, key {key}{between}{message}" if key else f"{label}: {message}")
     raise SubmissionError(*texts)
 
 
@@ -190,10 +190,10 @@ def _read(path: Path) -> Manifest | list[_Problem]:
     if not isinstance(training, dict):
         problems.append(("training", "must be a table, [training]"))
         training = {}
-    kept = _checked(content, kinds, "", problems)
+    values = _checked(content, kinds, "", problems)
     problems += [(key, "is missing") for key in kinds if key not in content]
     trained = _checked(training, get_type_hints(Training), "training.", problems)
-    return problems or Manifest(**kept, training=Training(**trained))
+    return problems or Manifest(**values, training=Training(**trained))
 
 
 def read_as_json(folder: str, label: str) -> dict[str, Any]:
@@ -272,7 +272,7 @@ _EXAMPLES = {
     "training.compute": 'write compute = "20 min on 2 CPU cores", or leave it out',
     "training.per_lung": "write per_lung = true or false, or leave it out",
 }
-_OTHER_ADVICE = "see submission.toml in submissions/README.md for the keys and their values"
+_GENERAL_ADVICE = "see submission.toml in submissions/README.md for the keys and their values"
 
 # How tomllib names a place.
 _TOML_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)")
@@ -289,27 +289,27 @@ def check_manifest(folder: Path) -> tuple[list[Finding], Manifest | None]:
     return [_explained(*problem, lines) for problem in read], None
 
 
-def _explained(key: str, what: str, lines: list[str]) -> Finding:
+def _explained(key: str, message: str, lines: list[str]) -> Finding:
     """A finding of one of the manifest's problems."""
     if not key:
-        at = _TOML_PLACE.search(what)
+        at = _TOML_PLACE.search(message)
         place = (int(at[1]), int(at[2])) if at else (None, None)
-        return Finding("manifest", MANIFEST, _TOML_PLACE.sub("", what), _OTHER_ADVICE, *place)
-    unknown, table = what.startswith(_UNKNOWN), "training." * key.startswith("training.")
+        return Finding("manifest", MANIFEST, _TOML_PLACE.sub("", message), _GENERAL_ADVICE, *place)
+    unknown, table = message.startswith(_UNKNOWN), "training." * key.startswith("training.")
     key = table + key.removeprefix(table).strip("'\"")
-    advice = "remove or rename it" if unknown else _EXAMPLES.get(key, _OTHER_ADVICE)
-    return Finding("manifest", MANIFEST, f"key {key} {what}", advice, _line(lines, key))
+    advice = "remove or rename it" if unknown else _EXAMPLES.get(key, _GENERAL_ADVICE)
+    return Finding("manifest", MANIFEST, f"key {key} {message}", advice, _line(lines, key))
 
 
 def _line(lines: list[str], key: str) -> int | None:
     table, _, name = key.rpartition(".")
     pattern = re.compile(rf"\s*[\"']?{re.escape(name)}[\"']?\s*=|\s*\[\s*{re.escape(name)}\s*\]")
-    table_here = ""
+    current_table = ""
     for number, line in enumerate(lines, 1):
-        if pattern.match(line) and table_here == table:
+        if pattern.match(line) and current_table == table:
             return number
         header = re.match(r"\s*\[\s*(\w+)\s*\]", line)
-        table_here = header[1] if header else table_here
+        current_table = header[1] if header else current_table
     return None
 
 
@@ -319,28 +319,30 @@ def _lines(path: Path) -> list[str]:
 
 
 def _consistency(manifest: Manifest, folder: Path, lines: list[str]) -> Iterator[Finding]:
-    def finding(key: str, what: str, advice: str, *, problem: bool = False) -> Finding:
-        text = f"key {key} {what}"
+    def finding(key: str, message: str, advice: str, *, problem: bool = False) -> Finding:
+        text = f"key {key} {message}"
         return Finding("manifest", MANIFEST, text, advice, _line(lines, key), problem=problem)
 
     if not _SPDX.fullmatch(manifest.licence):
-        what = f"{manifest.licence!r} is not an SPDX identifier{_licence_hint(manifest.licence)}"
-        yield finding("licence", what, _EXAMPLES["licence"], problem=True)
+        message = f"{manifest.licence!r} is not an SPDX identifier{_licence_hint(manifest.licence)}"
+        yield finding("licence", message, _EXAMPLES["licence"], problem=True)
     else:
         for name in re.split(r" (?:AND|OR|WITH) ", manifest.licence):
             if name.strip("()") not in LICENCES:
-                what = f"{name!r} is not a well-known SPDX identifier{_licence_hint(name)}"
+                message = f"{name!r} is not a well-known SPDX identifier{_licence_hint(name)}"
                 advice = "make sure that it allows others to run and publish the submission"
-                yield finding("licence", what, advice)
+                yield finding("licence", message, advice)
     if manifest.name != folder.name:
-        what = f"is {manifest.name}, the folder is {folder.name}"
-        yield finding("name", what, f"a pull request must put it into submissions/{manifest.name}/")
+        message = f"is {manifest.name}, the folder is {folder.name}"
+        yield finding(
+            "name", message, f"a pull request must put it into submissions/{manifest.name}/"
+        )
     if AUTHOR in manifest.authors:
         yield finding("authors", f"still says {AUTHOR}", "write your name")
     if manifest.training.per_lung and "robustness" in manifest.tracks:
-        what = "is true, but task.lung is None on the robustness track"
+        message = "is true, but task.lung is None on the robustness track"
         advice = "make sure that it can do without, or leave it out"
-        yield finding("training.per_lung", what, advice)
+        yield finding("training.per_lung", message, advice)
     if manifest.family not in ("pid", "other") and not manifest.training.data:
         yield finding("training.data", "is missing", "say what it was trained on")
 

@@ -105,8 +105,8 @@ class Reference:
 
     def save(self, path: Path) -> str:
         """Write the file in one step and return its SHA-256; the same content gives one hash."""
-        about = np.array(json.dumps(dict(self.about), sort_keys=True))
-        arrays: dict[str, Any] = {"about": about, "gains": self.gains}
+        identity = np.array(json.dumps(dict(self.about), sort_keys=True))
+        arrays: dict[str, Any] = {"about": identity, "gains": self.gains}
         arrays |= {name: getattr(self, name) for name in (*_COLUMNS, "commands")}
         # Not compressed: the bytes then depend on no version of zlib.
         files.write_atomically(path, lambda file: np.savez(file, **arrays))
@@ -118,8 +118,8 @@ def settings(simulators: Mapping[str, Any], draws: Mapping[str, Any] | None) -> 
 
     As JSON values; draws are None for nominal cells alone.
     """
-    about = {"simulators": simulators.get("manifest_sha256"), "draws": draws}
-    return json.loads(json.dumps(about))
+    identity = {"simulators": simulators.get("manifest_sha256"), "draws": draws}
+    return json.loads(json.dumps(identity))
 
 
 def load(path: Path) -> Reference:
@@ -128,18 +128,18 @@ def load(path: Path) -> Reference:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path} is larger than {MAX_BYTES / 1e6:g} MB")
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as npz:
-            about = json.loads(str(npz["about"]))
+            identity = json.loads(str(npz["about"]))
             arrays = {name: npz[name] for name in ("gains", *_COLUMNS, "commands")}
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         if isinstance(error, InputError):
             raise
         # numpy takes whatever it does not know for a pickle.
-        why = "it is no .npz archive" if "pickle" in str(error) else error
+        reason = "it is no .npz archive" if "pickle" in str(error) else error
         raise InputError(
-            f"{path} is not a file of reference errors: {why}; make it with "
+            f"{path} is not a file of reference errors: {reason}; make it with "
             "`ventbench board headroom`"
         ) from error
-    return Reference(about, **arrays)
+    return Reference(identity, **arrays)
 
 
 @functools.cache
@@ -174,27 +174,27 @@ def reference_of(
     Raises:
         InputError: if a given reference is of other simulators or draws.
     """
-    given = reference
+    supplied = reference
     if reference is None:
         try:
             reference = published()
         except InputError:
             return None
-    own, wanted = dict(reference.about), settings(simulators, draws)
-    has, needed = own["draws"] or {}, wanted["draws"] or {}
+    actual, expected = dict(reference.about), settings(simulators, draws)
+    actual_draws, expected_draws = actual["draws"] or {}, expected["draws"] or {}
     keys = ("version", "sha256", "season")
-    same = own["simulators"] == wanted["simulators"] and (
-        draws is None or all(has.get(key) == needed.get(key) for key in keys)
+    matches = actual["simulators"] == expected["simulators"] and (
+        draws is None or all(actual_draws.get(key) == expected_draws.get(key) for key in keys)
     )
-    count = needed.get("count", 0)
-    if same and count <= has.get("count", 0):
+    count = expected_draws.get("count", 0)
+    if matches and count <= actual_draws.get("count", 0):
         return reference.first(count)
-    if given is None:
+    if supplied is None:
         return None
     raise InputError(
-        f"the reference errors are of simulators {str(own['simulators'])[:12]} and draws {has}, "
-        f"not of {str(wanted['simulators'])[:12]} and {needed}; make them with "
-        "`ventbench board headroom`"
+        f"the reference errors are of simulators {str(actual['simulators'])[:12]} and draws "
+        f"{actual_draws}, not of {str(expected['simulators'])[:12]} and {expected_draws}; make "
+        "them with `ventbench board headroom`"
     )
 
 
@@ -224,7 +224,7 @@ def compute(
     plants: Plant,
     cells: Scenario,
     gains: Floats,
-    about: Mapping[str, Any],
+    identity: Mapping[str, Any],
     *,
     folder: Path | None = None,
     starts: tuple[int, ...] = attainable.STARTS,
@@ -237,7 +237,7 @@ def compute(
         plants: leaves ``(L, 1 + K, 1, ...)``.
         cells: batch shape ``(L, 1 + K, P)``, nominal cells first.
         gains: of each lung's best PID, %/cmH2O, shape ``(L, 3)``.
-        about: what the reference belongs to, see :func:`settings`.
+        identity: what the reference belongs to, see :func:`settings`.
         folder: for finished parts; nothing is kept if not given.
         starts: see :data:`ventbench.task.attainable.STARTS`.
         pool: executor of the draws; this process if not given.
@@ -249,29 +249,31 @@ def compute(
     lungs, draws, pips = np.shape(cells.pip)
     work = None
     if folder is not None:
-        keys = {"about": dict(about), "starts": starts, "iterations": attainable.ITERATIONS}
+        keys = {"about": dict(identity), "starts": starts, "iterations": attainable.ITERATIONS}
         keys["sweeps"] = SWEEPS
         keys["inputs"] = fingerprint((plants, cells, gains))
         work = WorkFolder(folder, keys)
-    report = progress or (lambda done, total: None)
-    size, whole = lungs * pips, lungs * draws * pips * (1 + SWEEPS)
+    report = progress or (lambda completed, total: None)
+    size, total = lungs * pips, lungs * draws * pips * (1 + SWEEPS)
     parts: dict[str, Floats] = {}
     stacked = np.empty(0)
     for sweep in range(1 + SWEEPS):
         jobs: dict[str, tuple[Any, ...]] = {}
         neighbours = _neighbours(stacked) if sweep else None
         for draw in range(draws):
-            each = jax.tree.map(lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells))
+            draw_inputs = jax.tree.map(
+                lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells)
+            )
             begin = starts if neighbours is None else neighbours[:, :, draw]
-            jobs[f"draw-{draw}.{sweep}"] = (*each, np.asarray(gains), begin)
+            jobs[f"draw-{draw}.{sweep}"] = (*draw_inputs, np.asarray(gains), begin)
         for name, part in kept_results(work, pool or InProcess(), _part, jobs, ARRAY):
             parts[name] = part
-            report(len(parts) * size, whole)
+            report(len(parts) * size, total)
         stacked = np.stack([parts[name] for name in jobs], axis=1)
     columns = {name: stacked[..., k] for k, name in enumerate(_COLUMNS)}
     commands = stacked[..., len(_COLUMNS) :]
     commands = commands.reshape(*commands.shape[:3], len(protocol.SCORED_BREATHS), -1)
-    return Reference(dict(about), np.asarray(gains), **columns, commands=commands)
+    return Reference(dict(identity), np.asarray(gains), **columns, commands=commands)
 
 
 def _part(
@@ -329,12 +331,14 @@ def _inspirations(plants: Plant, cells: Scenario, breath: int) -> tuple[Plant, S
     """One scored inspiration of each cell ``(L, n, P)``, on one axis, with its plant."""
     shape = np.shape(cells.pip)
     size, at = int(np.prod(shape)), protocol.SCORED_BREATHS[breath]
-    each = jax.tree.map(
+    flat_plants = jax.tree.map(
         lambda x: np.broadcast_to(x, (*shape, *np.shape(x)[3:])).reshape(size, *np.shape(x)[3:]),
         plants,
     )
-    flat = jax.tree.map(lambda x: np.asarray(x).reshape(size, *np.shape(x)[3:]), cells)
-    return each, flat.replace(gain=flat.gain[:, [at]], noise=np.zeros((size, 1, 1)))
+    flat_cells = jax.tree.map(lambda x: np.asarray(x).reshape(size, *np.shape(x)[3:]), cells)
+    return flat_plants, flat_cells.replace(
+        gain=flat_cells.gain[:, [at]], noise=np.zeros((size, 1, 1))
+    )
 
 
 def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floats:
@@ -344,33 +348,35 @@ def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floa
     """
     errors = []
     for breath in range(len(protocol.SCORED_BREATHS)):
-        each, flat = _inspirations(plants, cells, breath)
-        commands = reference.commands[..., breath, :].reshape(len(flat.pip), -1)
+        flat_plants, flat_cells = _inspirations(plants, cells, breath)
+        commands = reference.commands[..., breath, :].reshape(len(flat_cells.pip), -1)
         with compilation.float64():
-            pressure = attainable.pressures(each, flat, commands)
-        errors.append(np.mean(np.abs(pressure - flat.pip[:, None]), axis=1))
+            pressure = attainable.pressures(flat_plants, flat_cells, commands)
+        errors.append(np.mean(np.abs(pressure - flat_cells.pip[:, None]), axis=1))
     return np.mean(errors, axis=0).reshape(np.shape(cells.pip))
 
 
-def second_errors(plants: Plant, cells: Scenario, some: Ints) -> Floats:
+def second_errors(plants: Plant, cells: Scenario, index: Ints) -> Floats:
     """Least errors that the second optimiser finds in some cells, cmH2O, ``(m,)``.
 
     Args:
         plants: as of :func:`compute`.
         cells: as of :func:`compute`.
-        some: which, by their index in the flat table of all, ``(m,)``.
+        index: of these cells in the flat table of all, ``(m,)``.
     """
     breaths = range(len(protocol.SCORED_BREATHS))
-    each = [jax.tree.map(lambda x: x[some], _inspirations(plants, cells, k)) for k in breaths]
-    found = second_optimum(*jax.tree.map(lambda *x: np.concatenate(x), *each))
-    return found.reshape(len(breaths), -1).mean(axis=0)
+    inspirations = [
+        jax.tree.map(lambda x: x[index], _inspirations(plants, cells, k)) for k in breaths
+    ]
+    errors = second_optimum(*jax.tree.map(lambda *x: np.concatenate(x), *inspirations))
+    return errors.reshape(len(breaths), -1).mean(axis=0)
 
 
 def rise_errors(plants: Plant, cells: Scenario) -> Floats:
     """Errors that no commands can be below, cmH2O, ``(L, 1 + K, P)``; arguments as of above."""
     breaths = range(len(protocol.SCORED_BREATHS))
-    each = [attainable.rise_error(*_inspirations(plants, cells, k)) for k in breaths]
-    return np.mean(each, axis=0).reshape(np.shape(cells.pip))
+    by_breath = [attainable.rise_error(*_inspirations(plants, cells, k)) for k in breaths]
+    return np.mean(by_breath, axis=0).reshape(np.shape(cells.pip))
 
 
 def checked(
@@ -388,21 +394,25 @@ def checked(
         and ``second_optimiser_worse_by``, its mean lag, all cmH2O; ``sound``, whether witnesses
         agree to 1e-9 and the lead is below :data:`TOLERANCE`.
     """
-    off = np.abs(witness_errors(reference, plants, cells) - reference.attainable)
-    pid = np.abs(pid_errors(plants, cells, reference.gains) - reference.pid)
-    some = np.arange(0, off.size, every)
-    lead = reference.attainable.ravel()[some] - second_errors(plants, cells, some)
+    deviation = np.abs(witness_errors(reference, plants, cells) - reference.attainable)
+    pid_deviation = np.abs(pid_errors(plants, cells, reference.gains) - reference.pid)
+    index = np.arange(0, deviation.size, every)
+    lead = reference.attainable.ravel()[index] - second_errors(plants, cells, index)
     gap = reference.attainable - reference.lower
     result: dict[str, Any] = {
-        "cells": off.size,
-        "witness_deviation": float(off.max()),
-        "pid_deviation": float(pid.max()),
+        "cells": deviation.size,
+        "witness_deviation": float(deviation.max()),
+        "pid_deviation": float(pid_deviation.max()),
         "gap_mean": float(gap.mean()),
         "gap_max": float(gap.max()),
         "stationarity_max": float(reference.stationarity.max()),
-        "second_optimiser_cells": len(some),
+        "second_optimiser_cells": len(index),
         "second_optimiser_better_by": float(lead.max()),
         "second_optimiser_worse_by": float(-lead.mean()),
     }
-    sound = max(off.max(), pid.max()) < 1e-9 and lead.max() < TOLERANCE and gap.min() > -1e-9
+    sound = (
+        max(deviation.max(), pid_deviation.max()) < 1e-9
+        and lead.max() < TOLERANCE
+        and gap.min() > -1e-9
+    )
     return {**result, "sound": bool(sound)}

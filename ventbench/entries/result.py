@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 #: Failures and stressed conditions that a printed score names; the JSON has all.
-_FAILURES_SHOWN, _CONDITIONS_SHOWN = 3, 10
+_LISTED_FAILURES, _LISTED_CONDITIONS = 3, 10
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -259,15 +259,15 @@ class Score:
     def __repr__(self) -> str:
         return f"<Score of {self._headline()}>"
 
-    def _said(self) -> list[str]:
+    def _sentences(self) -> list[str]:
         """Headline, failures, and the headline of the stressed runs."""
-        failures = [failure.message for failure in self.failed[:_FAILURES_SHOWN]]
+        failures = [failure.message for failure in self.failed[:_LISTED_FAILURES]]
         more = len(self.failed) - len(failures)
-        said = [*failures, *([f"... {more} more"] * (more > 0))]
+        sentences = [*failures, *([f"... {more} more"] * (more > 0))]
         if (runs := self.stressed) is not None:
             low, high = runs.interval(runs.by_lung_and_draw)
             failed = f"failed in {len(runs.failures)} runs"
-            said.append(
+            sentences.append(
                 f"Under missing physics: {failed}"
                 if math.isnan(runs.score)
                 else f"Under missing physics: {runs.score:.3f} cmH2O [{low:.3f}, {high:.3f}], "
@@ -275,7 +275,7 @@ class Score:
                 f"{int(np.sum(~runs.safe[1:]))} of {runs.safe[1:].size} runs unsafe. What costs "
                 "most:"
             )
-        return said
+        return sentences
 
     def _worst(self) -> pd.DataFrame | None:
         """Conditions that cost most."""
@@ -283,23 +283,23 @@ class Score:
             return None
         columns = ["error_cmH2O", "rise_cmH2O", "survived", "unsafe_runs", "volume_ratio"]
         table = self.stressed.summary().iloc[1:].sort_values("error_cmH2O", ascending=False)
-        return table[columns].head(_CONDITIONS_SHOWN).reset_index()
+        return table[columns].head(_LISTED_CONDITIONS).reset_index()
 
     def __str__(self) -> str:
         rows = self.summary().reset_index()
         lines = [rows.to_string(index=False, float_format="{:.3f}".format, na_rep="failed")]
         if (worst := self._worst()) is not None:
             lines += [worst.to_string(index=False, float_format="{:.2f}".format)]
-        return "\n".join([self._headline(), lines[0], *self._said(), *lines[1:]])
+        return "\n".join([self._headline(), lines[0], *self._sentences(), *lines[1:]])
 
     def _repr_html_(self) -> str:
         rows = self.summary().reset_index()
         tables = [rows.to_html(index=False, float_format="{:.3f}".format, na_rep="failed")]
         if (worst := self._worst()) is not None:
             tables += [worst.to_html(index=False, float_format="{:.2f}".format)]
-        said = "".join(f"<p>{html.escape(text)}</p>" for text in self._said())
+        paragraphs = "".join(f"<p>{html.escape(text)}</p>" for text in self._sentences())
         headline = f"<p>{html.escape(self._headline())}</p>"
-        return f"<div>{headline}{tables[0]}{said}{''.join(tables[1:])}</div>"
+        return f"<div>{headline}{tables[0]}{paragraphs}{''.join(tables[1:])}</div>"
 
     def _stress(self) -> dict[str, Any] | None:
         """What missing physics does, as JSON values."""
@@ -332,7 +332,7 @@ class Score:
         *,
         first: int = 0,
         published: bool = False,
-        some: Bools | slice = slice(None),
+        selection: Bools | slice = slice(None),
     ) -> dict[str, Any] | None:
         """Mean over some draws, ``(k, lungs)``, of all lungs or of those from ``first`` on.
 
@@ -345,15 +345,18 @@ class Score:
         score, ci95 = math.nan, (math.nan, math.nan)
         if np.isfinite(means).all():  # a draw that failed must not be left out of a mean
             lungs = slice(first, first + values.shape[1])
-            rig, member = self.rig_draws.rig[lungs, some], self.rig_draws.member[lungs, some]
+            rig, member = (
+                self.rig_draws.rig[lungs, selection],
+                self.rig_draws.member[lungs, selection],
+            )
             score = float(values.mean())
             ci95 = bootstrap.limits(bootstrap.resampled_scores(values.T, rig, member))
-        about = self.rig_draws.about()
+        identity = self.rig_draws.about()
         return {
             "score": number(score),
             "ci95": [number(limit) for limit in ci95],
             "values": [number(value) for value in means],
-            **(about if published else {}),
+            **(identity if published else {}),
         }
 
     def _normalised(self, lung: int | None = None) -> dict[str, Any]:
@@ -366,14 +369,14 @@ class Score:
         if values is None or reference is None:
             return {"normalised": None}
         lungs = slice(None) if lung is None else slice(lung, lung + 1)
-        drawn, ranked = lung_score(values[lungs, 1:]).T, self.ranked
-        training = drawn[~ranked].mean() if len(ranked) > ranked.sum() else math.nan
+        by_draw, ranked = lung_score(values[lungs, 1:]).T, self.ranked
+        training = by_draw[~ranked].mean() if len(ranked) > ranked.sum() else math.nan
         return {
             "normalised": {
                 "nominal": number(np.mean(values[lungs, 0])),
-                "draws": self._draws(drawn[ranked], first=lung or 0, some=ranked),
+                "draws": self._draws(by_draw[ranked], first=lung or 0, selection=ranked),
                 "training": number(training),
-                "held_out_gap": number(drawn[ranked].mean() - training) if ranked.any() else None,
+                "held_out_gap": number(by_draw[ranked].mean() - training) if ranked.any() else None,
                 "attainable_cmH2O": float(reference.attainable[lungs].mean()),
                 "pid_cmH2O": float(reference.pid[lungs].mean()),
             }
@@ -382,9 +385,9 @@ class Score:
     def _secondary(self, lungs: slice) -> dict[str, Any]:
         means, missing = {}, {}
         for name, values in self.figures.items():
-            there = values[lungs][~np.isnan(values[lungs])]
-            means[name] = number(np.mean(there)) if there.size else None
-            missing[name] = int(values[lungs].size - there.size)
+            finite = values[lungs][~np.isnan(values[lungs])]
+            means[name] = number(np.mean(finite)) if finite.size else None
+            missing[name] = int(values[lungs].size - finite.size)
         missing = {name: count for name, count in missing.items() if count}
         return {"secondary": means, "secondary_missing": missing}
 

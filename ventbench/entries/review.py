@@ -66,13 +66,15 @@ def _parsed(path: Path, name: str) -> ast.Module | Finding:
             content = path.read_bytes()
             encoding = _declared(content)
             if encoding not in ("utf-8", "utf-8-sig"):
-                what = f"names the encoding {encoding}, and is read as UTF-8"
-                return Finding("source", name, what, "save it as UTF-8, and leave out the name", 1)
+                message = f"names the encoding {encoding}, and is read as UTF-8"
+                return Finding(
+                    "source", name, message, "save it as UTF-8, and leave out the name", 1
+                )
             return ast.parse(source_text(content), name)
     except SyntaxError as error:
-        what = f"is not Python: {error.msg}"
+        message = f"is not Python: {error.msg}"
         advice = "python -m py_compile shows the place"
-        return Finding("source", name, what, advice, error.lineno, error.offset or None)
+        return Finding("source", name, message, advice, error.lineno, error.offset or None)
     except (ValueError, RecursionError, MemoryError, OSError) as error:
         return Finding("source", name, f"is not Python: {error}", "save it as plain UTF-8 text")
 
@@ -102,43 +104,43 @@ _LATE = "import it at the top of the file; later the folder is not searched any 
 
 def _check_imports(trees: Mapping[str, ast.Module]) -> list[Finding]:
     """Follow the imports from ``controller.py`` on, in all parsed sources by path in the folder."""
-    own = {name.partition("/")[0].removesuffix(".py") for name in trees}
-    waiting, seen, findings = [CONTROLLER], set(), []
+    local_modules = {name.partition("/")[0].removesuffix(".py") for name in trees}
+    waiting, visited, findings = [CONTROLLER], set(), []
     while waiting:
         name = waiting.pop()
-        if name in seen or name not in trees:
+        if name in visited or name not in trees:
             continue
-        seen.add(name)
+        visited.add(name)
         for imported in imports(trees[name].body):
-            finding = _import_finding(imported, name, own)
+            finding = _import_finding(imported, name, local_modules)
             if finding is not None:
                 findings.append(finding)
             waiting += module_files(imported, name)
     return list(dict.fromkeys(findings))  # `from a import b` may be two modules
 
 
-def _import_finding(imported: Import, name: str, own: set[str]) -> Finding | None:
-    top, what = imported.module.partition(".")[0], ""
+def _import_finding(imported: Import, name: str, local_modules: set[str]) -> Finding | None:
+    top, message = imported.module.partition(".")[0], ""
     if imported.level:
         if "/" in name:
             return None
-        what, advice = "uses a relative import, and is not in a package", "leave out the dot"
-    elif top in own:
+        message, advice = "uses a relative import, and is not in a package", "leave out the dot"
+    elif top in local_modules:
         if not imported.late or imported.optional:
             return None
-        what, advice = f"imports {top} inside a function", _LATE
+        message, advice = f"imports {top} inside a function", _LATE
     elif top in _USELESS:
-        what, advice = f"imports {top}, but the sandbox closes {_USELESS[top]}", _SANDBOX
+        message, advice = f"imports {top}, but the sandbox closes {_USELESS[top]}", _SANDBOX
     elif top in ALLOWED or top in sys.stdlib_module_names:
         return None
     elif top == "ventbench":
-        what = "imports ventbench, which a submission does not have"
+        message = "imports ventbench, which a submission does not have"
         advice = "copy what it needs into the folder; task and observation come by themselves"
     else:
-        what = f"imports {top}, which is neither in the folder nor among the packages it may use"
+        message = f"imports {top}, which is neither in the folder nor among the packages it may use"
         advice = f"use {', '.join(ALLOWED)} and the standard library"
     place = imported.node.lineno, imported.node.col_offset + 1
-    return Finding("source", name, what, advice, *place, problem=not imported.optional)
+    return Finding("source", name, message, advice, *place, problem=not imported.optional)
 
 
 _MODULES = {
@@ -185,17 +187,17 @@ def review(folder: Path) -> list[Finding]:
         if isinstance(tree, Finding):
             continue  # check_sources says so
         notes += [
-            Finding("source", name, what, _ADVICE, line, problem=False)
-            for line, what in _characters(source_text(path.read_bytes()))
+            Finding("source", name, message, _ADVICE, line, problem=False)
+            for line, message in _characters(source_text(path.read_bytes()))
         ]
-        seen = set()
+        noted = set()
         for node in ast.walk(tree):
             for used, why in _uses(node):
                 line = getattr(node, "lineno", None)
-                if (used, line) not in seen:
-                    seen.add((used, line))
-                    what = f"uses {used}, which {why}"
-                    notes.append(Finding("source", name, what, _ADVICE, line, problem=False))
+                if (used, line) not in noted:
+                    noted.add((used, line))
+                    message = f"uses {used}, which {why}"
+                    notes.append(Finding("source", name, message, _ADVICE, line, problem=False))
     return sorted(notes, key=lambda note: (note.file, note.line or 0))
 
 
@@ -209,8 +211,8 @@ def _characters(text: str) -> Iterator[tuple[int, str]]:
             yield number, f"holds {names}, which is not seen and may hide or move what is"
         words = {word for word in _WORD.findall(line) if not word.isascii()}
         if words:
-            shown = ", ".join(sorted(words))
-            yield number, f"holds {shown}, in letters that may look like others"
+            quoted = ", ".join(sorted(words))
+            yield number, f"holds {quoted}, in letters that may look like others"
 
 
 #: Categories of Unicode: control characters, formats (direction, width zero), line separators.
@@ -275,8 +277,8 @@ def findings_as_json(folder: str, *checks: str) -> list[dict[str, Any]]:
     for check in checks:
         findings = _CHECKS[check](Path(folder))
         # Problems first: what is cut off must not be what stops the submission.
-        kept = sorted(findings, key=lambda finding: not finding.problem)[:LISTED]
-        listed += [dataclasses.asdict(finding) for finding in findings if finding in kept]
+        limited = sorted(findings, key=lambda finding: not finding.problem)[:LISTED]
+        listed += [dataclasses.asdict(finding) for finding in findings if finding in limited]
     return listed
 
 
@@ -289,7 +291,7 @@ def inspect_folder(folder: Path) -> tuple[Finding, ...]:
     """
     function, findings = "ventbench.entries.review:findings_as_json", list[Finding]()
     with contextlib.suppress(UnreadableError):
-        return tuple(Finding(**each) for each in read_apart(function, folder, [*_CHECKS]))
+        return tuple(Finding(**fields) for fields in read_apart(function, folder, [*_CHECKS]))
     for check in _CHECKS:
         try:
             answer = read_apart(function, folder, [check])

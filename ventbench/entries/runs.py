@@ -106,8 +106,10 @@ class Runs:
     @property
     def held_out_score(self) -> float:
         """Mean error under stressors that nothing may be tuned under, cmH2O; NaN without any."""
-        apart = held_out()
-        at = [k for k, c in enumerate(self.conditions) if c.stressors and set(c.stressors) <= apart]
+        excluded = held_out()
+        at = [
+            k for k, c in enumerate(self.conditions) if c.stressors and set(c.stressors) <= excluded
+        ]
         return float(np.mean(self.error[at])) if at else float("nan")
 
     @property
@@ -161,26 +163,26 @@ class Runs:
             values = values - (sums / count)[index] + values.mean()
         return limits(resampled_scores(values, self.rig, self.member))
 
-    def comparable(self, other: Runs) -> bool:
+    def comparable(self, baseline: Runs) -> bool:
         """Whether another entry was run under the same conditions on the same draws."""
         return (
-            self.conditions == other.conditions
-            and self.lungs == other.lungs
+            self.conditions == baseline.conditions
+            and self.lungs == baseline.lungs
             and all(
-                np.array_equal(getattr(self, name), getattr(other, name))
+                np.array_equal(getattr(self, name), getattr(baseline, name))
                 for name in ("pips", "rig", "member")
             )
         )
 
-    def difference(self, other: Runs) -> tuple[float, tuple[float, float]]:
+    def difference(self, baseline: Runs) -> tuple[float, tuple[float, float]]:
         """Stress score less that of another entry, cmH2O, and its paired 95 % interval.
 
         Raises:
             InputError: if the other one was run on other draws or under other conditions.
         """
-        if not self.comparable(other):
+        if not self.comparable(baseline):
             raise InputError("these entries were run under different conditions or draws")
-        change = self.by_lung_and_draw - other.by_lung_and_draw
+        change = self.by_lung_and_draw - baseline.by_lung_and_draw
         return float(change.mean()), self.interval(change)
 
     def to_frame(self) -> pd.DataFrame:
@@ -226,7 +228,7 @@ class Runs:
 
     def headline(self) -> dict[str, Any]:
         """What a table shows of an entry, as JSON values: score, rise, survival, safety, worst."""
-        worst_one = max(self.by_condition[1:], key=lambda row: _order(row["error_cmH2O"]))
+        worst = max(self.by_condition[1:], key=lambda row: _order(row["error_cmH2O"]))
         stressed, rise = self.by_lung_and_draw, self.over_conditions(self.rise)
         return {
             "score": number(self.score),
@@ -243,8 +245,8 @@ class Runs:
             "unsafe_runs": int(np.sum(~self.safe[1:])),
             "stressed_runs": int(self.safe[1:].size),
             "above_alarm_s": number(np.mean(self.alarm_s[1:])),
-            "worst_condition": worst_one["condition"],
-            "worst_error": worst_one["error_cmH2O"],
+            "worst_condition": worst["condition"],
+            "worst_error": worst["error_cmH2O"],
             "complete": self.complete,
             "categories": self.by_category(),
             "conditions": list(self.by_condition),
@@ -299,8 +301,8 @@ def pip_columns(lungs: int, n: int) -> Ints:
 
     In each draw the lungs have different PIPs, and over six draws each lung has each PIP once.
     """
-    turns = np.array(_TURNS)[np.arange(n) % len(_TURNS)]
-    return (np.arange(lungs)[:, None] + turns) % len(protocol.PIPS)
+    offsets = np.array(_TURNS)[np.arange(n) % len(_TURNS)]
+    return (np.arange(lungs)[:, None] + offsets) % len(protocol.PIPS)
 
 
 def category_of(condition: Condition) -> str:

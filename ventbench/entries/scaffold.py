@@ -161,8 +161,8 @@ def contents(name: str, family: str, exported_from: Path | str | None = None) ->
     """
     if exported_from is not None:
         return _exported_files(name, "other" if family == "pid" else family, Path(exported_from))
-    known = (_TEMPLATES / f"{family}.py").is_file()
-    controller = _template(f"{family if known else 'pid'}.py")
+    has_template = (_TEMPLATES / f"{family}.py").is_file()
+    controller = _template(f"{family if has_template else 'pid'}.py")
     files = {CONTROLLER: controller.encode()}
     network = "from network import" in controller
     if network:
@@ -192,7 +192,7 @@ def _described(
 
 
 def _exported_files(name: str, family: str, path: Path) -> dict[str, bytes]:
-    arrays, source, off, count = exported(path)
+    arrays, source, deviation, count = exported(path)
     files = {
         CONTROLLER: _template("ppo.py").replace("; it starts as a PI controller", "").encode(),
         "network.py": source.encode(),
@@ -201,8 +201,8 @@ def _exported_files(name: str, family: str, path: Path) -> dict[str, bytes]:
     layers = len(arrays) // 2
     description = f"A network of {layers} dense layers that another library trained."
     data = "not said yet: what the network was trained on"
-    told = _EXPORTED.format(count=count, file=path.name, off=off)
-    return _described(files, name, family, description, data, told)
+    section = _EXPORTED.format(count=count, file=path.name, off=deviation)
+    return _described(files, name, family, description, data, section)
 
 
 def exported(path: Path) -> tuple[dict[str, NDArray[np.floating]], str, float, int]:
@@ -229,64 +229,74 @@ def exported(path: Path) -> tuple[dict[str, NDArray[np.floating]], str, float, i
     from safetensors.numpy import load_file
 
     try:
-        found = load_file(path)
+        tensors = load_file(path)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file") from None
     except (SafetensorError, KeyError, TypeError) as error:
         raise InputError(
             f"{path}: no safetensors file of numpy's types ({error}); write it by save_file"
         ) from None
-    arrays = _layers(found, path)
+    arrays = _layers(tensors, path)
     inputs, depth = len(arrays["w0"]), len(arrays) // 2
     if inputs % _OBSERVED:
         raise InputError(
             f"{path}: the network has {inputs} inputs; an observation of Ventilator-v1 has "
             f"{_OBSERVED}. Use `ventbench new --family ppo` and write your own Features"
         )
-    if not {"check.input", "check.output"} <= set(found):
+    if not {"check.input", "check.output"} <= set(tensors):
         raise InputError(
             f"{path}: check.input and check.output are missing; save some inputs (n, {inputs}) and "
             "the actions that the network gives for them beside its weights"
         )
-    given, wanted = found["check.input"].astype(float), found["check.output"].astype(float).ravel()
-    if given.shape != (len(wanted), inputs) or not np.isfinite(given).all():
-        raise InputError(f"{path}: check.input is {given.shape}, not finite numbers (n, {inputs})")
-    off, between, behind = np.inf, "", ""
+    check_input, check_output = (
+        tensors["check.input"].astype(float),
+        tensors["check.output"].astype(float).ravel(),
+    )
+    if check_input.shape != (len(check_output), inputs) or not np.isfinite(check_input).all():
+        raise InputError(
+            f"{path}: check.input is {check_input.shape}, not finite numbers (n, {inputs})"
+        )
+    deviation, between, behind = np.inf, "", ""
     for hidden, last in product(ACTIVATIONS, OUTPUTS):
-        x = given
+        x = check_input
         with np.errstate(over="ignore"):
             for k in range(depth):
                 activate, _ = ACTIVATIONS[hidden] if k < depth - 1 else OUTPUTS[last]
                 x = activate(x @ arrays[f"w{k}"] + arrays[f"b{k}"])
-        error = np.max(np.abs(x[:, 0] - wanted) / np.maximum(1.0, np.abs(wanted)))
-        if error < off:
-            off, between, behind = float(error), hidden, last
-    if not off <= _TOLERANCE:
+        error = np.max(np.abs(x[:, 0] - check_output) / np.maximum(1.0, np.abs(check_output)))
+        if error < deviation:
+            deviation, between, behind = float(error), hidden, last
+    if not deviation <= _TOLERANCE:
         raise InputError(
             f"{path}: no copy gives check.output to {_TOLERANCE:g}; the nearest, with {between} "
-            f"between layers and {behind} behind, is {off:.1e} off. Known are "
+            f"between layers and {behind} behind, is {deviation:.1e} off. Known are "
             f"{', '.join(ACTIVATIONS)}; float64 tells rounding from another network"
         )
     code = _template("network.py").partition("def activation")
     code = code[1] + code[2].replace(ACTIVATIONS["relu"][1], ACTIVATIONS[between][1])
     code = code.replace("return x @ w + b", f"x = x @ w + b\n        return {OUTPUTS[behind][1]}")
-    return arrays, _GYMNASIUM.format(frames=inputs // _OBSERVED) + code, off, len(wanted)
+    return (
+        arrays,
+        _GYMNASIUM.format(frames=inputs // _OBSERVED) + code,
+        deviation,
+        len(check_output),
+    )
 
 
-def _layers(found: dict[str, NDArray[Any]], path: Path) -> dict[str, NDArray[np.floating]]:
+def _layers(tensors: dict[str, NDArray[Any]], path: Path) -> dict[str, NDArray[np.floating]]:
     """Weights ``w0``, ``b0``, ... from the input to the one output."""
 
     def order(name: str) -> list[Any]:
         return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
 
     layers = []
-    for name in sorted(found, key=order):
+    for name in sorted(tensors, key=order):
         layer = _LAYER.fullmatch(name)
         if layer is None or _NO_ACTOR.search(name):
             continue
-        weight = found[name]
+        weight = tensors[name]
         weight = weight.T if layer[2] == "weight" else weight
-        bias = found.get(f"{layer[1]}.bias".lstrip("."), np.zeros(weight.shape[-1], weight.dtype))
+        bias = tensors.get(f"{layer[1]}.bias".lstrip("."), np.zeros(weight.shape[-1], weight.dtype))
         finite = np.isfinite(weight).all() and np.isfinite(bias).all()
         if weight.ndim != 2 or bias.shape != weight.shape[1:] or not finite:
             raise InputError(f"{path}: {name} of shape {weight.shape} is no finite dense layer")

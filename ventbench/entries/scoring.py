@@ -153,7 +153,7 @@ def run_protocol(
             f"{submission.label}: submission.toml, key tracks: is scored for {track}; missing "
             "physics does not tell the lung and needs an entry of the robustness track"
         )
-    what = protocol_of(
+    scoring_protocol = protocol_of(
         rigs,
         draws=draws,
         drawn=drawn,
@@ -164,12 +164,12 @@ def run_protocol(
     )
     count = _counted(progress, 1 + stress)
     with compilation.float64():
-        run = run_cells(what.cells, runner, submission, tasks, count)
+        run = run_cells(scoring_protocol.cells, runner, submission, tasks, count)
         under_stress = None
-        if what.stressed is not None:
-            stressed = run_cells(what.stressed, runner, submission, tasks, count)
-            under_stress = runs_of(stressed, what.stressed, submission, tasks)
-    scenario = what.cells.scenario
+        if scoring_protocol.stressed is not None:
+            stressed = run_cells(scoring_protocol.stressed, runner, submission, tasks, count)
+            under_stress = runs_of(stressed, scoring_protocol.stressed, submission, tasks)
+    scenario = scoring_protocol.cells.scenario
     inspired = run.u_in[0, :, 0]
     fixed = expiratory_command(np.arange(protocol.INSPIRATION_STEPS, protocol.BREATH_STEPS))
     fixed = np.broadcast_to(fixed, (*inspired.shape[:-1], len(fixed)))
@@ -191,14 +191,16 @@ def run_protocol(
     return Score(
         submission=submission,
         track=track,
-        protocol=what,
-        runs=runs_of(run, what.cells, submission, tasks),
+        protocol=scoring_protocol,
+        runs=runs_of(run, scoring_protocol.cells, submission, tasks),
         stressed=under_stress,
         controllable=controllable,
         figures=figures(InspirationSignals(*signals, *levels)),
         below=np.sum(requested < 0.0, axis=(1, 2, 3)),
         above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3)),
-        trajectories=end_to_end(submission.manifest.name, track, names, what.pips, *joined),
+        trajectories=end_to_end(
+            submission.manifest.name, track, names, scoring_protocol.pips, *joined
+        ),
         sandbox=runner.sandbox,
         timing={
             "seconds": time.perf_counter() - started,
@@ -236,9 +238,9 @@ def enter(
             f"{submission.label}: submission.toml, key tracks: enters {', '.join(entered)}; "
             f"it cannot be scored for {track}"
         )
-    known = track == "performance"
+    named = track == "performance"
     return track, [
-        Task(track, name if known else None, protocol.DT, protocol.INSPIRATION_STEPS)
+        Task(track, name if named else None, protocol.DT, protocol.INSPIRATION_STEPS)
         for name in lungs
     ]
 
@@ -327,18 +329,18 @@ def transfer(
         raise InputError("these simulators have one rig a lung: there is nothing to transfer to")
     runner = runner or runner_of(submission, sandbox=True)
     track, tasks = enter(submission, track, tuple(lung.id for lung in rigs.lungs), runner)
-    most = rigs.members - 1 + max(map(len, rigs.sessions))
-    places = []
-    for own in rigs.sessions:
-        every = [(own[0], member) for member in range(rigs.members)]
-        every += [(rig, 0) for rig in own[1:]]
-        places.append(every + [every[0]] * (most - len(every)))
-    rig, member = np.moveaxis(np.array(places), -1, 0)
+    width = rigs.members - 1 + max(map(len, rigs.sessions))
+    plants_of_lungs = []
+    for sessions in rigs.sessions:
+        plants_of_lung = [(sessions[0], member) for member in range(rigs.members)]
+        plants_of_lung += [(rig, 0) for rig in sessions[1:]]
+        plants_of_lungs.append(plants_of_lung + [plants_of_lung[0]] * (width - len(plants_of_lung)))
+    rig, member = np.moveaxis(np.array(plants_of_lungs), -1, 0)
     pips = np.broadcast_to(np.array(protocol.PIPS), (*rig.shape, len(protocol.PIPS)))
     with compilation.float64():
         plants = draws.plants_of(rigs.plants, rig, member)
-        scenario, every = nominal_scenario(pips), np.zeros(most, np.int64)
-        cells = Cells(rigs.lungs, (Condition(),), plants, scenario, pips, every, rig, member)
+        scenario, draw = nominal_scenario(pips), np.zeros(width, np.int64)
+        cells = Cells(rigs.lungs, (Condition(),), plants, scenario, pips, draw, rig, member)
         run = run_cells(cells, runner, submission, tasks, _counted(progress, 1))
     return dataclasses.replace(runs_of(run, cells, submission, tasks), requested=None)
 
@@ -352,18 +354,20 @@ def by_group(runs: Runs, rigs: Rigs) -> dict[str, Any]:
     """
     table = runs.to_frame().drop_duplicates(["lung", "pip_cmH2O", "rig", "member"])
     assert rigs.sessions is not None
-    reference = {lung: own[0] for lung, own in zip(runs.lungs, rigs.sessions, strict=True)}
-    apart = {rig for rigs_of_lung in rigs.held_out for rig in rigs_of_lung}
-    at_home = table.rig == table.lung.map(reference)
-    kinds = [at_home & (table.member == 0), at_home, ~table.rig.isin(apart)]
+    reference = {
+        lung: sessions[0] for lung, sessions in zip(runs.lungs, rigs.sessions, strict=True)
+    }
+    held_out = {rig for rigs_of_lung in rigs.held_out for rig in rigs_of_lung}
+    on_reference = table.rig == table.lung.map(reference)
+    kinds = [on_reference & (table.member == 0), on_reference, ~table.rig.isin(held_out)]
     table["group"] = np.select(kinds, GROUPS[:3], GROUPS[3])
     groups = {}
     for group in GROUPS:
-        own = table[table.group == group].groupby("lung", sort=False).error_cmH2O
-        lungs = own.agg(lambda errors: errors.mean(skipna=False))
+        errors = table[table.group == group].groupby("lung", sort=False).error_cmH2O
+        lungs = errors.agg(lambda values: values.mean(skipna=False))
         groups[group] = {
             "error_cmH2O": number(lungs.mean(skipna=False)),
-            "plants": int(own.size().sum()) // len(protocol.PIPS),
+            "plants": int(errors.size().sum()) // len(protocol.PIPS),
             "lungs": {lung: number(lungs.get(lung, np.nan)) for lung in runs.lungs},
         }
     return groups

@@ -81,10 +81,10 @@ class Chart:
         """Add a line of values each of which holds until the next one."""
         self.line(look, np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1])
 
-    def between(self, look: str, x: ArrayLike, one: ArrayLike, other: ArrayLike) -> None:
+    def between(self, look: str, x: ArrayLike, first: ArrayLike, second: ArrayLike) -> None:
         """Add the area between two lines; none where one of them has a gap."""
-        if made := area(self._points(x, one), self._points(x, other)):
-            self.areas.append((look, made))
+        if filled := area(self._points(x, first), self._points(x, second)):
+            self.areas.append((look, filled))
 
     def stairs(self, look: str, edges: ArrayLike, y: ArrayLike) -> None:
         """Add one level for each of k ranges with ``k + 1`` edges."""

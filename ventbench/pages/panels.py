@@ -216,14 +216,14 @@ WIDTH, HEIGHT = 184.0, 150.0
 PRESSURE, VALVE = (25.0, 3.0, 5.0, 57.0), (25.0, 3.0, 102.0, 14.0)
 
 #: Steps of the breath that are shown: until 0.3 s after the target's fall.
-SHOWN = round((protocol.FALL_END + 0.3) / protocol.DT)
+WINDOW_STEPS = round((protocol.FALL_END + 0.3) / protocol.DT)
 
 #: The breath that is shown, counted from 0.
 BREATH = max(protocol.SCORED_BREATHS)
 
 #: Its steps in a run, and their times, s since the start of the breath.
-WINDOW = slice(BREATH * protocol.BREATH_STEPS, BREATH * protocol.BREATH_STEPS + SHOWN + 1)
-TIMES = protocol.DT * np.arange(SHOWN + 1)
+WINDOW = slice(BREATH * protocol.BREATH_STEPS, BREATH * protocol.BREATH_STEPS + WINDOW_STEPS + 1)
+TIMES = protocol.DT * np.arange(WINDOW_STEPS + 1)
 
 
 def axes(target: Floats, limits: tuple[float, float]) -> tuple[Chart, Chart]:

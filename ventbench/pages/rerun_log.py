@@ -33,7 +33,7 @@ APPLICATION = "ventbench"
 TIMELINE = "run_time"
 
 #: Entity of the text panel.
-ABOUT = "/about"
+TEXT_ENTITY = "/about"
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,9 @@ def written(
         file = Path(folder, "run.rrd")
         stream.save(file, default_blueprint=layout)
         stream.send_recording_name(name)
-        stream.log(ABOUT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+        stream.log(
+            TEXT_ENTITY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True
+        )
         log(stream)
         stream.disconnect()  # writes the rest and the footer
         return file.read_bytes()
@@ -212,7 +214,7 @@ def beside_text(tabs: rrb.Tabs, name: str, share: float, timeline: str) -> rrb.B
     """Views with the text panel beside them, so many times as wide, and all else closed."""
     return rrb.Blueprint(
         rrb.Horizontal(
-            tabs, rrb.TextDocumentView(origin=ABOUT, name=name), column_shares=[share, 1]
+            tabs, rrb.TextDocumentView(origin=TEXT_ENTITY, name=name), column_shares=[share, 1]
         ),
         rrb.TimePanel(state="collapsed", timeline=timeline, play_state="paused"),
         rrb.BlueprintPanel(state="collapsed"),

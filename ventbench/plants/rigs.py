@@ -63,12 +63,12 @@ class Rigs:
         by_lung = [
             self.population.rigs(seed, lung, draw_tables.COUNT) for lung in range(len(sessions))
         ]
-        population = jax.tree.map(lambda *leaves: np.stack(leaves), *by_lung)
+        sampled_rigs = jax.tree.map(lambda *leaves: np.stack(leaves), *by_lung)
         return draw_tables.build(
             sessions,
             self.members,
             held_out=self.held_out,
-            drawn=population,
+            sampled_rigs=sampled_rigs,
             seed=seed,
             name=name,
             pips=pips,
@@ -89,7 +89,7 @@ class Rigs:
         """Plants of draws, leaves ``(L, n, 1, ...)``, or ``(L, ...)`` with one rig a lung."""
         if self.sessions is None:
             return self.plants
-        return draw_tables.plants_of(self.plants, draws.rig, draws.member, draws.drawn)
+        return draw_tables.plants_of(self.plants, draws.rig, draws.member, draws.sampled_rigs)
 
     def cells(self, draws: Draws | None, pips: Sequence[float]) -> tuple[Plant, Scenario]:
         """Nominal cells in front of K draws, and their plants, at P PIPs, cmH2O.
@@ -103,8 +103,8 @@ class Rigs:
         cells, rig, member = draw_tables.with_nominal(draws, reference, pips)
         if self.sessions is None:
             return self.plants, cells
-        anew = None if draws is None else draws.drawn
-        return draw_tables.plants_of(self.plants, rig, member, anew), cells
+        sampled_rigs = None if draws is None else draws.sampled_rigs
+        return draw_tables.plants_of(self.plants, rig, member, sampled_rigs), cells
 
 
 def load_rigs(simulator: SimulatorLike = "frozen") -> Rigs:

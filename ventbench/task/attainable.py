@@ -111,8 +111,8 @@ def _in_batches(function: Any, plants: Plant, cells: Scenario, u_in: Floats) -> 
     for first in range(0, n, BATCH):
         # The last batch is padded, so that all compile once.
         index = np.minimum(np.arange(first, first + BATCH), n - 1)
-        some, cell = jax.tree.map(lambda x, i=index: np.asarray(x)[i], (plants, cells))
-        parts.append(np.asarray(function(some, cell, u_in[index]))[: n - first])
+        plant, cell = jax.tree.map(lambda x, i=index: np.asarray(x)[i], (plants, cells))
+        parts.append(np.asarray(function(plant, cell, u_in[index]))[: n - first])
     return np.concatenate(parts)
 
 
@@ -164,17 +164,17 @@ def _descend(plants: Plant, cells: Scenario, pip: Floats, u_in: Floats) -> Float
     slopes = np.zeros((n, COMMANDS, COMMANDS))
     stale = np.ones(n, bool)
     for _ in range(ITERATIONS):
-        anew = live[stale[live]]
-        if len(anew):
-            some, cell = jax.tree.map(lambda x, i=anew: np.asarray(x)[i], (plants, cells))
-            slopes[anew] = _in_batches(all_slopes, some, cell, u_in[anew])
+        relinearised = live[stale[live]]
+        if len(relinearised):
+            plant, cell = jax.tree.map(lambda x, i=relinearised: np.asarray(x)[i], (plants, cells))
+            slopes[relinearised] = _in_batches(all_slopes, plant, cell, u_in[relinearised])
         trial, predicted = u_in[live].copy(), np.zeros(len(live))
         for at, i in enumerate(live):
             change, value = programs.solve(miss[i], slopes[i], u_in[i], radius[i])
             trial[at] = np.clip(u_in[i] + change, 0.0, protocol.U_MAX)
             predicted[at] = error[i] - value
-        some, cell = jax.tree.map(lambda x, i=live: np.asarray(x)[i], (plants, cells))
-        missed = pip[live] - pressures(some, cell, trial)
+        plant, cell = jax.tree.map(lambda x, i=live: np.asarray(x)[i], (plants, cells))
+        missed = pip[live] - pressures(plant, cell, trial)
         reached = np.mean(np.abs(missed), axis=1)
         ratio = (error[live] - reached) / np.maximum(predicted, 1e-15)
         accepted, stale[live] = ratio > ACCEPTED, ratio > ACCEPTED
@@ -260,8 +260,8 @@ def second_optimum(plants: Plant, cells: Scenario) -> NDArray:
     random = uniforms(DEVELOPMENT_SEED, "second optimum", (RANDOM_STARTS, COMMANDS))
     starts = np.concatenate([np.where(opened, 2.5, -2.4), 6.0 * random - 3.0])
     with compilation.float64():
-        each = np.broadcast_to(starts[:, None], (len(starts), n, COMMANDS))
-        return np.asarray(_search(*jax.tree.map(jnp.asarray, (plants, cells, each))))
+        initial = np.broadcast_to(starts[:, None], (len(starts), n, COMMANDS))
+        return np.asarray(_search(*jax.tree.map(jnp.asarray, (plants, cells, initial))))
 
 
 @jax.jit
@@ -272,14 +272,15 @@ def _search(plants: Plant, cells: Scenario, starts: Array) -> Array:
     def errors(free: Array) -> tuple[Array, Array]:
         u_in = protocol.U_MAX * jax.nn.sigmoid(free)
         pressure = jax.vmap(all_pressures, (None, None, 0))(plants, cells, u_in)
-        found = jnp.mean(jnp.abs(pressure - cells.pip[:, None]), axis=-1)
-        return found.sum(), found
+        values = jnp.mean(jnp.abs(pressure - cells.pip[:, None]), axis=-1)
+        return values.sum(), values
 
     def iterate(carry: tuple[Array, Any, Array], _: None) -> tuple[tuple[Array, Any, Array], None]:
         free, state, best = carry
-        slopes, found = jax.grad(errors, has_aux=True)(free)
+        slopes, values = jax.grad(errors, has_aux=True)(free)
         updates, state = optimiser.update(jnp.nan_to_num(slopes), state)
-        return (jnp.asarray(optax.apply_updates(free, updates)), state, jnp.fmin(best, found)), None
+        free, best = jnp.asarray(optax.apply_updates(free, updates)), jnp.fmin(best, values)
+        return (free, state, best), None
 
     initial = (starts, optimiser.init(starts), jnp.full(starts.shape[:2], jnp.inf))
     (free, _, best), _ = jax.lax.scan(iterate, initial, length=ADAM_ITERATIONS)

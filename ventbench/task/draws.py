@@ -131,7 +131,7 @@ class Draws:
     member: Ints  #: member of the ensemble, 0 for a drawn rig, shape ``(L, n)``.
     ranked: Bools  #: whether a draw is meant for rigs that nobody trained on, shape ``(n,)``.
     #: rigs that are drawn anew, leaves ``(L, n, ...)``; None where there are none.
-    drawn: Plant | None = None
+    sampled_rigs: Plant | None = None
 
     @property
     def count(self) -> int:
@@ -152,9 +152,9 @@ class Draws:
 
     def only(self, at: Ints) -> Draws:
         """Return some draws."""
-        parts = (self.cells, self.rig, self.member, self.drawn)
-        cells, rig, member, drawn = jax.tree.map(lambda x: x[:, at], parts)
-        return Draws(self.name, self.commitment, cells, rig, member, self.ranked[at], drawn)
+        parts = (self.cells, self.rig, self.member, self.sampled_rigs)
+        cells, rig, member, sampled_rigs = jax.tree.map(lambda x: x[:, at], parts)
+        return Draws(self.name, self.commitment, cells, rig, member, self.ranked[at], sampled_rigs)
 
     def about(self) -> dict[str, Any]:
         """Commitment, number and name of the draws, with the keys that records have."""
@@ -171,7 +171,7 @@ def build(
     members: int,
     *,
     held_out: Sequence[Sequence[int]] = (),
-    drawn: Plant | None = None,
+    sampled_rigs: Plant | None = None,
     seed: bytes = DEVELOPMENT_SEED,
     name: str = DEVELOPMENT,
     n: int = COUNT,
@@ -186,8 +186,8 @@ def build(
         rigs: sessions of each lung that may be drawn; L of them.
         members: number of members of the ensemble.
         held_out: those of them on which nothing was trained; L of them, or nothing.
-        drawn: a rig of each lung and draw from the population, leaves ``(L, n, ...)``. If there are
-            none, the rigs themselves deviate (:data:`OF_RIGS`), and no gain does.
+        sampled_rigs: a rig of each lung and draw from the population, leaves ``(L, n, ...)``. If
+            there are none, the rigs themselves deviate (:data:`OF_RIGS`), and no gain does.
         seed: 32 bytes.
         name: of the draws.
         n: number of draws.
@@ -216,7 +216,7 @@ def build(
         name: low + (high - low) * uniform(name, cells) for name, (low, high) in RANGES.items()
     }
     gain = np.ones((*cells, protocol.BREATHS))
-    if drawn is not None:
+    if sampled_rigs is not None:
         values |= {name: np.full(cells, _nominal(name)) for name in OF_RIGS}
         gain = np.exp(_log_gain(uniform("gain", gain.shape), np))
     low, high = NOISE_SD
@@ -230,21 +230,23 @@ def build(
     pip = np.broadcast_to(np.asarray(pips, float), values["pip_shift"].shape)
     noise = values.pop("noise")
     quantum = np.full(pip.shape, QUANTUM)
-    apart = held_out or [()] * len(rigs)
-    places = [
-        _places(scored, out, drawn is not None, partial(uniform, f"rig {k}"), n)
-        for k, (scored, out) in enumerate(zip(rigs, apart, strict=True))
+    held_out_rigs = held_out or [()] * len(rigs)
+    rig_of_draw = [
+        _places(scored, out, sampled_rigs is not None, partial(uniform, f"rig {k}"), n)
+        for k, (scored, out) in enumerate(zip(rigs, held_out_rigs, strict=True))
     ]
-    rig = np.array(places)
-    turns = [_balanced(uniform(f"member {k}", (n + 1,)), members) for k in range(len(rigs))]
+    rig = np.array(rig_of_draw)
+    balanced_members = [
+        _balanced(uniform(f"member {k}", (n + 1,)), members) for k in range(len(rigs))
+    ]
     return Draws(
         name=name,
         commitment=commitment(seed),
         cells=deviate(pip, values, quantum, noise),
         rig=rig,
-        member=np.where(rig >= FIRST_DRAWN, 0, turns),
+        member=np.where(rig >= FIRST_DRAWN, 0, balanced_members),
         ranked=ranked(rig),
-        drawn=drawn,
+        sampled_rigs=sampled_rigs,
     )
 
 
@@ -262,22 +264,22 @@ def ranked(rig: Ints) -> Bools:
 def _places(
     rigs: Sequence[int],
     held_out: Sequence[int],
-    anew: bool,
+    from_population: bool,
     uniform: Callable[[tuple[int, ...]], Floats],
     n: int,
 ) -> Ints:
     """Rig of each draw of one lung."""
     kind = np.resize(np.array(PATTERN), n)
-    kind[(kind == DRAWN) & (not anew)] = HELD_OUT
-    kind[(kind == HELD_OUT) & (not held_out)] = DRAWN if anew else TRAINING
+    kind[(kind == DRAWN) & (not from_population)] = HELD_OUT
+    kind[(kind == HELD_OUT) & (not held_out)] = DRAWN if from_population else TRAINING
     numbers = uniform((n + 1,))
     rig = FIRST_DRAWN + np.arange(n)
     training = [session for session in rigs if session not in held_out]
     for value, choices in ((TRAINING, training), (HELD_OUT, held_out)):
         at = np.flatnonzero(kind == value)
         if len(at):
-            some = _balanced(numbers[np.append(0, 1 + at)], len(choices))
-            rig[at] = np.array(choices)[some]
+            dealt = _balanced(numbers[np.append(0, 1 + at)], len(choices))
+            rig[at] = np.array(choices)[dealt]
     return rig
 
 
@@ -315,30 +317,32 @@ def with_nominal(
     return cells, np.hstack([rig, draws.rig]), np.hstack([member, draws.member])
 
 
-def plants_of(plants: PlantT, rig: Ints, member: Ints, population: PlantT | None = None) -> PlantT:
+def plants_of(
+    plants: PlantT, rig: Ints, member: Ints, sampled_rigs: PlantT | None = None
+) -> PlantT:
     """Plants of cells.
 
     Args:
         plants: of every member and session, leaves ``(members, sessions, ...)``.
         rig: sessions, or :data:`FIRST_DRAWN` and more, shape ``(L, n)``.
         member: members, shape ``(L, n)``.
-        population: of the last draws, leaves ``(L, k, ...)`` with k <= n.
+        sampled_rigs: of the last draws, leaves ``(L, k, ...)`` with k <= n.
 
     Returns:
         Leaves ``(L, n, 1, ...)``, float64: the axis of length 1 stands for the PIPs.
     """
-    anew = rig >= FIRST_DRAWN
-    session = np.where(anew, 0, rig)
+    from_population = rig >= FIRST_DRAWN
+    session = np.where(from_population, 0, rig)
     chosen = jax.tree.map(lambda leaf: np.asarray(leaf, float)[member, session], plants)
-    if population is not None:
-        places = np.nonzero(anew)
-        before = rig.shape[1] - jax.tree.leaves(population)[0].shape[1]
+    if sampled_rigs is not None:
+        replaced_cells = np.nonzero(from_population)
+        before = rig.shape[1] - jax.tree.leaves(sampled_rigs)[0].shape[1]
 
         def replaced(leaf: Floats, new: Floats) -> Floats:
-            leaf[places] = new[places[0], places[1] - before]
+            leaf[replaced_cells] = new[replaced_cells[0], replaced_cells[1] - before]
             return leaf
 
-        chosen = jax.tree.map(replaced, chosen, population)
+        chosen = jax.tree.map(replaced, chosen, sampled_rigs)
     return jax.tree.map(lambda leaf: leaf[:, :, None], chosen)
 
 
@@ -402,15 +406,15 @@ def random_scenarios(
     """
     n = pip.shape[0]
     keys = jax.random.split(key, len(RANGES) + 3)
-    drawn = {}
+    deviations = {}
     for deviation_key, (name, (low, high)) in zip(keys, RANGES.items(), strict=False):
         if spread is None:
-            drawn[name] = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
+            deviations[name] = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
         else:
             middle = _nominal(name)
             low, high = low - middle, high - middle
             value = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
-            drawn[name] = middle + spread * value
+            deviations[name] = middle + spread * value
     # The order of these two keys is that with which the published weights were trained.
     sd_key, noise_key = (keys[-3], keys[-2]) if smooth else (keys[-2], keys[-3])
     sd = jax.random.uniform(sd_key, (n, 1, 1), minval=NOISE_SD[0], maxval=NOISE_SD[1])
@@ -424,10 +428,10 @@ def random_scenarios(
         scale = jnp.broadcast_to(spread, (n,))
         noise = scale[:, None, None] * noise
         quantum = jnp.where(scale > 0, quantum, 0.0)
-        drawn["delay"] = jnp.minimum(drawn["delay"], 0.99)
+        deviations["delay"] = jnp.minimum(deviations["delay"], 0.99)
         gain = scale[:, None] * gain
-    drawn["gain"] = jnp.exp(gain)
-    return deviate(pip, drawn, quantum, noise)
+    deviations["gain"] = jnp.exp(gain)
+    return deviate(pip, deviations, quantum, noise)
 
 
 def _nominal(name: str) -> float:

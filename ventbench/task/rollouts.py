@@ -116,8 +116,8 @@ def control_step(
         at: index of the breath, index of the step, and inputs of the policy.
     """
     loop, state = carry
-    breath, index, given = at
-    state, requested = policy(state, env.observe(scenario, loop, breath, index), given)
+    breath, index, inputs = at
+    state, requested = policy(state, env.observe(scenario, loop, breath, index), inputs)
     after, applied = env.inspire(plant, scenario, loop, requested)
     return (after, state), record(loop, after, requested, applied)
 

@@ -147,7 +147,7 @@ def explore(
     ranges: ExplorationRanges | None = None,
     ease: float = protocol.SAFETY_PRESSURE,
     pips: tuple[float, ...] = protocol.PIPS,
-    progress: Callable[[int, int], object] = lambda done, total: None,
+    progress: Callable[[int, int], object] = lambda explored, total: None,
 ) -> Breaths:
     """Explore a ventilator; the PIPs take turns.
 
@@ -175,14 +175,14 @@ def explore(
     setting, ranges = parse_lung(lung_id), ranges or RANGES[lung_id]
     random = np.random.default_rng(seed)
     columns: list[tuple[Floats, Floats, Floats]] = []
-    done = vented = 0
-    while done < breaths and vented < _VENTED_BREATHS:
-        pip = np.array([pips[(done + k) % len(pips)] for k in range(ventilator.width)])
+    explored = vented = 0
+    while explored < breaths and vented < _VENTED_BREATHS:
+        pip = np.array([pips[(explored + k) % len(pips)] for k in range(ventilator.width)])
         added = draw_disturbances(random, ranges, ventilator.width)
         recorded = _breaths(ventilator, pip, ranges, ease, added)
         columns.append(recorded)
-        done += ventilator.width
-        progress(min(done, breaths), breaths)
+        explored += ventilator.width
+        progress(min(explored, breaths), breaths)
         vented += int(np.sum(recorded[1][:, : protocol.INSPIRATION_STEPS].any(axis=1)))
     together = zip(*columns, strict=True)
     u_in, u_out, pressure = (np.concatenate(column)[:breaths] for column in together)

@@ -270,7 +270,7 @@ def tune_pid(
     rigs = load_rigs(simulator).of_training
     count = FINALISTS if draws else 1
     candidates = paper_gains() if gains is None else np.asarray(gains, float)
-    grid = _nominal_grid(rigs, where, candidates, progress or (lambda done, total: None))
+    grid = _nominal_grid(rigs, where, candidates, progress or (lambda completed, total: None))
     nominal = grid.error.astype(float)
     weighted = np.einsum("lgp,lp->lg", nominal, weights)
     common = np.argsort(weighted.sum(axis=0), kind="stable")[: count if single else 0]
@@ -347,7 +347,7 @@ class BestPIDs:
 def best_pids(
     rigs: Rigs,
     *,
-    drawn: Draws | None = None,
+    rig_draws: Draws | None = None,
     groups: Sequence[Sequence[int]] | None = None,
     weights: Floats | None = None,
     progress: Progress | None = None,
@@ -356,26 +356,28 @@ def best_pids(
 
     Args:
         rigs: lungs; what they hold out has no part.
-        drawn: draws on the rigs of the training; the development draws if not given.
+        rig_draws: draws on the rigs of the training; the development draws if not given.
         groups: lungs that share a PID; each has its own if not given.
         weights: of the PIPs of each lung; equal if not given.
         progress: called with the number of groups done, and of all.
     """
     rigs = rigs.of_training
-    drawn = rigs.draws(draw_tables.COUNT) if drawn is None else drawn
+    rig_draws = rigs.draws(draw_tables.COUNT) if rig_draws is None else rig_draws
     groups = [[lung] for lung in range(len(rigs.lungs))] if groups is None else groups
-    weight = np.ones(np.shape(drawn.cells.pip)[::2]) if weights is None else weights
-    report = progress or (lambda done, total: None)
+    weight = np.ones(np.shape(rig_draws.cells.pip)[::2]) if weights is None else weights
+    report = progress or (lambda completed, total: None)
 
-    def mean_error(group: Sequence[int], drawn: Draws, gains: Floats, **options: int) -> Floats:
-        per_lung = [errors_on_draws(rigs, drawn, at, gains, **options) * weight[at] for at in group]
+    def mean_error(group: Sequence[int], rig_draws: Draws, gains: Floats, **options: int) -> Floats:
+        per_lung = [
+            errors_on_draws(rigs, rig_draws, at, gains, **options) * weight[at] for at in group
+        ]
         return np.mean(per_lung, axis=(0, 2))
 
-    few, ends = drawn.first(min(4, drawn.count)), []
-    for done, group in enumerate(groups):
-        report(done, len(groups))
+    few, ends = rig_draws.first(min(4, rig_draws.count)), []
+    for completed, group in enumerate(groups):
+        report(completed, len(groups))
         starts = _starts(partial(mean_error, group, few))
-        ends.append([_search(partial(mean_error, group, drawn, together=1), x) for x in starts])
+        ends.append([_search(partial(mean_error, group, rig_draws, together=1), x) for x in starts])
     report(len(groups), len(groups))
     best_gains = np.array([[gains for gains, _ in results] for results in ends])
     error = np.array([[error for _, error in results] for results in ends])
@@ -414,7 +416,7 @@ def tune_beyond(
     where = [trained_on.names.index(name) for name in names]
     best_gains = best_pids(
         rigs,
-        drawn=rigs.draws(draws, seed=TUNING_SEED, name=TUNING),
+        rig_draws=rigs.draws(draws, seed=TUNING_SEED, name=TUNING),
         groups=[[at] for at in where] * each + [where] * single,
         weights=trained_on.weights,
         progress=progress,

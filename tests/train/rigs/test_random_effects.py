@@ -110,4 +110,4 @@ def test_left_out_units_are_inside_as_often_as_said_and_odd_ones_are_not():
     odd = units.weighted.copy()
     odd[7] += units.information[7] @ [8.0, -8.0]
     moved = Units(units.information, odd, units.design)
-    assert surprise(moved, 7, fit_mixed(moved.without(7), prior(2, 2), iterations=60)) > 0.999
+    assert surprise(moved, 7, fit_mixed(moved.excluding(7), prior(2, 2), iterations=60)) > 0.999

@@ -53,7 +53,7 @@ def test_networks_of_one_lung_and_of_all_are_trained_apart():
 @pytest.mark.parametrize("name", RECIPES)
 def test_published_settings_fit_their_lungs(name):
     recipe = RECIPES[name]
-    for lungs, found in ((1, recipe.one), (6, recipe.every)):
+    for lungs, found in ((1, recipe.per_lung), (6, recipe.every)):
         assert found.breaths % lungs == 0
         steps = found.breaths * environment.MOVES * 7
         assert shortened(found, name, steps + 10).iterations == 7

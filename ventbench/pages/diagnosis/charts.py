@@ -34,7 +34,7 @@ _FIRST_EDGE_TIME = 0.01
 _BEFORE, _AFTER = 0.12, 0.28
 
 #: Colour class of a characteristic without and with its mechanism.
-_WITHOUT, _WITH = "refit", "after"
+_BASELINE, _ACTING = "refit", "after"
 
 #: Breaths of a request that are drawn.
 REQUESTED = 4
@@ -231,8 +231,8 @@ def characteristic_chart(name: str, curve: Characteristic) -> Chart:
         width=360.0,
         height=200.0,
     )
-    chart.line(_WITHOUT, curve.x, curve.baseline)
-    chart.line(_WITH, curve.x, curve.acting)
+    chart.line(_BASELINE, curve.x, curve.baseline)
+    chart.line(_ACTING, curve.x, curve.acting)
     return chart
 
 

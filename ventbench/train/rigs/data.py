@@ -66,7 +66,7 @@ def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings
         try:
             part = load(path)
         except RecordingError as error:
-            if not _other_schema(error):
+            if not _is_foreign_schema(error):
                 raise
             skipped.append(path.name)
             continue
@@ -129,7 +129,7 @@ def assign_folds(breaths: Breaths, *, count: int = 5, seed: int = 0) -> Ints:
     return fold
 
 
-def _other_schema(error: RecordingError) -> bool:
+def _is_foreign_schema(error: RecordingError) -> bool:
     """Whether a file has another header, which is no mistake in a folder of mixed files."""
     return "column" in str(error).lower() and "missing" in str(error).lower()
 
@@ -211,7 +211,7 @@ def inspirations(
     pressure = _first(breaths.pressure, np.nan, samples)[:, 1:]
     arrays = {
         "start": np.nan_to_num(start),
-        "start_known": np.isfinite(start) * 1.0,
+        "start_measured": np.isfinite(start) * 1.0,
         "u_in": _first(breaths.u_in, 0.0, samples)[:, :-1],
         "dt": _first(breaths.dt, 0.03, samples)[:, :-1],
         "pressure": np.where(counted, pressure, 0.0),

@@ -124,38 +124,38 @@ class LabelTest:
     @property
     def reasons(self) -> list[str]:
         """Why the session is not what its label says, in sentences; empty if nothing says so."""
-        out, most = [], f"{100 * TOLERANCE:.0f} %"
+        out, limit = [], f"{100 * TOLERANCE:.0f} %"
         flow = REFERENCE_FLOW / LABEL_FLOW
         at_label = [self.lung.R * (share + (1.0 - share) * flow) for share in self._shares]
         low, high = min(at_label), max(at_label)
         if not low * (1.0 - TOLERANCE) <= self.R <= high * (1.0 + TOLERANCE):
             out.append(
-                f"fitted R {self.R:.1f} cmH2O/(L/s) at {REFERENCE_FLOW:g} L/s is more than {most} "
+                f"fitted R {self.R:.1f} cmH2O/(L/s) at {REFERENCE_FLOW:g} L/s is more than {limit} "
                 f"from what a resistor of the label {self.lung.R:g} has there, {low:g} to {high:g}"
             )
-        apart = self.C / self.lung.C - 1.0
-        if abs(apart) > TOLERANCE:
+        deviation = self.C / self.lung.C - 1.0
+        if abs(deviation) > TOLERANCE:
             out.append(
-                f"fitted C {self.C:.1f} mL/cmH2O is {100 * abs(apart):.0f} % too "
-                f"{'high' if apart > 0 else 'low'} for the label {self.lung.C:g}"
+                f"fitted C {self.C:.1f} mL/cmH2O is {100 * abs(deviation):.0f} % too "
+                f"{'high' if deviation > 0 else 'low'} for the label {self.lung.C:g}"
             )
-        elif self._told and not any(self._close):
+        elif self._identifiable and not any(self._close):
             out.append(
                 f"C by the flow that its resistor tells, {self._range} mL/cmH2O, is more than "
-                f"{most} from the label {self.lung.C:g}"
+                f"{limit} from the label {self.lung.C:g}"
             )
-        other_error = self.error_best_other_label
-        if other_error is not None and other_error < self.error_own_label:
+        alternative = self.error_best_other_label
+        if alternative is not None and alternative < self.error_own_label:
             out.append(
                 f"its breaths are explained better by {self.best_other_label} (median error "
-                f"{other_error:.2f} cmH2O) than by its own label ({self.error_own_label:.2f})"
+                f"{alternative:.2f} cmH2O) than by its own label ({self.error_own_label:.2f})"
             )
         return out
 
     @property
     def doubts(self) -> list[str]:
         """Why it cannot be told that the session is what its label says; empty if it can."""
-        if not self._told:
+        if not self._identifiable:
             return [
                 f"the drop over its resistor tells the gain of the valve, and C, to "
                 f"{100 * self.gain_uncertainty:.0f} % only"
@@ -170,7 +170,7 @@ class LabelTest:
         return not self.reasons and not self.doubts
 
     @property
-    def _told(self) -> bool:
+    def _identifiable(self) -> bool:
         return self.gain_uncertainty <= 0.5 * math.log1p(TOLERANCE)
 
     @property
@@ -222,8 +222,8 @@ def resistance_and_compliance(plant: Hybrid) -> Floats:
 
 def interval(value: float, resampled: Floats) -> tuple[float, float]:
     """Return the 95 % interval of a positive quantity from its values in resampled fits."""
-    wide = 1.96 * float(np.std(np.log(resampled), ddof=1)) if len(resampled) > 1 else 0.0
-    return float(value * np.exp(-wide)), float(value * np.exp(wide))
+    half_width = 1.96 * float(np.std(np.log(resampled), ddof=1)) if len(resampled) > 1 else 0.0
+    return float(value * np.exp(-half_width)), float(value * np.exp(half_width))
 
 
 @jax.jit
@@ -239,7 +239,7 @@ def _errors(
 
 def label_errors(
     pooled: Pooled,
-    left_out: Sequence[int],
+    held_out: Sequence[int],
     data: InspirationData,
     labels: Sequence[Lung],
     scales: Scales,
@@ -248,7 +248,7 @@ def label_errors(
 
     Args:
         pooled: a fit that has not seen the sessions, so that they have no deviations of their own.
-        left_out: the sessions.
+        held_out: the sessions.
         data: all inspirations.
         labels: the settings, as they are numbered.
         scales: gives the spread of gains.
@@ -258,7 +258,7 @@ def label_errors(
     """
     # All breaths are simulated, so that every call has one shape and is compiled once.
     session = np.asarray(data.groups.session)
-    out: dict[int, list[float]] = {index: [] for index in left_out}
+    out: dict[int, list[float]] = {index: [] for index in held_out}
     for number in range(len(labels)):
         groups = dataclasses.replace(data.groups, lung=jnp.full_like(data.groups.lung, number))
         error = np.array(
@@ -281,7 +281,7 @@ def label_errors(
                 for gain in _GAINS
             ]
         )
-        for index in left_out:
+        for index in held_out:
             medians = np.median(error[:, session == index], axis=1)
             out[index].append(float(np.min(medians + _GAIN_COST * np.abs(_GAINS))))
     return out
@@ -308,7 +308,7 @@ def label_tests(
         laminar_share: see :class:`LabelTest`.
     """
     values = resistance_and_compliance(fitted)
-    again = np.array([resistance_and_compliance(part) for part in resampled])
+    resampled_values = np.array([resistance_and_compliance(part) for part in resampled])
     ids = [lung.id for lung in labels]
     tests = []
     for index, row in enumerate(sessions.table):
@@ -316,12 +316,15 @@ def label_tests(
         (r, c), limits = (
             values[:, index],
             [
-                interval(values[k, index], again[:, k, index] if len(again) else np.empty(0))
+                interval(
+                    values[k, index],
+                    resampled_values[:, k, index] if len(resampled_values) else np.empty(0),
+                )
                 for k in range(2)
             ],
         )
-        apart = np.where(np.arange(len(ids)) == labelled, np.inf, errors[index])
-        best = int(np.argmin(apart)) if len(ids) > 1 else None
+        alternatives = np.where(np.arange(len(ids)) == labelled, np.inf, errors[index])
+        best = int(np.argmin(alternatives)) if len(ids) > 1 else None
         tests.append(
             LabelTest(
                 session=index,
@@ -335,7 +338,7 @@ def label_tests(
                 laminar_share=laminar_share,
                 error_own_label=float(errors[index][labelled]),
                 best_other_label=None if best is None else ids[best],
-                error_best_other_label=None if best is None else float(apart[best]),
+                error_best_other_label=None if best is None else float(alternatives[best]),
             )
         )
     return tests

@@ -60,16 +60,16 @@ SCALES = {
     "valve_bend": 0.1,
     "direction": 0.3,
 }
-OTHER_SCALE = 0.15
+DEFAULT_SCALE = 0.15
 
 #: How many sessions these scales count for, and how many count for no correlation. With fewer of
 #: either the renewals of the linearisation do not settle: some curves run away. The manifest says
-#: how sessions that were left out lie in what results (:meth:`FittedPopulation.left_out`).
+#: how sessions that were left out lie in what results (:meth:`FittedPopulation.cross_validated`).
 PRIOR_SESSIONS, UNCORRELATED_SESSIONS = 5.0, 30.0
 
 #: What the data cannot bound, as a play's weight changes nothing any more when it nears its bound:
 #: its scale is given.
-GIVEN = ("direction",)
+FIXED_SCALES = ("direction",)
 
 #: Standard deviations of means around those of the fitted plants; the second is of what a label
 #: says: that fit ties lungs of one labelled resistor or spring together, which this one does not.
@@ -94,7 +94,7 @@ class Units:
     weighted: Floats  #: ``b_j``, shape ``(J, p)``.
     design: Floats  #: ``X_j``, shape ``(J, p, q)``.
 
-    def without(self, j: int) -> Units:
+    def excluding(self, j: int) -> Units:
         """All units but one."""
         return Units(*(np.delete(part, j, axis=0) for part in vars(self).values()))
 
@@ -190,8 +190,8 @@ def surprise(units: Units, j: int, population: Population) -> float:
     estimate = (vectors[:, positive] / np.sqrt(values[positive])).T @ units.weighted[j]
     mean, spread = population.predictive(units.design[j])
     covariance = np.eye(root.shape[1]) + root.T @ spread @ root
-    off = estimate - root.T @ mean
-    distance = float(off @ np.linalg.solve(covariance, off))
+    deviation = estimate - root.T @ mean
+    distance = float(deviation @ np.linalg.solve(covariance, deviation))
     return float(chi2.cdf(distance, root.shape[1]))
 
 
@@ -211,11 +211,11 @@ class _Breaths:
         return np.asarray(self.data.share) > 0
 
     @property
-    def known(self) -> Bools:
+    def measured_start(self) -> Bools:
         return np.asarray(self.data.start_measured) > 0
 
     def at_start(self) -> Floats:
-        first = np.where(self.known, np.asarray(self.data.start), self.noise.unknown_start)
+        first = np.where(self.measured_start, np.asarray(self.data.start), self.noise.unknown_start)
         return first + self.start
 
 
@@ -250,21 +250,21 @@ def _linearised(
     return residual, weight, slopes
 
 
-def _own(breaths: _Breaths, scale: float) -> tuple[Floats, Floats]:
+def _breath_priors(breaths: _Breaths, scale: float) -> tuple[Floats, Floats]:
     """Prior precisions of each breath's gain and start, ``(n, 2)``, and their values."""
     noise = breaths.noise
     unknown = np.hypot(noise.unknown_start_scale, noise.rig_start)
-    start = np.where(breaths.known, noise.start, unknown)
+    start = np.where(breaths.measured_start, noise.start, unknown)
     gain = scale**2 * (TAIL + (breaths.gain / scale) ** 2) / (TAIL + 1.0)
     return np.stack([1.0 / gain, start**-2.0], -1), np.stack([breaths.gain, breaths.start], -1)
 
 
-def _with_own(breaths: _Breaths, rigs: Floats, scale: float, steps: int) -> _Breaths:
+def _fit_breaths(breaths: _Breaths, rigs: Floats, scale: float, steps: int) -> _Breaths:
     """Fit each breath's gain and start for given rigs."""
     for _ in range(steps):
         residual, weight, slopes = _linearised(breaths, rigs, _by_breath)
         by = np.stack(slopes, -1)
-        prior, posterior = _own(breaths, scale)
+        prior, posterior = _breath_priors(breaths, scale)
         normal = np.einsum("bt,bti,btj->bij", weight, by, by)
         normal[:, [0, 1], [0, 1]] += prior
         right = np.einsum("bt,bti->bi", weight * residual, by) - prior * posterior
@@ -285,7 +285,7 @@ def _units(breaths: _Breaths, rigs: Floats, design: Floats) -> Units:
     """Information of the sessions, the breaths' gains and starts integrated out."""
     residual, weight, (by_rig, *slopes) = _linearised(breaths, rigs, _by_all)
     by = np.stack(slopes, -1)
-    prior, posterior = _own(breaths, GAIN)
+    prior, posterior = _breath_priors(breaths, GAIN)
     weighted = weight[..., None] * by_rig
     inner = np.einsum("bt,bti,btj->bij", weight, by, by)
     inner[:, [0, 1], [0, 1]] += prior
@@ -322,7 +322,7 @@ def scales() -> Floats:
     """:data:`SCALES` of all numbers of a rig, shape ``(len(NAMES),)``."""
 
     def scale(name: str) -> float:
-        return next((s for start, s in SCALES.items() if name.startswith(start)), OTHER_SCALE)
+        return next((s for start, s in SCALES.items() if name.startswith(start)), DEFAULT_SCALE)
 
     return np.array([scale(name) for name in NAMES])
 
@@ -340,12 +340,12 @@ class FittedPopulation:
     gain_sd: float  #: standard deviation of it within sessions.
     gain_lag: float  #: correlation of it between neighbours in the files' order.
 
-    def left_out(self) -> list[float]:
+    def cross_validated(self) -> list[float]:
         """:func:`surprise` of each session by the others."""
         out = []
         for j in range(len(self.sessions)):
             refit = fit_mixed(
-                self.units.without(j), self.prior, iterations=30, start=self.population.covariance
+                self.units.excluding(j), self.prior, iterations=30, start=self.population.covariance
             )
             out.append(surprise(self.units, j, refit))
         return out
@@ -399,13 +399,13 @@ def fit_population(
     design = design_of(lungs)
     fit = np.linalg.lstsq(design.reshape(-1, design.shape[2]), rigs.ravel(), rcond=None)
     centre = np.asarray(fit[0], float)
-    counts = [np.inf if name.startswith(GIVEN) else PRIOR_SESSIONS for name in NAMES]
+    counts = [np.inf if name.startswith(FIXED_SCALES) else PRIOR_SESSIONS for name in NAMES]
     labelled = design[:, [NAMES.index(name) for name in LABELLED]].any(axis=(0, 1))
     wide = np.where(labelled, LABELLED_SCALE, CENTRE_SCALE)
     prior = Prior(scales(), np.array(counts), UNCORRELATED_SESSIONS, centre, wide)
     start = None
     for turn in range(renewals):
-        breaths = _with_own(breaths, rigs, GAIN, BREATH_STEPS)
+        breaths = _fit_breaths(breaths, rigs, GAIN, BREATH_STEPS)
         units = _units(breaths, rigs, design)
         last = turn == renewals - 1
         fitted = fit_mixed(units, prior, iterations=200 if last else MIXED_STEPS, start=start)
@@ -414,7 +414,7 @@ def fit_population(
             rigs = rigs + np.clip(fitted.units - rigs, -LARGEST, LARGEST)
         if progress is not None:
             progress((turn + 1) / renewals)
-    breaths = _with_own(breaths, rigs, WIDE_GAIN, 4 * BREATH_STEPS)
+    breaths = _fit_breaths(breaths, rigs, WIDE_GAIN, 4 * BREATH_STEPS)
     measured = breaths.weight == 1.0
     gain, sd, lag = _scatter(breaths.gain[measured], at[measured])
     return FittedPopulation(tuple(sessions), tuple(lungs), units, prior, fitted, gain, sd, lag)
@@ -467,7 +467,7 @@ def _write(fitted: FittedPopulation, base: frozen.Frozen) -> None:
     levels = np.linspace(0.0, 1.0, len(GAIN_QUANTILES))
     manifest = {
         "sessions": list(fitted.sessions),
-        "left_out": [round(share, 4) for share in fitted.left_out()],
+        "left_out": [round(share, 4) for share in fitted.cross_validated()],
         "deviations": {name: round(float(x), 4) for name, x in zip(NAMES, sd, strict=True)},
         "gain_breaths": len(fitted.gain),
         "gain_deviation": round(fitted.gain_sd, 4),
@@ -490,13 +490,13 @@ def _scatter(gain: Floats, group: Ints) -> tuple[Floats, float, float]:
     Returns:
         The deviations; the standard deviation; and the correlation between neighbours.
     """
-    off, squares, freedom, products = np.zeros(len(gain)), 0.0, 0, []
+    deviations, squares, freedom, products = np.zeros(len(gain)), 0.0, 0, []
     for name in np.unique(group):
         gains_of_rig = gain[group == name]
-        off[group == name] = gains_of_rig - np.median(gains_of_rig)
+        deviations[group == name] = gains_of_rig - np.median(gains_of_rig)
         deviation = gains_of_rig - gains_of_rig.mean()
         squares, freedom = squares + float(deviation @ deviation), freedom + len(gains_of_rig) - 1
         products += (deviation[1:] * deviation[:-1]).tolist()
     sd = float(np.sqrt(squares / max(freedom, 1)))
     lag = float(np.mean(products) / sd**2) if products and sd > 0 else 0.0
-    return off * (sd / max(float(np.std(off)), 1e-12)), sd, lag
+    return deviations * (sd / max(float(np.std(deviations)), 1e-12)), sd, lag

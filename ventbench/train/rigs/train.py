@@ -119,7 +119,7 @@ class _Problem:
     listed: tuple[str, ...]
     table: Sessions
     inspirations: InspirationData
-    whole: WholeBreaths
+    full_breaths: WholeBreaths
     weight: Floats
     centre: Centre
     scales: Scales
@@ -140,10 +140,12 @@ class _Problem:
             label.id: [i for i, row in enumerate(self.table.table) if row.lung == label.id]
             for label in self.data.labels
         }
-        several = [sessions for sessions in by_lung.values() if len(sessions) > 1]
+        repeated = [sessions for sessions in by_lung.values() if len(sessions) > 1]
         listed = [len(by_lung[name]) for name in self.listed if len(by_lung[name]) > 1]
         count = max(listed, default=0)
-        return [[i for sessions in several for i in sessions[turn::count]] for turn in range(count)]
+        return [
+            [i for sessions in repeated for i in sessions[turn::count]] for turn in range(count)
+        ]
 
 
 def train_rigs(
@@ -182,7 +184,7 @@ def train_rigs(
         OSError: if a file cannot be read or written.
     """
     folder, out = Path(folder), Path(out)
-    config, report = config or RigConfig(), progress or (lambda what, share: None)
+    config, report = config or RigConfig(), progress or (lambda stage, share: None)
     report("reading the recordings", 0.0)
     data = load_rig_recordings(folder, folds=config.folds, seed=config.seed)
     listed = _listed(data, lungs)
@@ -259,7 +261,7 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
     )
     stored = _fitted_format(template)
     total = 1.0 + config.folds + 2.0 * len(problem.rounds) + 0.5 * config.resamples
-    done = 0.0
+    completed = 0.0
 
     def run(
         name: str,
@@ -269,7 +271,7 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
         expiration: bool = False,
         start: Fitted | None = None,
     ) -> Fitted:
-        nonlocal done
+        nonlocal completed
         cost = 0.5 if start is not None else 1.0
 
         def compute() -> Fitted:
@@ -285,16 +287,18 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
                 problem.noise,
                 settings,
                 start,
-                lambda share: report(stage, 0.95 * (done + cost * share) / total),
+                lambda share: report(stage, 0.95 * (completed + cost * share) / total),
             )
             if expiration:
-                pooled = fit_expiration(fitted.pooled, problem.whole, jnp.asarray(weight[:m]))
+                pooled = fit_expiration(
+                    fitted.pooled, problem.full_breaths, jnp.asarray(weight[:m])
+                )
                 fitted = dataclasses.replace(fitted, pooled=pooled)
             return fitted
 
-        report(stage, 0.95 * done / total)
+        report(stage, 0.95 * completed / total)
         result = parts.get(name, compute, stored)
-        done += cost
+        completed += cost
         return result
 
     scored = run("all", "all breaths", problem.weight, expiration=True)
@@ -311,8 +315,8 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
 
     def excluding_rigs(name: str, doubtful: Sequence[int]) -> list[Fitted]:
         out = []
-        for turn, left_out in enumerate(problem.rounds):
-            silent = np.isin(problem.session, [*left_out, *doubtful])
+        for turn, held_out in enumerate(problem.rounds):
+            silent = np.isin(problem.session, [*held_out, *doubtful])
             weight = np.where(silent, 0.0, problem.weight)
             out.append(run(f"{name}-{turn}", f"rigs held out, {name} {turn + 1}", weight))
         return out
@@ -339,23 +343,29 @@ def _label_tests(
 ) -> list[LabelTest]:
     data, table = problem.data, problem.table
     errors: dict[int, Sequence[float]] = {}
-    for left_out, part in zip(problem.rounds, excluding_rigs, strict=True):
+    for held_out, part in zip(problem.rounds, excluding_rigs, strict=True):
         errors |= label_errors(
-            part.pooled, left_out, problem.inspirations, data.labels, problem.scales
+            part.pooled, held_out, problem.inspirations, data.labels, problem.scales
         )
-    alone = [index for index in range(len(table)) if index not in errors]
-    if alone:  # the only session of its lung cannot be left out
+    untested = [index for index in range(len(table)) if index not in errors]
+    if untested:  # the only session of its lung cannot be left out
         errors |= label_errors(
-            scored.pooled, alone, problem.inspirations, data.labels, problem.scales
+            scored.pooled, untested, problem.inspirations, data.labels, problem.scales
         )
     counts = [
         np.bincount(part, minlength=len(table))
         for part in (problem.session[: data.measured], problem.session)
     ]
     groups = groups_of_sessions(table, data.labels)
-    fitted, *again = (plants(part.pooled, groups) for part in (scored, *resampled))
+    fitted, *resampled_plants = (plants(part.pooled, groups) for part in (scored, *resampled))
     return label_tests(
-        fitted, again, errors, table, data.labels, (counts[0], counts[1]), problem.laminar_share
+        fitted,
+        resampled_plants,
+        errors,
+        table,
+        data.labels,
+        (counts[0], counts[1]),
+        problem.laminar_share,
     )
 
 
@@ -401,14 +411,14 @@ def _assess(
     rigs = {name: choose_rigs([t for t in tests if t.lung.id == name], table) for name in listed}
 
     measured = data.measured_breaths
-    known = training_list(data.breaths, _seen_by(data))
-    simulators = frozen.Frozen(out, {}, "", table, members, known)
+    training = training_list(data.breaths, _held_out_member(data))
+    simulators = frozen.Frozen(out, {}, "", table, members, training)
     cross_fitted_error = simulation.open_loop_errors(simulators.cross_fitted, measured)
     unseen = np.full(data.measured, np.nan)
-    for left_out, part in zip(problem.rounds, fits.excluding_rigs, strict=True):
+    for held_out, part in zip(problem.rounds, fits.excluding_rigs, strict=True):
         shared = partial(_shared_plants, part.pooled, table, data.labels)
-        which = np.isin(of_measured, left_out)
-        unseen[which] = simulation.open_loop_errors(shared, measured)[which]
+        selected = np.isin(of_measured, held_out)
+        unseen[selected] = simulation.open_loop_errors(shared, measured)[selected]
     lungs = {}
     for name in listed:
         index = measured.by_lung_index.get(name, np.empty(0, np.int64))
@@ -432,17 +442,17 @@ def _assess(
     }, members
 
 
-def _seen_by(data: RigRecordings) -> Ints:
+def _held_out_member(data: RigRecordings) -> Ints:
     """Member that has not seen each breath; the members of the folds follow the scored one."""
-    rest = len(data.breaths) - data.measured
-    return np.append(data.fold + 1, np.full(rest, BY_ALL))
+    unmeasured = len(data.breaths) - data.measured
+    return np.append(data.fold + 1, np.full(unmeasured, BY_ALL))
 
 
 def _shared_plants(
     pooled: Pooled, table: Sessions, labels: Sequence[Lung], breaths: Breaths
 ) -> Hybrid:
-    wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), pooled)
-    return plants(wide, groups_of(breaths, table, labels))
+    double_precision = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), pooled)
+    return plants(double_precision, groups_of(breaths, table, labels))
 
 
 def choose_rigs(tests: Sequence[LabelTest], table: Sessions) -> dict[str, Any]:
@@ -466,18 +476,20 @@ def choose_rigs(tests: Sequence[LabelTest], table: Sessions) -> dict[str, Any]:
     open_ = sorted((test for test in tests if not test.reasons), key=recorded)
     chosen = passed or open_ or sorted(tests, key=recorded)[:1]
     verdict = "passed" if passed else "cannot be told" if open_ else "no session passed"
-    reference, rest = chosen[0], chosen[1:]
+    reference, alternates = chosen[0], chosen[1:]
     out: dict[str, Any] = {
         "session": reference.session,
-        "rigs": [reference.session, *sorted(test.session for test in rest)],
+        "rigs": [reference.session, *sorted(test.session for test in alternates)],
         "label_test": verdict,
     }
-    if rest:
+    if alternates:
         kind = table.table[reference.session].rig
-        apart = min(rest, key=lambda t: (table.table[t.session].rig == kind, *recorded(t)))
-        remaining = sorted((t.session for t in rest if t is not apart), key=partial(_digest, table))
+        held_out = min(alternates, key=lambda t: (table.table[t.session].rig == kind, *recorded(t)))
+        remaining = sorted(
+            (t.session for t in alternates if t is not held_out), key=partial(_digest, table)
+        )
         count = math.ceil(HELD_OUT_SHARE * len(chosen))
-        out["held_out_rigs"] = [apart.session, *remaining][:count]
+        out["held_out_rigs"] = [held_out.session, *remaining][:count]
     return out
 
 
@@ -507,7 +519,7 @@ def _valve(problem: _Problem, members: Sequence[Pooled], fits: _Fits) -> dict[st
     high = np.asarray(problem.inspirations.u_in) >= WIDE_OPEN
     measured = np.arange(len(counted)) < problem.data.measured
     flows = [round(float(np.exp(full_flow(part))), 3) for part in members]
-    again = [round(float(np.exp(full_flow(part.pooled))), 3) for part in fits.resampled]
+    resampled_flows = [round(float(np.exp(full_flow(part.pooled))), 3) for part in fits.resampled]
     return {
         "wide_open_from": WIDE_OPEN,
         "samples": int(counted.sum()),
@@ -516,7 +528,7 @@ def _valve(problem: _Problem, members: Sequence[Pooled], fits: _Fits) -> dict[st
         "data_sheet_flow": SHEET_FLOW,
         "flow_at_100": flows[0],
         "flow_at_100_members": flows[1:],
-        "flow_at_100_resampled": again,
+        "flow_at_100_resampled": resampled_flows,
     }
 
 
@@ -541,7 +553,7 @@ def _provenance(
 
 
 def _write(out: Path, manifest: dict[str, Any], members: Hybrid, data: RigRecordings) -> None:
-    unseen = training_list(data.breaths, _seen_by(data))
+    unseen = training_list(data.breaths, _held_out_member(data))
     save_plant(out / frozen.MEMBERS, members)
     arrays = {**vars(unseen.prints), "fold": unseen.fold}
     files.write_atomically(out / frozen.TRAINING_LIST, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]

@@ -120,9 +120,9 @@ def nominal_error(lungs: environment.Lungs, policy: Any) -> Array:
     The mean over lungs and PIPs, without weights.
     """
     pips = np.repeat(np.asarray(protocol.PIPS), lungs.count)
-    which = jnp.arange(len(pips)) % lungs.count
+    lung_of_cell = jnp.arange(len(pips)) % lungs.count
     cells = nominal_scenario(pips)
-    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], lungs.nominal)
+    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[lung_of_cell], lungs.nominal)
     episodes = environment.Episodes(plants, cells, jnp.ones(len(pips)))
     return jnp.mean(environment.errors(episodes, policy))
 
@@ -172,7 +172,7 @@ def train(
     seeds: Sequence[int],
     *,
     chunk: int,
-    about: str = "",
+    identity: str = "",
     file: Path | None = None,
     progress: RunsProgress | None = None,
 ) -> TrainedPolicies:
@@ -187,7 +187,7 @@ def train(
         plants: lungs of each run, an axis ``(R, ...)`` in front of all leaves; taken in float32.
         seeds: one for each run.
         chunk: iterations between two points of the curves.
-        about: text that tells one training from another, such as the simulators' hash.
+        identity: text that tells one training from another, such as the simulators' hash.
         file: checkpoint that is resumed from and written to; kept at the end.
         progress: see :data:`RunsProgress`.
 
@@ -208,7 +208,7 @@ def train(
             "recipe": asdict(method),
             "seeds": list(map(int, seeds)),
             "chunk": chunk,
-            "about": about,
+            "about": identity,
             "jax": jax.__version__,
         }
         stored = Checkpoint(file, settings)
@@ -253,7 +253,7 @@ class Recipe:
     """Published settings of a method."""
 
     name: str  #: of the method, as reports and checkpoints have it.
-    one: Method  #: settings for one lung.
+    per_lung: Method  #: settings for one lung.
     every: Method  #: settings for all six.
     chunk: int  #: iterations between two points of a learning curve.
 
@@ -333,7 +333,8 @@ def train_networks(
         names = (*names, ALL)
     groups = _groups(names, len(available))
     methods = [
-        shortened(recipe.one if group.lungs == 1 else recipe.every, name, steps) for group in groups
+        shortened(recipe.per_lung if group.lungs == 1 else recipe.every, name, steps)
+        for group in groups
     ]
     report = progress or (lambda *_: None)
     networks_report, checkpoints, used = {}, [], {}
@@ -348,7 +349,7 @@ def train_networks(
             plants,
             [seed for _ in group.names for seed in seeds],
             chunk=recipe.chunk,
-            about=f"{group.names} {fingerprint(plants)}",
+            identity=f"{group.names} {fingerprint(plants)}",
             file=checkpoints[-1],
             progress=lambda share, best, label=label: report(label, share, float(best.mean())),
         )
@@ -381,13 +382,13 @@ def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> environment
     """Lungs of each run, an axis of R in front: the seeds of a network in a row."""
     available = list(trained_on.names)
     if ALL in group.names:
-        where = np.repeat([list(range(len(available)))], seeds, axis=0)
+        lung_index = np.repeat([list(range(len(available)))], seeds, axis=0)
     else:
-        where = np.repeat([[available.index(name)] for name in group.names], seeds, axis=0)
-    plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, where], trained_on.plants)
+        lung_index = np.repeat([[available.index(name)] for name in group.names], seeds, axis=0)
+    plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, lung_index], trained_on.plants)
     # (plants, runs, lungs, ...) -> (runs, plants, lungs, ...)
     plants = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), plants)
-    return environment.Lungs(plants, jnp.asarray(trained_on.weights[where]))
+    return environment.Lungs(plants, jnp.asarray(trained_on.weights[lung_index]))
 
 
 def _pid_errors(lungs: environment.Lungs) -> list[float]:
@@ -430,11 +431,11 @@ def asked(
     parser: argparse.ArgumentParser,
 ) -> Iterator[tuple[argparse.Namespace, tuple[str, ...] | None, range]]:
     """What a command line asks for, its networks and its seeds; errors end it with a sentence."""
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     compilation.keep()
-    names = (ALL,) if given.all else given.lung and (given.lung,)
+    names = (ALL,) if arguments.all else arguments.lung and (arguments.lung,)
     try:
-        yield given, names, range(given.seed, given.seed + given.seeds)
+        yield arguments, names, range(arguments.seed, arguments.seed + arguments.seeds)
     except InputError as error:
         parser.exit(1, f"error: {error}\n")
     except KeyboardInterrupt:
@@ -446,14 +447,14 @@ def command(recipe: Recipe, description: str) -> None:
     parser = options(description, Path("runs", recipe.name))
     parser.set_defaults(seeds=2)
     parser.add_argument("--steps", type=int, help="control steps of experience of each training")
-    with asked(parser) as (given, names, seeds):
+    with asked(parser) as (arguments, names, seeds):
         trained = train_networks(
             recipe,
             names,
-            given.out,
+            arguments.out,
             seeds=seeds,
-            steps=given.steps,
-            simulator=given.plant,
+            steps=arguments.steps,
+            simulator=arguments.plant,
             progress=lambda label, share, best: print(f"{label}: {share:.0%}, {best:.3f} cmH2O"),
         )
         print(trained.to_frame().to_string())

@@ -128,7 +128,7 @@ def test_a_job_with_which_workers_of_a_cluster_died_is_named():
     def job():
         raise KilledWorker
 
-    with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="died.* with heavy"):
+    with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match=r"died.* with heavy"):
         list(results(pool, job, {"heavy": ()}))
 
 

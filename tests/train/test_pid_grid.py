@@ -185,4 +185,5 @@ def test_an_error_on_draws_is_that_of_the_scorer():
 
     score = run_protocol(submission_of(Controller), rigs, drawn=drawn)
     assert score.controllable is not None
-    np.testing.assert_allclose(found[0], score.controllable[2, 1], atol=1e-9)
+    # The environment rounds a submission's commands to 0.001 %.
+    np.testing.assert_allclose(found[0], score.controllable[2, 1], atol=1e-4)

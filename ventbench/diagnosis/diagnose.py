@@ -583,7 +583,8 @@ def _missing_mechanism(
         at = place_of_change(model.evaluator, model.fit, experiment.identification_data, path)
         values[changes[0]] = replace(values[changes[0]], value=at.value, ci95=(at.low, at.high))
         ids = experiment.breaths.breath_id
-        first = np.searchsorted(experiment.data.position, at).clip(max=len(ids) - 1)
+        change = (at.value, at.low, at.high)
+        first = np.searchsorted(experiment.data.position, change).clip(max=len(ids) - 1)
         now, low, high = (int(i) for i in ids[first])
         affected = (now, low, high)
     return MissingMechanism(

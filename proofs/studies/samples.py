@@ -267,7 +267,7 @@ def sample_efficiency(
             lungs,
             seeds,
             chunk=min(CHUNKS[name], recipe.iterations),
-            about=f"study {lung.id} {simulators.manifest_sha256}",
+            identity=f"study {lung.id} {simulators.manifest_sha256}",
             file=out / f"{name}.npz",
             progress=lambda done, error, name=name: progress(name, done, float(error.mean())),
         )

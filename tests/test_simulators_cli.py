@@ -228,7 +228,7 @@ def test_train_hands_over_folder_target_and_progress(tmp_path, monkeypatch):
 
 def test_the_program_ends_with_2_and_one_line(tmp_path):
     for arguments, message in (
-        (("open-loop", tmp_path / "none.csv"), "no such file"),
+        (("data", "open-loop", tmp_path / "none.csv"), "no such file"),
         (
             ("train", "simulator", "--recordings", tmp_path / "nowhere", "--out", tmp_path / "out"),
             "is no folder; give --recordings DIR",

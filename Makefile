@@ -43,7 +43,7 @@ test: check ## ruff, arrows between rooms and the fast tests
 
 test-slow: setup $(VENV)/.validator ## the tests that take seconds or minutes each
 	$(PY) -m pytest -n auto --dist loadfile -m "listed and not slow" $(PYTEST_ARGS) $(if $(PYTEST_ARGS),|| [ $$$$? = 5 ])
-	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder -m slow $(PYTEST_ARGS) $(if $(PYTEST_ARGS),|| [ $$$$? = 5 ])
+	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder -m slow $(PYTEST_ARGS) $(SLOW_ROOMS) $(if $(PYTEST_ARGS),|| [ $$$$? = 5 ])
 
 check: setup ## ruff, arrows between rooms and how big they are, changing nothing
 	$(PY) -m ruff check .

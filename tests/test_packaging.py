@@ -250,7 +250,7 @@ def test_wheel_works_outside_the_repository(wheel: Path, tmp_path: Path) -> None
 
     assert ventbench.__version__ in ventbench_command("--version")
     assert "score" in ventbench_command("--help")
-    assert "R20C50" in ventbench_command("lungs")
+    assert "R20C50" in ventbench_command("list", "lungs")
     assert "identify_plan" in ventbench_command("board", "show")
     for extra, _, command in NEEDS_EXTRA.values():
         program, *words = shlex.split(command.format(root=ROOT))

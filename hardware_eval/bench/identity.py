@@ -90,7 +90,8 @@ def identified(
         flow=flows[0],
     )
     try:
-        each = [identify(replace(recorded, flow=flow))[0] for flow in flows]
+        readings = ("pressure", "flow") if measured else ("pressure",)
+        each = [identify(replace(recorded, flow=x), readings=readings)[0] for x in flows]
     except InputError as error:
         return False, False, str(error)
     found = min(each, key=lambda x: x.noise)

@@ -96,6 +96,20 @@ def test_held_values_are_found_but_not_a_level_of_a_simulation():
     assert find_bad_samples({"pressure": level}) == ()
 
 
+def test_no_flow_at_rest_is_a_reading_and_a_dead_sensor_is_not():
+    """A flow without noise, which steps with the valve, is exactly zero in a lung at rest."""
+    rng = np.random.default_rng(0)
+    phase = np.tile(np.arange(0.0, 4.0, 0.04), 4)
+    flow = np.where(phase < 1.0, rng.uniform(50.0, 500.0, phase.size), 0.0)
+    flow += np.where((phase > 1.0) & (phase < 2.0), -300.0 * np.exp(-3.0 * phase), 0.0)
+    volume = np.where(phase < 1.0, 0.3 * phase, 0.3 * np.exp(-8.0 * np.maximum(phase - 1.0, 0.0)))
+    pressure = 5.0 + 50.0 * volume + rng.normal(0.0, 0.05, phase.size)
+    assert find_bad_samples({"pressure": pressure, "flow": flow}) == ()
+    flow[(phase > 0.2) & (phase < 0.8)] = 0.0
+    bad = find_bad_samples({"pressure": pressure, "flow": flow})
+    assert {x.column for x in bad} == {"flow"}
+
+
 def test_a_sensor_slower_than_the_rows_is_named():
     columns = signals()
     columns["pressure"] = np.repeat(columns["pressure"][::4], 4)

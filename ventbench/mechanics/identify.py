@@ -8,7 +8,7 @@ sensor does not see, a reversed sign, another unit, a volume that drifts.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,7 +46,7 @@ from ventbench.mechanics.term_selection import (
     delay,
     select_terms,
 )
-from ventbench.recordings.bad_samples import clean, isolated, notable
+from ventbench.recordings.bad_samples import MEASURED, clean, isolated, notable
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.roles import check_roles, find_saturation
 from ventbench.system_id.fit import t_quantile
@@ -186,19 +186,22 @@ class Mechanics:
 
 
 def identify(
-    breaths: Breaths, progress: Callable[[int, int], object] | None = None
+    breaths: Breaths,
+    progress: Callable[[int, int], object] | None = None,
+    readings: Collection[str] = MEASURED,
 ) -> tuple[Mechanics, ...]:
     """Identify each lung of a recording with flow or volume; they are one session.
 
     Args:
         breaths: the recording.
         progress: called after each lung with how many breaths are done, and of how many.
+        readings: columns that a sensor read: a flow that commands give has no bad samples.
 
     Raises:
         InputError: if neither is recorded, or too little of a lung to tell R from C, or more than
             a fifth of the readings are none.
     """
-    breaths, lungs, completed = clean(breaths), [], 0
+    breaths, lungs, completed = clean(breaths, readings=readings), [], 0
     notable(breaths)
     for name, part in breaths.by_lung().items():
         lungs.append(_identify_lung(name, part))

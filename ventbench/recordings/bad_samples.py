@@ -24,6 +24,9 @@ from ventbench.recordings.breaths import Breaths
 #: Columns that are measured.
 MEASURED = ("pressure", "flow", "volume")
 
+#: Share of the span of the pressure within which it rests: less is creep, or noise.
+_RESTS = 0.05
+
 #: Fewest readings by which the nature of a signal shows, and fewest different ones.
 _READINGS, _DISTINCT = 100, 20
 
@@ -162,9 +165,17 @@ def notable(breaths: Breaths) -> str | None:
     return text if share > _NOTABLE else None
 
 
-def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
-    """Breaths without bad samples, which its notes list first; the same object if there is none."""
-    names = [name for name in (*MEASURED, "u_in") if getattr(breaths, name) is not None]
+def clean(
+    breaths: Breaths, missing: Collection[float] = (), readings: Collection[str] = MEASURED
+) -> Breaths:
+    """Breaths without bad samples, which its notes list first; the same object if there is none.
+
+    Args:
+        breaths: the recording.
+        missing: see :func:`find_bad_samples`.
+        readings: columns that a sensor read; what was computed holds no bad sample.
+    """
+    names = [name for name in (*readings, "u_in") if getattr(breaths, name) is not None]
     columns = {name: getattr(breaths, name)[breaths.valid] for name in names}
     bad = find_bad_samples(columns, missing)
     if not bad:
@@ -270,11 +281,26 @@ def _held(columns: Mapping[str, Floats]) -> list[BadSamples]:
             if np.isfinite(values).any()
             else together
         )
+        if name == "flow" and "pressure" in columns:
+            ends = ends | _at_rest(values, columns["pressure"])
         rows = np.flatnonzero(together | (_improbable(repeats[name], chances[name]) & ~ends))
         if len(rows):
             of = int(np.isfinite(values).sum())
             collected.append(BadSamples(name, "held", rows, values[rows], of))
     return collected
+
+
+def _at_rest(flow: Floats, pressure: Floats) -> Bools:
+    """Runs of no flow at all while the pressure rests, ``(m,)``: nothing moves, nothing is held."""
+    out = np.zeros(len(flow), bool)
+    if not np.isfinite(pressure).any():
+        return out
+    span = float(np.diff(np.nanquantile(pressure, [0.05, 0.95]))[0])
+    for start, stop in runs(flow == 0.0):
+        during = pressure[start:stop]
+        if np.isfinite(during).any():
+            out[start:stop] = np.nanmax(during) - np.nanmin(during) < _RESTS * span
+    return out
 
 
 def _improbable(repeats: Bools, chance: float) -> Bools:

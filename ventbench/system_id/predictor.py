@@ -59,7 +59,7 @@ _ACTS = 1e-6
 
 #: How XLA compiles for a processor. Loops of many small operations spend their time between these:
 #: an analysis of regions saves copies of a loop's state, and the older emitters compile and run
-#: faster here, by 15 % for 40 breaths (``benchmarks/derivatives.py``).
+#: faster here, by 15 % for 40 breaths.
 _COMPILER = {
     "xla_cpu_copy_insertion_use_region_analysis": True,
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
@@ -220,7 +220,7 @@ class Predictor:
         """Predictions, and their derivatives with respect to k columns, ``(n, k, c, T)``.
 
         The derivatives are finite differences: a point takes two thirds of the time of an exact
-        directional derivative, and half the time to compile (``benchmarks/derivatives.py``).
+        directional derivative, and half the time to compile.
         Pressures are continuous in all free parameters; a parameter in which they are not, such as
         the bias of a rounding, is tried value by value. An effect that may have either sign can
         have a kink where it is off: there, the derivative is the mean of both one-sided slopes.

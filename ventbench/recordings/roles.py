@@ -7,7 +7,7 @@ opposite, flow is counted from the patient.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,7 +108,7 @@ def breath_figures(
         starts: first sample of each breath, ``(k,)``.
 
     Returns:
-        Figures by name, ``(k,)`` each.
+        Figures by name, ``(k,)`` each; cross products of four columns, ``(k, 10)``.
     """
     lengths = np.diff(starts, append=len(time))
     breath = np.repeat(np.arange(len(starts)), lengths)
@@ -169,18 +169,35 @@ def _commands_of(
     dt = np.where(within > 0, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0)
     volume = np.cumsum(np.nan_to_num(u_in) * dt)
     volume -= volume[starts][breath]
-    sums = {}
+    products = {}
     for shift in _SHIFTS:
         neighbour = np.clip(breath + shift, 0, len(starts) - 1)
         at = np.minimum(starts[neighbour] + within, len(time) - 1)
         good = (neighbour == breath + shift) & (within < lengths[neighbour])
         good &= np.isfinite(u_in[at]) & np.isfinite(pressure) & np.isfinite(u_in)
         columns = (u_in[at], volume[at], np.ones(len(time)), pressure)
-        columns = [np.where(good, x, 0.0) for x in columns]
-        for i, a in enumerate(columns):
-            for j, b in enumerate(columns[i:], i):
-                sums[f"shift{shift}:{i}{j}"] = np.add.reduceat(a * b, starts)
-    return sums
+        products[f"shift{shift}"] = _cross_products(columns, good, starts)
+    return products
+
+
+#: Pairs of four columns, and the place of each pair of them in a matrix.
+_PAIRS, _PLACE = np.triu_indices(4), np.zeros((4, 4), int)
+_PLACE[_PAIRS] = _PLACE.T[_PAIRS] = np.arange(10)
+
+
+def _cross_products(columns: Sequence[Floats], use: Bools, starts: Ints) -> Floats:
+    """Cross products of four columns ``(m,)`` over the used samples of each breath, ``(n, 10)``."""
+    used = [np.where(use, column, 0.0) for column in columns]
+    pairs = zip(*_PAIRS, strict=True)
+    return np.stack([np.add.reduceat(used[i] * used[j], starts) for i, j in pairs], axis=1)
+
+
+def _covariances(products: Floats) -> Floats:
+    """Covariances ``(n, 4, 4)`` of columns, of which the third is one, by their cross products."""
+    products = products[:, _PLACE]
+    count = np.maximum(products[:, 2, 2], 1.0)[:, None]
+    mean = products[:, 2] / count
+    return products / count[..., None] - mean[:, :, None] * mean[:, None, :]
 
 
 def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
@@ -211,7 +228,7 @@ def _regression(
     starts: Ints,
     breath: Ints,
 ) -> dict[str, Floats]:
-    """Correlation of pressure and flow, and the cross products of p = R Q + V / C + p0.
+    """Correlation of pressure and flow, and cross products of Q, V, 1 and p (p = R Q + V / C + p0).
 
     With a measured volume also how many times the integrated flow it is, and their correlation.
     """
@@ -221,26 +238,21 @@ def _regression(
     dt = np.where(same, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0)
     volume = np.cumsum(0.5 * dt * (q + np.roll(q, 1)))
     volume -= volume[starts][breath]
-    columns = {"q": q, "v": volume, "1": np.ones(len(q)), "p": np.where(finite, pressure, 0.0)}
-    sums = {
-        a + b: np.add.reduceat(columns[a] * columns[b] * finite, starts)
-        for a, b in ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p", "pp")
-    }
-    n = np.maximum(sums["11"], 1.0)
+    columns = [q, volume, np.ones(len(q)), pressure]
+    figures = {"flow_products": _cross_products(columns, finite, starts)}
+    spread = _covariances(figures["flow_products"])
+    figures["correlation"] = _correlation(spread, 0, 3)
     if measured is not None:
-        both = finite & np.isfinite(measured)
-        count = np.maximum(np.add.reduceat(both * 1.0, starts), 1.0)
-        v, w = (np.where(both, x, 0.0) for x in (volume, measured))
-        v, w = (
-            np.where(both, x - (np.add.reduceat(x, starts) / count)[breath], 0.0) for x in (v, w)
-        )
-        vv, vw, ww = (np.add.reduceat(a * b, starts) for a, b in ((v, v), (v, w), (w, w)))
-        sums["volume_ratio"] = _ratio(vw, vv)
-        sums["volume_correlation"] = _ratio(vw, np.sqrt(vv * ww))
-    covariance = sums["qp"] / n - sums["q1"] * sums["1p"] / n**2
-    variances = (sums["qq"] / n - (sums["q1"] / n) ** 2) * (sums["pp"] / n - (sums["1p"] / n) ** 2)
-    sums["correlation"] = _ratio(covariance, np.sqrt(np.maximum(variances, 0.0)))
-    return sums
+        columns[3] = measured
+        spread = _covariances(_cross_products(columns, finite & np.isfinite(measured), starts))
+        figures["volume_ratio"] = _ratio(spread[:, 1, 3], spread[:, 1, 1])
+        figures["volume_correlation"] = _correlation(spread, 1, 3)
+    return figures
+
+
+def _correlation(covariances: Floats, i: int, j: int) -> Floats:
+    variances = np.maximum(covariances[:, i, i] * covariances[:, j, j], 0.0)
+    return _ratio(covariances[:, i, j], np.sqrt(variances))
 
 
 def _ratio(a: Floats, b: Floats) -> Floats:
@@ -400,13 +412,9 @@ def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Find
     """Pressures that follow the commands of the breath before, or after, by far better."""
     residual = dict.fromkeys(_SHIFTS, 0.0)
     rows = dict.fromkeys(_SHIFTS, 0.0)
-    for label in np.unique(np.stack([R, C]), axis=1).T:
-        same_lung = (label[0] == R) & (label[1] == C)
+    for *_, same_lung in _by_label(R, C):
         for shift in _SHIFTS:
-            A = np.zeros((4, 4))
-            for i in range(4):
-                for j in range(i, 4):
-                    A[i, j] = A[j, i] = figures[f"shift{shift}:{i}{j}"][same_lung].sum()
+            A = figures[f"shift{shift}"][same_lung].sum(axis=0)[_PLACE]
             solved = np.linalg.lstsq(A[:3, :3], A[:3, 3], rcond=1e-9)[0]
             residual[shift] += max(float(A[3, 3] - A[:3, 3] @ solved), 0.0)
             rows[shift] += A[2, 2]
@@ -469,19 +477,13 @@ def _pressures(peep: float, pip: float) -> list[Finding]:
 def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding]:
     """Labels whose R and C are exchanged, by a regression of pressure on flow and volume."""
     collected = []
-    pairs = np.unique(np.stack([R, C], axis=1), axis=0) if "qq" in figures else []
-    for labelled_R, labelled_C in pairs:
-        same_label = (labelled_R == R) & (labelled_C == C)
-        s = {
-            k: float(figures[k][same_label].sum())
-            for k in ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p")
-        }
-        A = np.array(
-            [[s["qq"], s["qv"], s["q1"]], [s["qv"], s["vv"], s["v1"]], [s["q1"], s["v1"], s["11"]]]
-        )
-        if s["qq"] == 0.0 or np.linalg.matrix_rank(A) < 3:
+    if "flow_products" not in figures:
+        return []
+    for labelled_R, labelled_C, same_lung in _by_label(R, C):
+        A = figures["flow_products"][same_lung].sum(axis=0)[_PLACE]
+        if A[0, 0] == 0.0 or np.linalg.matrix_rank(A[:3, :3]) < 3:
             continue
-        r, e, _ = solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
+        r, e, _ = solve(A[:3, :3], A[:3, 3])
         if r <= 0.0 or e <= 0.0:
             continue
         fit = np.log([1000.0 * r, 1.0 / e])
@@ -496,6 +498,12 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
             advice = f"Pass --lung R{labelled_C:g}C{labelled_R:g} to `ventbench data import`."
             collected.append(Finding("R", message, advice, value=float(labelled_R)))
     return collected
+
+
+def _by_label(R: Floats, C: Floats) -> Iterator[tuple[float, float, Bools]]:
+    """Each label that breaths have, and which of them have it, ``(k,)``."""
+    for label in np.unique(np.stack([R, C], axis=1), axis=0):
+        yield *label, (label[0] == R) & (label[1] == C)
 
 
 def opposite_sign(pressure: Floats, flow: Floats) -> bool:

@@ -397,7 +397,7 @@ class Scanned:
     )  #: shortest and longest interval between two samples of each breath, s, (k, 2).
     blank_pressures: np.ndarray  #: samples without pressure, (k,).
     optional: tuple[str, ...]  #: optional columns of the file.
-    figures: dict[str, np.ndarray]  #: of :func:`~.roles.breath_figures`, (k,) each.
+    figures: dict[str, np.ndarray]  #: of :func:`~.roles.breath_figures`, (k, ...) each.
     bad: tuple[BadSamples, ...]  #: samples that were left out, by rows of the file.
     #: time, s from each breath's first sample, NaN in all of a breath without times; u_in %, u_out
     #: 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file has them, each (m,).

@@ -37,6 +37,7 @@ from ventbench.recordings.foreign.shapes import epoch_unit, one_row_a_sample
 from ventbench.recordings.foreign.tables import Table
 from ventbench.recordings.headers import STATES, Conversion, conversion, in_file_unit, read_header
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
+from ventbench.recordings.scan import complete_times
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung
 
@@ -838,24 +839,18 @@ def _breaths(
     notes: list[str],
 ) -> Breaths:
     rows, lengths = np.concatenate(pieces), np.array([len(piece) for piece in pieces])
-    first = np.array([piece[0] for piece in pieces])
-    parts = []
-    for piece in pieces:
-        at, k = time[piece], np.arange(len(piece))
-        finite = np.isfinite(at)
-        at = np.interp(k, k[finite], at[finite]) if not finite.all() else at
-        parts.append(at - at[0])
+    starts = np.cumsum(lengths) - lengths
     columns = {
         name: values[rows].astype(np.int8 if name == "u_out" else float)
         for name, values in samples.items()
     }
     return arranged(
         lengths,
-        np.concatenate(parts),
+        complete_times(time[rows], starts, lengths).time,
         columns,
         breath_id=np.arange(1, len(pieces) + 1),
-        R=R[first].astype(float),
-        C=C[first].astype(float),
+        R=R[rows[starts]].astype(float),
+        C=C[rows[starts]].astype(float),
         source=source,
         notes=tuple(notes),
     )

@@ -198,7 +198,7 @@ def test_simulate_refuses_bad_input(commands, tmp_path):
     bad = tmp_path / "bad.csv"
     bad.write_text("u_in\n5\n120\n")
     message = run("simulate", "--lung", "R5C10", "--controls", bad, code=2)
-    assert "line 3, column u_in: 120 is outside" in message
+    assert "line 3, column u_in: '120' is outside" in message
 
 
 def test_train_needs_recordings(tmp_path, monkeypatch):

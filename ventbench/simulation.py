@@ -225,52 +225,38 @@ def read_controls(path: Path | str, *, by_breath: bool = False) -> list[Controls
         InputError: if a column is missing or a value is wrong; it says which.
         OSError: if the file cannot be read.
     """
-    import csv
+    import pandas as pd
 
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        try:
-            rows = list(csv.DictReader(file, strict=True))
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise InputError(f"{path} is not a CSV file in UTF-8: {error}") from error
-    if not rows or "u_in" not in rows[0]:
+    try:
+        texts = pd.read_csv(path, dtype=str, keep_default_na=False, encoding="utf-8-sig")
+    except (ValueError, UnicodeDecodeError) as error:  # the parser's errors are ValueErrors
+        raise InputError(f"{path} is not a CSV file in UTF-8: {error}") from error
+    if texts.empty or "u_in" not in texts:
         raise InputError(f"{path} needs a header line with a column u_in, and at least one row")
 
-    def column(name: str) -> Floats:
-        return _numbers(path, name, [row[name] or "" for row in rows])
+    def check(column: str, bad: Bools, why: str) -> None:
+        if np.any(bad):
+            row = int(np.argmax(bad))
+            cell = texts[column].iloc[row]
+            raise InputError(f"{path} line {row + 2}, column {column}: {cell!r} {why} Fix the row.")
 
-    u_in = column("u_in")
-    u_out = column("u_out") if "u_out" in rows[0] else np.zeros(len(rows))
-    time = column("time_step") if "time_step" in rows[0] else _steps(len(rows))
-    out = (u_in < 0) | (u_in > protocol.U_MAX)
-    _first(path, "u_in", out, u_in, "is outside 0..100 %. Fix the row.")
-    _first(path, "u_out", (u_out != 0) & (u_out != 1), u_out, "is neither 0 nor 1. Fix the row.")
-    breath = [row.get("breath_id") if by_breath else None for row in rows]
-    starts = [k for k in range(1, len(rows)) if breath[k] != breath[k - 1]]
+    def numbers(column: str) -> Floats:
+        values = np.array(pd.to_numeric(texts[column], errors="coerce"), float)
+        check(column, ~np.isfinite(values), "is not a number.")
+        return values
+
+    u_in = numbers("u_in")
+    u_out = numbers("u_out") if "u_out" in texts else np.zeros(len(texts))
+    time = numbers("time_step") if "time_step" in texts else _steps(len(texts))
+    check("u_in", (u_in < 0) | (u_in > protocol.U_MAX), "is outside 0..100 %.")
+    check("u_out", (u_out != 0) & (u_out != 1), "is neither 0 nor 1.")
+    breath = texts["breath_id"].to_numpy() if by_breath and "breath_id" in texts else u_in * 0.0
+    starts = np.flatnonzero(breath[1:] != breath[:-1]) + 1
     back = np.append(False, np.diff(time) <= 0)
     back[starts] = False
-    _first(path, "time_step", back, time, "s is not later than the row before. Give one breath.")
+    check("time_step", back, "s is not later than the row before, in one breath.")
     parts = zip(*(np.split(column, starts) for column in (time, u_in, u_out)), strict=True)
     return [Controls(*part) for part in parts]
-
-
-def _numbers(path: Path | str, column: str, text: list[str]) -> Floats:
-    values = np.empty(len(text))
-    for row, cell in enumerate(text):
-        try:
-            values[row] = float(cell)
-        except ValueError:
-            values[row] = np.nan
-        if not np.isfinite(values[row]):
-            raise InputError(
-                f"{path} line {row + 2}, column {column}: {cell!r} is not a number. Fix the row."
-            )
-    return values
-
-
-def _first(path: Path | str, column: str, bad: Bools, values: Floats, why: str) -> None:
-    if np.any(bad):
-        row = int(np.argmax(bad))
-        raise InputError(f"{path} line {row + 2}, column {column}: {values[row]:g} {why}")
 
 
 def _steps(count: int) -> Floats:

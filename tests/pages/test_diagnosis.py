@@ -42,6 +42,7 @@ def test_report(found: Diagnosis, tmp_path: Path) -> None:
     assert "Missing in the physics simulator: dead time of the inspiratory valve" in page.text
     assert "41 ms [38, 44]" in page.text
     assert "97 %" in page.text
+    assert report.facts(found)[0] == ("How sure?", "posterior probability of 97 %", "")
     one = found.open_loop
     for value in (one.before.rmse, one.refit.rmse, one.after.rmse, one.noise_floor):
         assert f"{value:.2f}" in page.text

@@ -30,7 +30,7 @@ class Chart:
     #: whether the horizontal axis is logarithmic; smaller values stand at its left end.
     log: bool = False
     #: room left, right, top and bottom of the frame, picture units.
-    room: tuple[float, float, float, float] = (40.0, 16.0, 16.0, 30.0)
+    room: tuple[float, float, float, float] = (40.0, 16.0, 18.0, 30.0)
     marks: tuple[float, ...] = ()  #: values that the vertical axis marks in place of round ones.
 
     @property

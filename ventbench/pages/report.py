@@ -180,10 +180,8 @@ def comparison(
         "rows": [
             {
                 "name": lung,
-                "cells": [
-                    {"text": number(value, sign=True), "shade": _shade(value)} for value in row
-                ],
-                "mean": number(mean, sign=True),
+                "cells": [{"text": _signed(value), "shade": _shade(value)} for value in row],
+                "mean": _signed(mean),
             }
             for lung, row, mean in zip(runs[0].lungs, difference, lungs, strict=True)
         ],
@@ -274,9 +272,13 @@ def _difference(value: float) -> dict[str, str]:
     """Text of a difference and whether that is better; what rounds to 0.00 is neither."""
     if not np.isfinite(value):
         return {"difference": "", "class": ""}
-    text = number(value, sign=True)
     kind = "same" if round(value, 2) == 0.0 else "better" if value < 0.0 else "worse"
-    return {"difference": "±0.00" if kind == "same" else text, "class": kind}
+    return {"difference": _signed(value), "class": kind}
+
+
+def _signed(difference: float) -> str:
+    """Text of a difference, of which what rounds to 0.00 has no sign."""
+    return "±0.00" if round(difference, 2) == 0.0 else number(difference, sign=True)
 
 
 #: Values of D that are shown beside the best one, %/cmH2O.

@@ -110,11 +110,9 @@ def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     errors, count = diagnosis.open_loop, len(diagnosis.open_loop.held_out_breaths)
     answers = []
     if sure := report_text.sureness(diagnosis):
-        decided, _, breaths = sure.partition(" on ")
-        prefix = "each, " if sure.startswith("each at ") else ""
-        answers.append(("How sure?", decided.removeprefix("each at "), f"{prefix}on {breaths}"))
-        if sure.startswith("uncertain"):
-            answers[-1] = ("How sure?", "uncertain", sure.removeprefix("uncertain: "))
+        first, _, doubts = sure.partition(": ")
+        each = "each effect by itself" if sure.startswith("each at ") else ""
+        answers.append(("How sure?", first.removeprefix("each at "), doubts or each))
     after, out = _number(errors.after.rmse), errors.groups.get("expiration", {})
     if diagnosis.verdict == "nothing_missing":
         also = f"; expiration {_number(out['after'].rmse)}" if "after" in out else ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,54 +19,26 @@ import numpy as np
 import optax
 import pandas as pd
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
-from scipy.stats import trim_mean
+from numpy.typing import NDArray
 
 from submissions.dqn.train import DQN
 from submissions.ppo.train import PPO
 from ventbench.base import files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import require
+from ventbench.board.comparison import over_seeds
 from ventbench.controllers import residual
 from ventbench.controllers.residual import SCALE, GaussianPolicy, Parameters, TanhNetwork
 from ventbench.palette import RUNS
 from ventbench.plants import frozen
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS, Lung
-from ventbench.task.metrics import bootstrap
 from ventbench.train import pid_search
 from ventbench.train.rl import environment
 from ventbench.train.rl.train import Method, State, train
 
 #: How close to its final score counts as having reached it.
 CLOSE = 0.02
-
-
-def interquartile_mean(values: ArrayLike) -> Floats:
-    """Mean of what is left after cutting a quarter at each end; over the first axis.
-
-    Args:
-        values: shape ``(n, ...)``; ``floor(n / 4)`` values are cut at each end.
-    """
-    return trim_mean(np.asarray(values, float), 0.25, axis=0)
-
-
-def band(values: ArrayLike) -> tuple[Floats, Floats]:
-    """95 % bootstrap interval of the interquartile mean, the seeds drawn with replacement.
-
-    Args:
-        values: shape ``(seeds, points)``.
-
-    Returns:
-        Lower and upper limits, shape ``(points,)``.
-    """
-    values = np.asarray(values, float)
-    bits = np.random.PCG64(bootstrap.SEED)
-    drawn = bits.random_raw((len(values), bootstrap.RESAMPLES)) >> np.uint64(32)
-    index = ((drawn * np.uint64(len(values))) >> np.uint64(32)).astype(np.intp)
-    means = np.stack([interquartile_mean(column[index]) for column in values.T], axis=-1)
-    low, high = np.quantile(means, (0.025, 0.975), axis=0)
-    return low, high
 
 
 @dataclass(frozen=True)
@@ -78,14 +51,15 @@ class LearningCurve:
     compile_seconds: float  #: time of compiling, s.
     scores: Floats  #: nominal, cmH2O, ``(seeds, points)``.
 
-    @property
-    def middle(self) -> Floats:
-        """Interquartile mean over the seeds, ``(points,)``."""
-        return interquartile_mean(self.scores)
+    @cached_property
+    def bands(self) -> Floats:
+        """Interquartile mean over the seeds, and its 95 % interval's ends, ``(3, points)``."""
+        each = [over_seeds(scores) for scores in self.scores.T]
+        return np.array([(x.value, x.low, x.high) for x in each]).T
 
     def first_below(self, score: float) -> int | None:
         """Index of the first point whose interquartile mean is at or below a score."""
-        points = np.flatnonzero(self.middle <= score)
+        points = np.flatnonzero(self.bands[0] <= score)
         return int(points[0]) if points.size else None
 
 
@@ -102,14 +76,11 @@ class SampleStudy:
         """One row for each point of each curve."""
         parts = []
         for curve in self.curves:
-            low, high = band(curve.scores)
             columns = {
                 "method": curve.method,
                 "episodes": curve.episodes,
                 "seconds": np.round(curve.seconds, 3),
-                "iqm": curve.middle,
-                "low95": low,
-                "high95": high,
+                **dict(zip(("iqm", "low95", "high95"), curve.bands, strict=True)),
             }
             columns |= {f"seed{i}": row for i, row in enumerate(curve.scores)}
             parts.append(pd.DataFrame(columns))
@@ -133,8 +104,7 @@ class SampleStudy:
         }
 
     def _row(self, curve: LearningCurve) -> dict[str, object]:
-        low, high = band(curve.scores[:, -1:])
-        final = float(curve.middle[-1])
+        final, low, high = curve.bands[:, -1].tolist()
         close = curve.first_below((1.0 + CLOSE) * final)
         better = curve.first_below(self.best_pid)
         at_100 = int(np.flatnonzero(curve.episodes <= 100)[-1])
@@ -145,10 +115,10 @@ class SampleStudy:
         return {
             "method": curve.method,
             "final": round(final, 3),
-            "low95": round(float(low[0]), 3),
-            "high95": round(float(high[0]), 3),
+            "low95": round(low, 3),
+            "high95": round(high, 3),
             "episodes": int(curve.episodes[-1]),
-            "at_100_episodes": round(float(curve.middle[at_100]), 3),
+            "at_100_episodes": round(float(curve.bands[0, at_100]), 3),
             "episodes_to_best_pid": at(curve.episodes, better),
             "episodes_to_2_percent": at(curve.episodes, close),
             "seconds_to_2_percent": at(np.round(curve.seconds, 2), close),
@@ -331,9 +301,9 @@ def learning_curves_png(study: SampleStudy) -> bytes:
 def _curves(axes: Any, study: SampleStudy, across: Callable[[LearningCurve], Any]) -> None:
     for curve in study.curves:
         x, color = across(curve)[1:], _CURVE_COLORS[curve.method]
-        low, high = band(curve.scores[:, 1:])
+        middle, low, high = curve.bands[:, 1:]
         axes.fill_between(x, low, high, color=color, alpha=0.2, linewidth=0)
-        axes.plot(x, curve.middle[1:], color=color, linewidth=1.6, label=CURVE_LABELS[curve.method])
+        axes.plot(x, middle, color=color, linewidth=1.6, label=CURVE_LABELS[curve.method])
     axes.axhline(study.start, color="#5b636d", linestyle=":", linewidth=1.2)
     axes.axhline(study.best_pid, color="#5b636d", linestyle="--", linewidth=1.2)
     end = axes.get_xlim()[1]

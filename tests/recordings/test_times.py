@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ventbench.recordings import check, load
-from ventbench.recordings.scan import interval_table
+from ventbench.recordings.scan import estimated_intervals
 
 TIME = 4
 
@@ -64,10 +64,10 @@ def test_times_are_moved_to_start_at_zero(rows, write_csv):
     np.testing.assert_array_equal(load(path).time[1], load(path).time[0])
 
 
-def test_the_interval_table():
-    n = np.array([31, 31, 31, 29, 29, 30])
-    table = interval_table(n, np.array([0.031, 0.032, 0.033, 0.034, 0.035, np.nan]))
-    assert table.estimate(31, 80) == 0.032
-    assert table.estimate(29, 80) == 1 / 29
-    assert table.estimate(0, 80) == table.estimate(80, 80) == 0.033
-    assert interval_table(n, np.full(6, np.nan)).estimate(0, 80) is None
+def test_intervals_are_those_of_breaths_alike():
+    n = np.array([31, 31, 31, 29, 29, 30, 0, 80])
+    interval = np.array([0.031, 0.032, 0.033, 0.034, 0.035, np.nan, np.nan, np.nan])
+    found = estimated_intervals(n, interval, np.full(8, 80))
+    wanted = [0.032] * 3 + [1 / 29] * 2 + [1 / 30] + [0.033] * 2
+    np.testing.assert_array_equal(found, wanted)
+    assert np.isnan(estimated_intervals(n, np.full(8, np.nan), np.full(8, 80))[-1])

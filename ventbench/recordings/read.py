@@ -274,7 +274,7 @@ def describe(scanned: Scanned) -> dict[str, Any]:
         "lungs": {Lung(*pair).id: int(n) for pair, n in zip(pairs.tolist(), counts, strict=True)},
         "interval": _intervals(scanned),
         "time_inferred": {
-            int(scanned.breath_id[i]): dt for i, dt in scanned.inferred.items() if dt is not None
+            int(scanned.breath_id[i]): dt for i, dt in scanned.inferred.items() if np.isfinite(dt)
         },
         "time_interpolated": int(scanned.time_interpolated.sum()),
         "time_shifted": int(scanned.time_shifted.sum()),
@@ -352,7 +352,7 @@ def check_lengths(scanned: Scanned, log: ProblemLog, *, pad: bool) -> None:
 
 def check_inferable(scanned: Scanned, log: ProblemLog) -> None:
     """Check that the interval of every breath without times can be inferred."""
-    for at in (i for i, dt in scanned.inferred.items() if dt is None):
+    for at in (i for i, dt in scanned.inferred.items() if np.isnan(dt)):
         message = (
             f"the times of breath {scanned.breath_id[at]} are blank and cannot be inferred: no "
             "breath of the file has times, and u_out does not switch from 0 to 1 in this one"
@@ -531,7 +531,6 @@ def _assemble(scanned: Scanned, file: str) -> Breaths:
     samples = dict(scanned.samples)
     time = samples.pop("time").copy()
     for i, dt in scanned.inferred.items():
-        assert dt is not None  # check_inferable
         start, length = scanned.starts[i], scanned.lengths[i]
         time[start : start + length] = dt * np.arange(length)
     return arranged(

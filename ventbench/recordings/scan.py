@@ -291,38 +291,26 @@ INSPIRATION = 1.0
 """Duration of inspiration, s."""
 
 
-@dataclass(frozen=True)
-class IntervalTable:
-    """Sampling intervals of a file's breaths with known times."""
+def estimated_intervals(
+    n_inspiratory: np.ndarray, interval: np.ndarray, lengths: np.ndarray
+) -> np.ndarray:
+    """Sampling interval of each breath by the known ones of the file, s, (k,); see the module.
 
-    by_count: dict[int, float]  #: median interval, s, by number of inspiratory samples.
-    overall: float | None  #: median interval of all breaths, s, or None if no breath has times.
-
-    def estimate(self, n_inspiratory: int, length: int) -> float | None:
-        """Interval of a breath without times, s, of n inspiratory samples of so many in all.
-
-        None if no breath of the file has times and u_out does not switch.
-        """
-        if not 0 < n_inspiratory < length:
-            return self.overall
-        return self.by_count.get(n_inspiratory, INSPIRATION / n_inspiratory)
-
-
-def interval_table(n_inspiratory: np.ndarray, interval: np.ndarray) -> IntervalTable:
-    """Tabulate the intervals of a file.
+    NaN if no breath has times and u_out does not switch.
 
     Args:
         n_inspiratory: leading samples with u_out = 0, (k,).
         interval: mean sampling interval, s, NaN where times are blank, (k,).
+        lengths: samples, (k,).
     """
-    finite = np.isfinite(interval)
-    counts, intervals = n_inspiratory[finite], interval[finite]
-    by_count = {
-        int(n): float(np.median(intervals[counts == n]))
-        for n, many in zip(*np.unique(counts, return_counts=True), strict=True)
-        if many >= ENOUGH
-    }
-    return IntervalTable(by_count, float(np.median(intervals)) if len(intervals) else None)
+    import pandas as pd
+
+    alike = pd.Series(interval).groupby(n_inspiratory)
+    few = alike.transform("count").to_numpy() < ENOUGH
+    median = alike.transform("median").to_numpy()
+    switches = (n_inspiratory > 0) & (n_inspiratory < lengths)
+    by_count = np.where(few, INSPIRATION / np.maximum(n_inspiratory, 1), median)
+    return np.where(switches, by_count, pd.Series(interval).median())
 
 
 def leading_zeros(u_out: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -405,17 +393,10 @@ class Scanned:
     samples: dict[str, np.ndarray]
 
     @cached_property
-    def intervals(self) -> IntervalTable:
-        """Sampling intervals of the breaths whose times are known."""
-        return interval_table(self.n_inspiratory, self.interval)
-
-    @cached_property
-    def inferred(self) -> dict[int, float | None]:
-        """Interval, s, estimated for each breath without times, by its place; None without one."""
-        return {
-            i: self.intervals.estimate(int(self.n_inspiratory[i]), int(self.lengths[i]))
-            for i in np.flatnonzero(self.time_blank).tolist()
-        }
+    def inferred(self) -> dict[int, float]:
+        """Interval, s, estimated for each breath without times, by its place; NaN without one."""
+        estimated = estimated_intervals(self.n_inspiratory, self.interval, self.lengths)
+        return {i: float(estimated[i]) for i in np.flatnonzero(self.time_blank).tolist()}
 
 
 def scan(

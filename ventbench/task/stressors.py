@@ -474,18 +474,6 @@ def stressor(name: str) -> Stressor:
     raise InputError(f"no stressor {name!r}; choose of {', '.join(s.name for s in STRESSORS)}")
 
 
-def condition_of(name: str, where: str) -> Condition:
-    """A condition by its :attr:`Condition.id`.
-
-    Raises:
-        InputError: if no condition of this table of stressors has it.
-    """
-    for condition in conditions():
-        if condition.id == name:
-            return condition
-    raise InputError(f"{where}: {name[:80]!r} is no condition of the stress track")
-
-
 def conditions() -> tuple[Condition, ...]:
     """All conditions of the track: nothing first, then each stressor twice, then the pairs."""
     single = [Condition((s.name,), severity) for s in STRESSORS for severity in SEVERITIES]

@@ -138,6 +138,7 @@ def _lung(lung: str, time: rrb.TimeAxis, name: str) -> rrb.Vertical:
                 contents=contents,
                 name=title,
                 axis_x=time,
+                axis_y=rrb.ScalarAxis(range=(-0.1, 1.1)) if part == "u_out" else None,
                 plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=part == "pressure"),
             )
         )

@@ -118,9 +118,10 @@ class SafetySettings:
     no_reading: Check = Check(
         0.0,
         "readings",
-        0.06,
+        0.09,
         True,
-        "Two steps without a number, or one outside -20..110 cmH2O: nothing can be controlled.",
+        "Three steps without a number between -20 and 110 cmH2O, answered or not, as no score "
+        "allows; the device, which samples more often, vents after 50 ms.",
     )
     no_answer: Check = Check(
         0.0,
@@ -425,7 +426,7 @@ def _values(
             and (state.expected > settings.stuck_sensor.threshold or still > _STUCK_AT_REST_S),
         ),
         "implausible_slope": (jump, jump > settings.implausible_slope.threshold),
-        "no_reading": (0.0 if number else 1.0, not number and sample.answered),
+        "no_reading": (0.0 if number else 1.0, not number),
         "no_answer": (0.0 if sample.answered else 1.0, not sample.answered),
         "low_pressure": (pressure, pressure < settings.low_pressure.threshold),
         "expiratory_valve": (

@@ -31,7 +31,8 @@ from hardware_eval.wire.client import Client, LinkError
 #: Runs that the bench spoils in a row before the session gives up.
 MAX_ATTEMPTS = 3
 
-#: Runs that a busy host or a slow line ends in a row before the session gives up.
+#: Runs that a busy host, a slow line or a device that restarts ends in a row before the session
+#: gives up.
 MAX_HELD_UP = 10
 
 #: What is said of a host that is late time and again.
@@ -118,8 +119,8 @@ def _runs(
             # The device has vented or will: by the vent that follows, or by its watchdog.
             log.append({"type": "event", "what": "link", "message": str(error)})
             log.append(_run_line(run, attempts[run.number] - 1, "aborted", str(error)))
-            spoilt += 1
-            if spoilt > MAX_ATTEMPTS:
+            held_up += 1
+            if held_up >= MAX_HELD_UP:
                 raise
             bench.operator.tell(f"{error}; connecting again")
             bench.client.reconnect()

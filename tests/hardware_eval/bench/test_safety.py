@@ -69,7 +69,7 @@ FAULTS: dict[str, tuple[Callable[[int, SafetySample], SafetySample], float]] = {
     "software_delay": (lambda i, s: s._replace(late=0.11), 0.0),
     "missed_deadlines": (lambda i, s: s._replace(late=0.012), 0.12),
     "stuck_sensor": (lambda i, s: s._replace(pressure=12.0), 1.5),
-    "no_reading": (lambda i, s: s._replace(pressure=math.nan), 0.06),
+    "no_reading": (lambda i, s: s._replace(pressure=math.nan), 0.09),
     "no_answer": (lambda i, s: s._replace(pressure=math.nan, answered=False), 0.06),
     "low_pressure": (lambda i, s: s._replace(pressure=0.5 + 0.01 * (i % 3)), 0.5),
     "expiratory_valve": (

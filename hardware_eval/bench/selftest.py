@@ -151,8 +151,8 @@ _PROBES = ((15.0, 1.0, 2.0), (25.0, 1.0, 2.0), (15.0, 3.0, 1.0), (25.0, 0.3, 4.0
 _SWEEP, _SWEPT_RESISTANCE = (5.0, 10.0, 20.0, 40.0), 20.0
 _PUFF = 3
 
-#: Steps at rest before a puff, with both valves closed after it, and of those that count.
-_LEAD, _STILL, _SETTLED = 10, 10, 7
+#: Steps at rest before a puff, and with both valves closed after it.
+_LEAD, _STILL = 10, 10
 
 #: Least share of the nominal valve's rise.
 _LEAST_RISE = 0.25
@@ -397,15 +397,20 @@ def _openings(lung: str) -> tuple[tuple[float, ...], int]:
 
 
 def _sweep(puffs: Sequence[Driven], noise: float, lung: str) -> list[Finding]:
-    """Compare the rises of the puffs, of no opening and of :func:`_openings`, with the noise."""
+    """Compare the rises of the puffs, of no opening and of :func:`_openings`, with the noise.
+
+    A rise is the mean from a puff's first command on, against that at rest. Of a soft lung hardly
+    anything remains of it after the puff, while its resistance shows in it.
+    """
     openings, steps = _openings(lung)
     whole = [puff.pressure.size == _LEAD + steps + _STILL for puff in puffs]
     if whole != [True] * (1 + len(openings)):
         return [Finding("valve_sweep", math.nan, False, "the sweep was stopped")]
     rises = [
-        float(puff.pressure[-_SETTLED:].mean() - puff.pressure[1:_LEAD].mean()) for puff in puffs
+        float(puff.pressure[_LEAD + 1 :].mean() - puff.pressure[1:_LEAD].mean()) for puff in puffs
     ]
-    error = noise * math.sqrt(2.0 * (1.0 / _SETTLED + 1.0 / (_LEAD - 1)))  # of a difference of two
+    counted = steps + _STILL - 1
+    error = noise * math.sqrt(2.0 * (1.0 / counted + 1.0 / (_LEAD - 1)))  # of a difference of two
     nominal = VALVE_GAIN * np.diff([0.0, *openings]) * steps * protocol.DT / parse_lung(lung).C
     further = np.diff(rises) > _LEAST_RISE * nominal - _SIGMAS * error
     opens = rises[-1] - rises[0] > _SIGMAS * error

@@ -23,6 +23,7 @@ from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, run_once
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
+from hardware_eval.emulation.simulated import PVP_SENSOR
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError
 from hardware_eval.wire.messages import Reading
 from tests.hardware_eval import faults
@@ -219,7 +220,7 @@ def main(trials: int = 10, lung: str = "R20C20", only: str = "") -> None:
     --only: only faults whose names hold this.
     """
     random = np.random.default_rng(0)
-    device = FaultyDevice(faulty_lung(lung, noise=0.1, quantum=0.0703))
+    device = FaultyDevice(faulty_lung(lung, sensor=PVP_SENSOR))
     for fault in (fault for fault in FAULTS if only in fault.name):
         done: dict[str, list[float]] = {}
         for _ in range(trials):

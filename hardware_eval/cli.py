@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import secrets
 import sys
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,7 @@ from hardware_eval.commands import (
     calibration_of,
     numbers,
     report,
+    show,
     told,
     trial,
 )
@@ -163,23 +165,84 @@ def run(
         raise typer.Exit(1)
 
 
-@app.command(
-    context_settings={
-        "allow_extra_args": True,
-        "ignore_unknown_options": True,
-        "help_option_names": [],
-    }
-)
-def emulate(context: typer.Context) -> None:
+@app.command()
+def emulate(
+    lung: Annotated[
+        str, typer.Option(help="Lung on it.", autocompletion=options.complete_lungs)
+    ] = "R20C50",
+    plant: options.PlantName = "frozen",
+    conceal: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WORDS",
+            help="A lung with physics that the simulator lacks; the words determine it.",
+        ),
+    ] = None,
+    seal: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Where the sealed answer of --conceal goes, as JSON."),
+    ] = None,
+    link: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Symbolic link to make to the terminal.")
+    ] = None,
+    control: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Control socket to make.")
+    ] = None,
+    firmware: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A program of hardware_eval/firmware as the device; .elf runs under QEMU.",
+        ),
+    ] = None,
+) -> None:
     """Emulate the ventilator and a lung on a pseudo-terminal; prints its path.
-
-    Its options, such as --lung, --conceal, --fault and --firmware: `emulate --help`.
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """
-    from hardware_eval.emulation.emulator import main as run_emulator
+    from hardware_eval.device.program import DeviceService, DeviceSettings
+    from hardware_eval.emulation import emulator, simulated
+    from hardware_eval.emulation.firmware import Firmware, command_of
+    from hardware_eval.realtime import prefer, told_to_end
+    from ventbench.plants.catalog import load_simulators
 
-    raise typer.Exit(run_emulator(context.args))
+    if seal is not None and conceal is None:
+        raise InputError("--seal: nothing is concealed; give --conceal too")
+    emulator.check_paths(link, control)
+    runs_image = None if firmware is None else command_of(firmware)
+    if conceal is None:
+        lung_plant, name = load_simulators(plant).plant(lung), f"emulated {lung}"
+        shown = name
+    else:
+        hidden = simulated.conceal(conceal, plant)
+        lung_plant, name = hidden.plant, f"emulated {hidden.lung}"
+        shown = f"{name}, with physics {hidden.seal['commitment'][:16]}..."
+        if seal is not None:
+            hidden.write(seal)
+    print("compiling the lung; the terminal appears when it answers", file=sys.stderr, flush=True)
+    hal = simulated.SimulatedHal(lung_plant, name=name, sensor=simulated.PVP_SENSOR)
+    begun = time.monotonic()
+    image = None if runs_image is None else Firmware(runs_image, hal, begun)
+    try:
+        device = emulator.Emulator(
+            image or DeviceService(hal, DeviceSettings(), 0.0),
+            link=link,
+            control=control,
+            begun=begun,
+        )
+        prefer()
+        ended = told_to_end()
+        if image is not None:
+            image.start(lambda: device.port.inbox.put(b""))
+        print(device.terminal, flush=True)
+        print(f"ready: {shown}; Ctrl-C ends it", file=sys.stderr, flush=True)
+        device.run(lambda: ended() or (image is not None and image.lost))
+        print(f"longest lateness of the device: {1e3 * device.lateness:.1f} ms", file=sys.stderr)
+    finally:
+        if image is not None:
+            image.close()
+    if image is not None and image.lost:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -205,8 +268,7 @@ def selftest(
     with bench_on(port, yes=True) as (line, bench, _):
         baseline = calibration_of(line, calibration).baseline()
         sheet = run_selftest(bench, label, simulator=simulators, baseline=baseline, skip=left_out)
-    emit(sheet.as_dict(), json)
-    print(sheet, file=told(json))
+    show(sheet.as_dict(), json, sheet)
     if not sheet.go:
         raise typer.Exit(1)
 
@@ -236,8 +298,11 @@ def conformance(
         transport.close()
     failed = sum(clause.holds is False for clause in clauses)
     held = sum(clause.holds is True for clause in clauses)
-    emit({"holds": not failed, "clauses": [dataclasses.asdict(clause) for clause in clauses]}, json)
-    print(f"{held} hold, {failed} fail, {len(clauses) - held - failed} not tried", file=shown)
+    show(
+        {"holds": not failed, "clauses": [dataclasses.asdict(clause) for clause in clauses]},
+        json,
+        f"{held} hold, {failed} fail, {len(clauses) - held - failed} not tried",
+    )
     if failed:
         raise typer.Exit(1)
 
@@ -288,14 +353,14 @@ def compare(
             if out is not None:
                 diagnoses[lung].save(out / lung)
     found = {lung: diagnosis.as_dict() for lung, diagnosis in diagnoses.items()}
-    emit({"simulator": tested.name, "unit": "cmH2O", "lungs": lungs, "diagnoses": found}, json)
-    to = told(json)
-    print(f"open-loop MAE of the {tested.name} simulators, cmH2O", file=to)
-    for lung, figures in lungs.items():
-        shown = "-" if figures["mae"] is None else f"{figures['mae']:.2f}"
-        print(f"  {lung}: {shown} ({figures['breaths']} breaths)", file=to)
-    for lung, diagnosis in diagnoses.items():
-        print(f"{lung}: {diagnosis}", file=to)
+    maes = {lung: "-" if x["mae"] is None else f"{x['mae']:.2f}" for lung, x in lungs.items()}
+    show(
+        {"simulator": tested.name, "unit": "cmH2O", "lungs": lungs, "diagnoses": found},
+        json,
+        f"open-loop MAE of the {tested.name} simulators, cmH2O",
+        *(f"  {lung}: {maes[lung]} ({x['breaths']} breaths)" for lung, x in lungs.items()),
+        *(f"{lung}: {diagnosis}" for lung, diagnosis in diagnoses.items()),
+    )
 
 
 @app.command()
@@ -303,7 +368,7 @@ def collect(
     port: Port,
     lung: Lung,
     breaths: Annotated[int, typer.Option(min=1, help="Breaths in all.")] = 60,
-    seed: Annotated[int, typer.Option(help="Seed of the disturbances.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the disturbances.")] = 0,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Log and recording; a collection continues.")
     ] = Path("runs/exploration"),
@@ -329,6 +394,7 @@ def collect(
         raise InputError(
             f"--ease {ease:g} cmH2O: give more than {protocol.PEEP:g} and at most {highest:g}"
         )
+    files.claim_folder(out)
     with bench_on(port, yes=yes, kept=out) as (line, bench, person):
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
@@ -344,12 +410,13 @@ def collect(
                 progress=lambda number: exploring(number, breaths),
             )
     count = len(done.breaths)
-    emit({"breaths": count, "recording": str(done.recording), "stopped": done.stopped}, json)
-    to = told(json)
-    print(f"{count} whole breaths: {done.recording}", file=to)
+    lines = [f"{count} whole breaths: {done.recording}"]
     if done.stopped:
-        print(f"stopped: {plain(done.stopped)}; {line.client.ending()}", file=to)
-        print(f"what is done is in {out}; the same command continues", file=to)
+        lines.append(f"stopped: {plain(done.stopped)}; {line.client.ending()}")
+        lines.append(f"what is done is in {out}; the same command continues")
+    about = {"breaths": count, "recording": str(done.recording), "stopped": done.stopped}
+    show(about, json, *lines)
+    if done.stopped:
         raise typer.Exit(1)
 
 
@@ -387,8 +454,7 @@ def demo(
         sandbox=not in_process,
         tell=lambda text: print(text, file=to, flush=True),
     )
-    emit(done.as_dict(), json)
-    print(f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}", file=to)
+    show(done.as_dict(), json, f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}")
     if not done.better:
         raise typer.Exit(1)
 
@@ -414,8 +480,7 @@ def replay(
     from hardware_eval.results.record import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
-    emit(report.as_dict(), json)
-    print(report, file=told(json))
+    show(report.as_dict(), json, report)
     if report.problems:
         raise typer.Exit(1)
 

@@ -42,6 +42,12 @@ def told(json: Path | None) -> TextIO:
     return sys.stderr if str(json) == "-" else sys.stdout
 
 
+def show(value: object, json: Path | None, *lines: object) -> None:
+    """Write the result of a command to the file of ``--json``, and lines for people."""
+    emit(value, json)
+    print(*lines, sep="\n", file=told(json))
+
+
 @contextlib.contextmanager
 def bench_on(
     port: str,
@@ -66,7 +72,8 @@ def bench_on(
     client = line.client
 
     def ending(reason: str) -> str:
-        left = f"; what is done is in {kept}: the same command continues" if kept else ""
+        begun = kept is not None and kept.exists()
+        left = f"; what is done is in {kept}: the same command continues" if begun else ""
         return f"{reason}; {client.ending()}{left}"
 
     try:
@@ -82,7 +89,7 @@ def bench_on(
     except BrokenPipeError as error:
         raise InputError(ending("nobody reads this program's output any more")) from error
     except OSError as error:
-        raise InputError(ending(f"{error.filename}: {error.strerror}")) from error
+        raise InputError(ending(f"{error.filename or 'output'}: {error.strerror}")) from error
     except InputError as error:
         raise InputError(ending(str(error))) from error
 
@@ -118,8 +125,7 @@ def trial(
     from hardware_eval.results.trial import analyse
 
     done = analyse(sessions)
-    emit(done.as_dict(), json)
-    print(done, file=told(json))
+    show(done.as_dict(), json, done)
 
 
 def report(
@@ -133,14 +139,11 @@ def report(
     from hardware_eval.results import acceptance, page
 
     written = {"session": str(page.write(session))}
-    to = told(json)
     try:
         written["acceptance"] = str(acceptance.write(session))
     except InputError as error:  # no run is complete yet
-        print(error, file=to)
-    emit(written, json)
-    for path in written.values():
-        print(path, file=to)
+        print(error, file=told(json))
+    show(written, json, *written.values())
 
 
 def calibrate(
@@ -183,15 +186,18 @@ def calibrate(
     dropped = [x for x in kept if part in calibration.BASE and x not in calibration.BASE]
     kept = {kind: x for kind, x in kept.items() if kind not in dropped}
     saved = calibration.Calibration(device, {**kept, part: made}).save(out)
-    emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
-    to = told(json)
-    print(made, file=to)
+    lines = [str(made)]
     if part == "leak":
-        print(f"leak: {calibration.lost_flow(made, label)} mL/s of {label}", file=to)
+        lines.append(f"leak: {calibration.lost_flow(made, label)} mL/s of {label}")
     if dropped:
-        print(f"measured by the readings of before, measure again: {', '.join(dropped)}", file=to)
-    print(f"readings are corrected to {saved.correction()}", file=to)
-    print(f"{out}: {', '.join(saved.parts)}; SHA-256 {saved.sha256}", file=to)
+        lines.append(f"measured by the readings of before, measure again: {', '.join(dropped)}")
+    show(
+        {"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256},
+        json,
+        *lines,
+        f"readings are corrected to {saved.correction()}",
+        f"{out}: {', '.join(saved.parts)}; SHA-256 {saved.sha256}",
+    )
 
 
 def bringup(
@@ -217,26 +223,26 @@ def bringup(
     from hardware_eval.bench import bringup as steps
     from hardware_eval.bench import dated
 
+    if not operator.strip():
+        raise InputError("--operator: give the name of who stands at the machine")
     if only is not None and only not in steps.STEPS:
         raise InputError(f"--only {only!r}: choose of {', '.join(steps.STEPS)}")
-    to = told(json)
     with bench_on(port, yes=False, confirmed=False) as (line, bench, _):
         if line.client.simulated and only is None:
-            emit({"simulated": True}, json)
-            print("a simulated device: no valve moves, so that it needs no bring-up", file=to)
+            needless = "a simulated device: no valve moves, so that it needs no bring-up"
+            show({"simulated": True}, json, needless)
             return
         if only is not None:
             findings = steps.look(bench, only)
-            emit({"findings": [x.as_dict() for x in findings]}, json)
-            print(*findings, sep="\n", file=to)
+            show({"findings": [x.as_dict() for x in findings]}, json, *findings)
             if not all(x.ok for x in findings):
                 raise typer.Exit(1)
             return
         done = steps.bring_up(bench, operator=operator)
     path = steps.place(done.device)
     digest = dated.save(path, done.as_dict())
-    emit({**done.as_dict(), "file": str(path), "sha256": digest}, json)
-    print(done, f"{path}; SHA-256 {digest}", sep="\n", file=to)
+    content = {**done.as_dict(), "file": str(path), "sha256": digest}
+    show(content, json, done, f"{path}; SHA-256 {digest}")
     if not done.go:
         raise typer.Exit(1)
 

@@ -39,7 +39,13 @@ from hardware_eval.bench.plan import Procedure, make_plan
 from hardware_eval.bench.raw_log import lines
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.emulation.emulator import LoopbackDevice
-from hardware_eval.emulation.simulated import SimulatedHal, breath_begun, conceal, reveal
+from hardware_eval.emulation.simulated import (
+    PVP_SENSOR,
+    SimulatedHal,
+    breath_begun,
+    conceal,
+    reveal,
+)
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results.evaluate import Line
 from hardware_eval.results.record import scored_plants
@@ -66,9 +72,6 @@ BREATHS = 36
 #: Simulators of the demo. The concealed physics is all that the library's physics lacks; the
 #: frozen simulators differ from that physics by themselves, which hides what is concealed.
 SIMULATOR = "physics"
-
-#: Noise of the emulated sensor, cmH2O, and the step of its converter (PVP's).
-NOISE, QUANTUM = 0.1, 0.0703
 
 #: How the entries run.
 _HOW = Procedure(fallback=False, dry_run=False, selftest=False, rest=2.0, notes="emulated lung")
@@ -305,9 +308,9 @@ def demo(
         InputError: if the folder is not empty, or a plan does not finish.
     """
     began = time.perf_counter()
+    files.claim_folder(out)
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out} is not empty; choose another --out")
-    out.mkdir(parents=True, exist_ok=True)
     steps: list[str] = []
 
     def step(title: str, figures: str) -> None:
@@ -383,7 +386,7 @@ def demo(
 
 def emulated_line(plant: Plant, lung: str) -> Line:
     """A line to an emulated lung of a label, in this process on a virtual clock."""
-    hal = SimulatedHal(plant, name=f"emulated {lung}", noise=NOISE, quantum=QUANTUM)
+    hal = SimulatedHal(plant, name=f"emulated {lung}", sensor=PVP_SENSOR)
     device = LoopbackDevice(hal)
     client = Client(device, device.clock)
     client.hello()

@@ -73,7 +73,7 @@ class ConsoleOperator(Operator):
 
         What was typed before is dropped: nothing could move yet.
         """
-        if not sys.stdin.isatty():
+        if sys.stdin is None or not sys.stdin.isatty():  # it is None where it was closed
             yield
             return
         import termios

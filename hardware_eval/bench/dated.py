@@ -56,7 +56,8 @@ def load(path: Path, form: str, device: Mapping[str, str], remedy: str) -> dict[
         content = json.loads(path.read_text("utf-8"))
         digest, of = content.pop("sha256"), dict(content["device"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path} is none ({error}); make one by `{remedy}`") from None
+        reason = error.strerror if isinstance(error, OSError) else "it is no such file"
+        raise InputError(f"{path} cannot be read: {reason}; make one by `{remedy}`") from None
     if digest != _digest(content) or content.get("format") != form:
         raise InputError(f"{path} was changed after it was written; run `{remedy}` again")
     if of != device:

@@ -134,7 +134,8 @@ def read_procedure(path: Path | None) -> Procedure:
         given = {} if path is None else tomllib.loads(path.read_text("utf-8"))
         return msgspec.convert(given, Procedure)
     except (OSError, ValueError) as error:
-        raise InputError(f"--plan {path}: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"--plan {path}: {reason}; the manual shows a plan") from error
 
 
 def make_plan(

@@ -87,6 +87,18 @@ class RawLog:
         self.close()
 
 
+def log_of(session: Path) -> Path:
+    """The log of a session, which is named by its folder or by the log itself.
+
+    Raises:
+        InputError: if it is not there.
+    """
+    path = session / LOG if session.is_dir() else session
+    if not path.is_file():
+        raise InputError(f"{path} is not there: give the folder of a session")
+    return path
+
+
 def lines(path: Path) -> Iterator[dict[str, Any]]:
     """Read a log; a line that was cut off is left out.
 

@@ -7,21 +7,18 @@ real time. The tube can be disturbed while it runs: by lines of text on a socket
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import heapq
-import math
 import os
 import socket
 import sys
 import time
 import tty
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from hardware_eval import realtime
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
 from hardware_eval.emulation.firmware import Firmware
@@ -140,8 +137,7 @@ class Emulator(Guard):
         begun = time.monotonic() if begun is None else begun
         self._link, self._control_path = link, control
         self._slave = -1
-        if link is not None and link.exists() and not link.is_symlink():
-            raise InputError(f"--link {link}: there is a file of that name; remove it")
+        check_paths(link, control)
         first = self._open()
         self._control = self._open_control() if control else None
         unopened = [first]
@@ -187,7 +183,6 @@ class Emulator(Guard):
         self.terminal = os.ttyname(self._slave)
         if self._link is not None:
             try:
-                self._link.parent.mkdir(parents=True, exist_ok=True)
                 self._link.unlink(missing_ok=True)
                 self._link.symlink_to(self.terminal)
             except OSError as error:
@@ -231,80 +226,19 @@ def tell(control: Path, text: str) -> None:
             raise InputError(f"--control {control}: no emulator listens there: {error}") from error
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run an emulated device until it is interrupted; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        "ventbench-hardware emulate",
-        description="Emulate a ventilator with a lung on a pseudo-terminal.",
-        epilog="Example: ventbench-hardware emulate --lung R20C50 --link ./lung",
-    )
-    add = parser.add_argument
-    add("--lung", default="R20C50", help="lung on the ventilator")
-    add("--plant", default="frozen", help="simulator: a name, a file or module:function")
-    add(
-        "--conceal",
-        metavar="WORDS",
-        dest="words",
-        help="a lung with physics that the simulator lacks; the words determine it",
-    )
-    add("--seal", type=Path, help="where the sealed answer of --conceal goes (JSON)")
-    add("--link", type=Path, help="symbolic link to make to the terminal")
-    add("--control", type=Path, help="control socket to make")
-    add("--noise", type=float, default=0.0, help="sensor noise, cmH2O (SD)")
-    add("--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O")
-    add("--highest", type=float, default=math.inf, help="end of the sensor's range, cmH2O")
-    add(
-        "--realtime",
-        action="store_true",
-        help="refuse to run without real-time scheduling, which is taken where it is granted",
-    )
-    add(
-        "--firmware",
-        type=Path,
-        metavar="FILE",
-        help="a program of hardware_eval/firmware as the device: .elf runs under QEMU",
-    )
-    add("--pressure-limit", type=float, help="device's own limit, cmH2O")
-    given = parser.parse_args(arguments)
-    try:
-        return _emulate(given)
-    except InputError as error:
-        print(f"ventbench-hardware emulate: {error}", file=sys.stderr)
-        return 2
+def check_paths(link: Path | None, control: Path | None) -> None:
+    """Check where an emulator shall make its link and its control socket.
 
-
-def _emulate(given: argparse.Namespace) -> int:
-    from hardware_eval.emulation.simulated import emulated_lung
-
-    limit = given.pressure_limit
-    if given.firmware is not None and limit is not None:
-        raise InputError("--pressure-limit: with --firmware, the limit is the firmware's own")
-    settings = DeviceSettings() if limit is None else DeviceSettings(limit)
-    sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
-    print("compiling the lung; the terminal appears when it answers", file=sys.stderr, flush=True)
-    hal = emulated_lung(given.lung, given.plant, given.words, given.seal, **sensor)
-    begun, image = time.monotonic(), None
-    if given.firmware is not None:
-        image = Firmware(given.firmware, hal, begun)
-    try:
-        emulator = Emulator(
-            image or DeviceService(hal, settings, 0.0),
-            link=given.link,
-            control=given.control,
-            begun=begun,
-        )
-        reason = realtime.prefer()
-        if given.realtime and reason:
-            emulator.close()
-            raise InputError(f"--realtime: {reason}; run as root, or without it")
-        ended = realtime.told_to_end()
-        if image is not None:
-            image.start(lambda: emulator.port.inbox.put(b""))
-        print(emulator.terminal, flush=True)
-        print(f"ready: {hal.told}; Ctrl-C ends it", file=sys.stderr, flush=True)
-        emulator.run(lambda: ended() or (image is not None and image.lost))
-        print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
-    finally:
-        if image is not None:
-            image.close()
-    return int(image is not None and image.lost)
+    Raises:
+        InputError: if another file would be lost, or there is no such folder.
+    """
+    for option, path, is_ours in (
+        ("--link", link, Path.is_symlink),
+        ("--control", control, Path.is_socket),
+    ):
+        if path is None:
+            continue
+        if not path.parent.is_dir():
+            raise InputError(f"{option} {path}: {path.parent} is no folder; make it first")
+        if path.exists() and not is_ours(path):
+            raise InputError(f"{option} {path}: there is a file of that name; remove it")

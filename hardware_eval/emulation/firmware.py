@@ -16,7 +16,7 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,13 +64,15 @@ class Firmware:
         lost: whether it has ended.
     """
 
-    def __init__(self, image: Path, hal: Hal, begun: float) -> None:
-        """Prepare an image; sensors and valves have a clock of ``time.monotonic`` since ``begun``.
+    def __init__(self, command: Sequence[str], hal: Hal, begun: float) -> None:
+        """Prepare an image.
 
-        Raises:
-            InputError: if the image or its emulator is not there.
+        Args:
+            command: what runs it, of :func:`command_of`.
+            hal: sensors and valves.
+            begun: zero of their clock on ``time.monotonic``, s.
         """
-        self._command = _command(image)
+        self._command = command
         self.hal, self._begun = hal, begun
         self.state, self.lost = Order(), False
         self._answers: deque[bytes] = deque()
@@ -180,7 +182,7 @@ def _content(frame: bytes) -> bytes | None:
         return None
 
 
-def _command(image: Path) -> list[str]:
+def command_of(image: Path) -> list[str]:
     """What runs an image, with places for the descriptors of host and bus.
 
     Raises:

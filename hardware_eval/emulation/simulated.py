@@ -65,6 +65,19 @@ _LEFT_OUT = ("patient_effort", "sensor_drift", "command_rounding", "inertance")
 _CASES = 68
 
 
+@dataclass(frozen=True)
+class Sensor:
+    """What a pressure sensor makes of a pressure, cmH2O."""
+
+    noise: float = 0.0  #: standard deviation.
+    quantum: float = 0.0  #: step of the converter; 0 for none.
+    highest: float = math.inf  #: end of the range.
+
+
+#: A sensor without errors, and one with the noise and the converter of PVP's.
+PERFECT, PVP_SENSOR = Sensor(), Sensor(noise=0.1, quantum=0.0703)
+
+
 class SimulatedHal:
     """A plant as a ventilator; compiles the plant once, before any time passes."""
 
@@ -73,9 +86,7 @@ class SimulatedHal:
         plant: Plant,
         *,
         name: str = "simulated lung",
-        noise: float = 0.0,
-        quantum: float = 0.0,
-        highest: float = math.inf,
+        sensor: Sensor = PERFECT,
         seed: int = 0,
     ) -> None:
         """Put a lung at rest at PEEP on the ventilator.
@@ -83,20 +94,10 @@ class SimulatedHal:
         Args:
             plant: the lung on its ventilator, without a batch shape.
             name: what the device is called.
-            noise: standard deviation of the sensor's noise, cmH2O.
-            quantum: step of the sensor's converter, cmH2O; 0 for none.
-            highest: end of the sensor's range, cmH2O.
-            seed: of the noise.
-
-        Raises:
-            InputError: if noise or quantum is negative or not finite.
+            sensor: of the pressure.
+            seed: of its noise.
         """
-        for what, value in (("noise", noise), ("quantum", quantum)):
-            if not 0.0 <= value < math.inf:
-                raise InputError(f"--{what} {value:g} cmH2O: give 0 or more, such as 0.1")
-        if not highest > 0.0:
-            raise InputError(f"--highest {highest:g} cmH2O: give more than 0, such as 50.8")
-        self._noise, self._quantum, self._highest = noise, quantum, highest
+        self._sensor = sensor
         leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(plant))
         calibration = hashlib.sha256(type(plant).__name__.encode() + leaves).digest()
         start = jnp.asarray(protocol.PEEP, jnp.float32)
@@ -105,10 +106,9 @@ class SimulatedHal:
         vector, unravel = ravel_pytree(rest)
         self._flow = signals.flow is not None
         capabilities = Capability.SIMULATED | (Capability.FLOW if self._flow else Capability.NONE)
-        noisy = noise > 0.0 and noise >= 0.5 * quantum
-        self.told = name
+        noisy = sensor.noise > 0.0 and sensor.noise >= 0.5 * sensor.quantum
         self.identity = Identity(
-            name, calibration[:8], calibration, capabilities, highest=highest, noisy=noisy
+            name, calibration[:8], calibration, capabilities, highest=sensor.highest, noisy=noisy
         )
 
         def advance(vector: jax.Array, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -146,13 +146,13 @@ class SimulatedHal:
 
     def sample(self, now: float) -> Sample:
         """Pressure and flow by now; see :class:`~hardware_eval.device.program.Hal`."""
-        pressure, flow = self.shown(now)
-        if self._noise:
-            pressure += self._noise * float(self._random.standard_normal())
-        if self._quantum:
-            pressure = round(pressure / self._quantum) * self._quantum
-        pressure = min(pressure, self._highest)
-        return Sample(now, pressure, flow, saturated=pressure >= self._highest)
+        (pressure, flow), sensor = self.shown(now), self._sensor
+        if sensor.noise:
+            pressure += sensor.noise * float(self._random.standard_normal())
+        if sensor.quantum:
+            pressure = round(pressure / sensor.quantum) * sensor.quantum
+        pressure = min(pressure, sensor.highest)
+        return Sample(now, pressure, flow, saturated=pressure >= sensor.highest)
 
     def actuate(self, now: float, u_in: float, u_out: int) -> None:
         """Hold a command from now on; see :class:`~hardware_eval.device.program.Hal`."""
@@ -283,21 +283,3 @@ def _draw(words: str) -> tuple[Effect, Lung]:
     ]
     case = strong[int(rng.integers(len(strong)))]
     return case.effects[0], Lung(case.lung_R, case.lung_C)
-
-
-def emulated_lung(
-    lung: str, plant: str, words: str | None, seal: Path | None, **sensor: Any
-) -> SimulatedHal:
-    """Make the lung that ``emulate`` is asked for.
-
-    Raises:
-        InputError: if there is none.
-    """
-    if words is None:
-        return simulated_lung(lung, plant, **sensor)
-    concealed = conceal(words, plant)
-    hal = SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
-    hal.told = f"{hal.identity.name}, with physics {concealed.seal['commitment'][:16]}..."
-    if seal:
-        concealed.write(seal)
-    return hal

@@ -121,10 +121,10 @@ def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
         _await(port)
         return Link(port), RealClock()
     from hardware_eval.emulation.emulator import LoopbackDevice
-    from hardware_eval.emulation.simulated import simulated_lung
+    from hardware_eval.emulation.simulated import PVP_SENSOR, simulated_lung
 
-    # With the noise and the converter of a PVP: without them all repeats would be one.
-    lung = simulated_lung(port.removeprefix(VIRTUAL), noise=0.1, quantum=0.0703)
+    # Without noise all repeats would be one.
+    lung = simulated_lung(port.removeprefix(VIRTUAL), sensor=PVP_SENSOR)
     device = LoopbackDevice(lung)
     return device, device.clock
 

@@ -16,7 +16,7 @@ import numpy as np
 
 import ventbench
 from hardware_eval.bench.plan import Plan, progress
-from hardware_eval.bench.raw_log import LOG, LoggedBreath, breaths, lines
+from hardware_eval.bench.raw_log import LoggedBreath, breaths, lines, log_of
 from hardware_eval.results import record, trial
 from hardware_eval.results.record import plan_of, timing
 from ventbench import palette
@@ -58,9 +58,7 @@ def read(folder: Path) -> Session:
     Raises:
         InputError: if there is no log, or no session has begun.
     """
-    path = folder / LOG if folder.is_dir() else folder
-    if not path.is_file():
-        raise InputError(f"{path} is not there: give the folder of a session")
+    path = log_of(folder)
     logged = list(lines(path))
     if not any(line["type"] == "session" for line in logged):
         raise InputError(f"{path} holds no session; a collection has no page")

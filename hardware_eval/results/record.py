@@ -20,7 +20,7 @@ import numpy as np
 
 from hardware_eval.bench.loop import ON_TIME_S, BreathLog
 from hardware_eval.bench.plan import CONTROL, UNDISTURBED, Plan, complete_runs, make_plan, progress
-from hardware_eval.bench.raw_log import LOG, LoggedBreath, breaths, lines, recording
+from hardware_eval.bench.raw_log import LOG, LoggedBreath, breaths, lines, log_of, recording
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, create, record, schema
@@ -320,7 +320,7 @@ def replay(
     Raises:
         InputError: if there is no such log, or the record is none.
     """
-    log = log / LOG if log.is_dir() else log
+    log = log_of(log)
     logged = list(lines(log))
     plan = plan_of(logged, str(log))
     everything = breaths(log)
@@ -386,7 +386,7 @@ def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
         InputError: if the log is not there, or not the one that the record names.
     """
     if path.is_dir():
-        path = path / LOG
+        path = log_of(path)
     if path.name.endswith(".jsonl"):
         return recording(path, kinds=(*UNDISTURBED, "explore"))
     if not path.name.endswith(".json"):

@@ -28,7 +28,7 @@ from scipy import stats
 
 from hardware_eval.bench.identity import interval
 from hardware_eval.bench.plan import complete_runs
-from hardware_eval.bench.raw_log import LOG, lines
+from hardware_eval.bench.raw_log import lines, log_of
 from hardware_eval.results.record import plan_of
 from ventbench.base import files
 from ventbench.base.arrays import Floats
@@ -154,7 +154,7 @@ def analyse(logs: Sequence[Path]) -> Trial:
     Raises:
         InputError: if a log holds no plan, is not finished, or is of another trial.
     """
-    measured, simulated, mountings = _tables([x / LOG if x.is_dir() else x for x in logs])
+    measured, simulated, mountings = _tables([log_of(x) for x in logs])
     entries: dict[str, EntryTrial] = {}
     missing: list[str] = []
     for name, errors in measured.items():

@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from queue import Empty, Queue, SimpleQueue
 from typing import Protocol, TypeVar, cast
+from urllib.parse import urlsplit
 
 import numpy as np
 import serial
@@ -56,6 +57,9 @@ from ventbench.base.errors import InputError
 
 #: Bits per second; USB devices ignore it. A control step then takes 9 ms of a real UART.
 BAUD_RATE = 115_200
+
+#: What a port is.
+_PORTS = "write a device such as /dev/ttyACM0, or socket://HOST:PORT"
 
 #: Longest time in which the port does not take what is written, s.
 WRITE_TIMEOUT = 1.0
@@ -289,6 +293,8 @@ class Link:
 
     def _open(self) -> serial.Serial:
         try:
+            if self.url.startswith("socket:") and urlsplit(self.url).port is None:
+                raise ValueError("it has no number")
             port = serial.serial_for_url(self.url, BAUD_RATE, do_not_open=True)
             if isinstance(port, serial.Serial):
                 port.exclusive = True  # a second program would steal bytes
@@ -297,10 +303,7 @@ class Link:
             port.timeout = READ_SLICE  # fixed: pyserial configures the port anew at each change
             port.open()
         except ValueError as error:
-            raise PortMissingError(
-                f"port {self.url!r}: {error}; write a device such as /dev/ttyACM0, or "
-                "socket://HOST:PORT"
-            ) from error
+            raise PortMissingError(f"port {self.url!r}: {error}; {_PORTS}") from error
         except (OSError, serial.SerialException) as error:
             raise self._not_opened(error) from error
         return cast(serial.Serial, port)  # others, such as sockets, have the same methods
@@ -322,7 +325,7 @@ class Link:
                 f"port {self.url}: it is not there ({error.strerror or error}); is the cable in "
                 "and the device on? `python -m serial.tools.list_ports` lists the ports"
             )
-        return LinkError(f"port {self.url} cannot be opened: {error}")
+        return LinkError(f"port {self.url} cannot be opened: {error}; {_PORTS}")
 
     def _disconnected(self, error: Exception) -> DisconnectedError:
         return DisconnectedError(

@@ -67,10 +67,16 @@ NOT_TRIED = (
 WINDOW = 65_536
 
 
+def _shows(
+    seen: Reading | Refusal, what: str, mode: Mode, u_in: float = 0.0, u_out: int = 1
+) -> None:
+    equal(f"mode {what}", seen.mode.name, mode.name)
+    if isinstance(seen, Reading):
+        equal(f"valves {what}", (seen.u_in, seen.u_out), (u_in, u_out))
+
+
 def _vented(reading: Reading | Refusal, what: str, flags: Flag | None = None) -> None:
-    equal(f"mode {what}", reading.mode.name, "VENTED")
-    if isinstance(reading, Reading):
-        equal(f"valves {what}", (reading.u_in, reading.u_out), (0.0, 1))
+    _shows(reading, what, Mode.VENTED)
     if flags is not None:
         equal(f"flags {what}", reading.flags & ~Flag.SATURATED, flags)
 
@@ -155,9 +161,8 @@ def _welcome(host: Probe) -> None:
     equal("a lower limit", host.hello(lower).pressure_limit, lower)
     equal("a limit of 655.34", host.hello(655.34).pressure_limit, own.pressure_limit)
     equal("the device's own limit", host.hello().pressure_limit, own.pressure_limit)
-    equal("mode after hello", host.reading().mode.name, "READY")
     reading = host.reading()
-    equal("valves after hello", (reading.u_in, reading.u_out), (0.0, 1))
+    _shows(reading, "after hello", Mode.READY)
     equal("flow is known", not math.isnan(reading.flow), Capability.FLOW in own.capabilities)
 
 
@@ -177,12 +182,10 @@ def _sessions(host: Probe) -> None:
         for message in (Arm(), Command(1.0, 0, 0), Heartbeat(), Statistics()):
             host.refused(message, Reason.SESSION, session=other, consumes=False)
         host.refused(Command(200.0, 0, 0), Reason.SESSION, session=other, consumes=False)
-    equal("mode after strangers", host.reading().mode.name, "READY")
+    _shows(host.reading(), "after strangers", Mode.READY)
     old, since = host.session, host.inspire()
     host.hello()
-    reading = host.reading()
-    equal("mode after a second host", reading.mode.name, "READY")
-    equal("valves after a second host", (reading.u_in, reading.u_out), (0.0, 1))
+    _shows(host.reading(), "after a second host", Mode.READY)
     host.in_time(since)
     host.refused(Heartbeat(), Reason.SESSION, session=old, consumes=False)
 
@@ -192,7 +195,7 @@ def _again(host: Probe) -> None:
     for step in (0, -1):
         host.refused(Hello(), Reason.SEQUENCE, step=step, consumes=False)
     host.ask(Hello(pressure_limit=20.0), Welcome)
-    equal("mode after a hello of the same session", host.reading().mode.name, "READY")
+    _shows(host.reading(), "after a hello of the same session", Mode.READY)
 
 
 def _numbers(host: Probe) -> None:
@@ -224,7 +227,7 @@ def _not_armed(host: Probe) -> None:
     with host.counting(not_armed=2):
         host.refused(host.command(10.0, 0), Reason.NOT_ARMED)
         host.refused(host.command(10.0, 0, age=5000), Reason.NOT_ARMED)
-    equal("mode after a command before arming", host.reading().mode.name, "READY")
+    _shows(host.reading(), "after a command before arming", Mode.READY)
 
 
 def _commands(host: Probe) -> None:
@@ -235,10 +238,10 @@ def _commands(host: Probe) -> None:
             host.in_time(since)
             reading = host.ask(command, Reading)
             host.in_time(since)
-            equal("valves", (reading.u_in, reading.u_out), (u_in, u_out))
-            equal("mode", reading.mode.name, "RUNNING")
+            _shows(reading, "after a command", Mode.RUNNING, u_in, u_out)
             kept = host.reading()
-            equal("valves after a heartbeat", (kept.u_in, kept.u_out), (u_in, u_out))
+            host.in_time(sent)
+            _shows(kept, "after a heartbeat", Mode.RUNNING, u_in, u_out)
             since = sent
 
 
@@ -267,8 +270,7 @@ def _stale(host: Probe) -> None:
             host.in_time(since)
         reading = host.reading()
         host.in_time(since)
-        equal("valves after stale commands", (reading.u_in, reading.u_out), (0.0, 1))
-        equal("mode after stale commands", reading.mode.name, "RUNNING")
+        _shows(reading, "after stale commands", Mode.RUNNING)
         asked = host.clock.now()
         fresh = host.command(50.0, 0, age=50)
         host.in_time(since)
@@ -296,8 +298,7 @@ def _vent(host: Probe) -> None:
 
 def _rearm(host: Probe) -> None:
     host.in_time(host.inspire())
-    reading = host.ask(Arm(), Reading)
-    equal("valves after arming again", (reading.u_in, reading.u_out), (0.0, 1))
+    _shows(host.ask(Arm(), Reading), "after arming again", Mode.RUNNING)
 
 
 def _pressure(host: Probe) -> None:

@@ -134,7 +134,7 @@ class FaultyLung(SimulatedHal):
             self._stuck_reading = math.nan
         if FaultKind.SENSOR_LOST in kinds:
             pressure = math.nan
-        self._last = Sample(now, pressure, seen.flow, saturated=pressure >= self._highest)
+        self._last = Sample(now, pressure, seen.flow, saturated=pressure >= self._sensor.highest)
         return self._last
 
     def forced(self, now: float) -> tuple[float, float, float]:

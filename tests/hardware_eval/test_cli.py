@@ -174,9 +174,7 @@ def test_a_command_waits_for_an_emulator_that_compiles(
 def commands() -> list[str]:
     text = "\n".join(re.findall(r"^```sh\n(.*?)^```", MANUAL.read_text("utf-8"), re.M | re.S))
     lines = [part.strip(" &") for line in text.splitlines() for part in line.split("&&")]
-    # `emulate` has a parser of its own.
-    hardware = [line for line in lines if line.startswith("ventbench-hardware ")]
-    return [line for line in hardware if shlex.split(line)[1] != "emulate"]
+    return [line for line in lines if line.startswith("ventbench-hardware ")]
 
 
 @pytest.mark.parametrize("line", commands())
@@ -228,17 +226,6 @@ def test_a_wrong_plan_is_refused_with_its_key(text: str, said: str, tmp_path: Pa
     assert str(path) in str(refused.value)
 
 
-@pytest.mark.parametrize("ease", ["nan", "5", "99"])
-def test_pressures_that_would_not_ease_are_refused_before_the_port_is_opened(
-    ease: str, tmp_path: Path
-) -> None:
-    words = f"collect --port /dev/nothing --lung R5C20 --ease {ease} --yes --out".split()
-    done = invoke(*words, str(tmp_path / "out"))
-    assert isinstance(done.exception, InputError)
-    assert f"--ease {ease} cmH2O: give more than 5 and at most" in str(done.exception)
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("line", "said"),
     [
@@ -246,6 +233,11 @@ def test_pressures_that_would_not_ease_are_refused_before_the_port_is_opened(
         ("calibrate zero --out {file}/calibration.json", "is a file, not a folder"),
         ("selftest --lung R5C20 --plant nothing", "--plant 'nothing'"),
         ("selftest --lung R5C20 --skip nothing", "no part 'nothing'"),
+        ("collect --lung R5C20 --ease nan --out {new}", "--ease nan cmH2O: give more than 5"),
+        ("collect --lung R5C20 --ease 5 --out {new}", "--ease 5 cmH2O: give more than 5"),
+        ("collect --lung R5C20 --ease 99 --out {new}", "and at most 60"),
+        ("collect --lung R5C20 --out {file}", "is a file, not a folder"),
+        ("bringup --operator ''", "--operator: give the name"),
     ],
 )
 def test_what_would_be_lost_at_the_end_is_refused_before_the_port_is_opened(
@@ -253,6 +245,54 @@ def test_what_would_be_lost_at_the_end_is_refused_before_the_port_is_opened(
 ) -> None:
     file = tmp_path / "file"
     file.touch()
-    done = invoke(*line.format(file=file).split(), "--port", "/dev/nothing")
+    words = shlex.split(line.format(file=file, new=tmp_path / "new"))
+    done = invoke(*words, "--port", "/dev/nothing")
     assert isinstance(done.exception, InputError)
     assert said in str(done.exception)
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("port", ["socket://localhost", "socket://localhost:ten", "foo://bar"])
+def test_a_port_that_is_none_is_told_what_one_is(port: str) -> None:
+    done = invoke("conformance", "--port", port)
+    assert isinstance(done.exception, InputError)
+    assert re.fullmatch(f"port '{port}': .*; write a device such as .*", str(done.exception))
+
+
+@pytest.mark.parametrize("line", ["replay", "compare", "trial", "report"])
+def test_a_folder_without_a_session_is_named(line: str, tmp_path: Path) -> None:
+    done = invoke(line, str(tmp_path))
+    assert isinstance(done.exception, InputError)
+    assert str(done.exception) == f"{tmp_path}/raw.jsonl is not there: give the folder of a session"
+
+
+def test_a_demo_without_words_leaves_nothing(tmp_path: Path) -> None:
+    done = invoke("demo", "--conceal", "", "--out", str(tmp_path / "out"))
+    assert "give some words" in str(done.exception)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("--lung R7", "R7"),
+        ("--plant nothing", "nothing"),
+        ("--conceal ''", "--conceal: give some words"),
+        ("--seal {new}", "give --conceal too"),
+        ("--link {file}", "{file}: there is a file of that name"),
+        ("--control {file}", "{file}: there is a file of that name"),
+        ("--control {new}/socket", "is no folder; make it first"),
+        ("--link {file}/lung", "is no folder; make it first"),
+        ("--firmware {new}", "make it with `make`"),
+    ],
+)
+def test_a_lung_that_cannot_be_emulated_is_refused_before_it_is_compiled(
+    line: str, said: str, tmp_path: Path
+) -> None:
+    file, new = tmp_path / "file", tmp_path / "new"
+    file.touch()
+    done = invoke("emulate", *shlex.split(line.format(file=file, new=new)))
+    assert isinstance(done.exception, InputError)
+    assert said.format(file=file) in str(done.exception)
+    assert "compiling" not in done.output
+    assert list(tmp_path.iterdir()) == [file]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 import socket
 import threading
@@ -16,9 +15,7 @@ import pytest
 import serial
 
 from hardware_eval.device.program import DeviceService, DeviceSettings
-from hardware_eval.emulation import emulator as emulator_module
-from hardware_eval.emulation.emulator import Emulator, tell
-from hardware_eval.emulation.simulated import emulated_lung
+from hardware_eval.emulation.emulator import tell
 from hardware_eval.wire.client import (
     Client,
     DisconnectedError,
@@ -199,23 +196,6 @@ def test_a_socket_and_a_loop_are_links_too() -> None:
         with pytest.raises(DisconnectedError, match="vents the lung by itself"):
             link.read(PATIENCE)
         link.close()
-
-
-def test_wrong_arguments_say_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert emulator_module.main(["--pressure-limit", "200"]) == 2
-    assert "outside 0..100" in capsys.readouterr().err
-    for lung, sensor, said in (
-        ("X", {}, "R20C50"),
-        ("R5C20", {"noise": -1.0}, "--noise -1 cmH2O: give 0 or more"),
-        ("R5C20", {"quantum": math.nan}, "--quantum nan cmH2O: give 0 or more"),
-        ("R5C20", {"highest": -1.0}, "--highest -1 cmH2O: give more than 0"),
-    ):
-        with pytest.raises(InputError, match=said):
-            emulated_lung(lung, "single_compartment", None, None, **sensor)
-    taken = tmp_path / "taken"
-    taken.touch()
-    with pytest.raises(InputError, match="remove it"):
-        Emulator(DeviceService(Bench(), DeviceSettings(), 0.0), link=taken)
 
 
 def test_pyserial_is_the_link() -> None:

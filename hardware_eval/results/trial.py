@@ -163,11 +163,11 @@ def analyse(logs: Sequence[Path]) -> Trial:
             missing.append(f"{name} has no score: a run of it failed")
     some = next(iter(measured.values()))
     if not all(np.isfinite(table).all() for table in simulated.values()):
-        missing.append("no gap and no rank agreement: the log has no whole dry run")
+        missing.append("No gap and no rank agreement: the log has no whole dry run")
     if some.shape[-1] < 2:
-        missing.append("no interval as mounted: it needs two repeats at least")
+        missing.append("No interval as mounted: it needs two repeats at least")
     if len(mountings) < 2:
-        missing.append("no interval mounted anew: it needs two lungs or sessions at least")
+        missing.append("No interval mounted anew: it needs two lungs or sessions at least")
     both = [
         name
         for name in measured

@@ -24,7 +24,7 @@ from ventbench.task import protocol
 from ventbench.task.lungs import RECORDED_LUNGS
 from ventbench.task.lungs import lung as parse_lung
 
-#: How far rigs lie from their label, as standard deviations of log R at 1 L/s and of log C: those
+#: How far rigs lie from their label, as shares of R at 1 L/s and of C, standard deviations: those
 #: of the population of rigs, between labels and within (R is 0.74 to 1.07 of the label on average,
 #: with 0.1; C 0.95 to 1.17, with 0.08). The 50 of R has no rig there.
 RIG_R, RIG_C = 0.2, 0.12
@@ -101,15 +101,15 @@ def identified(
 
     R, C = match.fitted_R, match.fitted_C
     told = f"R {value_text(R, match.ci95_R)}, C {value_text(C, match.ci95_C)}"
-    errors = [
-        math.log(high * wide**2 / low) / (2.0 * 1.96) if low > 0.0 else math.inf
-        for low, high in (match.ci95_R, match.ci95_C)
-    ]
-    if not R > 0.0 or not max(errors) < math.log(2.0):  # two settings are no further apart
+    error_R, error_C = (
+        (0.5 * (high - low) + value * math.log(wide)) / 1.96
+        for value, (low, high) in ((R, match.ci95_R), (C, match.ci95_C))
+    )
+    if not math.isfinite(error_R + error_C):
         return None, False, f"{told}: too wide to tell"
-    spread = [math.hypot(rig, error) for rig, error in zip((RIG_R, RIG_C), errors, strict=True)]
     away = {
-        x.id: (math.log(R / x.R) / spread[0]) ** 2 + (math.log(C / x.C) / spread[1]) ** 2
+        x.id: ((R - x.R) / math.hypot(RIG_R * x.R, error_R)) ** 2
+        + ((C - x.C) / math.hypot(RIG_C * x.C, error_C)) ** 2
         for x in RECORDED_LUNGS
     }
     nearest = min(away, key=lambda name: away[name])

@@ -24,9 +24,10 @@ from ventbench.task import protocol
 from ventbench.task.lungs import RECORDED_LUNGS
 from ventbench.task.lungs import lung as parse_lung
 
-#: How far rigs lie from their label, as shares of R at 1 L/s and of C, standard deviations: those
-#: of the population of rigs, between labels and within (R is 0.74 to 1.07 of the label on average,
-#: with 0.1; C 0.95 to 1.17, with 0.08). The 50 of R has no rig there.
+#: How far rigs lie from their label, standard deviations: as a share of R at 1 L/s, whose estimate
+#: may be zero, and of log C: those of the population of rigs, between labels and within (R is 0.74
+#: to 1.07 of the label on average, with 0.1; C 0.95 to 1.17, with 0.08). The 50 of R has no rig
+#: there.
 RIG_R, RIG_C = 0.2, 0.12
 
 #: Squared distance, in standard deviations of R and C, beyond which a lung is none of a label: one
@@ -105,11 +106,11 @@ def identified(
         (0.5 * (high - low) + value * math.log(wide)) / 1.96
         for value, (low, high) in ((R, match.ci95_R), (C, match.ci95_C))
     )
-    if not math.isfinite(error_R + error_C):
+    if not math.isfinite(error_R + error_C) or not C > 0.0:
         return None, False, f"{told}: too wide to tell"
     away = {
         x.id: ((R - x.R) / math.hypot(RIG_R * x.R, error_R)) ** 2
-        + ((C - x.C) / math.hypot(RIG_C * x.C, error_C)) ** 2
+        + (math.log(C / x.C) / math.hypot(RIG_C, error_C / C)) ** 2
         for x in RECORDED_LUNGS
     }
     nearest = min(away, key=lambda name: away[name])

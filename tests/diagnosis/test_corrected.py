@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from proofs.challenge.first import rig
 from ventbench.base import compilation
 from ventbench.diagnosis import corrected as module
 from ventbench.diagnosis.corrected import choose, compare_open_loop, correct, fit_open_loop
@@ -20,7 +21,8 @@ from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics import paths, physics
 from ventbench.plants.catalog import load_simulators
-from ventbench.recordings.breaths import Breaths
+from ventbench.plants.plant_files import parse_rig_id
+from ventbench.recordings.breaths import Breaths, join
 from ventbench.system_id import Noise, make_data
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import lung
@@ -177,6 +179,38 @@ def test_a_function_has_corrected_pressures_but_no_plants(breaths, fake):
     assert correction.plants == {}
     np.testing.assert_allclose(correction.pressures["after"], after)
     assert f"no plant stands behind {simulators.name} that" in correction.notes[0]
+
+
+@pytest.mark.parametrize("gains", [(22.8, 30.0), (22.8, 22.8)])
+def test_each_ventilator_has_its_gain_if_that_helps(gains, monkeypatch):
+    """Two ventilators, which their clocks tell apart, with one lung; and two that are alike."""
+    parts = []
+    for gain, interval in zip(gains, (0.0319, 0.0340), strict=True):
+        monkeypatch.setattr(rig, "INTERVALS", (interval,))
+        base = dataclasses.replace(small.RIG, gain=gain)
+        parts.append(small.made(base=base, breaths=12, noise=0.1, seed=len(parts)))
+        parts[-1] = dataclasses.replace(parts[-1], breath_id=np.arange(12) + 12 * len(parts))
+    breaths = join(parts)
+    experiment = prepare(breaths, load_simulators("physics"))
+    data, fitted = experiment.data, experiment.uses.fitted
+    evaluator = make_evaluator(data, ~fitted, paths(), settings=small.SETTINGS)
+    model = evaluator.fit(Hypothesis(), Noise((0.1,)))
+    found = module._gains_of_rigs(experiment, model, evaluator)
+    if gains[0] == gains[1]:
+        assert found is None
+        return
+    assert found is not None
+    at = {parse_rig_id(key)[1]: factor for key, factor in found.factors.items()}
+    fast, slow = sorted(interval for interval in at if interval is not None)
+    assert (fast, slow) == pytest.approx((0.0319, 0.0340), rel=0.01)
+    ratio = at[slow] / at[fast]
+    assert ratio == pytest.approx(gains[1] / gains[0], rel=0.05)
+    common = evaluator.predict(model, evaluator.partition(data))[:, 0]
+    mask = breaths.inspiratory & (breaths.time > 0)
+    before, after = (
+        experiment.judge.error(pressure, mask).mae for pressure in (common, found.pressures)
+    )
+    assert after < 0.5 * before
 
 
 @pytest.mark.parametrize("label", [(20.0, 20.0), (50.0, 10.0), (5.0, 50.0)])

@@ -116,6 +116,20 @@ def test_plants_by_lung_from_a_mapping_and_a_file(breaths, tmp_path):
         load_simulators({"R20C50": {}})  # type: ignore[dict-item]
 
 
+def test_a_lung_at_several_ventilators_is_told_by_the_clock(breaths):
+    with compilation.float64():
+        slow, fast = (single_compartment(lung(name)) for name in ("R20C50", "R20C20"))
+    one = breaths.select(np.flatnonzero(breaths.lung_ids == "R20C50")[:1])
+    both = load_simulators({"R20C50": slow, "R20C50@31.9ms": fast, "R20C50@34ms": slow})
+    assert both.lungs == (lung("R20C50"),)
+    for interval, plant in ((0.0317, fast), (0.0345, slow)):
+        dt = np.where(one.valid, interval, 0.0)
+        sampled = dataclasses.replace(one, dt=dt, time=np.cumsum(dt, axis=1) - dt)
+        np.testing.assert_array_equal(
+            both.pressures(sampled), load_simulators({"R20C50": plant}).pressures(sampled)
+        )
+
+
 def test_one_plant_is_every_lung(breaths):
     plant = single_compartment(lung("R5C10"))
     found = load_simulators(plant)

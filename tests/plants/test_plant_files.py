@@ -18,7 +18,13 @@ from ventbench.entries.cells import InProcessRunner
 from ventbench.physics import physics
 from ventbench.plants import frozen, plant_files
 from ventbench.plants.corrected import Corrected
-from ventbench.plants.plant_files import load_plant, load_plants, save_plant, save_plants
+from ventbench.plants.plant_files import (
+    load_plant,
+    load_plants,
+    rig_id,
+    save_plant,
+    save_plants,
+)
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, stack_heterogeneous, take
 from ventbench.plants.two_balloon import two_balloon
@@ -115,7 +121,11 @@ def late(lung_id: str, **base: float):
 
 @pytest.mark.parametrize("kind", ["physics", "frozen"])
 def test_plants_by_lung_come_back_to_the_bit(kind: str, tmp_path: Path) -> None:
-    plants = {"R20C50": late("R20C50"), "R33C7.5": late("R33C7.5", R_ex=6.1)}
+    plants = {
+        "R20C50": late("R20C50"),
+        rig_id("R20C50", 0.0319): late("R20C50", R_ex=4.1),  # at one of several ventilators
+        "R33C7.5": late("R33C7.5", R_ex=6.1),
+    }
     if kind == "frozen":
         plants = {item.id: take(frozen.load().plants, i) for i, item in enumerate(LUNGS[:2])}
     path = tmp_path / "corrected.json"
@@ -140,6 +150,7 @@ def test_what_is_no_file_of_plants_is_refused(tmp_path: Path) -> None:
     unknown = json.loads(json.dumps(good).replace('"Physics"', '"Popen"'))
     dtype = json.loads(json.dumps(good).replace('"float64"', '"object"', 1))
     label = {**good, "lungs": {"big": good["lungs"]["R20C50"]}}
+    clock = {**good, "lungs": {"R20C50@fast": good["lungs"]["R20C50"]}}
     for text in (
         "",
         "[]",
@@ -149,6 +160,7 @@ def test_what_is_no_file_of_plants_is_refused(tmp_path: Path) -> None:
         json.dumps(unknown),
         json.dumps(dtype),
         json.dumps(label),
+        json.dumps(clock),
         json.dumps({**good, "arrays": {}}),
     ):
         path.write_text(text)

@@ -12,9 +12,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import Any
 
+import jax
 import numpy as np
 
+from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator
@@ -25,7 +28,10 @@ from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.settings import CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.plants.corrected import Corrected
+from ventbench.plants.plant_files import parse_rig_id, rig_id
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.clocks import rigs_by_clock, sampling_intervals
+from ventbench.recordings.decimation import is_fast
 from ventbench.system_id.data import Data
 from ventbench.system_id.problem import parameter_of, parameter_values
 from ventbench.task.interfaces import Plant
@@ -33,7 +39,11 @@ from ventbench.task.interfaces import Plant
 #: Length of what is reported as the beginning of inspiration, s.
 _BEGINNING = 0.2
 
-#: Plants of the lungs, by label.
+#: Logarithms of the factors on the valve's gain that are tried: those of public rigs are within
+#: 0.5, and a step of 0.025 is a third of what breaths of one rig scatter by.
+_GAINS = np.linspace(-0.6, 0.6, 49)
+
+#: Plants of the lungs, by label, and by label and clock where several ventilators recorded one.
 Plants = dict[str, Plant]
 
 
@@ -79,7 +89,7 @@ def correct(
     breaths, data, split = experiment.breaths, experiment.data, experiment.uses
     before, simulators = experiment.before, experiment.simulators
     if simulator_model is None:
-        pressures, plants, notes = _base_model(breaths, data, split, before, recording_model)
+        pressures, plants, notes = _base_model(experiment, recording_model)
     else:
         pressures, plants, notes = _any_model(
             breaths, data, split, before, recording_model, simulator_model
@@ -117,17 +127,27 @@ def correct(
     }
     result: Plants = {}
     for name, stage in chosen.items():
-        if simulator_model is None:
-            result[name] = uncorrected[name] if stage == "before" else plants[stage][name]
-        else:
+        if simulator_model is not None:
             identified = plants["before"][name]
             result[name] = Corrected(uncorrected[name], plants[stage][name], identified)
+        elif stage == "before":
+            result[name] = uncorrected[name]
+        else:
+            of_lung = {k: plant for k, plant in plants[stage].items() if parse_rig_id(k)[0] == name}
+            result |= of_lung
     return Correction(final, errors, result, chosen, unchanged, tuple(notes))
 
 
 _NOTE_ON_DRIFT = (
     "The corrected simulator is fitted for the least open-loop error: with the reported "
     "parameters, which allow for slow noise and for valve gains that scatter, it would err more."
+)
+
+
+_NOTE_ON_RIGS = (
+    "More than one ventilator recorded these breaths, as their clocks tell (from {intervals} ms a "
+    "sample): the corrected simulator has a gain of the valve for each lung at each of them, and "
+    "takes the one whose clock is nearest."
 )
 
 
@@ -180,14 +200,16 @@ def _by_lung(breaths: Breaths, pressures: dict[str, Floats], stages: dict[str, S
 
 
 def _base_model(
-    breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel
+    experiment: Experiment, recording_model: IdentifiedModel
 ) -> tuple[dict[str, Floats], dict[str, Plants], list[str]]:
     """Candidates for the base model: refitted, and with everything that was identified.
 
     The refit errs least in open loop on its breaths. The correction has the reported parameters,
     unless coloured noise let them drift: then it is fitted anew for the least error. The
-    nonparametric term is left out if it throws breaths far off, as robust likelihoods allow.
+    nonparametric term is left out if it throws breaths far off, as robust likelihoods allow. Last,
+    each lung at each ventilator takes a gain of its own.
     """
+    breaths, data, split = experiment.breaths, experiment.data, experiment.uses
     first = breaths.pressure[:, 0]
     evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
     settings = evaluator.settings.correction
@@ -216,11 +238,85 @@ def _base_model(
                     "With the nonparametric term, the simulator would err more than with R and C "
                     "refitted alone, so the corrected simulator does without."
                 )
-    plants = {
-        "refit": estimates.plants_of(base, evaluator),
-        "after": estimates.plants_of(model, evaluator),
-    }
-    return {"before": before, "refit": refit, "after": after}, plants, notes
+    of_model = estimates.plants_of(model, evaluator)
+    gains = None
+    if model.names and not (model.hypothesis.breath_terms or experiment.by_flow):
+        gains = _gains_of_rigs(experiment, model, evaluator)
+    if gains is not None:
+        after = gains.pressures
+        of_model = {
+            key: _with_gain(of_model[parse_rig_id(key)[0]], factor)
+            for key, factor in gains.factors.items()
+        }
+        clocks = sorted({x for x in (parse_rig_id(key)[1] for key in of_model) if x is not None})
+        if clocks:
+            intervals = " and ".join(f"{1000.0 * clock:.4g}" for clock in (clocks[0], clocks[-1]))
+            notes.append(_NOTE_ON_RIGS.format(intervals=intervals))
+    plants = {"refit": estimates.plants_of(base, evaluator), "after": of_model}
+    return {"before": experiment.before, "refit": refit, "after": after}, plants, notes
+
+
+@dataclass(frozen=True, eq=False)
+class _Gains:
+    """Gains of the valve of each lung at each ventilator."""
+
+    factors: dict[str, float]  #: on the gain of the model, by lung id or rig id.
+    pressures: Floats  #: with them, cmH2O, ``(n, T)``.
+
+
+def _gains_of_rigs(
+    experiment: Experiment, model: FittedModel, evaluator: Evaluator
+) -> _Gains | None:
+    """Gains with the least mean absolute error on the breaths of the fits, of each lung and rig.
+
+    Breaths of one ventilator share what setting it up changed; the likelihood lets a few breaths of
+    far-off gains pull those of all. None if gains of groups do not help breaths that are left out
+    of their group one at a time.
+    """
+    breaths, fitted = experiment.breaths, experiment.uses.fitted
+    partition = evaluator.partition(experiment.data)
+    values = evaluator.transferred_values(model, partition)
+    values[:, -1] = breaths.pressure[:, 0]
+    gain, bounds = partition.predictor.names.index("gain"), parameter_of("gain")
+    points = np.repeat(values[None], len(_GAINS), axis=0)
+    points[:, :, gain] *= np.exp(_GAINS)[:, None]
+    points[:, :, gain] = np.clip(points[:, :, gain], bounds.low, bounds.high)
+    predicted = partition.predictor.predict_all(points)[:, :, 0]  # (k, n, T)
+    judged = breaths.valid & (breaths.time > 0) & fitted[:, None] & np.isfinite(breaths.pressure)
+    off = np.where(judged, np.abs(predicted - breaths.pressure), 0.0)
+    errors = off.sum(axis=2) / np.maximum(judged.sum(axis=1), 1)  # (k, n)
+    unchanged = len(_GAINS) // 2
+    chosen = np.full(len(breaths), unchanged)
+    left_out = chosen.copy()
+    recorded = experiment.recorded
+    clocks = sampling_intervals(recorded)
+    rigs = np.zeros(len(breaths), int) if is_fast(recorded) else rigs_by_clock(recorded)
+    factors: dict[str, float] = {}
+    for label, index in breaths.by_lung_index.items():
+        groups = [index[rigs[index] == rig] for rig in np.unique(rigs[index])]
+        for members in sorted(groups, key=len):
+            of_fits = members[fitted[members]]
+            if len(of_fits) > 1:
+                total = errors[:, of_fits].sum(axis=1)
+                chosen[members] = total.argmin()
+                left_out[of_fits] = np.argmin(total[:, None] - errors[:, of_fits], axis=0)
+            factor = float(np.exp(_GAINS[chosen[members[0]]]))
+            if len(groups) > 1:
+                factors[rig_id(label, float(np.median(clocks[members])))] = factor
+            factors[label] = factor  # the last has most breaths
+    at = np.flatnonzero(fitted)
+    least = evaluator.settings.correction.drift_ratio * errors[unchanged, at].mean()
+    if errors[left_out[at], at].mean() >= least:
+        return None
+    return _Gains(factors, np.take_along_axis(predicted, chosen[None, :, None], axis=0)[0])
+
+
+def _with_gain(plant: Any, factor: float) -> Plant:
+    """The plant with another gain of its valve."""
+    bounds = parameter_of("gain")
+    with compilation.float64():
+        gain = np.clip(factor * np.asarray(plant.get("gain")), bounds.low, bounds.high)
+        return jax.tree.map(np.asarray, plant.having(gain=gain))
 
 
 def _any_model(

@@ -38,7 +38,7 @@ from ventbench.base import compilation, files
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
-from ventbench.plants.plant_files import FAMILIES, load_plants
+from ventbench.plants.plant_files import FAMILIES, load_plants, parse_rig_id
 from ventbench.plants.python_simulators import (
     PythonSimulators,
     is_jax_plant,
@@ -53,6 +53,7 @@ from ventbench.plants.simulators import (
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.clocks import sampling_intervals
 from ventbench.recordings.read import COLUMNS, read_simulated, simulated_pressures
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNGS, Lung, lung
@@ -267,23 +268,37 @@ def _plants(
             raise InputError(
                 f"{name}, lung {key}: a {type(plant).__name__} is no plant; it needs init and step"
             )
-    plants = {lung(key).id: plant for key, plant in plants.items()}
+    by_lung: dict[str, Plant] = {}
+    by_clock: dict[str, list[tuple[float, Plant]]] = {}
+    for key, plant in plants.items():
+        label, interval = parse_rig_id(key)
+        if interval is None:
+            by_lung[label] = plant
+        else:
+            by_clock.setdefault(label, []).append((interval, plant))
+
+    def of(label: str, interval: float) -> Plant:
+        rigs = by_clock.get(label)
+        if rigs is None:
+            return by_lung[label]
+        return min(rigs, key=lambda rig: abs(np.log(rig[0] / interval)))[1]
 
     def for_breaths(breaths: Breaths) -> Plant:
-        missing = sorted(set(breaths.lung_ids.tolist()) - set(plants))
+        missing = sorted(set(breaths.lung_ids.tolist()) - set(by_lung))
         if missing:
             raise InputError(
                 f"the simulator has no lung {missing[0]} of the recording ({name}); it has "
-                f"{', '.join(plants)}"
+                f"{', '.join(by_lung)}"
             )
-        return stack_heterogeneous([plants[key] for key in breaths.lung_ids.tolist()])
+        pairs = zip(breaths.lung_ids.tolist(), sampling_intervals(breaths).tolist(), strict=True)
+        return stack_heterogeneous([of(label, interval) for label, interval in pairs])
 
     return PlantSimulators(
         name=name,
         about=provenance,
-        lungs=tuple(lung(key) for key in plants),
+        lungs=tuple(lung(label) for label in by_lung),
         sha256=sha256,
-        stack=lambda: stack_heterogeneous(list(plants.values())),
+        stack=lambda: stack_heterogeneous(list(by_lung.values())),
         of_breaths=for_breaths,
     )
 

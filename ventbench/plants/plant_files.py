@@ -68,10 +68,26 @@ FORMAT = "ventbench-plants-1"
 _STRUCTURE = "structure"
 
 
+def rig_id(lung_id: str, interval: float) -> str:
+    """Id of a lung at one of several ventilators, which its sampling interval, s, tells."""
+    return f"{lung_id}@{1000.0 * interval:.4g}ms"
+
+
+def parse_rig_id(text: str) -> tuple[str, float | None]:
+    """Id of a lung, and sampling interval of its ventilator, s, if the text says which.
+
+    Raises:
+        InputError: if there is no such lung.
+        ValueError: if the interval is no number.
+    """
+    name, at, interval = text.partition("@")
+    return lung(name).id, float(interval.removesuffix("ms")) / 1000.0 if at else None
+
+
 def save_plants(
     path: Path, plants: Mapping[str, Plant], about: Mapping[str, Any] | None = None
 ) -> None:
-    """Write plants by lung id as JSON in one step.
+    """Write plants by lung id, or :func:`rig_id`, as JSON in one step.
 
     ``about`` are JSON values that say where they come from.
 
@@ -93,8 +109,9 @@ def load_plants(path: Path) -> tuple[dict[str, Plant], dict[str, Any]]:
     """Read what :func:`save_plants` wrote.
 
     Returns:
-        Plants by the id of their lung, in the order of the file, with NumPy leaves, which take the
-        precision in force where they are used; and what the file says of their making.
+        Plants by the id of their lung, or :func:`rig_id`, in the order of the file, with NumPy
+        leaves, which take the precision in force where they are used; and what the file says of
+        their making.
 
     Raises:
         InputError: if the file is not such a file, or names an unknown type of plant.
@@ -107,7 +124,11 @@ def load_plants(path: Path) -> tuple[dict[str, Plant], dict[str, Any]]:
         if not head["lungs"]:
             raise ValueError("it holds no lung")
         arrays = {name: _array(value) for name, value in head["arrays"].items()}
-        plants = {lung(name).id: _decode(node, arrays) for name, node in head["lungs"].items()}
+        plants = {}
+        for name, node in head["lungs"].items():
+            label, interval = parse_rig_id(name)
+            key = label if interval is None else rig_id(label, interval)
+            plants[key] = _decode(node, arrays)
         return plants, dict(head.get("about", {}))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         why = "it is no text" if isinstance(error, UnicodeDecodeError) else error

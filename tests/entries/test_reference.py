@@ -133,7 +133,6 @@ def test_a_damaged_file_is_named(tmp_path, content):
         references.load(path)
 
 
-@pytest.mark.slow
 def test_checks_find_a_forged_bound(found, inputs):
     plants, cells = inputs[:2]
     result = references.checked(found, plants, cells, every=40)

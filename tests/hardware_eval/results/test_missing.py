@@ -79,6 +79,12 @@ def read(log: Path) -> HardwareRecord:
     return made
 
 
+@pytest.fixture(scope="module")
+def whole(done: ev.Evaluation) -> tuple[HardwareRecord, str]:
+    """Record and page of the session that lacks nothing."""
+    return read(done.log), page.page(page.read(done.log))
+
+
 @settings(max_examples=20, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(
     share=st.sampled_from([0.0, 0.02, 0.05, 0.3]),
@@ -88,14 +94,14 @@ def read(log: Path) -> HardwareRecord:
 )
 def test_figures_stay_within_bounds_or_a_word_says_why(
     done: ev.Evaluation,
+    whole: tuple[HardwareRecord, str],
     tmp_path_factory: pytest.TempPathFactory,
     share: float,
     cut: float,
     unscored: float,
     seed: int,
 ) -> None:
-    whole = read(done.log)
-    complete = page.page(page.read(done.log))
+    record_of_all, complete = whole
     folder = tmp_path_factory.mktemp("lacking")
     log = without(done.log, folder, share, cut, unscored, seed)
     shown = page.page(page.read(log))
@@ -109,13 +115,13 @@ def test_figures_stay_within_bounds_or_a_word_says_why(
             analyse([log])
         assert "runs are left" in shown
         return
-    given = np.array(whole.header.trace.pressure_milli_cmH2O, float) / 1000.0
+    given = np.array(record_of_all.header.trace.pressure_milli_cmH2O, float) / 1000.0
     # A gap of two lies between its neighbours: it is off by three steps of the pressure at most.
     bound = measured.MISSING_SHARE * 3.0 * np.abs(np.diff(given, axis=-1)).max()
-    assert np.abs(left.errors - whole.errors).max() <= bound
-    assert left.header.safe == whole.header.safe
+    assert np.abs(left.errors - record_of_all.errors).max() <= bound
+    assert left.header.safe == record_of_all.header.safe
     assert given.max() - 3.0 <= left.header.peak_pressure_cmH2O[0] + 1e-9
-    assert left.header.peak_pressure_cmH2O[0] <= whole.header.peak_pressure_cmH2O[0]
+    assert left.header.peak_pressure_cmH2O[0] <= record_of_all.header.peak_pressure_cmH2O[0]
     made = records.save(folder, records.hardware_record(log, open_submission("pid_best")))
     assert records.replay(log, record=made).problems == ()
     told = acceptance.report(page.read(log))

@@ -209,5 +209,5 @@ def command_of(image: Path) -> list[str]:
             f"chardev:{line}",
         )
     ]
-    machine = ["-M", "mps2-an385", "-icount", "shift=5", "-display", "none", "-monitor", "none"]
+    machine = ["-M", "mps2-an385", "-display", "none", "-monitor", "none"]
     return [_EMULATOR, *machine, *lines, "-kernel", str(image)]

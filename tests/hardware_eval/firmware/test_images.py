@@ -29,7 +29,7 @@ from hardware_eval.emulation.emulator import Emulator
 from hardware_eval.emulation.firmware import Firmware, Order, command_of
 from hardware_eval.wire.client import Client, Link, NoAnswerError, RefusedError
 from hardware_eval.wire.conformance import conformance
-from hardware_eval.wire.messages import Flag, Mode
+from hardware_eval.wire.messages import Flag, Mode, Reason
 from tests.hardware_eval.electronics import WiredHal
 from tests.hardware_eval.firmware.core import FIRMWARE, tool
 
@@ -187,29 +187,44 @@ def test_an_image_conforms(device: tuple[Logged, Path]) -> None:
     firmware, folder = device
     _until(lambda: firmware.orders[-1].time > 0.0)
     link = Link(str(folder / "lung"))
+    failed: list[str] = []
     for _ in range(10):
         firmware.orders.clear()
         clauses = conformance(link, DeviceClock(firmware))
-        times = [order.time for order in firmware.orders]
-        if times == sorted(times):
-            break  # else a busy machine held the board up, and its watchdog reset it
+        failed = [str(clause) for clause in clauses if clause.holds is False]
+        steps = np.diff([order.time for order in list(firmware.orders)])
+        if not failed or (steps.min() >= 0.0 and steps.max() <= 2 * STEP):
+            break  # else a busy machine held the board up, or its watchdog reset it: again
     link.close()
-    assert not [str(clause) for clause in clauses if clause.holds is False]
+    assert not failed
 
 
 @pytest.mark.slow
 def test_electronics_vent_when_the_image_stands_still(device: tuple[Logged, Path]) -> None:
     firmware, folder = device
-    client = Client(Link(str(folder / "lung")), timeout=10.0)
+    client = Client(Link(str(folder / "lung")), timeout=2.0)
     _until(lambda: firmware.orders[-1].time > 0.0)
     _inspiring(firmware, client)
     image = firmware.process
     os.kill(image, signal.SIGSTOP)
     log = folder / "electronics.csv"
     _until(lambda: log.read_text().splitlines()[-1].endswith("0,1,monostable"))
+    before = len(firmware.orders)
     os.kill(image, signal.SIGCONT)
-    _until(lambda: client.heartbeat().mode is Mode.VENTED)
+    # It vents by itself, before anybody asks; what an order began before the pause may come first.
+    _until(lambda: any((x.u_in, x.u_out) == (0.0, 1) for x in firmware.orders[before:]))
+    _until(lambda: _says_that_it_vented(client))
     client.close()
+
+
+def _says_that_it_vented(client: Client) -> bool:
+    """A board that its watchdog has reset loses what arrives meanwhile, and knows no session."""
+    try:
+        return client.heartbeat().mode is Mode.VENTED
+    except NoAnswerError:
+        return False
+    except RefusedError as error:
+        return error.refusal.reason is Reason.SESSION
 
 
 @pytest.mark.slow

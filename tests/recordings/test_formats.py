@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pyedflib import highlevel
 
 from ventbench.base.errors import InputError
 from ventbench.recordings.foreign import Imported, import_recording
@@ -27,6 +26,9 @@ def waveforms(cycles: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
 
 def edf(folder: Path) -> Path:
+    pytest.importorskip("pyedflib", reason="pyedflib has no wheel for this Python")
+    from pyedflib import highlevel
+
     pressure, flow = waveforms()
     headers = [
         highlevel.make_signal_header(name, unit, rate, -200.0, 200.0)

@@ -94,7 +94,7 @@ def test_it_is_refused_before_it_is_unpacked(
     if make is wfdb_header:
         pytest.importorskip("wfdb")
     if make is edf:
-        pytest.importorskip("pyedflib")
+        pytest.importorskip("pyedflib", reason="pyedflib has no wheel for this Python")
     path = make(tmp_path)
     assert path.stat().st_size < 100_000
     monkeypatch.setattr(sizes, "LARGEST", LARGEST)
@@ -109,7 +109,7 @@ def test_it_is_refused_before_it_is_unpacked(
 
 
 def test_a_header_must_not_claim_what_is_not_there(tmp_path: Path) -> None:
-    pytest.importorskip("pyedflib")
+    pytest.importorskip("pyedflib", reason="pyedflib has no wheel for this Python")
     with pytest.raises(InputError, match="claims 1000 samples that are not in it"):
         read_table(edf(tmp_path, "10", 100))
 

@@ -74,6 +74,7 @@ def build(folder: Path, out: Path, simulators: Load | None = None) -> Built:
         InputError: if a record was changed, or jinja2 is not installed.
         OSError: if a file cannot be read or written.
     """
+    pages.environment()  # what it needs is missed before the replay, which may take minutes
     leaderboard = replay.load(folder, simulators)
     built = content(leaderboard)
     named = sorted(filter(canonical.named, canonical.walk(folder)[0]))

@@ -250,7 +250,11 @@ def _channels(
 
 
 def _edf(file: str) -> Table:
-    require("pyedflib", extra="formats", what="EDF files")
+    require(
+        "pyedflib",
+        extra="formats",
+        what="EDF files (from Python 3.13 on, `pip install pyedflib` first, with a C compiler)",
+    )
     from pyedflib import highlevel
 
     sizes.check_edf(file)

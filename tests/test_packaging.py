@@ -210,7 +210,10 @@ def test_wheel_content(wheel: Path) -> None:
 
 
 @pytest.mark.slow
-def test_wheel_works_outside_the_repository(wheel: Path, tmp_path: Path) -> None:
+def test_wheel_works_outside_the_repository(
+    wheel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PYTHONPATH", raising=False)  # it may name this checkout
     # A venv of its own, with links to this one's packages behind it: neither this checkout, which
     # a path file in those names, nor the packages of any extra can be seen.
     home = tmp_path / "venv"

@@ -193,8 +193,9 @@ def test_an_image_conforms(device: tuple[Logged, Path]) -> None:
         clauses = conformance(link, DeviceClock(firmware))
         failed = [str(clause) for clause in clauses if clause.holds is False]
         steps = np.diff([order.time for order in list(firmware.orders)])
-        if not failed or (steps.min() >= 0.0 and steps.max() <= 2 * STEP):
-            break  # else a busy machine held the board up, or its watchdog reset it: again
+        on_time = steps.min() >= 0.0 and steps.max() <= 2 * STEP
+        if not failed or (on_time and "the host was too slow" not in str(failed)):
+            break  # else a busy machine held host or board up, or its watchdog reset it: again
     link.close()
     assert not failed
 

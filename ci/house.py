@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 #: Most tokens of all that is kept by hand beside the tests, and of the largest parts of it.
-LIMITS = {"sum": 500_100, "ventbench": 332_000, "hardware_eval": 66_200}
+LIMITS = {"sum": 501_400, "ventbench": 333_400, "hardware_eval": 66_050}
 
 #: What is counted together.
 PACKAGES = ("ventbench", "hardware_eval", "proofs", "benchmarks", "ci")

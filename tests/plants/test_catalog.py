@@ -122,6 +122,8 @@ def test_a_lung_at_several_ventilators_is_told_by_the_clock(breaths):
     one = breaths.select(np.flatnonzero(breaths.lung_ids == "R20C50")[:1])
     both = load_simulators({"R20C50": slow, "R20C50@31.9ms": fast, "R20C50@34ms": slow})
     assert both.lungs == (lung("R20C50"),)
+    with pytest.raises(InputError, match="R20C50 is there at ventilators alone"):
+        load_simulators({"R20C50@31.9ms": fast})
     for interval, plant in ((0.0317, fast), (0.0345, slow)):
         dt = np.where(one.valid, interval, 0.0)
         sampled = dataclasses.replace(one, dt=dt, time=np.cumsum(dt, axis=1) - dt)

@@ -150,7 +150,10 @@ def test_what_is_no_file_of_plants_is_refused(tmp_path: Path) -> None:
     unknown = json.loads(json.dumps(good).replace('"Physics"', '"Popen"'))
     dtype = json.loads(json.dumps(good).replace('"float64"', '"object"', 1))
     label = {**good, "lungs": {"big": good["lungs"]["R20C50"]}}
-    clock = {**good, "lungs": {"R20C50@fast": good["lungs"]["R20C50"]}}
+    clocks = [
+        json.dumps({**good, "lungs": {f"R20C50@{interval}": good["lungs"]["R20C50"]}})
+        for interval in ("fast", "nanms", "0ms", "-3ms", "infms", "")
+    ]
     for text in (
         "",
         "[]",
@@ -160,7 +163,7 @@ def test_what_is_no_file_of_plants_is_refused(tmp_path: Path) -> None:
         json.dumps(unknown),
         json.dumps(dtype),
         json.dumps(label),
-        json.dumps(clock),
+        *clocks,
         json.dumps({**good, "arrays": {}}),
     ):
         path.write_text(text)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
-import jax
 import numpy as np
 
 from ventbench.base import compilation
@@ -133,8 +132,8 @@ def correct(
         elif stage == "before":
             result[name] = uncorrected[name]
         else:
-            of_lung = {k: plant for k, plant in plants[stage].items() if parse_rig_id(k)[0] == name}
-            result |= of_lung
+            of_stage = plants[stage].items()
+            result |= {key: plant for key, plant in of_stage if parse_rig_id(key)[0] == name}
     return Correction(final, errors, result, chosen, unchanged, tuple(notes))
 
 
@@ -144,10 +143,10 @@ _NOTE_ON_DRIFT = (
 )
 
 
-_NOTE_ON_RIGS = (
-    "More than one ventilator recorded these breaths, as their clocks tell (from {intervals} ms a "
-    "sample): the corrected simulator has a gain of the valve for each lung at each of them, and "
-    "takes the one whose clock is nearest."
+_NOTE_ON_GAINS = (
+    "The corrected simulator has a gain of the valve for each lung at each ventilator, which the "
+    "clock tells: breaths left out of their group one at a time err {:.2f} cmH2O, with one gain "
+    "for all {:.2f}."
 )
 
 
@@ -239,19 +238,15 @@ def _base_model(
                     "refitted alone, so the corrected simulator does without."
                 )
     of_model = estimates.plants_of(model, evaluator)
-    gains = None
-    if model.names and not (model.hypothesis.breath_terms or experiment.by_flow):
-        gains = _gains_of_rigs(experiment, model, evaluator)
+    unsuited = not model.names or model.hypothesis.breath_terms or experiment.by_flow
+    gains = None if unsuited else _gains_of_rigs(experiment, model, evaluator)
     if gains is not None:
         after = gains.pressures
         of_model = {
             key: _with_gain(of_model[parse_rig_id(key)[0]], factor)
             for key, factor in gains.factors.items()
         }
-        clocks = sorted({x for x in (parse_rig_id(key)[1] for key in of_model) if x is not None})
-        if clocks:
-            intervals = " and ".join(f"{1000.0 * clock:.4g}" for clock in (clocks[0], clocks[-1]))
-            notes.append(_NOTE_ON_RIGS.format(intervals=intervals))
+        notes.append(_NOTE_ON_GAINS.format(*gains.errors))
     plants = {"refit": estimates.plants_of(base, evaluator), "after": of_model}
     return {"before": experiment.before, "refit": refit, "after": after}, plants, notes
 
@@ -262,6 +257,8 @@ class _Gains:
 
     factors: dict[str, float]  #: on the gain of the model, by lung id or rig id.
     pressures: Floats  #: with them, cmH2O, ``(n, T)``.
+    #: mean absolute error of breaths that are left out of their group, and with one gain, cmH2O.
+    errors: tuple[float, float]
 
 
 def _gains_of_rigs(
@@ -288,8 +285,7 @@ def _gains_of_rigs(
     unchanged = len(_GAINS) // 2
     chosen = np.full(len(breaths), unchanged)
     left_out = chosen.copy()
-    recorded = experiment.recorded
-    clocks = sampling_intervals(recorded)
+    recorded, clocks = experiment.recorded, sampling_intervals(experiment.recorded)
     rigs = np.zeros(len(breaths), int) if is_fast(recorded) else rigs_by_clock(recorded)
     factors: dict[str, float] = {}
     for label, index in breaths.by_lung_index.items():
@@ -305,10 +301,12 @@ def _gains_of_rigs(
                 factors[rig_id(label, float(np.median(clocks[members])))] = factor
             factors[label] = factor  # the last has most breaths
     at = np.flatnonzero(fitted)
-    least = evaluator.settings.correction.drift_ratio * errors[unchanged, at].mean()
-    if errors[left_out[at], at].mean() >= least:
+    own = float(errors[left_out[at], at].mean())
+    common = float(errors[unchanged, at].mean())
+    if own >= evaluator.settings.correction.drift_ratio * common:
         return None
-    return _Gains(factors, np.take_along_axis(predicted, chosen[None, :, None], axis=0)[0])
+    pressures = np.take_along_axis(predicted, chosen[None, :, None], axis=0)[0]
+    return _Gains(factors, pressures, (own, common))
 
 
 def _with_gain(plant: Any, factor: float) -> Plant:
@@ -316,7 +314,7 @@ def _with_gain(plant: Any, factor: float) -> Plant:
     bounds = parameter_of("gain")
     with compilation.float64():
         gain = np.clip(factor * np.asarray(plant.get("gain")), bounds.low, bounds.high)
-        return jax.tree.map(np.asarray, plant.having(gain=gain))
+        return plant.having(gain=gain)
 
 
 def _any_model(

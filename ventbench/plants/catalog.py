@@ -277,10 +277,11 @@ def _plants(
         else:
             by_clock.setdefault(label, []).append((interval, plant))
 
+    if unknown := sorted(by_clock.keys() - by_lung.keys()):
+        raise InputError(f"{name}: {unknown[0]} is there at ventilators alone; add it by its id")
+
     def of(label: str, interval: float) -> Plant:
-        rigs = by_clock.get(label)
-        if rigs is None:
-            return by_lung[label]
+        rigs = by_clock.get(label, [(interval, by_lung[label])])
         return min(rigs, key=lambda rig: abs(np.log(rig[0] / interval)))[1]
 
     def for_breaths(breaths: Breaths) -> Plant:

@@ -77,11 +77,15 @@ def parse_rig_id(text: str) -> tuple[str, float | None]:
     """Id of a lung, and sampling interval of its ventilator, s, if the text says which.
 
     Raises:
-        InputError: if there is no such lung.
-        ValueError: if the interval is no number.
+        InputError: if there is no such lung or interval.
     """
     name, at, interval = text.partition("@")
-    return lung(name).id, float(interval.removesuffix("ms")) / 1000.0 if at else None
+    if not at:
+        return lung(name).id, None
+    number = interval.removesuffix("ms")
+    if not number.replace(".", "", 1).isdecimal() or not float(number):
+        raise InputError(f"{text!r}: no sampling interval; write it as R20C50@33.3ms")
+    return lung(name).id, float(number) / 1000.0
 
 
 def save_plants(

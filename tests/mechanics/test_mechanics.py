@@ -13,6 +13,7 @@ from scipy import integrate
 
 from ventbench import mechanics
 from ventbench.base.errors import InputError
+from ventbench.mechanics.balance import leak
 from ventbench.mechanics.labels import (
     Estimate,
     LungMatch,
@@ -22,6 +23,7 @@ from ventbench.mechanics.labels import (
     tolerance_text,
     value_text,
 )
+from ventbench.mechanics.segments import segments
 from ventbench.recordings import Breaths, make_breaths
 from ventbench.task.lungs import lung
 
@@ -237,18 +239,57 @@ def test_a_sensor_that_no_circuit_could_delay_as_much_is_named(R, quadratic, lag
     near(found.C, 50.0, 0.05)
 
 
-def test_a_leak_is_gas_that_does_not_come_back():
-    """The sensor sees what leaks away behind it: 5 mL/s per cmH2O."""
-    plain = recording(20.0, 20.0, n=20, seed=6)
-    dose = np.cumsum(plain.pressure * plain.dt, axis=1)
+def leaking(plain: Breaths, conductance: float, zero: float = 0.0) -> Breaths:
+    """A leak, mL/s per cmH2O, behind the sensor of flow, whose zero is off by some mL/s."""
     assert plain.flow is not None
-    found = only(replace(plain, volume=None, flow=plain.flow + 5.0 * plain.pressure))
-    assert dose[:, -1].min() > 0
-    (term,) = found.terms
-    assert "leak" in (term.name, *term.alternatives)
+    return replace(plain, volume=None, flow=plain.flow + conductance * plain.pressure + zero)
+
+
+@pytest.mark.parametrize("conductance", [2.0, 5.0])
+@pytest.mark.parametrize("quadratic", [0.0, 15.0])
+def test_a_leak_is_gas_that_does_not_come_back(conductance, quadratic):
+    """The sensor sees what leaks away behind it; a parabolic resistor changes nothing of that."""
+    rohrer = lambda V, Q, slope, t, p: quadratic * Q * np.abs(Q)  # noqa: E731
+    found = only(leaking(recording(20.0, 20.0, rohrer, n=8, seed=6), conductance))
+    terms = {term.name: term for term in found.terms}
+    assert set(terms) == {"leak"} | ({"turbulent_resistance"} if quadratic else set())
+    assert terms["leak"].alternatives == ("flow_sensor_zero",)
+    near(terms["leak"].parameters["conductance"], conductance, 0.15)
+    near(found.R, 20.0, 0.05)
     near(found.C, 20.0, 0.05)
-    assert term.name == "leak"
-    near(term.parameters["conductance"], 5.0, 0.2)
+
+
+def test_a_zero_within_its_scatter_is_no_leak_and_a_leak_is_as_large_as_it_says():
+    """Flow sensors whose zeros scatter by 5 mL/s: false alarms, and how often intervals hold."""
+    rng = np.random.default_rng(3)
+    false, held = 0, 0
+    for seed in range(60):
+        lung = rng.choice([5.0, 20.0, 50.0]), rng.choice([10.0, 20.0, 50.0])
+        plain, zero = recording(*lung, n=8, seed=seed), rng.normal(0.0, 5.0)
+        false += leak(segments(leaking(plain, 0.0, zero)))[1] is not None
+        (term,) = [leak(segments(leaking(plain, 4.0, zero)))[1]]
+        assert term is not None
+        low, high = term.parameters["conductance"].ci95
+        held += low <= 4.0 <= high
+    assert false <= 2
+    assert held >= 54
+
+
+def test_a_cough_and_pieces_of_breaths_are_no_leak():
+    """Half of a breath does not give back what it took, and a cough throws out more."""
+    plain = recording(20.0, 20.0, n=10, seed=4)
+    assert plain.flow is not None
+    flow, valid = plain.flow.copy(), plain.valid.copy()
+    flow[3, 250:260] -= 1500.0
+    valid[0, 120:] = False
+    valid[9, 60:] = False
+    breaths = replace(plain, flow=flow, volume=None, valid=valid)
+    assert leak(segments(breaths))[1] is None
+    (term,) = [leak(segments(leaking(breaths, 4.0)))[1]]
+    assert term is not None
+    near(term.parameters["conductance"], 4.0, 0.2)
+    inspirations = plain.valid & (plain.time < 1.2)
+    assert leak(segments(replace(plain, volume=None, valid=inspirations)))[1] is None
 
 
 @pytest.mark.slow

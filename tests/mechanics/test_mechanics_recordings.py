@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from proofs.real.pairs import with_leak
 from ventbench import mechanics
 from ventbench.cli import app
 from ventbench.recordings.foreign import import_runs
@@ -30,7 +31,7 @@ def test_the_lungs_are_what_their_labels_say(surveyed):
     assert len(surveyed) == 40
     assert not any("2020-07-01-Control-Tests-AIR" in one["name"] for one in surveyed)
     good = [one for one in surveyed if one["match"]["label_matches"]]
-    assert len(good) >= 32
+    assert len(good) >= 36
     for one in good:
         assert one["settings"][0] == one["label"]
     # Wherever the label does not hold, no wrong setting is claimed without a warning.
@@ -62,3 +63,22 @@ def test_another_label_is_refused(public_recordings):
         (found,) = mechanics.identify(replace(breaths, R=wrong))
         assert not found.match.label_matches
         assert found.match.settings[0] == breaths.lung_ids[0]
+
+
+def test_an_added_leak_is_named_and_brings_no_other_name(public_recordings):
+    """4 mL/s per cmH2O behind the sensor of real runs, one of each lung and day."""
+    runs = import_runs(public_recordings / "respiraworks_quicklung.parquet")
+    chosen = [name for name in sorted(runs)[::3] if runs[name].volume is not None]
+    assert len(chosen) >= 10
+    named, others = [], []
+    for name in chosen:
+        before, after = (
+            {term.name: term for term in mechanics.identify(breaths)[0].terms}
+            for breaths in (runs[name], with_leak(runs[name], 4.0))
+        )
+        others += sorted(set(after) - set(before) - {"leak"})
+        if "leak" in after:
+            named.append(after["leak"].parameters["conductance"].value)
+    assert len(named) >= 0.8 * len(chosen)
+    assert len(others) <= 0.1 * len(chosen)
+    assert np.median(named) == pytest.approx(4.0, abs=0.2)

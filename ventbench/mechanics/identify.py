@@ -15,6 +15,7 @@ import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.mechanics.balance import leak
 from ventbench.mechanics.labels import (
     WRONG,
     Estimate,
@@ -37,6 +38,7 @@ from ventbench.mechanics.regression import (
     cross_products,
     effect_size,
     fit,
+    parabolic,
 )
 from ventbench.mechanics.segments import Segment, clipped_share, segments
 from ventbench.mechanics.term_selection import (
@@ -162,10 +164,13 @@ FAULTS = {
 _FITTED = {"late": "inertance", "zero": "leak"}
 
 #: Faults of the flow sensor that look like an effect.
-_SENSORS = {"inertance": ("flow_sensor_lag",), "leak": ("flow_sensor_zero",)}
+_SENSORS = {
+    "inertance": ("flow_sensor_lag",),
+    "direction_resistance": ("expiratory_flow_calibration",),
+}
 
-#: Largest product of R and leak for which R and 1/C are corrected.
-_MOST_LEAK = 0.5
+#: What expiration has more, linear in the flow or quadratic.
+_DIRECTIONS = (("difference", "cmH2O/(L/s)"), ("quadratic", "cmH2O s2/L2"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +263,8 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
             f"{name}: no piece of a breath has pressure with flow or volume for about a second; "
             "record longer pieces"
         )
-    at_lung, delayed_by = delay(measured)
+    without_leak, leaks = leak(measured)
+    at_lung, delayed_by = delay(without_leak)
     table = bounded(cross_products(at_lung))
     selected = select_terms(table)
     full = _fit_lung(table, selected, at_lung, breaths)
@@ -270,7 +276,12 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     notes = (*unlikely, *_notes(breaths, at_lung, table, noise))
     samples = sum(len(segment) for segment in at_lung)
     problem = problem_with(breaths, best.resistance(0.0), best.compliance())
-    shows = {fault: term in [s.name for s in selected] for fault, term in _FITTED.items()}
+    terms = (
+        *(() if leaks is None else (leaks,)),
+        *_with_equivalent_lag(delayed_by, best),
+        *(full.term(term) for term in selected),
+    )
+    shows = {fault: term in [t.name for t in terms] for fault, term in _FITTED.items()}
     shows |= {
         "unsound": problem is not None,
         "clipped": any(saturation.column == "flow" for saturation in find_saturation(breaths)),
@@ -298,7 +309,7 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
         best.resistance(0.0),
         best.compliance(),
         full.offset(),
-        (*_with_equivalent_lag(delayed_by, best), *(full.term(term) for term in selected)),
+        terms,
         match,
         noise,
         len(table),
@@ -317,9 +328,7 @@ def _drop_isolated(breaths: Breaths) -> tuple[Breaths, list[str]]:
     """
     if breaths.flow is None or not (measured := segments(breaths)):
         return breaths, []
-    table = cross_products(measured, range(len(BASE)))
-    fitted = fit(bounded(table), np.ones(len(table), bool), range(len(BASE)))
-    r, elastance = fitted.coefficients[:2] / 1000.0
+    r, elastance = parabolic(measured).coefficients[:2] / 1000.0
     flow = np.where(breaths.valid, breaths.flow, np.nan)
     volume = np.cumsum(np.nan_to_num(flow) * breaths.dt, axis=1)
     residual = (breaths.pressure - r * flow - elastance * volume)[breaths.valid]
@@ -440,7 +449,7 @@ class LungFit:
 
         def value(x: Callable[[str], float]) -> float:
             quadratic = x("turbulent_resistance") * flow
-            return (x("resistance") + quadratic + x("volume_resistance") * half) * _leak_factor(x)
+            return x("resistance") + quadratic + x("volume_resistance") * half
 
         estimate = self._derived(value, "cmH2O/(L/s)")
         peak = max(float(segment.flow.max()) for segment in self.segments)
@@ -455,9 +464,7 @@ class LungFit:
     def compliance(self) -> Estimate:
         """Compliance over the tidal volume, mL/cmH2O."""
         tidal = self._tidal_volume()
-        elastance = self._derived(
-            lambda x: (x("elastance") + x("nonlinear_compliance") * tidal) * _leak_factor(x), ""
-        )
+        elastance = self._derived(lambda x: x("elastance") + x("nonlinear_compliance") * tidal, "")
         half_width = 0.5 * (elastance.ci95[1] - elastance.ci95[0])
         jumps = elastance.value * self.blur * self.jump / tidal
         reach = half_width + jumps
@@ -494,9 +501,8 @@ class LungFit:
         coefficients = {
             "turbulent_resistance": ("quadratic", "cmH2O s2/L2"),
             "inertance": ("inertance", "cmH2O s2/L"),
-            "direction_resistance": ("difference", "cmH2O/(L/s)"),
+            "direction_resistance": _DIRECTIONS[column == columns_of("direction_resistance")[1]],
             "volume_resistance": ("slope", "cmH2O s/L2"),
-            "expiratory_flow": ("quadratic", "cmH2O s2/L2"),
         }
         if name in coefficients:
             short, unit = coefficients[name]
@@ -504,9 +510,6 @@ class LungFit:
         if name == "nonlinear_compliance":
             stiffening = self._derived(lambda x: 2.0 * x(name) / x("elastance") ** 2, "1/cmH2O")
             return {"stiffening": stiffening}
-        if name == "leak":
-            leak = self._derived(lambda x: 1000.0 * x(name) / x("elastance"), "mL/s per cmH2O")
-            return {"conductance": leak}
         time = COLUMNS[column].time
         assert time is not None
         low = max((t for t in TIMES if t < time), default=time)
@@ -541,12 +544,3 @@ class LungFit:
     def _tidal_volume(self) -> float:
         """Range of the volume, median over the segments, L."""
         return float(np.median([np.ptp(segment.volume) for segment in self.segments]))
-
-
-def _leak_factor(x: Callable[[str], float]) -> float:
-    """Factor by which R and 1/C are larger if part of the measured flow leaks before the lung.
-
-    With a leak g, p = R (Q - g p) + ...: the regression finds R / (1 + R g) and (1/C) / (1 + R g).
-    """
-    lost = x("resistance") * x("leak") / x("elastance")
-    return 1.0 / (1.0 - min(lost, _MOST_LEAK))

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from scipy.linalg import solve_banded
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.base.linear import inverse, solve
@@ -57,25 +58,26 @@ class RegressionColumn:
     #: values of the column at the m samples of a segment, ``(m,)``.
     values: Callable[[Segment], Floats]
     time: float | None = None  #: relaxation time, s, or None.
-    #: whether the column is made of the measured pressure, which a lag has delayed already.
-    of_pressure: bool = False
+
+
+def _driven(decay: Floats, added: Floats) -> Floats:
+    """Course of ``x[k + 1] = decay[k] x[k] + added[k]`` from zero, ``(m,)`` or ``(m, c)``."""
+    bands = np.stack([np.ones(len(decay) + 1), -np.append(decay, 0.0)])
+    return solve_banded((1, 0), bands, np.concatenate([np.zeros_like(added[:1]), added]))
 
 
 def _relaxing_volume(time: float, periodic: bool) -> Callable[[Segment], Floats]:
     """Solution of dS/dt = Q - S / time, from rest or as if the same breath came before."""
 
     def values(segment: Segment) -> Floats:
-        t, v = segment.time, segment.volume
-        decay = np.exp(-np.diff(t) / time)
+        step = np.diff(segment.time)
+        decay = np.exp(-step / time)
         # Exact for a flow that is constant within a step.
-        gain = (1.0 - decay) * time / np.diff(t) * np.diff(v)
-        steps = list(zip(decay.tolist(), gain.tolist(), strict=True))
-        relaxed = [0.0]
-        for _ in range(2 if periodic else 1):
-            relaxed = [relaxed[-1]]
-            for decays, added in steps:
-                relaxed.append(relaxed[-1] * decays + added)
-        return np.array(relaxed)
+        gain = (1.0 - decay) * time / step * np.diff(segment.volume)
+        relaxed = _driven(decay, gain)
+        if periodic:
+            relaxed = relaxed + relaxed[-1] * np.exp(-(segment.time - segment.time[0]) / time)
+        return relaxed
 
     return values
 
@@ -95,10 +97,9 @@ COLUMNS = (
     RegressionColumn("turbulent_resistance", lambda s: s.flow * np.abs(s.flow)),
     RegressionColumn("nonlinear_compliance", lambda s: s.volume**2),
     RegressionColumn("inertance", lambda s: s.slope),
-    RegressionColumn("leak", lambda s: -s.dose, of_pressure=True),
     RegressionColumn("direction_resistance", lambda s: np.minimum(s.flow, 0.0)),
+    RegressionColumn("direction_resistance", lambda s: np.minimum(s.flow, 0.0) * np.abs(s.flow)),
     RegressionColumn("volume_resistance", lambda s: s.flow * s.volume),
-    RegressionColumn("expiratory_flow", lambda s: np.minimum(s.flow, 0.0) * np.abs(s.flow)),
     *(
         RegressionColumn("viscoelasticity", _relaxing_volume(time, periodic), time)
         for periodic in (False, True)
@@ -106,11 +107,14 @@ COLUMNS = (
     ),
 )
 
+#: Columns of a lung behind a parabolic resistor, as airways and test lungs have.
+PARABOLIC = tuple(range(len(BASE) + 1))
+
 #: Terms beyond R and C, in the order of their columns.
 TERMS = tuple(dict.fromkeys(column.term for column in COLUMNS[len(BASE) :]))
 
 #: Terms whose coefficient must be positive.
-POSITIVE = ("turbulent_resistance", "viscoelasticity", "leak", "inertance")
+POSITIVE = ("turbulent_resistance", "viscoelasticity", "inertance")
 
 
 def columns_of(term: str) -> tuple[int, ...]:
@@ -126,19 +130,13 @@ def lagged(time: Floats, values: Floats, lag: float) -> Floats:
     step = np.diff(time)[:, None]
     decay = np.exp(-step / lag)
     falls = lag * np.diff(values, axis=0) / step * (1.0 - decay)
-    behind = np.zeros_like(values)
-    for k, (share, lost) in enumerate(zip(decay.tolist(), falls, strict=True)):
-        behind[k + 1] = share[0] * behind[k] + lost
-    return values - behind
+    return values - _driven(decay[:, 0], falls)
 
 
 def course(segment: Segment, columns: Sequence[RegressionColumn]) -> Floats:
     """Columns at all samples of a segment, as late as its pressure, ``(m, k)``."""
     values = np.stack([column.values(segment) for column in columns], axis=1)
-    late = [k for k, column in enumerate(columns) if not column.of_pressure]
-    if segment.lag and late:
-        values[:, late] = lagged(segment.time, values[:, late], segment.lag)
-    return values
+    return lagged(segment.time, values, segment.lag) if segment.lag else values
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,14 +276,19 @@ def bounded(table: CrossProducts) -> CrossProducts:
     """Bound the influence of breaths that no model of the others explains."""
     if len(table) < 4:
         return table
-    columns = (*range(len(BASE)), *columns_of("turbulent_resistance"))
-    fitted = fit(table, np.ones(len(table), bool), columns)
+    fitted = fit(table, np.ones(len(table), bool), PARABOLIC)
     square = _squares(table, fitted) / np.maximum(table.freedom, 1.0)
     weight = np.minimum(1.0, _BOUND * np.median(square) / np.maximum(square, 1e-12))
     if (weight == 1.0).all():
         return table
     products = table.products * weight[:, None, None, None]
     return CrossProducts(products, table.freedom * weight, table.constant * weight[:, None])
+
+
+def parabolic(segments: Sequence[Segment]) -> RegressionFit:
+    """Fit R, C and the quadratic part of the resistance, with bounded influence of breaths."""
+    table = bounded(cross_products(segments, PARABOLIC))
+    return fit(table, np.ones(len(table), bool), PARABOLIC)
 
 
 def _squares(table: CrossProducts, fitted: RegressionFit) -> Floats:

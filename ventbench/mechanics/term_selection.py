@@ -12,6 +12,7 @@ from ventbench.mechanics.labels import Estimate
 from ventbench.mechanics.regression import (
     BASE,
     COLUMNS,
+    PARABOLIC,
     POSITIVE,
     TERMS,
     CrossProducts,
@@ -30,18 +31,16 @@ from ventbench.system_id.fit import t_quantile
 #: Log-likelihood ratio on held-out breaths that a term needs: one false term in a hundred.
 LEAST_NATS = 4.6
 
-#: Terms that are accepted as well if held-out breaths gain this much over the model without the
-#: term, fitted to the same breaths as the model with it, and this many times the scatter of the
-#: gains over breaths. Nearly all of a leak looks like a drift. A model without it that is fitted to
-#: the held-out breaths themselves can give these drifts that differ, and so always explains
-#: breaths that differ from each other by more than their noise.
-_BY_GAIN, _LEAST_GAIN, _LEAST_GAIN_SCATTER = ("leak",), 6.9, 1.3
-
 #: Share of the held-out breaths whose likelihood must rise.
 _LEAST_AGREEMENT = 0.6
 
 #: Least effect of a term, cmH2O, and as a share of the noise.
 _LEAST_EFFECT, _LEAST_EFFECT_SHARE = 0.03, 0.1
+
+#: Least effect of a term as a share of the pressure's standard deviation within a breath: sensors
+#: of flow and pressure are linear to 2 % of what they read, and a term that explains less may be
+#: the sensor.
+_LINEARITY = 0.02
 
 #: Least strengths that are named: tubes and airways have an inertance of 0.01 to 0.02 cmH2O s2/L,
 #: and a flow sensor that is a thousandth of a second late looks like 0.02 in an R20.
@@ -53,6 +52,9 @@ _ALTERNATIVE_SHARE = 0.1
 #: Relative standard deviation of 1/C above which a term has replaced the compliance.
 _MOST_UNCERTAINTY = 0.1
 
+#: Term that stands while others are tried.
+_STANDING = "turbulent_resistance"
+
 #: Fewest breaths that can be split, and most terms.
 FEWEST_BREATHS, MOST_TERMS = 4, 5
 
@@ -63,8 +65,7 @@ class SelectedTerm:
 
     name: str  #: name of the effect.
     column: int  #: index of its column.
-    #: log-likelihood ratio on held-out breaths, or what they gain (see :data:`_BY_GAIN`).
-    nats: float
+    nats: float  #: log-likelihood ratio on held-out breaths.
     alternatives: tuple[str, ...]  #: other terms that would have gained nearly as much.
 
 
@@ -78,10 +79,17 @@ class _Trial:
 
 
 def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
-    """Select the terms that are needed beyond R, C and a delay, forward, with backward checks."""
-    selected: list[SelectedTerm] = []
+    """Select the terms that are needed beyond R, C and a delay, forward, with backward checks.
+
+    The quadratic part of the resistance stands while others are tried: airways and test lungs have
+    it, and terms that look alike would stand for it. It stays if it passes beside them.
+    """
+    if len(table) < FEWEST_BREATHS:
+        return ()
+    parabolic = SelectedTerm(_STANDING, PARABOLIC[-1], 0.0, ())
+    selected = [parabolic] if _trial(table, _columns([]), _STANDING).gain > 0.0 else []
     dropped: set[str] = set()
-    while len(table) >= FEWEST_BREATHS and len(selected) < MOST_TERMS:
+    while len(selected) < MOST_TERMS:
         columns = _columns(selected)
         excluded = {term.name for term in selected} | dropped
         trials = [_trial(table, columns, name) for name in TERMS if name not in excluded]
@@ -94,15 +102,18 @@ def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
         ]
         best = contenders[0]  # TERMS are in the order of how common they are
         alternatives = tuple(trial.name for trial in contenders[1:])
-        nats = best.nats if best.nats > LEAST_NATS else best.gain
-        selected.append(SelectedTerm(best.name, best.column, nats, alternatives))
+        selected.append(SelectedTerm(best.name, best.column, best.nats, alternatives))
         # The new term may make an earlier one superfluous.
         for term in selected[:-1]:
             rest = [term_left for term_left in selected if term_left is not term]
-            if not _trial(table, _columns(rest), term.name).passes:
+            if term is not parabolic and not _trial(table, _columns(rest), term.name).passes:
                 selected = rest
                 dropped.add(term.name)
-    return tuple(selected)
+    rest = [term for term in selected if term is not parabolic]
+    trial = _trial(table, _columns(rest), _STANDING)
+    if trial.passes and len(rest) < len(selected):
+        return (replace(parabolic, nats=trial.nats), *rest)
+    return tuple(rest)
 
 
 def _columns(selected: list[SelectedTerm]) -> tuple[int, ...]:
@@ -132,12 +143,11 @@ def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
     by_breath = np.nanmean(gains, axis=0)
     size = effect_size(table, fitted, column)
     gain = float(by_breath.sum())
-    scatter = float(np.std(by_breath, ddof=1)) * np.sqrt(len(by_breath))
-    clear = gain > max(_LEAST_GAIN, _LEAST_GAIN_SCATTER * scatter)
+    swing = float(np.sqrt(table.products[:, 0, -1, -1].sum() / table.freedom.sum()))
     passes = bool(
-        (nats > LEAST_NATS or (name in _BY_GAIN and clear))
+        nats > LEAST_NATS
         and float(np.mean(by_breath > 0)) >= _LEAST_AGREEMENT
-        and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * fitted.sigma)
+        and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * fitted.sigma, _LINEARITY * swing)
         and _allowed(name, fitted)
         and abs(fitted.coefficients[-1]) >= _LEAST_STRENGTH.get(name, 0.0)
         and _plausible(table, fitted)
@@ -203,8 +213,9 @@ def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None
     smaller than they are. A lag delays the signals of the lung; what a circuit takes up is computed
     from the pressure that the best lag predicts, which has no noise (an instrumental variable).
 
-    Returns the segments with the delay, if there is one: with the sensor's lag, or with flow and
-    volume behind the circuit. The delay is None if the breaths do not need it.
+    Returns the segments with the sensor's lag, or with flow and volume behind the circuit, and the
+    delay; None if the breaths do not need it. A lag that is too small to be named is taken out of
+    the segments all the same, so that no other term has to make up for it.
     """
     if len({segment.breath for segment in segments}) < FEWEST_BREATHS:
         return tuple(segments), None
@@ -227,7 +238,8 @@ def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None
         if (estimate := _delay(family, tables)) is not None
     }
     if not candidates:
-        return tuple(segments), None
+        small = _peak(_SENSOR, sensor, every)
+        return tuple(replace(segment, lag=small) for segment in segments), None
     gains = {
         _CIRCUIT.name: max(_value(table, every) for table in circuit),
         _SENSOR.name: max(_value(table, every) for table in sensor),
@@ -254,7 +266,6 @@ def predicted(
     """
     fitted = fit(table, np.ones(len(table), bool), range(len(_COLUMNS)))
     columns = [COLUMNS[c] for c in _COLUMNS]
-    delayed = [not column.of_pressure for column in columns]
     result = []
     for segment in segments:
         late = course(replace(segment, lag=lag), columns)
@@ -265,7 +276,7 @@ def predicted(
             [np.zeros(len(since)), np.ones(len(since))],
         )
         if lag > 0.0:  # then the derivative is known: it drives the lag
-            rises[:, delayed] = ((course(segment, columns) - late) / lag)[:, delayed]
+            rises = (course(segment, columns) - late) / lag
             nuisances.append(np.exp(-since / lag))
             nuisance_rises.append(-nuisances[-1] / lag)
         lung, nuisance = late @ fitted.coefficients, np.stack(nuisances, axis=1)
@@ -304,7 +315,6 @@ _CREEP = (0.4, 1.5)
 _COLUMNS = (
     *range(len(BASE)),
     *columns_of("turbulent_resistance"),
-    *columns_of("leak"),
     *(
         min(columns_of("viscoelasticity"), key=lambda c: abs((COLUMNS[c].time or np.inf) - time))
         for time in _CREEP

@@ -137,11 +137,12 @@ def test_the_report_counts():
             made("label", True),
             made("label", False),
             made("lag", True, 0.02, value=0.021, in_class=True),
-            made("lag", False, 0.02, wrong_names=("leak",)),
+            made("lag", False, 0.02, new_names=("leak",)),
+            made("lag", False, 0.02, new_names=("turbulent_resistance",)),
         ]
     )
     assert "| `label` | which lung a run was recorded with (flow) | 1 of 2 (9–91) |" in text
-    assert "| 20 | 1 of 2 (9–91) | 1 | 21 | 1 |" in text
+    assert "| 20 | 1 of 3 (6–79) | 1 | 21 | 2 | 1 |" in text
 
 
 def test_a_rival_that_grows_counts_as_of_its_class(material):

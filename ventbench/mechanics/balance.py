@@ -1,0 +1,106 @@
+"""A leak by the balance of volume: gas that flows in and does not come back.
+
+Over a breath from one rest to the next the lung gives back what it took, whatever its resistance
+and its compliance are. What is missing went through a leak, or the sensor's zero is off. The shape
+of the signals within a breath does not decide: a leak changes it as creep, a nonlinear resistance
+and a drift do, and hundreds of samples would outvote the one number that only a leak explains.
+
+Signals without the leak are those of the lung, so that no other term has to make up for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ventbench.base.arrays import Floats
+from ventbench.mechanics.labels import Estimate
+from ventbench.mechanics.regression import ZERO, parabolic
+from ventbench.mechanics.segments import Segment
+from ventbench.mechanics.term_selection import FEWEST_BREATHS, LEAST_NATS, Term
+from ventbench.system_id.fit import t_quantile
+
+#: Relative error of the volume that a change of the pressure between the ends of segments stands
+#: for, in all of them alike: segments that begin or end within a breath say little.
+_STORED_ERROR = 0.2
+
+#: Relative error by which a sensor of flow reads inspiration and expiration differently.
+_CALIBRATION_ERROR = 0.02
+
+#: Degrees of freedom of the errors of single segments: a cough must not count for much.
+_TAILS = 3.0
+
+#: Least scatter of the balances of segments, L/s, and steps of the weights.
+_LEAST_SCATTER, _STEPS = 0.001, 20
+
+
+def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]:
+    """Estimate a leak between flow sensor and lung, and take it out of flow and volume.
+
+    The imbalance of segment i, per time, is ``k p_i + z + f s_i + c v_i + e_i``: the leak's
+    conductance k, L/s per cmH2O, times the mean pressure; the zero z of the flow sensor, whose
+    standard deviation is :data:`~.regression.ZERO`; relative errors f of what the lung stores
+    between the ends of the segment, and c of the volume that it breathes; and an error with tails.
+
+    Returns the segments with the lung's own flow and volume, and the leak; None where no leak is
+    needed, or too few segments could tell.
+    """
+    breaths = len({segment.breath for segment in segments})
+    if breaths < FEWEST_BREATHS:
+        return tuple(segments), None
+    resistance, elastance, _, quadratic = parabolic(segments).coefficients
+    if elastance <= 0.0:
+        return tuple(segments), None
+    pressures = [np.gradient(segment.dose, segment.time, edge_order=2) for segment in segments]
+    rows = []
+    for segment, pressure in zip(segments, pressures, strict=True):
+        flow = segment.flow
+        inside = pressure - (resistance + quadratic * np.abs(flow)) * flow
+        stored = (inside[-1] - inside[0]) / elastance
+        lost = segment.volume[-1] - segment.volume[0] - stored
+        breathed = np.ptp(segment.volume)
+        rows.append((lost, segment.dose[-1] - segment.dose[0], stored, breathed))
+    times = np.array([segment.time[-1] - segment.time[0] for segment in segments])
+    imbalance, pressure, stored, breathed = np.array(rows).T / times
+    columns = np.stack([pressure, np.ones(len(rows)), stored, breathed], axis=1)
+    deviations = np.array([np.inf, ZERO, _STORED_ERROR, _CALIBRATION_ERROR])
+    conductance, sd = _first_coefficient(imbalance, columns, deviations)
+    nats = 0.5 * (conductance / sd) ** 2
+    if conductance <= 0.0:
+        return tuple(segments), None
+    reach = t_quantile(breaths - 1) * sd
+    ends = (1000.0 * (conductance - reach), 1000.0 * (conductance + reach))
+    strength = Estimate(1000.0 * conductance, "mL/s per cmH2O", ends)
+    lost = np.concatenate([conductance * (s.dose - s.dose.mean()) for s in segments])
+    effect = float(elastance * np.sqrt(np.mean(lost**2)))
+    corrected = tuple(
+        replace(
+            segment,
+            flow=segment.flow - conductance * pressure,
+            slope=segment.slope - conductance * np.gradient(pressure, segment.time),
+            volume=segment.volume - conductance * (segment.dose - segment.dose[0]),
+        )
+        for segment, pressure in zip(segments, pressures, strict=True)
+    )
+    term = Term("leak", {"conductance": strength}, nats, effect, ("flow_sensor_zero",))
+    return corrected, term if nats > LEAST_NATS else None
+
+
+def _first_coefficient(values: Floats, columns: Floats, deviations: Floats) -> tuple[float, float]:
+    """First coefficient of a regression with errors of Student's t, and its standard deviation.
+
+    Args:
+        values: ``(n,)``.
+        columns: ``(n, k)``.
+        deviations: prior standard deviations of the coefficients around zero, ``(k,)``.
+    """
+    residual = values - np.median(values)
+    for _ in range(_STEPS):
+        scatter = max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SCATTER)
+        weight = (_TAILS + 1.0) / (_TAILS + (residual / scatter) ** 2) / scatter**2
+        covariance = np.linalg.inv((columns.T * weight) @ columns + np.diag(deviations**-2.0))
+        coefficients = covariance @ (columns.T @ (weight * values))
+        residual = values - columns @ coefficients
+    return float(coefficients[0]), float(np.sqrt(covariance[0, 0]))

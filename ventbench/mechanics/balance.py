@@ -26,6 +26,10 @@ from ventbench.system_id.fit import t_quantile
 #: for, in all of them alike: segments that begin or end within a breath say little.
 _STORED_ERROR = 0.2
 
+#: Least share of the inspired volume that a sensor must see leave: one that sees less does not see
+#: expirations, and what it misses is no leak.
+_SEEN = 0.2
+
 #: Relative error by which a sensor of flow reads inspiration and expiration differently.
 _CALIBRATION_ERROR = 0.02
 
@@ -51,7 +55,9 @@ def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]
     if breaths < FEWEST_BREATHS:
         return tuple(segments), None
     resistance, elastance, _, quadratic = parabolic(segments).coefficients
-    if elastance <= 0.0:
+    steps = np.concatenate([np.diff(segment.volume) for segment in segments])
+    inspired, expired = steps[steps > 0.0].sum(), -steps[steps < 0.0].sum()
+    if elastance <= 0.0 or expired < _SEEN * inspired:
         return tuple(segments), None
     pressures = [np.gradient(segment.dose, segment.time, edge_order=2) for segment in segments]
     rows = []

@@ -38,13 +38,13 @@ _LEAST_AGREEMENT = 0.6
 _LEAST_EFFECT, _LEAST_EFFECT_SHARE = 0.03, 0.1
 
 #: Least effect of a term as a share of the pressure's standard deviation within a breath: sensors
-#: of flow and pressure are linear to 2 % of what they read, and a term that explains less may be
-#: the sensor.
-_LINEARITY = 0.02
+#: of flow and pressure are linear to 2 % of what they read, and a term without dynamics that
+#: explains less may be the sensor.
+_LINEARITY, _DYNAMIC = 0.02, ("inertance", "viscoelasticity")
 
-#: Least strengths that are named: tubes and airways have an inertance of 0.01 to 0.02 cmH2O s2/L,
-#: and a flow sensor that is a thousandth of a second late looks like 0.02 in an R20.
-_LEAST_STRENGTH = {"inertance": 0.03}
+#: Least inertance that is named, cmH2O s2/L: tubes and airways have 0.01 to 0.02, and a flow sensor
+#: that is a thousandth of a second late looks like 0.02 in an R20.
+_LEAST_INERTANCE = 0.03
 
 #: Share of the best term's gain by which another term may fall short and still be an alternative.
 _ALTERNATIVE_SHARE = 0.1
@@ -78,21 +78,24 @@ class _Trial:
     passes: bool
 
 
-def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
+def select_terms(table: CrossProducts, timing: float = 0.0) -> tuple[SelectedTerm, ...]:
     """Select the terms that are needed beyond R, C and a delay, forward, with backward checks.
 
     The quadratic part of the resistance stands while others are tried: airways and test lungs have
     it, and terms that look alike would stand for it. It stays if it passes beside them.
+
+    ``timing`` is the error of the delay that was taken out, s: an inertance must exceed what that
+    error looks like.
     """
     if len(table) < FEWEST_BREATHS:
         return ()
     parabolic = SelectedTerm(_STANDING, PARABOLIC[-1], 0.0, ())
-    selected = [parabolic] if _trial(table, _columns([]), _STANDING).gain > 0.0 else []
+    selected = [parabolic] if _trial(table, timing, _columns([]), _STANDING).gain > 0.0 else []
     dropped: set[str] = set()
     while len(selected) < MOST_TERMS:
         columns = _columns(selected)
         excluded = {term.name for term in selected} | dropped
-        trials = [_trial(table, columns, name) for name in TERMS if name not in excluded]
+        trials = [_trial(table, timing, columns, name) for name in TERMS if name not in excluded]
         passing = [trial for trial in trials if trial.passes]
         if not passing:
             break
@@ -106,11 +109,14 @@ def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
         # The new term may make an earlier one superfluous.
         for term in selected[:-1]:
             rest = [term_left for term_left in selected if term_left is not term]
-            if term is not parabolic and not _trial(table, _columns(rest), term.name).passes:
+            if (
+                term is not parabolic
+                and not _trial(table, timing, _columns(rest), term.name).passes
+            ):
                 selected = rest
                 dropped.add(term.name)
     rest = [term for term in selected if term is not parabolic]
-    trial = _trial(table, _columns(rest), _STANDING)
+    trial = _trial(table, timing, _columns(rest), _STANDING)
     if trial.passes and len(rest) < len(selected):
         return (replace(parabolic, nats=trial.nats), *rest)
     return tuple(rest)
@@ -120,7 +126,7 @@ def _columns(selected: list[SelectedTerm]) -> tuple[int, ...]:
     return (*range(len(BASE)), *(term.column for term in selected))
 
 
-def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
+def _trial(table: CrossProducts, timing: float, columns: tuple[int, ...], name: str) -> _Trial:
     """Try one more term: its best column on all breaths, and its gain on held-out breaths."""
     every = np.ones(len(table), bool)
     column = _best_column(table, every, columns, name)
@@ -144,12 +150,16 @@ def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
     size = effect_size(table, fitted, column)
     gain = float(by_breath.sum())
     swing = float(np.sqrt(table.products[:, 0, -1, -1].sum() / table.freedom.sum()))
+    nonlinear = 0.0 if name in _DYNAMIC else _LINEARITY * swing
+    strengths = dict(zip(fitted.columns, fitted.coefficients, strict=True))
+    at_1 = strengths[0] + strengths.get(PARABOLIC[-1], 0.0)
+    least = max(_LEAST_INERTANCE, timing * at_1) if name == "inertance" else 0.0
     passes = bool(
         nats > LEAST_NATS
         and float(np.mean(by_breath > 0)) >= _LEAST_AGREEMENT
-        and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * fitted.sigma, _LINEARITY * swing)
+        and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * fitted.sigma, nonlinear)
         and _allowed(name, fitted)
-        and abs(fitted.coefficients[-1]) >= _LEAST_STRENGTH.get(name, 0.0)
+        and abs(fitted.coefficients[-1]) >= least
         and _plausible(table, fitted)
     )
     return _Trial(name, column, nats, gain, passes)

@@ -89,11 +89,7 @@ CREEP, CREEP_TIME = (0.04, 0.08), (0.5, 1.8)
 
 #: Parts of the self-test that could find it; all if not here.
 ALL = selftest.PARTS
-PARTS_OF = {
-    CREEPS: ("sensor", "leak"),
-    LEAKS: ("sensor", "leak"),
-    STUCK: ("sensor", "sweep"),
-}
+PARTS_OF = {CREEPS: ("sensor", "leak"), LEAKS: ("sensor", "leak")}
 
 
 class Lungs(Protocol):

@@ -154,8 +154,10 @@ def measured_lung(
 ) -> tuple[KnownLung, float, float, float]:
     """R, C and the valve's flow over nominal, from ``p = p0 + R Q + V / C`` by least squares.
 
-    Where no flow is measured the nominal valve's is taken, two steps delayed as in the recordings,
-    and the valve's flow is what makes C the label's.
+    Of measured flows whole breaths are taken, with a resistance of the expiration of its own:
+    volumes that come and go halve the error of C. Else the nominal valve's flow is, of the
+    inspirations, two steps delayed as in the recordings, and the valve's is what makes C the
+    label's.
 
     Args:
         probes: of the part ``lung``.
@@ -164,17 +166,21 @@ def measured_lung(
     """
     steps = protocol.INSPIRATION_STEPS
     rows, pressures, given, nominal = [], [], 0.0, 0.0
-    measured = all(np.isfinite(probe.flow[:steps]).all() for probe in probes)
+    measured = all(np.isfinite(probe.flow).all() for probe in probes)
     for index, probe in enumerate(probes):
-        valve = 1e-3 * VALVE_GAIN * probe.u_in[:steps]  # L/s, from each sample to the next
-        flow = 1e-3 * probe.flow[:steps] if measured else np.append([0.0, 0.0], valve[:-2])
+        valve = 1e-3 * VALVE_GAIN * probe.u_in  # L/s, from each sample to the next
+        flow = 1e-3 * probe.flow if measured else np.append([0.0, 0.0], valve[:-2])
         between = 0.5 * (flow[1:] + flow[:-1]) if measured else valve[:-1]
         volume = np.append(0.0, np.cumsum(between * protocol.DT))
-        given, nominal = given + float(volume[-1]), nominal + float(valve.sum() * protocol.DT)
-        own = np.zeros((steps, len(probes)))
+        given += float(volume[steps - 1])
+        nominal += float(valve[:steps].sum() * protocol.DT)
+        expired = np.arange(len(flow)) >= steps
+        own = np.zeros((len(flow), len(probes)))
         own[:, index] = 1.0
-        rows.append(np.column_stack([flow, volume, own]))
-        pressures.append(probe.pressure[:steps])
+        used = measured | ~expired
+        columns = np.column_stack([flow * ~expired, volume, flow * expired, own])
+        rows.append(columns[used])
+        pressures.append(probe.pressure[used])
     design = np.concatenate(rows)
     solution, *_ = np.linalg.lstsq(design, np.concatenate(pressures), rcond=None)
     R, elastance = float(solution[0]), float(solution[1])

@@ -11,15 +11,17 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hardware_eval.bench.loop import BreathLog
-from hardware_eval.bench.plan import PlannedRun, complete_runs
+from hardware_eval.bench.plan import Plan, PlannedRun, complete_runs, make_plan
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, make_breaths
+from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.lungs import lung as parse_lung
 
 #: Files of a session or a collection in its folder.
@@ -145,7 +147,52 @@ def breaths(path: Path) -> list[LoggedBreath]:
     Raises:
         InputError: as of :func:`lines`.
     """
+    return _breaths(list(lines(path)))
+
+
+@dataclass(frozen=True)
+class Session:
+    """What the log of a plan says, of all of its sessions."""
+
+    path: Path  #: of the log.
+    logged: list[dict[str, Any]]  #: its lines.
+    plan: Plan  #: what was to run.
+
+    @cached_property
+    def breaths(self) -> list[LoggedBreath]:
+        """All breaths, in order."""
+        return _breaths(self.logged)
+
+    @property
+    def lungs(self) -> list[str]:
+        """Lungs of the plan, in the protocol's order."""
+        return [lung for lung in LUNG_IDS if lung in self.plan.lungs]
+
+    def of_type(self, kind: str) -> list[dict[str, Any]]:
+        """Lines of a type."""
+        return [line for line in self.logged if line["type"] == kind]
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """The last session's line: device, operator, notes."""
+        return self.of_type("session")[-1]
+
+
+def read_session(folder: Path) -> Session:
+    """Read a session's folder, or its log.
+
+    Raises:
+        InputError: if there is no log, or it holds no plan.
+    """
+    path = log_of(folder)
     logged = list(lines(path))
+    for line in logged:
+        if line["type"] == "plan":
+            return Session(path, logged, make_plan(**line["plan"]))
+    raise InputError(f"{path} holds no plan: no session has begun")
+
+
+def _breaths(logged: list[dict[str, Any]]) -> list[LoggedBreath]:
     finished = complete_runs(logged)
     return [
         LoggedBreath(

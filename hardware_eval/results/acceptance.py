@@ -24,8 +24,8 @@ import numpy as np
 
 import ventbench
 from hardware_eval.bench.plan import PERTURBED_BREATH
-from hardware_eval.bench.raw_log import LoggedBreath
-from hardware_eval.results.page import ACCEPTANCE, Session, read, style
+from hardware_eval.bench.raw_log import LoggedBreath, Session
+from hardware_eval.results import page
 from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
@@ -139,7 +139,7 @@ def report(session: Session) -> str:
         page_templates("hardware_eval.results")
         .get_template("acceptance.html.j2")
         .render(
-            style=style(session.plan.pips),
+            style=page.style(session.plan.pips),
             parts=parts,
             missing=missing,
             device=about["device"],
@@ -186,12 +186,5 @@ def _figures(errors: Floats) -> list[str]:
 
 
 def write(folder: Path) -> Path:
-    """Write the report of a session beside its log; returns its path.
-
-    Raises:
-        InputError: if there is no session, or none of its scored runs is complete.
-    """
-    session = read(folder)
-    path = session.path.parent / ACCEPTANCE
-    files.write_bytes(path, report(session).encode())
-    return path
+    """Write the report of a session; see :func:`hardware_eval.results.page.write`."""
+    return page.write(folder, report, page.ACCEPTANCE)

@@ -7,18 +7,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import ventbench
-from hardware_eval.bench.plan import Plan, progress
-from hardware_eval.bench.raw_log import LoggedBreath, breaths, lines, log_of
+from hardware_eval.bench.plan import progress
+from hardware_eval.bench.raw_log import LoggedBreath, Session, read_session
 from hardware_eval.results import record, trial
-from hardware_eval.results.record import plan_of, timing
 from ventbench import palette
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -26,43 +24,9 @@ from ventbench.base.interval import Interval
 from ventbench.base.text import number, page_templates, plain
 from ventbench.pages import panels
 from ventbench.task import protocol, waveform
-from ventbench.task.lungs import LUNG_IDS
 
 #: Files of the pages in a session's folder.
 PAGE, ACCEPTANCE = "session.html", "acceptance.html"
-
-
-@dataclass(frozen=True)
-class Session:
-    """What a log says of a session."""
-
-    path: Path  #: of the log.
-    logged: list[dict[str, Any]]  #: its lines.
-    plan: Plan  #: what was to run.
-    breaths: list[LoggedBreath]  #: all of them.
-
-    @property
-    def lungs(self) -> list[str]:
-        """Lungs of the plan, in the protocol's order."""
-        return [lung for lung in LUNG_IDS if lung in self.plan.lungs]
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """The last session's line: device, operator, notes."""
-        return next(line for line in reversed(self.logged) if line["type"] == "session")
-
-
-def read(folder: Path) -> Session:
-    """Read a session's folder, or its log.
-
-    Raises:
-        InputError: if there is no log, or no session has begun.
-    """
-    path = log_of(folder)
-    logged = list(lines(path))
-    if not any(line["type"] == "session" for line in logged):
-        raise InputError(f"{path} holds no session; a collection has no page")
-    return Session(path, logged, plan_of(logged, str(path)), breaths(path))
 
 
 def style(columns: Sequence[Any]) -> str:
@@ -100,14 +64,14 @@ def page(session: Session) -> str:
             entries=[_entry(session, name) for name in plan.entries],
             timing=[_timing(session, name) for name in plan.entries],
             stopped=_stopped(session),
-            tests=[line for line in session.logged if line["type"] == "selftest" and "go" in line],
-            control=record.control(session.path),
+            tests=[line for line in session.of_type("selftest") if "go" in line],
+            control=record.control(session),
             skipped=_skipped(session, len(done.remaining(plan))),
             shown_breath=panels.BREATH + 1,
             log=session.path.name,
             sha256=files.sha256(session.path),
             priority=about.get("priority"),
-            sessions=sum(line["type"] == "session" for line in session.logged),
+            sessions=len(session.of_type("session")),
             version=ventbench.__version__,
         )
     )
@@ -178,10 +142,10 @@ def _panel(pip: float, repeats: Sequence[LoggedBreath]) -> dict[str, Any]:
 
 def _timing(session: Session, name: str) -> dict[str, Any]:
     """Late answers and fallbacks of an entry in all of its attempts, and what ran beside it."""
-    runs = [x for x in session.logged if x["type"] == "run" and x["entry"] == name]
+    runs = [x for x in session.of_type("run") if x["entry"] == name]
     beside = [x["beside"] for x in runs if x.get("beside")]
     try:
-        figures: Any = timing(session.path, name)
+        figures: Any = record.timing(session, name)
     except InputError:  # no breath yet
         figures = None
     return {
@@ -197,8 +161,8 @@ def _stopped(session: Session) -> list[dict[str, Any]]:
     """Attempts that did not complete, alike ones together."""
     runs = [
         (x["entry"], x["lung"], f"{x['pip']:g}", x["status"], plain(x["reason"]))
-        for x in session.logged
-        if x["type"] == "run" and x["status"] != "complete"
+        for x in session.of_type("run")
+        if x["status"] != "complete"
     ]
     keys = ("entry", "lung", "pip", "status", "reason")
     return [{**dict(zip(keys, run, strict=True)), "count": n} for run, n in Counter(runs).items()]
@@ -209,25 +173,25 @@ def _skipped(session: Session, left: int) -> list[str]:
     told = []
     if left:
         told.append(f"{left} of {len(session.plan.runs)} runs are left; `run` continues the plan.")
-    if not any(x.get("simulated") for x in session.logged if x["type"] == "session"):
+    if not any(x.get("simulated") for x in session.of_type("session")):
         told.append("There was no dry run, so that nothing is known of the simulation.")
     if not session.plan.control_every:
         told.append("No control ran, so that a drift of the bench would not show.")
     told += [
         f"Self-test of {line['lung']}: {', '.join(line['skipped'])} left out."
-        for line in session.logged
-        if line["type"] == "selftest" and line["skipped"]
+        for line in session.of_type("selftest")
+        if line["skipped"]
     ]
     return list(dict.fromkeys(told))
 
 
-def write(folder: Path) -> Path:
-    """Write the page of a session beside its log; returns its path.
+def write(folder: Path, made: Callable[[Session], str] = page, name: str = PAGE) -> Path:
+    """Write a page of a session beside its log; returns its path.
 
     Raises:
-        InputError: if there is no session.
+        InputError: if there is no session, or there is nothing to say of it.
     """
-    session = read(folder)
-    path = session.path.parent / PAGE
-    files.write_bytes(path, page(session).encode())
+    session = read_session(folder)
+    path = session.path.parent / name
+    files.write_bytes(path, made(session).encode())
     return path

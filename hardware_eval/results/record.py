@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,15 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.loop import ON_TIME_S, BreathLog
-from hardware_eval.bench.plan import CONTROL, UNDISTURBED, Plan, complete_runs, make_plan, progress
-from hardware_eval.bench.raw_log import LOG, LoggedBreath, breaths, lines, log_of, recording
+from hardware_eval.bench.plan import CONTROL, UNDISTURBED, complete_runs, progress
+from hardware_eval.bench.raw_log import (
+    LOG,
+    LoggedBreath,
+    Session,
+    log_of,
+    read_session,
+    recording,
+)
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, create, record, schema
@@ -31,27 +37,14 @@ from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 from ventbench.task import protocol
-from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import measured
 
 #: Longest reason of a stopped run in a record, characters.
 _REASON = 1000
 
 
-def plan_of(logged: list[dict[str, Any]], label: str) -> Plan:
-    """The plan of a log.
-
-    Raises:
-        InputError: if it holds none.
-    """
-    for line in logged:
-        if line["type"] == "plan":
-            return make_plan(**line["plan"])
-    raise InputError(f"{label} holds no plan: no session has begun")
-
-
-def timing(log: Path, entry: str | None = None) -> dict[str, float]:
-    """Statistics of all steps of a log; answers of one entry's runs, or of all.
+def timing(session: Session, entry: str | None = None) -> dict[str, float]:
+    """Statistics of all steps of a session; answers of one entry's runs, or of all.
 
     Returns:
         ``steps``, and those that began after the deadline of the next one (``lost``); the share
@@ -67,15 +60,15 @@ def timing(log: Path, entry: str | None = None) -> dict[str, float]:
     """
     late, busy, longest = [], [], {"longest_answer": 0.0, "longest_fallback": 0}
     sums = {"late_answers": 0, "asked": 0, "outside": 0, "fallback": 0}
-    for line in lines(log):
-        if line["type"] == "breath":
-            late += line["late"]
-            busy += line["busy"]
-        if line["type"] == "run" and line["entry"] == (entry or line["entry"]):
+    for line in session.of_type("breath"):
+        late += line["late"]
+        busy += line["busy"]
+    for line in session.of_type("run"):
+        if line["entry"] == (entry or line["entry"]):
             sums = {name: value + line.get(name, 0) for name, value in sums.items()}
             longest = {name: max(value, line.get(name, 0)) for name, value in longest.items()}
     if not late:
-        raise InputError(f"{log} holds no breath")
+        raise InputError(f"{session.path} holds no breath")
     delays, asked = np.array(late, float), max(sums["asked"], 1)
     return {
         "steps": len(delays),
@@ -101,24 +94,20 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
     Raises:
         InputError: if the plan is not finished, the entry is not in it, or its files have changed.
     """
-    logged = list(lines(log))
-    plan = plan_of(logged, str(log))
-    name = submission.manifest.name
+    session = read_session(log)
+    plan, name = session.plan, submission.manifest.name
     if name not in plan.entries:
         raise InputError(f"{log} is of {', '.join(plan.entries)}, not of {name}")
-    left = [run for run in progress(plan, logged).remaining(plan) if run.entry == name]
+    left = [run for run in progress(plan, session.logged).remaining(plan) if run.entry == name]
     if left:
         raise InputError(
             f"{log}: {len(left)} runs of {name} are left; run the same command again, it continues"
         )
-    sessions = [line for line in logged if line["type"] == "session"]
-    _check_same(sessions, log, name)
-    about = sessions[-1]
+    about = session.about
+    _check_same(session, name)
     hashes = file_hashes(submission.folder)
     if combined_hash(hashes) != submission.sha256 or submission.sha256 != about["entries"][name]:
         raise InputError(f"{submission.label} has changed since it ran; it needs a plan of its own")
-    lungs = [lung for lung in LUNG_IDS if lung in plan.lungs]
-    runs = _scored(log, name)
     content = {
         "format": schema.FORMAT,
         "kind": "hardware",
@@ -134,20 +123,20 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
         "device": about["device"],
         "operator": about["operator"],
         "notes": about["notes"],
-        "lungs": lungs,
+        "lungs": session.lungs,
         "pips": list(plan.pips),
         "repeats": plan.repeats,
-        **_tables(plan, lungs, runs, logged, name),
+        **_tables(session, name),
         "recording": {
             "sha256": files.sha256(log),
             "bytes": log.stat().st_size,
-            "breaths": sum(line["type"] == "breath" for line in logged),
+            "breaths": len(session.breaths),
         },
         "plan": plan.as_dict(),
-        "control": control(log),
+        "control": control(session),
         "safety": about["safety"],
-        "selftest": _skipped(logged, lungs),
-        "timing": timing(log, name),
+        "selftest": _skipped(session),
+        "timing": timing(session, name),
         "sandbox": about["sandbox"],
         "provenance": {},
         "versions": create.versions(),
@@ -159,72 +148,55 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
     return made
 
 
-def _check_same(sessions: list[dict[str, Any]], log: Path, name: str) -> None:
+def _check_same(session: Session, name: str) -> None:
     """Refuse a log whose sessions were of other devices, calibrations or files of the entry."""
+    log, sessions = session.path, session.of_type("session")
     for key in ("device", "safety", "sandbox"):
-        if any(session[key] != sessions[0][key] for session in sessions):
+        if any(x[key] != sessions[0][key] for x in sessions):
             raise InputError(f"{log}: {key} changed between sessions; a record needs one of it")
-    if any(
-        session["entries"].get(name) != sessions[0]["entries"].get(name) for session in sessions
-    ):
+    if len({x["entries"].get(name) for x in sessions}) > 1:
         raise InputError(f"{log}: the files of {name} changed between sessions")
 
 
-_Cell = tuple[str, float, int]
-
-
-def _scored(log: Path, name: str) -> dict[_Cell, list[BreathLog]]:
-    """Breaths of the complete scored runs of an entry, by lung, PIP and repetition."""
-    runs: dict[_Cell, list[BreathLog]] = {}
-    for breath in breaths(log):
+def _tables(session: Session, name: str) -> dict[str, Any]:
+    """Errors, traces, stops and safety of every cell of an entry."""
+    plan = session.plan
+    runs: dict[tuple[str, float, int], list[BreathLog]] = {}
+    for breath in session.breaths:
         run = breath.run
         if run.entry == name and run.kind == "scored" and breath.complete:
             runs.setdefault((run.lung, run.pip, run.repeat), []).append(breath.log)
-    return runs
-
-
-def _tables(
-    plan: Plan,
-    lungs: list[str],
-    runs: Mapping[_Cell, list[BreathLog]],
-    logged: list[dict[str, Any]],
-    name: str,
-) -> dict[str, Any]:
-    """Errors, traces, stops and safety of every cell."""
     failed = {
         (line["lung"], line["pip"], line["repeat"]): line["reason"]
-        for line in logged
-        if line["type"] == "run"
-        and line["status"] == "failed"
-        and line["entry"] == name
-        and line["kind"] == "scored"
+        for line in session.of_type("run")
+        if (line["status"], line["entry"], line["kind"]) == ("failed", name, "scored")
     }
     errors, pressures, commands = [], [], []
     stops, safe, peaks = [], [], []
-    for lung in lungs:
+    for lung in session.lungs:
         peak, passed = -math.inf, True
         for tables in (errors, pressures, commands):
             tables.append([[] for _ in plan.pips])
         for place, pip in enumerate(plan.pips):
             for repeat in range(1, plan.repeats + 1):
                 cell = {"lung": lung, "pip": pip, "repeat": repeat}
-                run = runs.get((lung, pip, repeat))
-                if run is None:
+                measured_run = runs.get((lung, pip, repeat))
+                if measured_run is None:
                     reason, passed = failed.get((lung, pip, repeat), "stopped"), False
                     stops.append({**cell, "reason": reason[:_REASON]})
                     for tables in (errors, pressures, commands):
                         tables[-1][place].append(None)
                     continue
-                inspired = measured.scored([breath.pressure for breath in run])
-                u_in = measured.scored([breath.u_in for breath in run])
+                inspired = measured.scored([breath.pressure for breath in measured_run])
+                u_in = measured.scored([breath.u_in for breath in measured_run])
                 milli = np.round(1000.0 * inspired)
                 errors[-1][place].append(measured.mean_error(milli / 1000.0, pip))
                 pressures[-1][place].append(
                     [[None if math.isnan(x) else int(x) for x in row] for row in milli]
                 )
                 commands[-1][place].append(np.round(10.0 * u_in).astype(int).tolist())
-                peak = max(peak, *(measured.highest(breath.pressure) for breath in run))
-                passed &= all(measured.is_safe(x.pressure, pip, protocol.DT) for x in run)
+                peak = max(peak, *(measured.highest(breath.pressure) for breath in measured_run))
+                passed &= all(measured.is_safe(x.pressure, pip, protocol.DT) for x in measured_run)
         safe.append(passed)
         peaks.append(round(peak, 3) if math.isfinite(peak) else 0.0)
     return {
@@ -236,27 +208,25 @@ def _tables(
     }
 
 
-def _skipped(logged: list[dict[str, Any]], lungs: list[str]) -> dict[str, list[str]]:
+def _skipped(session: Session) -> dict[str, list[str]]:
     """Parts of the self-test that were left out on each lung, at any of its mountings."""
-    tests = [line for line in logged if line["type"] == "selftest" and line.get("go", True)]
+    tests = [line for line in session.of_type("selftest") if line.get("go", True)]
     return {
         lung: sorted({part for line in tests if line["lung"] == lung for part in line["skipped"]})
-        for lung in lungs
+        for lung in session.lungs
     }
 
 
-def control(log: Path) -> dict[str, Any]:
+def control(session: Session) -> dict[str, Any]:
     """Errors of the PID between the scored runs, by lung, and their drift.
 
     The drift is the slope of a line through them in their order, from the first to the last,
     cmH2O; beside it stands its standard error.
     """
     by_lung: dict[str, list[float]] = {}
-    logged = list(lines(log))
-    complete = complete_runs(logged)
-    for line in logged:
-        ran = line["type"] == "run" and line["entry"] == CONTROL
-        if ran and (line["run"], line["attempt"]) in complete:
+    complete = complete_runs(session.logged)
+    for line in session.of_type("run"):
+        if line["entry"] == CONTROL and (line["run"], line["attempt"]) in complete:
             by_lung.setdefault(line["lung"], []).append(line["error"])
     figures: dict[str, Any] = {}
     for lung, errors in by_lung.items():
@@ -320,14 +290,12 @@ def replay(
     Raises:
         InputError: if there is no such log, or the record is none.
     """
-    log = log_of(log)
-    logged = list(lines(log))
-    plan = plan_of(logged, str(log))
-    everything = breaths(log)
-    _show(everything, rerun, mcap, len(plan.runs))
-    problems = () if record is None else tuple(_differences(record, log, plan, logged))
-    done = len(progress(plan, logged).done)
-    return Replay(len(plan.runs), done, len(everything), timing(log), problems)
+    session = read_session(log)
+    runs, everything = len(session.plan.runs), session.breaths
+    _show(everything, rerun, mcap, runs)
+    problems = () if record is None else tuple(_differences(record, session))
+    done = len(progress(session.plan, session.logged).done)
+    return Replay(runs, done, len(everything), timing(session), problems)
 
 
 def _show(everything: list[LoggedBreath], rerun: str | None, mcap: Path | None, total: int) -> None:
@@ -343,14 +311,15 @@ def _show(everything: list[LoggedBreath], rerun: str | None, mcap: Path | None, 
         written.close()
 
 
-def _differences(path: Path, log: Path, plan: Plan, logged: list[dict[str, Any]]) -> list[str]:
+def _differences(path: Path, session: Session) -> list[str]:
     """Where a record says something else than the log."""
     loaded, problems = _loaded(path), []
-    if files.sha256(log) != loaded.header.recording.sha256:
-        problems.append(f"{log} is not the recording that the record names by its hash")
-    lungs = list(loaded.header.lungs)
-    tables = _tables(plan, lungs, _scored(log, loaded.name), logged, loaded.name)
-    errors = np.array(tables["errors"], float)
+    if files.sha256(session.path) != loaded.header.recording.sha256:
+        problems.append(f"{session.path} is not the recording that the record names by its hash")
+    lungs = [*loaded.header.lungs]
+    if lungs != session.lungs:
+        return [*problems, f"the log is of {', '.join(session.lungs)}"]
+    errors = np.array(_tables(session, loaded.name)["errors"], float)
     for lung, own, said in zip(lungs, errors, loaded.errors, strict=True):
         if own.shape != said.shape or not np.allclose(own, said, 0.0, 1e-3, equal_nan=True):
             problems.append(f"{lung}: the log gives other errors than the record")

@@ -28,8 +28,7 @@ from scipy import stats
 
 from hardware_eval.bench.identity import interval
 from hardware_eval.bench.plan import complete_runs
-from hardware_eval.bench.raw_log import lines, log_of
-from hardware_eval.results.record import plan_of
+from hardware_eval.bench.raw_log import read_session
 from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
@@ -154,7 +153,7 @@ def analyse(logs: Sequence[Path]) -> Trial:
     Raises:
         InputError: if a log holds no plan, is not finished, or is of another trial.
     """
-    measured, simulated, mountings = _tables([log_of(x) for x in logs])
+    measured, simulated, mountings = _tables(logs)
     entries: dict[str, EntryTrial] = {}
     missing: list[str] = []
     for name, errors in measured.items():
@@ -229,34 +228,32 @@ def _tables(logs: Sequence[Path]) -> tuple[dict[str, Floats], dict[str, Floats],
     simulated: dict[str, list[Floats]] = {}
     mountings: list[str] = []
     hashes: dict[str, str] = {}
-    for session, log in enumerate(logs):
-        logged = list(lines(log))
-        plan = plan_of(logged, str(log))
+    for number, log in enumerate(logs, 1):
+        session = read_session(log)
+        log, plan = session.path, session.plan
         plans.append((sorted(plan.entries), plan.pips, plan.repeats, plan.track))
         if plans[-1] != plans[0]:
             raise InputError(
                 f"{log} is of another trial than {logs[0]}: entries, PIPs, repeats or track differ"
             )
-        complete = complete_runs(logged)
+        complete = complete_runs(session.logged)
         ended = {
             (x["entry"], x["lung"], x["pip"], x["repeat"]): x.get("error")
-            for x in logged
-            if x["type"] == "run"
-            and x["kind"] == "scored"
+            for x in session.of_type("run")
+            if x["kind"] == "scored"
             and (x["status"] == "failed" or (x["run"], x["attempt"]) in complete)
         }
         predicted: dict[tuple[str, str, float], float] = {}
-        for line in logged:
-            if line["type"] == "session":
-                for name, digest in line["entries"].items():
-                    if hashes.setdefault(name, digest) != digest:
-                        raise InputError(f"{log}: the files of {name} changed; it is another entry")
-                predicted |= {(e, lung, pip): x for e, lung, pip, x in line.get("simulated", ())}
+        for line in session.of_type("session"):
+            for name, digest in line["entries"].items():
+                if hashes.setdefault(name, digest) != digest:
+                    raise InputError(f"{log}: the files of {name} changed; it is another entry")
+            predicted |= {(e, lung, pip): x for e, lung, pip, x in line.get("simulated", ())}
         left = len(plan.entries) * len(plan.lungs) * len(plan.pips) * plan.repeats - len(ended)
         if left:
             raise InputError(f"{log}: {left} scored runs are left; `run` continues the plan")
         for lung in sorted(plan.lungs):
-            mountings.append(lung if len(logs) == 1 else f"{lung} of session {session + 1}")
+            mountings.append(lung if len(logs) == 1 else f"{lung} of session {number}")
             for name in plan.entries:
                 cells = [
                     [ended[name, lung, pip, k] for k in range(1, plan.repeats + 1)]

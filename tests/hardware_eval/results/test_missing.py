@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from hardware_eval.bench.loop import Operator
 from hardware_eval.bench.plan import Procedure, make_plan
-from hardware_eval.bench.raw_log import RECORDING
+from hardware_eval.bench.raw_log import RECORDING, read_session
 from hardware_eval.results import acceptance, page
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results import record as records
@@ -82,7 +82,7 @@ def read(log: Path) -> HardwareRecord:
 @pytest.fixture(scope="module")
 def whole(done: ev.Evaluation) -> tuple[HardwareRecord, str]:
     """Record and page of the session that lacks nothing."""
-    return read(done.log), page.page(page.read(done.log))
+    return read(done.log), page.page(read_session(done.log))
 
 
 @settings(max_examples=20, phases=[Phase.explicit, Phase.reuse, Phase.generate])
@@ -104,7 +104,7 @@ def test_figures_stay_within_bounds_or_a_word_says_why(
     record_of_all, complete = whole
     folder = tmp_path_factory.mktemp("lacking")
     log = without(done.log, folder, share, cut, unscored, seed)
-    shown = page.page(page.read(log))
+    shown = page.page(read_session(log))
     assert not re.search(r"\bnan\b", shown, re.IGNORECASE)
     assert shown.count("<figure>") == complete.count("<figure>") == len(PIPS)
     try:
@@ -124,7 +124,7 @@ def test_figures_stay_within_bounds_or_a_word_says_why(
     assert left.header.peak_pressure_cmH2O[0] <= record_of_all.header.peak_pressure_cmH2O[0]
     made = records.save(folder, records.hardware_record(log, open_submission("pid_best")))
     assert records.replay(log, record=made).problems == ()
-    told = acceptance.report(page.read(log))
+    told = acceptance.report(read_session(log))
     assert "This is no certification" in told
     assert not re.search(r"\bnan\b", told, re.IGNORECASE)
     figures = json.dumps(analyse([log]).as_dict())

@@ -145,10 +145,13 @@ def _number(value: float) -> float | None:
 #: every lung, and slow enough that a stiff lung under a soft label does not overshoot.
 _PROBES = ((15.0, 1.0, 2.0), (25.0, 1.0, 2.0), (15.0, 3.0, 1.0), (25.0, 0.3, 4.0))
 
-#: Openings of the sweep, %, for :data:`_PUFF` steps each; of a lung with more resistance than this,
-#: cmH2O/(L/s), they are as much smaller and longer, so that no puff comes near the limit of
-#: pressure.
-_SWEEP, _SWEPT_RESISTANCE = (5.0, 10.0, 20.0, 40.0), 20.0
+#: Openings of the sweep, %, for :data:`_PUFF` steps each.
+_SWEEP = (5.0, 10.0, 20.0, 40.0)
+
+#: Resistance up to which openings and P are these, cmH2O/(L/s). Of a lung with more they are as
+#: much smaller, so that no puff comes near the limit of pressure, nor a loop in which P is several
+#: times what the resistance allows, and which rings.
+_MEANT_RESISTANCE = 20.0
 _PUFF = 3
 
 #: Steps at rest before a puff, and with both valves closed after it.
@@ -211,7 +214,10 @@ def programs(lung: str, noise: float = 0.0) -> dict[str, list[Program]]:
         "sensor": [(lambda: lambda step, pressure: (0.0, 1), 34, 10.0)],
         "leak": [(partial(fill_and_close, closed - _STILL_AFTER), held, 30.0)],
         "sweep": [(partial(_puff, u, puff), _LEAD + puff + _STILL, 30.0) for u in (0.0, *openings)],
-        "lung": [(partial(_probe, *probe), protocol.BREATH_STEPS, probe[0]) for probe in _PROBES],
+        "lung": [
+            (partial(_probe, pip, _share(lung) * P, rate), protocol.BREATH_STEPS, pip)
+            for pip, P, rate in _PROBES
+        ],
     }
 
 
@@ -390,9 +396,14 @@ def _puff(u_in: float, steps: int) -> Commands:
     return commands
 
 
+def _share(lung: str) -> float:
+    """Share of openings and gains that suits a labelled lung; see :data:`_MEANT_RESISTANCE`."""
+    return min(1.0, _MEANT_RESISTANCE / parse_lung(lung).R)
+
+
 def _openings(lung: str) -> tuple[tuple[float, ...], int]:
     """Openings of the sweep of a labelled lung, %, and steps of each puff."""
-    scale = min(1.0, _SWEPT_RESISTANCE / parse_lung(lung).R)
+    scale = _share(lung)
     return tuple(scale * opening for opening in _SWEEP), math.ceil(_PUFF / scale)
 
 

@@ -9,8 +9,9 @@ import pytest
 
 from hardware_eval.bench.drive import Driven
 from hardware_eval.bench.identity import identified
-from hardware_eval.bench.selftest import _PROBES, _probe
+from hardware_eval.bench.selftest import programs
 from ventbench.task import protocol
+from ventbench.task.metrics.score import safety_limit
 
 #: Settings of a QuickLung.
 SETTINGS = [(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0)]
@@ -25,9 +26,9 @@ def probed(R: float, C: float, parabolic: bool, noise: float, seed: int) -> list
     A parabolic resistor has its label's R at 1 L/s.
     """
     draw, done = np.random.default_rng(seed), []
-    for pip, P, I in _PROBES:  # noqa: E741 - the field's names
-        commands, volume, rows, u_in, u_out = _probe(pip, P, I), 0.0, [], 0.0, 1
-        for step in range(protocol.BREATH_STEPS):
+    for make, steps, _ in programs(f"R{R:g}C{C:g}")["lung"]:
+        commands, volume, rows, u_in, u_out = make(), 0.0, [], 0.0, 1
+        for step in range(steps):
             for _ in range(FINE):
                 elastic = volume / C
                 if u_out:
@@ -45,6 +46,13 @@ def probed(R: float, C: float, parabolic: bool, noise: float, seed: int) -> list
             u_in = min(u_in, 100.0)
         done.append(Driven(*np.array(rows, float).T, (), False, 0))  # type: ignore[arg-type]
     return done
+
+
+@pytest.mark.parametrize(("R", "C"), SETTINGS)
+def test_no_probe_comes_near_the_limit_of_pressure(R: float, C: float) -> None:
+    pips = [pip for _, _, pip in programs(f"R{R:g}C{C:g}")["lung"]]
+    for pip, probe in zip(pips, probed(R, C, False, 0.3, seed=1), strict=True):
+        assert probe.pressure.max() < safety_limit(pip) - 5.0
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from hardware_eval.bench import dated
 from hardware_eval.bench.drive import Commands, Driven, drive
 from hardware_eval.bench.identity import white_noise
 from hardware_eval.bench.loop import Bench
-from hardware_eval.bench.selftest import Finding, judged
+from hardware_eval.bench.selftest import Finding, judged, unknown
 from hardware_eval.wire.client import Client
 from ventbench.base import VERSION
 from ventbench.base.arrays import Floats
@@ -193,7 +193,7 @@ def _asked(bench: Bench, name: str, question: str) -> list[Finding]:
     """Nothing if a person confirms, else why the step was not taken."""
     if bench.operator.confirm(question):
         return []
-    return [Finding(name, math.nan, False, "not confirmed")]
+    return [unknown(name, "not confirmed")]
 
 
 def _room(bench: Bench) -> list[Finding]:
@@ -202,7 +202,7 @@ def _room(bench: Bench) -> list[Finding]:
         return refused
     read = pressures(bench, _READINGS)
     if not np.isfinite(read).all():
-        return [Finding("room", math.nan, False, "the sensor gives no pressure")]
+        return [unknown("room", "the sensor gives no pressure")]
     mean, noise = float(read.mean()), white_noise(read)
     found = [judged("room", mean, f"{mean:.2f} cmH2O open to the room")]
     if not np.ptp(read):
@@ -219,7 +219,7 @@ def _reference(bench: Bench) -> list[Finding]:
     )
     if not low <= applied <= high:
         text = f"{applied:g} cmH2O tell no slope: apply {low:g} to {high:g}"
-        return [Finding("reference", math.nan, False, text)]
+        return [unknown("reference", text)]
     shown = float(pressures(bench, _READINGS).mean())
     text = f"{shown:.2f} cmH2O where the reference shows {applied:g}"
     found = judged("reference", shown / applied, text)
@@ -247,7 +247,7 @@ def _clicked(bench: Bench, valve: str) -> list[Finding]:
         return refused
     driven = drive(at_open_tube(bench), _ANY_LUNG, _clicks(valve), _PERIOD * _MOVEMENTS, pip=_LIMIT)
     if driven.trips:
-        return [Finding("clicked", math.nan, False, f"{valve}: {driven.trips[0]}")]
+        return [unknown("clicked", f"{valve}: {driven.trips[0]}")]
     answer = bench.operator.number(
         "which valve clicked? 1 inspiratory, 2 expiratory, 3 both, 0 none: "
     )
@@ -285,7 +285,7 @@ def _vent(bench: Bench) -> list[Finding]:
     )
     closed = driven.u_out == 0.0
     if not closed.any():
-        return [Finding("rise", math.nan, False, "; ".join(driven.trips))]
+        return [unknown("rise", "; ".join(driven.trips))]
     before = float(driven.pressure[:_LEAD].mean())
     peak = float(driven.pressure[closed].max())
     text = f"the pressure rose by {peak - before:.1f} cmH2O"

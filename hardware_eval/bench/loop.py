@@ -120,9 +120,7 @@ class BreathLog:
             for name, each in vars(self).items()
             if name not in ("target", "u_out")
         }
-        about = {"run": run.number, "attempt": attempt, "breath": breath, "entry": run.entry}
-        label = {"kind": run.kind, "lung": run.lung, "pip": run.pip, "repeat": run.repeat}
-        return {"type": "breath", **about, **label, **rounded, "u_out": list(self.u_out)}
+        return run.line("breath", attempt, breath=breath, **rounded, u_out=[*self.u_out])
 
     @classmethod
     def of_line(cls, line: Mapping[str, Any]) -> BreathLog:

@@ -74,6 +74,20 @@ class PlannedRun:
     repeat: int  #: repetition, from 1.
     perturbation: str = ""  #: what happens to the tube; empty for nothing.
 
+    def line(self, kind: str, attempt: int, **more: Any) -> dict[str, Any]:
+        """A line of the log about it; ``attempt`` is how often it was begun before."""
+        about = {name: getattr(self, name) for name in _LOGGED}
+        return {"type": kind, "run": self.number, "attempt": attempt, **about, **more}
+
+    @classmethod
+    def of_line(cls, line: Mapping[str, Any]) -> PlannedRun:
+        """The run that a line is about."""
+        return cls(line["run"], *(line[name] for name in _LOGGED))
+
+
+#: What a line of the log tells of its run.
+_LOGGED = ("kind", "entry", "lung", "pip", "repeat")
+
 
 #: Kind, entry, PIP, repetition and perturbation of a run.
 _Case = tuple[Kind, str, float, int, str]

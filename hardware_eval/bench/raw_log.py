@@ -196,9 +196,7 @@ def _breaths(logged: list[dict[str, Any]]) -> list[LoggedBreath]:
     finished = complete_runs(logged)
     return [
         LoggedBreath(
-            PlannedRun(
-                line["run"], line["kind"], line["entry"], line["lung"], line["pip"], line["repeat"]
-            ),
+            PlannedRun.of_line(line),
             line["attempt"],
             line["breath"],
             (line["run"], line["attempt"]) in finished,

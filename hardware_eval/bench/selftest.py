@@ -331,11 +331,16 @@ def judged(name: str, value: float, text: str) -> Finding:
     return Finding(name, value, bool(limit.low - 1e-12 <= value <= limit.high + 1e-12), text)
 
 
+def unknown(name: str, why: str) -> Finding:
+    """What could not be measured is not within its limit."""
+    return Finding(name, math.nan, False, why)
+
+
 def _at_rest(rest: Driven, peep: float | None = None) -> tuple[list[Finding], float]:
     """Findings, and the standard deviation of the noise, cmH2O; PEEP as calibrated, if it was."""
     settled = rest.pressure[len(rest.pressure) // 2 :]
     if not settled.size or not np.isfinite(settled).all():
-        return [Finding("sensor_zero", math.nan, False, "the sensor gives no pressure")], 0.0
+        return [unknown("sensor_zero", "the sensor gives no pressure")], 0.0
     noise = white_noise(settled)
     mean = float(settled.mean())
     return [
@@ -380,7 +385,7 @@ def fill_and_close(filling: int) -> Commands:
 def _closed(held: Driven, lung: str, calibrated: float = 0.0) -> Finding:
     closed, _ = hold(lung, 0.0)
     if len(held.pressure) < closed + 10:
-        return Finding("leak", math.nan, False, "the lung could not be filled")
+        return unknown("leak", "the lung could not be filled")
     allowed = LIMITS["leak"].high + calibrated
     found = leak(held, closed, parse_lung(lung).C, allowed)
     told = f"loses {found.flow:.1f} mL/s at {found.pressure:.1f} cmH2O when closed"
@@ -416,7 +421,7 @@ def _sweep(puffs: Sequence[Driven], noise: float, lung: str) -> list[Finding]:
     openings, steps = _openings(lung)
     whole = [puff.pressure.size == _LEAD + steps + _STILL for puff in puffs]
     if whole != [True] * (1 + len(openings)):
-        return [Finding("valve_sweep", math.nan, False, "the sweep was stopped")]
+        return [unknown("valve_sweep", "the sweep was stopped")]
     rises = [
         float(puff.pressure[_LEAD + 1 :].mean() - puff.pressure[1:_LEAD].mean()) for puff in puffs
     ]
@@ -476,7 +481,7 @@ def span_finding(found: KnownLung, known: KnownLung | None) -> Finding:
     weights = 1.0 / (np.square(found.errors) + np.square(known.errors))
     use = np.isfinite(apart) & np.isfinite(weights)
     if not use.any():
-        return Finding("sensor_span", math.nan, False, "neither R nor C could be measured")
+        return unknown("sensor_span", "neither R nor C could be measured")
     change = float(np.average(apart[use], weights=weights[use]))
     error = float(np.sum(weights[use])) ** -0.5
     beyond = abs(change) - _SIGMAS * error > math.log(LIMITS["sensor_span"].high)

@@ -118,7 +118,7 @@ def _runs(
         except LinkError as error:
             # The device has vented or will: by the vent that follows, or by its watchdog.
             log.append({"type": "event", "what": "link", "message": str(error)})
-            log.append(_run_line(run, attempts[run.number] - 1, "aborted", str(error)))
+            log.append(_ended(run, attempts[run.number] - 1, "aborted", str(error)))
             held_up += 1
             if held_up >= MAX_HELD_UP:
                 raise
@@ -145,7 +145,7 @@ def _runs(
             reason = f"{run.entry} failed on {run.lung} at PIP {run.pip:g}: {result.reason}"
             skipped = [x for x in queue if x.entry == run.entry and x.lung == run.lung]
             for other in skipped:
-                log.append(_run_line(other, attempts.get(other.number, 0), "failed", reason))
+                log.append(_ended(other, attempts.get(other.number, 0), "failed", reason))
             queue = [x for x in queue if x not in skipped]
             bench.operator.tell(f"{reason}; its other runs on this lung are left out")
     return ""
@@ -179,7 +179,7 @@ def _one(
     try:
         controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
     except ControllerFailedError as error:
-        log.append(_run_line(run, attempt, "failed", str(error)))
+        log.append(_ended(run, attempt, "failed", str(error)))
         return RunResult("failed", str(error), (), (), 0, 0)
 
     def write(index: int, breath: BreathLog) -> None:
@@ -206,10 +206,9 @@ def _one(
         bench.operator.tell(trip.alarm)
     if not result.trips and math.isfinite(result.vented_after):
         bench.operator.tell(f"high priority alarm: {result.reason}")
-    line = _run_line(run, attempt, result.status, result.reason)
     log.append(
         {
-            **line,
+            **_ended(run, attempt, result.status, result.reason),
             **{name: getattr(result, name) for name in _COUNTED},
             "error": None if math.isnan(result.error) else result.error,
             "longest_answer": round(result.longest_answer, 6),
@@ -220,10 +219,8 @@ def _one(
     return result
 
 
-def _run_line(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[str, Any]:
-    about = {"run": run.number, "attempt": attempt, "status": status, "reason": reason}
-    label = {"entry": run.entry, "kind": run.kind, "lung": run.lung, "pip": run.pip}
-    return {"type": "run", **about, **label, "repeat": run.repeat}
+def _ended(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[str, Any]:
+    return run.line("run", attempt, status=status, reason=reason)
 
 
 def dry_run(

@@ -119,7 +119,7 @@ class Evaluator:
 
     def partition(self, data: Data) -> Partition:
         """Combine breaths with a predictor that has the parameters of this evaluator."""
-        return make_partition(data, self.training.predictor.names, self.settings)
+        return Partition(data, self.training.predictor.of(data))
 
     def fit(
         self,
@@ -359,15 +359,18 @@ def make_evaluator(
         excluded: mechanisms that cannot act.
         settings: every threshold.
     """
+    predictor = make_partition(data.select(~held_out), names, settings).predictor
 
-    def split(mask: Bools) -> tuple[Partition, Partition]:
-        training, testing = data.select(~mask), data.select(mask)
-        return make_partition(training, names, settings), make_partition(testing, names, settings)
+    def of(mask: Bools) -> Partition:
+        chosen = data.select(mask)
+        return Partition(chosen, predictor.of(chosen))
 
     order = np.cumsum(~held_out)
     folds = [~held_out & (order % 2 == k) for k in range(2)]
-    splits = tuple(split(fold) for fold in folds if fold.any() and not fold.all())
-    return Evaluator(*split(held_out), excluded=excluded, folds=splits, settings=settings)
+    splits = tuple((of(~fold), of(fold)) for fold in folds if fold.any() and not fold.all())
+    return Evaluator(
+        of(~held_out), of(held_out), excluded=excluded, folds=splits, settings=settings
+    )
 
 
 def cross_validated_gain(evaluator: Evaluator, full: FittedModel, reduced: FittedModel) -> Floats:

@@ -31,7 +31,7 @@ import numpy as np
 from scipy import special
 
 from ventbench.base.arrays import Floats
-from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition
+from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.linearised import CONSTANT, EFFORT, OPEN, LinearModel, Term, gaussian
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.events import HALF_SWING
@@ -173,7 +173,7 @@ def in_time(
     terms = of_some_breaths(model, partition, excluded, settings)
     unpenalised = swings(model, partition, [name for name in SWINGS if name not in excluded])
     if "lost_commands" not in excluded:
-        unpenalised += _commands(model, partition, around, settings)
+        unpenalised += _commands(model, partition, around)
     return [*terms, *(with_course(term, settings) for term in unpenalised)]
 
 
@@ -291,9 +291,7 @@ def _likeliest_swing(
     return Term(name, spreads, odds=odds, latent=columns, swing=swing), coefficients
 
 
-def _commands(
-    model: LinearModel, partition: Partition, around: FittedModel, settings: SelectionConfig
-) -> list[Term]:
+def _commands(model: LinearModel, partition: Partition, around: FittedModel) -> list[Term]:
     """Lost and late commands."""
     data, values, terms = partition.data, model.around.values, []
     problem, x, share = replace(around.problem, noise=model.noise), around.minimum.x, 0.1
@@ -304,8 +302,7 @@ def _commands(
         if not missed or ask_for_little(best, data.u_in) <= EXCHANGEABLE:
             break
         share = min(missed / sent, 0.5)  # a valve that waits counts at every sample
-        names = partition.predictor.names
-        reached = make_partition(replace(data, u_in=best.u_in), names, settings).predictor
+        reached = partition.predictor.of(replace(data, u_in=best.u_in))
         column = reached.predict(values)[:, 0] - partition.predictor.predict(values)[:, 0]
         odds = missed * np.log(share) + max(sent - missed, 0.0) * np.log1p(-share)
         odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2 + np.log(len(lags))

@@ -29,6 +29,9 @@ from ventbench.system_id.fit import Fit
 from ventbench.system_id.predictor import Predictor
 from ventbench.system_id.problem import Partition, Problem, free_paths
 
+#: Breaths that are simulated by functions of their own: those of a batch would be mostly idle.
+_FEW = 16
+
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
@@ -194,9 +197,9 @@ def make_partition(
     Args:
         data: the breaths.
         names: paths of the predictor's parameters.
-        settings: give the number of breaths that are simulated at once.
+        settings: give the number of breaths that are simulated at once, unless they are few.
     """
-    return Partition(data, Predictor(data, names, sizes=(settings.data.batch_size,)))
+    return Partition(data, Predictor(data, names, sizes=(_FEW, settings.data.batch_size)))
 
 
 @dataclass(frozen=True, eq=False)

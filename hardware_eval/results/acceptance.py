@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -118,22 +119,17 @@ def report(session: Session) -> str:
     Raises:
         InputError: if no scored run is complete.
     """
-    parts = []
-    for entry in session.plan.entries:
-        for condition, tube in CONDITIONS.items():
-            settings = settings_of(session, entry, tube)
-            if settings:
-                parts.append(_part(entry, condition, settings))
+    parts, missing = [], []
+    for entry, (condition, tube) in product(session.plan.entries, CONDITIONS.items()):
+        if settings := settings_of(session, entry, tube):
+            parts.append(_part(entry, condition, settings))
+        else:
+            lacks = f'{entry} has no run {condition}; `perturb = ["leak"]` in the plan makes them'
+            missing.append(lacks)
     if not parts:
         raise InputError(
             f"{session.path}: no scored run is complete, so there is nothing to report"
         )
-    missing = [
-        f'{entry} has no run {condition}; `perturb = ["leak"]` in the plan makes them'
-        for entry in session.plan.entries
-        for condition, tube in CONDITIONS.items()
-        if not settings_of(session, entry, tube)
-    ]
     about = session.about
     return (
         page_templates("hardware_eval.results")

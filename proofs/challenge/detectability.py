@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from hardware_eval.emulation.cases import Base, Case, Effect
 from proofs.challenge.generators import generator_of
+from ventbench.base.arrays import Floats
 from ventbench.recordings.breaths import Breaths
-
-Floats = NDArray[np.float64]
 
 #: Detection limit, nats over all breaths of a recording. The fifth of the breaths that a diagnosis
 #: holds out would hardly raise the likelihood of a weaker effect by log 100.

@@ -8,10 +8,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from proofs.challenge.judge import CONFIDENT, JudgedCase
+from ventbench.base.arrays import Floats
 
 #: Resamples of the cases for an interval, and bins of equally many cases of a calibration error.
 _RESAMPLES, _BINS = 2000, 10
@@ -70,7 +70,7 @@ def mean(
     values: Sequence[float],
     *,
     most: float | None = None,
-    of: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+    of: Callable[[Floats], Floats] | None = None,
 ) -> Figure:
     """Mean, or another statistic, with the interval that resampled cases give.
 
@@ -91,9 +91,7 @@ def mean(
     return Figure(what, value, goal, len(given), span, met)
 
 
-def interval(
-    values: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-) -> tuple[float, float]:
+def interval(values: Floats, statistic: Callable[[Floats], Floats]) -> tuple[float, float]:
     """95 % interval of a statistic by resampling cases, always with the same random numbers."""
     rng = np.random.default_rng(0)
     drawn = statistic(values[rng.integers(0, len(values), (_RESAMPLES, len(values)))])
@@ -101,7 +99,7 @@ def interval(
     return float(low), float(high)
 
 
-def calibration_error(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def calibration_error(values: Floats) -> Floats:
     """Expected calibration error of resamples: confidence and correctness, ``(m, n, 2)``.
 
     Cases are sorted by confidence into bins of equally many. It is above zero by chance, the more

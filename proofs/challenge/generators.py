@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case
 from proofs.challenge.faults import effects as faults
@@ -16,6 +15,7 @@ from proofs.challenge.first import plan, rig
 from proofs.challenge.questions import DrawnCase, Kind
 from proofs.challenge.stranger import effects as stranger
 from proofs.challenge.stranger import laboratory
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
@@ -32,9 +32,9 @@ class Generator:
     #: records a case; see :func:`~proofs.challenge.first.rig.record`.
     record: Callable[..., Breaths]
     #: responds without noise; see :func:`~proofs.challenge.first.rig.replay`.
-    replay: Callable[..., rig.Floats]
+    replay: Callable[..., Floats]
     #: where in a recording the effects of a case act, ``(n, T)``, or None if everywhere.
-    active: Callable[[Case, Breaths], NDArray[np.bool_] | None] = lambda case, breaths: None
+    active: Callable[[Case, Breaths], Bools | None] = lambda case, breaths: None
     compared: int = 8  #: most breaths by which it is measured how far an effect can be detected.
 
     def draw(

@@ -11,12 +11,12 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from proofs.challenge.contract import UNKNOWN, Answer, place_of
 from proofs.challenge.folder import Withheld
 from proofs.challenge.questions import DrawnCase, Kind
 from proofs.challenge.truth import Concealed, concealed, is_right, true_values
+from ventbench.base.arrays import Bools
 from ventbench.recordings.breaths import Breaths
 
 #: Least probability of the truth that the log score counts, so that no single case decides.
@@ -241,9 +241,7 @@ def _overlap(breaths: Breaths, withheld: Withheld, answer: Answer | None) -> flo
     return 2.0 * both / max(int(true.sum()) + int(told.sum()), 1)
 
 
-def _flags(
-    breaths: Breaths, spans: dict[int, tuple[tuple[float, float], ...]]
-) -> NDArray[np.bool_]:
+def _flags(breaths: Breaths, spans: dict[int, tuple[tuple[float, float], ...]]) -> Bools:
     flags = np.zeros(breaths.time.shape, bool)
     for k, breath in enumerate(breaths.breath_id.tolist()):
         for low, high in spans.get(breath, ()):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case, commitment, encrypt, random_generator
 from proofs.challenge.detectability import log_likelihood_loss
@@ -17,7 +16,7 @@ from proofs.challenge.folder import ChallengeFolder, Withheld, encode_answers
 from proofs.challenge.generators import generator, generator_of
 from proofs.challenge.questions import DrawnCase, Kind
 from ventbench.base import files
-from ventbench.base.arrays import runs
+from ventbench.base.arrays import Bools, runs
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.recordings.breaths import Breaths, write
@@ -32,8 +31,6 @@ _USUAL_ATTEMPTS, _GENTLE_ATTEMPTS, _GENTLER = 10, 10, 0.85
 
 #: One breath in so many is withheld.
 _WITHHELD = 6
-
-Flags = NDArray[np.bool_]
 
 #: Records a case; has the arguments of :func:`~proofs.challenge.first.rig.record`. That of
 #: the case's generator if None.
@@ -141,7 +138,7 @@ def _readings(breaths: Breaths, k: int) -> tuple[float | None, ...]:
     return tuple(None if np.isnan(p) else float(p) for p in breaths.pressure[k])
 
 
-def _intervals(breaths: Breaths, active: Flags) -> dict[int, tuple[tuple[float, float], ...]]:
+def _intervals(breaths: Breaths, active: Bools) -> dict[int, tuple[tuple[float, float], ...]]:
     """Where an effect acts, as intervals of time of the breaths."""
     found = {}
     for number, time, flags in zip(breaths.breath_id, breaths.time, active, strict=True):

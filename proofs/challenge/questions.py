@@ -1,14 +1,20 @@
-"""Questions of a challenge: their kinds, a case of one, and the noise that all sensors have."""
+"""What all generators share: kinds of questions, families of effects, a sensor's noise, a log."""
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_eval.emulation.cases import Case
+from hardware_eval.emulation.cases import Case, Effect, EffectFamily
+from ventbench.base.arrays import Floats, Ints
+from ventbench.recordings.breaths import Breaths, make_breaths
 
 Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked"]
 
@@ -21,9 +27,76 @@ class DrawnCase:
     case: Case
 
 
+@dataclass(frozen=True)
+class Family(EffectFamily):
+    """An effect of a generator that is none of the library's."""
+
+    forms: tuple[str, ...] = ("plain",)
+    #: names of the vocabulary that are right for it, though it is outside the library.
+    names: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()  #: places of the vocabulary that are right for it without a name.
+    #: ends of the share of the breaths that it affects; None for all.
+    share: tuple[float, float] | None = None
+
+
+def read_families(module: str) -> dict[str, Family]:
+    """Effects by name, from ``effects.toml`` beside a module's file."""
+    text = Path(module).with_name("effects.toml").read_text("utf-8")
+    return msgspec.convert(tomllib.loads(text), dict[str, Family])
+
+
+def parameter(effects: Mapping[str, Effect], name: str, key: str, absent: float = 0.0) -> float:
+    """A parameter of one of the effects of a rig, or what stands for it where that is absent."""
+    return effects[name].parameters[key] if name in effects else absent
+
+
+def in_turn(values: tuple, count: int, rng: np.random.Generator) -> list:
+    """At least ``count`` values, each once a round, in a new random order each round."""
+    rounds = count // len(values) + 1
+    return [values[i] for _ in range(rounds) for i in rng.permutation(len(values))]
+
+
+def held_levels(
+    time: Floats, end: float, rng: np.random.Generator, closed: float, highest: float
+) -> Floats:
+    """Relative commands that stand for 0.06 to 0.3 s each, up to an end of inspiration, ``(n, T)``.
+
+    A share ``closed`` of them is 0, the others 0.2 to ``highest``.
+    """
+    levels = np.zeros(time.shape)
+    for row, now in zip(levels, time, strict=True):
+        at = 0.0
+        while at < end:
+            length = rng.uniform(0.06, 0.3)
+            level = 0.0 if rng.uniform() < closed else rng.uniform(0.2, highest)
+            row[(now >= at) & (now < at + length)] = level
+            at += length
+    return levels
+
+
+def logged(
+    case: Case, number: Ints, time: Floats, u_in: Floats, u_out: NDArray[np.int8], pressure: Floats
+) -> Breaths:
+    """Breaths as the log has them, ``(n, T)``, with the label of the case.
+
+    ``number`` counts breaths from 0. A replay may ask for one several times, and takes the
+    pressures alone: ids go on from that of the first.
+    """
+    n = len(number)
+    return make_breaths(
+        number[0] + 1 + np.arange(n),
+        np.full(n, case.lung_R),
+        np.full(n, case.lung_C),
+        time,
+        u_in,
+        u_out,
+        np.round(pressure, 6),
+    )
+
+
 def coloured_noise(
     case: Case, correlation: float, rng: np.random.Generator, shape: tuple[int, ...]
-) -> NDArray[np.float64]:
+) -> Floats:
     """Noise of a sensor, cmH2O: white, and a share that is correlated from sample to sample."""
     white, slow = rng.standard_normal(shape), rng.standard_normal(shape)
     for k in range(1, shape[1]):

@@ -17,10 +17,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, EffectFamily, Strength
-from proofs.challenge.questions import Kind
+from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, Strength
+from proofs.challenge.questions import Kind, in_turn, read_families
+from ventbench.base.arrays import Bools, Ints
 from ventbench.task.lungs import Lung
 
 
@@ -36,41 +36,7 @@ class FaultsCase(Case):
     choice: int = 0  #: seed of which breaths and commands are affected.
 
 
-@dataclass(frozen=True)
-class Family(EffectFamily):
-    """A fault."""
-
-    forms: tuple[str, ...] = ("plain",)
-    #: ends of the share of the breaths that it affects; None for all.
-    share: tuple[float, float] | None = None
-
-
-_COURSES, _BOTH = ("linear", "warm-up"), (1.0, -1.0)
-
-FAULTS: dict[str, Family] = {
-    "saturation": Family("level", 31.0, 24.0),
-    "clock_offset": Family("offset", 0.03, 0.07),
-    "clock_skew": Family("skew", 0.012, 0.03),
-    "lost_commands": Family("share", 0.06, 0.15),
-    "late_commands": Family("share", 0.12, 0.3, ranges=(("delay", (0.06, 0.12)),)),
-    "gain_step": Family("change", 0.08, 0.25, signs=_BOTH),
-    "gain_drift": Family("change", 0.1, 0.3, forms=_COURSES, signs=_BOTH),
-    "zero_step": Family("change", 0.8, 2.0, signs=_BOTH),
-    "sensor_drift": Family("drift", 1.2, 3.0, forms=_COURSES, signs=_BOTH),
-    "resistance_step": Family("change", 0.25, 0.6, signs=_BOTH),
-    "resistance_drift": Family("change", 0.3, 0.6, forms=_COURSES, signs=_BOTH),
-    "compliance_step": Family("change", 0.15, 0.35, signs=_BOTH),
-    "compliance_drift": Family("change", 0.2, 0.4, forms=_COURSES, signs=_BOTH),
-    "intermittent_leak": Family("conductance", 9.0, 22.0, share=(0.2, 0.5)),
-    "disconnection": Family("share", 0.08, 0.25),
-    "relief_leak": Family("opening", 26.0, 19.0, ranges=(("conductance", (20.0, 40.0)),)),
-    "trapped_gas": Family("pressure", 2.0, 5.0),
-    "command_rounding": Family("step", 1.0, 2.0, forms=("nearest", "truncation")),
-    "supply_ripple": Family("amplitude", 0.08, 0.18, ranges=(("frequency", (2.0, 8.0)),)),
-    "circuit_water": Family("amplitude", 0.7, 1.6, ranges=(("frequency", (3.0, 7.0)),)),
-    "secretions": Family("increase", 0.5, 1.2, share=(0.3, 0.6)),
-    "cough": Family("pressure", 5.0, 14.0, share=(0.1, 0.3)),
-}
+FAULTS = read_families(__file__)
 
 #: Faults that act in part of the recording: in some breaths or above a pressure.
 PARTIAL = ("intermittent_leak", "disconnection", "relief_leak", "secretions", "cough")
@@ -95,8 +61,7 @@ _SAMPLING = ((0.03, 84), (0.025, 100), (0.0333, 76))
 def of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[FaultsCase]:
     """Draw cases of a kind."""
     every = tuple(FAULTS)
-    rounds = count // len(every) + 1
-    names = [every[i] for _ in range(rounds) for i in rng.permutation(len(every))]
+    names = in_turn(every, count, rng)
     flip = int(rng.integers(2))
     for k in range(count):
         strength: Strength = ("mild", "strong")[(k + flip) % 2]
@@ -120,7 +85,7 @@ def _effect(
     size = getattr(family, strength) * rng.uniform(1.0 - _VARIATION, 1.0 + _VARIATION)
     if faint:  # a level or an opening is faint where nothing reaches it
         size = 90.0 if family.parameter in ("level", "opening") else _FAINT_SIZE * family.mild
-    if family.signs == _BOTH and rng.uniform() < 0.5:
+    if len(family.signs) > 1 and rng.uniform() < 0.5:
         size = -size
     values = {family.parameter: float(size)}
     values |= {key: float(rng.uniform(*span)) for key, span in family.ranges}
@@ -161,7 +126,7 @@ def _case(effects: tuple[Effect, ...], breaths: int, rng: np.random.Generator) -
     )
 
 
-def affected(case: FaultsCase, effect: Effect, number: NDArray[np.int64]) -> NDArray[np.bool_]:
+def affected(case: FaultsCase, effect: Effect, number: Ints) -> Bools:
     """Which breaths a fault affects, by their numbers from 0, ``(n,)``."""
     share = effect.parameters["share" if effect.name == "disconnection" else "affected"]
     size = max(case.breaths, int(number.max()) + 1)

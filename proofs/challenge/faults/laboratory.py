@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case, Effect
 from proofs.challenge.faults.effects import PARTIAL, FaultsCase, affected
-from proofs.challenge.questions import coloured_noise
-from ventbench.recordings.breaths import Breaths, make_breaths
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from proofs.challenge.questions import coloured_noise, held_levels, logged, parameter
+from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.recordings.breaths import Breaths
 
 #: Takes the number of a sample and the sensor's pressure, ``(n,)``; returns the commands, %.
 Command = Callable[[int, Floats], Floats]
@@ -42,7 +40,7 @@ _SWINGS, _RATTLE, _DEPTH = 0.15, 11.0, 0.5
 class _Faults:
     """Faults of n breaths, resolved to one number or course for each breath."""
 
-    def __init__(self, case: FaultsCase, number: NDArray[np.int64]) -> None:
+    def __init__(self, case: FaultsCase, number: Ints) -> None:
         self.case, self.number = case, number
         self.effects = {effect.name: effect for effect in case.effects}
         self.position = number / max(case.breaths - 1, 1)
@@ -56,8 +54,7 @@ class _Faults:
         }
 
     def value(self, name: str, key: str) -> float:
-        effect = self.effects.get(name)
-        return 0.0 if effect is None else effect.parameters[key]
+        return parameter(self.effects, name, key)
 
     def course(self, quantity: str, key: str = "change") -> Floats:
         """Change of a quantity in each breath: a step, a line, or an exponential warm-up."""
@@ -71,7 +68,7 @@ class _Faults:
             change += drift.parameters["drift" if quantity == "zero" else "change"] * shape
         return change
 
-    def within(self, name: str, time: Floats) -> Flags:
+    def within(self, name: str, time: Floats) -> Bools:
         """Where a fault of some breaths acts, at times of the breath, ``(n,)`` or ``(n, T)``."""
         if name not in self.chosen:
             return np.zeros(time.shape, bool)
@@ -108,14 +105,8 @@ def record(case: Case, rng: np.random.Generator, *, share: float = 1.0) -> Breat
     flow = above / (base.R + case.inspiration / (1e-3 * base.C))
     falls = rng.uniform(0.0, 1.0, n)
     gain, integral = np.exp(rng.uniform(np.log(0.3), np.log(4.0), n)), rng.uniform(3.0, 15.0, n)
-    rise, level = rng.uniform(0.02, 0.25, n), np.zeros((n, samples))
-    for k in range(n):
-        at = 0.0
-        while at < case.inspiration:
-            length = rng.uniform(0.06, 0.3)
-            height = 0.0 if rng.uniform() < 0.2 else rng.uniform(0.2, 1.6)
-            level[k, (time[k] >= at) & (time[k] < at + length)] = height
-            at += length
+    rise = rng.uniform(0.02, 0.25, n)
+    level = held_levels(time, case.inspiration, rng, 0.2, 1.6)
     summed, noise = np.zeros(n), coloured_noise(case, 0.7, rng, time.shape)
 
     def command(k: int, pressure: Floats) -> Floats:
@@ -161,7 +152,7 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
     return simulated.pressure
 
 
-def active(case: Case, breaths: Breaths) -> Flags | None:
+def active(case: Case, breaths: Breaths) -> Bools | None:
     """Samples in which faults act that act in part of the recording, ``(n, T)``; None if none do.
 
     A leak above a pressure acts where the pressure, as recorded, is above it.
@@ -185,7 +176,7 @@ def _run(
     time: Floats,
     u_out: NDArray[np.int8],
     command: Command,
-    number: NDArray[np.int64],
+    number: Ints,
     noise: Floats,
     start: Floats | None = None,
     *,
@@ -208,13 +199,10 @@ def _run(
     fate = np.random.default_rng((case.choice, 2)).uniform(size=size)[number]
     for k in range(samples):
         u_in[:, k] = command(k, history[-1])
-        late = np.zeros(n)
-        if "late_commands" in faults.effects:
-            slow = fate[:, k] < faults.value("late_commands", "share")
-            late = np.where(slow, faults.value("late_commands", "delay"), 0.0)
+        slow = fate[:, k] < faults.value("late_commands", "share")
+        late = np.where(slow, faults.value("late_commands", "delay"), 0.0)
         arrives[:, k] = k * _STEPS + np.round(late / case.interval * _STEPS).astype(int)
-        if "lost_commands" in faults.effects:
-            arrives[fate[:, k] < faults.value("lost_commands", "share"), k] = -1
+        arrives[fate[:, k] < faults.value("lost_commands", "share"), k] = -1
         if k == samples - 1:
             break
         h = (time[:, k + 1] - time[:, k]) / _STEPS
@@ -231,19 +219,8 @@ def _run(
     pressure = _log(faults, np.array(clock).T, np.array(history).T, time, noise)
     if case.step and not exact:
         pressure = case.step * np.round(pressure / case.step)
-    if "saturation" in faults.effects:
-        pressure = np.minimum(pressure, faults.value("saturation", "level"))
-    ones = np.ones(n)
-    return make_breaths(
-        # A replay may ask for a breath several times, and takes the pressures alone.
-        number[0] + 1 + np.arange(n),
-        case.lung_R * ones,
-        case.lung_C * ones,
-        time,
-        u_in,
-        u_out,
-        np.round(pressure, 6),
-    )
+    pressure = np.minimum(pressure, parameter(faults.effects, "saturation", "level", np.inf))
+    return logged(case, number, time, u_in, u_out, pressure)
 
 
 def _moved(faults: _Faults, u: Floats) -> Floats:
@@ -297,12 +274,9 @@ def _step(
         x = np.clip((now - begins) / (0.15 + 0.15 * faults.random[:, 1]), 0.0, 1.0)
         shape = np.where(x < 0.3, x / 0.3, (1.0 - x) / 0.7)
         push = faults.value("cough", "pressure") * shape * faults.within("cough", now)
-    orifice = np.zeros(len(p))
-    if "intermittent_leak" in faults.chosen:
-        size = faults.value("intermittent_leak", "conductance")
-        orifice += size * faults.within("intermittent_leak", now)
-    if "disconnection" in faults.chosen:
-        orifice += _OPEN_TUBE * faults.within("disconnection", now)
+    size = faults.value("intermittent_leak", "conductance")
+    orifice = size * faults.within("intermittent_leak", now)
+    orifice = orifice + _OPEN_TUBE * faults.within("disconnection", now)
     # Conductances at the pressure before: a leak to the room, an outlet to PEEP, a relief valve.
     leak = 1e-3 * orifice / np.sqrt(np.maximum(np.abs(p), _LEAST))
     outlet = np.where((out == 1) & (p > base.peep), 1.0 / base.R_ex, 0.0)

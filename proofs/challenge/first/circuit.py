@@ -12,7 +12,9 @@ from collections.abc import Callable
 import numpy as np
 
 from hardware_eval.emulation.cases import Base
-from proofs.challenge.first.instruments import EffectsByName, Floats, solve_falling
+from proofs.challenge.first.instruments import EffectsByName, argument
+from proofs.challenge.questions import parameter
+from ventbench.base.arrays import Floats
 
 #: Flow at which both forms of turbulence cost the same pressure, L/s.
 _EQUAL_TURBULENCE = 0.7
@@ -103,7 +105,7 @@ class Recoil:
         self.C = 1e-3 * base.C
         stiffening = effects.get("nonlinear_compliance")
         self._form = stiffening.form if stiffening else "linear"
-        self._k = stiffening.parameters["stiffening"] if stiffening else 0.0
+        self._k = parameter(effects, "nonlinear_compliance", "stiffening")
         if self._form == "sigmoid":
             self._width = _sigmoid_width(1.0 / self._k)
             self._share = 1.0 / (1.0 + np.exp(_LOWER_BEND / self._width))
@@ -141,7 +143,7 @@ def _sigmoid_width(capacity: float) -> float:
     def missing(d: float) -> float:
         return -4.0 * d * (1.0 - 1.0 / (1.0 + np.exp(_LOWER_BEND / d)))
 
-    return solve_falling(missing, -capacity, 1.0, 100.0)
+    return argument(missing, -capacity, 1.0, 100.0)
 
 
 class Airway:
@@ -150,15 +152,13 @@ class Airway:
     def __init__(self, effects: EffectsByName, base: Base) -> None:
         self._R = base.R
         turbulent = effects.get("turbulent_resistance")
-        self._K = turbulent.parameters["quadratic"] if turbulent else 0.0
+        self._K = parameter(effects, "turbulent_resistance", "quadratic")
         self._power = 1.0
         if turbulent and turbulent.form == "exponent 1.75":
             self._power = 0.75
             self._K *= _EQUAL_TURBULENCE**0.25
-        direction = effects.get("direction_resistance")
-        self._out = direction.parameters["ratio"] if direction else 1.0
-        by_volume = effects.get("volume_resistance")
-        self._change = by_volume.parameters["change"] if by_volume else 0.0
+        self._out = parameter(effects, "direction_resistance", "ratio", 1.0)
+        self._change = parameter(effects, "volume_resistance", "change")
         self._rest, self._span = 1e-3 * base.C * base.peep, 1e-3 * base.C * 20.0
 
     def resistance(self, volume: Floats) -> Floats | float:
@@ -187,7 +187,7 @@ class Outlets:
         self._orifice = "expiratory_valve_orifice" in effects
         leak = effects.get("leak")
         self._form = leak.form if leak else None
-        self._g = 1e-3 * leak.parameters["conductance"] if leak else 0.0
+        self._g = 1e-3 * parameter(effects, "leak", "conductance")
 
     def __call__(self, p: Floats, opened: Floats) -> tuple[Floats, Floats]:
         """Flow, L/s, and its slope by airway pressure, ``(n,)`` each."""
@@ -227,33 +227,29 @@ class Circuit:
     """
 
     def __init__(self, effects: EffectsByName, base: Base, disturbances: Disturbances) -> None:
-        def parameter(name: str, key: str) -> float:
-            return effects[name].parameters[key] if name in effects else 0.0
-
         self._disturbances = disturbances
         self._recoil = Recoil(effects, base)
         self._airway = Airway(effects, base)
         self._outlets = Outlets(effects, base)
-        self._tau = parameter("valve_lag", "tau")
+        self._tau = parameter(effects, "valve_lag", "tau")
         self._double = "valve_lag" in effects and effects["valve_lag"].form == "two lags"
-        self._drop = parameter("supply_droop", "drop")
-        self._recovery = parameter("supply_droop", "recovery")
+        self._drop = parameter(effects, "supply_droop", "drop")
+        self._recovery = parameter(effects, "supply_droop", "recovery")
         self._subtract = (
             "supply_droop" in effects
             and self._drop
             and (effects["supply_droop"].form == "subtractive")
         )
-        self._tubing = 1e-3 * parameter("circuit_compliance", "compliance")
-        self._mass = parameter("inertance", "inertance")
-        self._stress = parameter("viscoelasticity", "ratio") / self._recoil.C
-        self._relax = parameter("viscoelasticity", "time")
-        self._slow = parameter("sensor_lag", "tau")
+        self._tubing = 1e-3 * parameter(effects, "circuit_compliance", "compliance")
+        self._mass = parameter(effects, "inertance", "inertance")
+        self._stress = parameter(effects, "viscoelasticity", "ratio") / self._recoil.C
+        self._relax = parameter(effects, "viscoelasticity", "time")
+        self._slow = parameter(effects, "sensor_lag", "tau")
         self._second: tuple[float, float] | None = None
         if "second_compartment" in effects:
-            share = effects["second_compartment"].parameters["share"]
-            C2 = share * self._recoil.C
+            C2 = parameter(effects, "second_compartment", "share") * self._recoil.C
             self._recoil.C -= C2
-            self._second = (C2, parameter("second_compartment", "time") / C2)
+            self._second = (C2, parameter(effects, "second_compartment", "time") / C2)
 
     def start(self, pressure: Floats) -> Floats:
         """State at rest at an airway pressure, cmH2O, ``(9, n)``."""

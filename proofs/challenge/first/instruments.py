@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from hardware_eval.emulation.cases import Case, Effect
-from proofs.challenge.questions import coloured_noise
+from proofs.challenge.questions import coloured_noise, parameter
+from ventbench.base.arrays import Floats
 
-Floats = NDArray[np.float64]
 EffectsByName = Mapping[str, Effect]
 
 #: Range over which a bent sensor is right at both ends, cmH2O.
@@ -76,10 +76,10 @@ def _curve(curve: Effect | None) -> tuple[Floats, Floats] | None:
     if curve.form == "library":
         y = x / (1.0 + x * loss / (1.0 - loss))
     elif curve.form == "tanh":
-        a = solve_falling(lambda a: np.tanh(a) / a, 1.0 - loss)
+        a = argument(lambda a: np.tanh(a) / a, 1.0 - loss)
         y = np.tanh(a * x) / a
     elif curve.form == "exponential":
-        a = solve_falling(lambda a: -np.expm1(-a) / a, 1.0 - loss)
+        a = argument(lambda a: -np.expm1(-a) / a, 1.0 - loss)
         y = -np.expm1(-a * x) / a
     elif curve.form == "power law":
         power = 1.0 + np.log10(1.0 - loss)
@@ -89,14 +89,11 @@ def _curve(curve: Effect | None) -> tuple[Floats, Floats] | None:
     return 100.0 * x, 100.0 * y
 
 
-def solve_falling(
+def argument(
     function: Callable[[float], float], value: float, low: float = 1e-6, high: float = 50.0
 ) -> float:
-    """Argument between two at which a falling function has a value, by bisection."""
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if function(middle) > value else (low, middle)
-    return low
+    """Argument between two at which a monotonic function has a value."""
+    return float(brentq(lambda x: function(x) - value, low, high, xtol=1e-14))  # type: ignore[arg-type]
 
 
 class Sensor:
@@ -123,8 +120,7 @@ class Sensor:
             if drift.form == "warming":
                 share = np.expm1(-3.0 * position) / np.expm1(-3.0)
             self._offset = drift.parameters["drift"] * share
-        nonlinearity = effects.get("sensor_nonlinearity")
-        self._bend = 4.0 * nonlinearity.parameters["bend"] if nonlinearity else 0.0
+        self._bend = 4.0 * parameter(effects, "sensor_nonlinearity", "bend")
 
     def read(self, k: int, pressure: Floats) -> Floats:
         """Reading of sample ``k``, cmH2O, ``(n,)``."""

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, draw_base
 from proofs.challenge.first.circuit import READING, Circuit, Disturbances
-from proofs.challenge.first.instruments import Floats, Sensor, Valve
-from ventbench.recordings.breaths import Breaths, make_breaths
+from proofs.challenge.first.instruments import Sensor, Valve
+from proofs.challenge.questions import logged, parameter
+from ventbench.base.arrays import Floats, Ints
+from ventbench.recordings.breaths import Breaths
 
 #: Means of the sampling interval that a breath may have, s.
 INTERVALS = (0.0319, 0.0340)
@@ -39,7 +41,7 @@ class StepGrid:
 
     nodes: Floats  #: ends of the steps, s, ``(n, steps + 1)``.
     #: index of the command that the valve follows in a step, -1 before the first, ``(n, steps)``.
-    command: NDArray[np.int64]
+    command: Ints
     opened: Floats  #: 1 in the steps with an open expiratory valve, ``(n, steps)``.
 
 
@@ -147,7 +149,7 @@ def _run(
     time: Floats,
     u_out: NDArray[np.int8],
     command: Callable[[int, Floats], Floats],
-    number: NDArray[np.int64],
+    number: Ints,
     rng: np.random.Generator,
     steps: int | None = None,
     start: Floats | None = None,
@@ -161,9 +163,8 @@ def _run(
     circuit = Circuit(effects, base, Disturbances(effects, began, rng))
     valve = Valve(effects, base.gain, n)
     sensor = Sensor(case, effects, number / max(case.breaths - 1, 1), rng)
-    delay = effects["valve_delay"].parameters["delay"] if "valve_delay" in effects else 0.0
-    opening = effects.get("exhalation_valve_delay")
-    opening_delay = opening.parameters["opening"] if opening else 0.0
+    delay = parameter(effects, "valve_delay", "delay")
+    opening_delay = parameter(effects, "exhalation_valve_delay", "opening")
     grid = step_grid(time, u_out, delay, opening_delay, steps)
     spread = 0.3 * rng.standard_normal(n)
     state = circuit.start(base.peep + spread if start is None else start)
@@ -181,16 +182,7 @@ def _run(
         for s in range(k * steps, (k + 1) * steps):
             flow = asked[rows, grid.command[:, s]]
             state = circuit.step(state, lengths[:, s], flow, grid.opened[:, s], grid.nodes[:, s])
-    return make_breaths(
-        # A replay may ask for a breath several times, and takes the pressures alone.
-        number[0] + 1 + np.arange(n),
-        np.full(n, case.lung_R),
-        np.full(n, case.lung_C),
-        time,
-        u_in,
-        u_out,
-        np.round(pressure, 6),
-    )
+    return logged(case, number, time, u_in, u_out, pressure)
 
 
 #: The paper's grid of gains.

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, EffectFamily, Strength
-from proofs.challenge.questions import Kind
+from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, Strength
+from proofs.challenge.questions import Kind, in_turn, read_families
 from ventbench.task.lungs import Lung
 
 #: Form of an effect whose parameter means the same as the library's of that name.
@@ -46,132 +46,7 @@ class StrangerCase(Case):
     dead_space: float = 0.03  #: compliance of the circuit that every rig has, mL/cmH2O.
 
 
-@dataclass(frozen=True)
-class Family(EffectFamily):
-    """An effect of the second generator."""
-
-    #: names of the vocabulary that are right for it, though it is outside the library.
-    names: tuple[str, ...] = ()
-    places: tuple[str, ...] = ()  #: places of the vocabulary that are right for it without a name.
-
-
-EFFECTS: dict[str, Family] = {
-    "valve_delay": Family("delay", 0.035, 0.075, (SAME,)),
-    "valve_lag": Family("tau", 0.04, 0.09, (SAME, "second order")),
-    "valve_dead_band": Family("width", 1.5, 3.5, ("spool overlap", "cracking")),
-    "valve_curve": Family(
-        "loss", 0.2, 0.5, ("rational saturation", "equal percentage", "quick opening")
-    ),
-    "valve_hysteresis": Family("width", 2.0, 5.0, ("backlash", "Bouc-Wen")),
-    "command_rounding": Family("amount", 1.0, 1.0, ("truncation",)),
-    "supply_droop": Family(
-        "drop", 0.1, 0.28, ("regulator and reservoir",), (("recovery", (0.6, 1.6)),)
-    ),
-    "leak": Family("conductance", 7.0, 18.0, (SAME, "laminar", "exponent 0.7")),
-    "circuit_compliance": Family("compliance", 1.2, 2.8, (SAME,)),
-    "inertance": Family("inertance", 0.06, 0.13, (SAME,), (("circuit", (0.1, 1.0)),)),
-    "turbulent_resistance": Family("quadratic", 4.0, 10.0, (SAME, "Blasius")),
-    "nonlinear_compliance": Family("capacity", 40.0, 24.0, ("Salazar-Knowles", "Venegas")),
-    "viscoelasticity": Family("ratio", 0.25, 0.65, (SAME,), (("time", (0.4, 2.0)),)),
-    "sensor_lag": Family("tau", 0.045, 0.11, (SAME, "second order")),
-    "sensor_drift": Family("drift", 1.2, 2.8, (SAME, "warming"), signs=(1.0, -1.0)),
-    "exhalation_valve_delay": Family("opening", 0.045, 0.09, (SAME, "slow opening")),
-    "patient_effort": Family(
-        "amplitude", 2.0, 5.0, ("half sine", "exponential"), (("duration", (0.5, 1.1)),)
-    ),
-    "volume_resistance": Family(
-        "capacity",
-        18.0,
-        8.0,
-        ("conductance grows with volume",),
-        inside=False,
-        places=("airway",),
-    ),
-    "direction_resistance": Family(
-        "ratio",
-        1.6,
-        2.1,
-        ("expiratory resistance",),
-        inside=False,
-        places=("airway",),
-    ),
-    "cardiogenic": Family(
-        "amplitude",
-        0.6,
-        1.2,
-        ("two harmonics",),
-        (("frequency", (0.9, 1.8)),),
-        inside=False,
-        places=("muscles",),
-    ),
-    "pulsating_supply": Family(
-        "amplitude",
-        0.12,
-        0.18,
-        ("piston",),
-        (("frequency", (2.5, 7.0)),),
-        inside=False,
-        places=("supply",),
-        names=("supply_ripple",),
-    ),
-    "second_compartment": Family(
-        "share",
-        0.25,
-        0.45,
-        ("Otis",),
-        (("time", (0.4, 1.6)),),
-        inside=False,
-        places=("lung",),
-        names=("viscoelasticity",),
-    ),
-    "sensor_nonlinearity": Family(
-        "bend",
-        0.9,
-        1.4,
-        ("bow",),
-        signs=(1.0, -1.0),
-        inside=False,
-        places=("pressure_sensor",),
-        names=("sensor_curve",),
-    ),
-    "expiratory_valve_orifice": Family(
-        "amount",
-        1.0,
-        1.0,
-        ("orifice",),
-        inside=False,
-        places=("expiratory_valve",),
-    ),
-    "supply_back_pressure": Family(
-        "supply",
-        120.0,
-        70.0,
-        ("incompressible valve",),
-        inside=False,
-        places=("supply", "inspiratory_valve", "circuit"),
-        names=("supply_pressure",),
-    ),
-    "compliance_change": Family(
-        "change",
-        0.2,
-        0.4,
-        ("recruitment",),
-        signs=(1.0, -1.0),
-        inside=False,
-        places=("lung",),
-        names=("compliance_drift",),
-    ),
-    "resistance_change": Family(
-        "change",
-        0.3,
-        0.6,
-        ("secretions",),
-        signs=(1.0, -1.0),
-        inside=False,
-        places=("airway",),
-        names=("resistance_drift",),
-    ),
-}
+EFFECTS = read_families(__file__)
 
 INSIDE: tuple[str, ...] = tuple(name for name, family in EFFECTS.items() if family.inside)
 OUTSIDE: tuple[str, ...] = tuple(name for name, family in EFFECTS.items() if not family.inside)
@@ -212,9 +87,8 @@ _SAMPLING = ((0.0319, 80), (0.0340, 80), (0.0250, 100))
 
 def of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[StrangerCase]:
     """Draw cases of a kind."""
-    lungs = [SETTINGS[i] for _ in range(count // 9 + 1) for i in rng.permutation(9)]
-    pool = OUTSIDE if kind == "outside" else INSIDE
-    names = [pool[i] for _ in range(count // len(pool) + 1) for i in rng.permutation(len(pool))]
+    lungs = in_turn(SETTINGS, count, rng)
+    names = in_turn(OUTSIDE if kind == "outside" else INSIDE, count, rng)
     flip = int(rng.integers(2))
     for k in range(count):
         strength: Strength = ("mild", "strong")[(k + flip) % 2]

@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case
-from proofs.challenge.questions import coloured_noise
+from proofs.challenge.questions import coloured_noise, held_levels, logged, parameter
 from proofs.challenge.stranger.effects import StrangerCase
-from proofs.challenge.stranger.rig import Floats, Rig
-from ventbench.recordings.breaths import Breaths, make_breaths
+from proofs.challenge.stranger.rig import Rig
+from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.recordings.breaths import Breaths
 
 #: Takes the number of a sample, what the sensors show and which breaths are due, ``(n,)``; returns
 #: their readings and commands.
-Command = Callable[[int, Floats, NDArray[np.bool_]], tuple[Floats, Floats]]
+Command = Callable[[int, Floats, Bools], tuple[Floats, Floats]]
 
 #: Step of the integration of recordings and of noise-free replays, s.
 STEP, REPLAY_STEP = 1e-4, 1e-3
@@ -32,9 +33,6 @@ _OUTLIER = (8.0, 40.0)
 
 #: Share of breaths in which a patient tries to breathe, and the scatter of these efforts.
 _EFFORTS, _EFFORT_SCATTER = 0.8, 0.3
-
-#: Time for which a command of an exploring breath stands, s.
-_HOLD = (0.06, 0.3)
 
 
 def record(
@@ -66,7 +64,7 @@ def record(
     summed = np.zeros(n)
     most = min(100.0, _FLOW_LIMIT / (case.base.R * case.base.gain * 1e-3))
 
-    def command(k: int, shown: Floats, due: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    def command(k: int, shown: Floats, due: Bools) -> tuple[Floats, Floats]:
         """Reading and command at sample k, for the breaths that are due."""
         nonlocal summed
         measured = shown + noise[:, k]
@@ -94,19 +92,10 @@ def record(
     blank = rng.uniform(size=pressure.shape) < case.missing
     blank[:, 0] = False
     pressure = np.where(blank, np.nan, pressure)
-    logged = time
+    clock = time
     if case.clock_step > 0:
-        logged = np.round(time / case.clock_step) * case.clock_step
-    ones = np.ones(n)
-    return make_breaths(
-        np.arange(1, n + 1),
-        case.lung_R * ones,
-        case.lung_C * ones,
-        np.round(logged, 6),
-        np.round(u_in, 6),
-        u_out,
-        np.round(pressure, 6),
-    )
+        clock = np.round(time / case.clock_step) * case.clock_step
+    return logged(case, np.arange(n), np.round(clock, 6), np.round(u_in, 6), u_out, pressure)
 
 
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
@@ -138,7 +127,7 @@ def _run(
     time: Floats,
     u_out: NDArray[np.int8],
     command: Command,
-    number: NDArray[np.int64],
+    number: Ints,
     step: float,
     start: Floats | None = None,
 ) -> tuple[Floats, Floats]:
@@ -157,7 +146,7 @@ def _run(
     if "patient_effort" in effects:
         acts = rng.uniform(size=m) < _EFFORTS
         scatter = np.clip(1.0 + _EFFORT_SCATTER * rng.standard_normal(m), 0.3, 1.8)
-        size = np.where(acts, effects["patient_effort"].parameters["amplitude"] * scatter, 0.0)
+        size = np.where(acts, parameter(effects, "patient_effort", "amplitude") * scatter, 0.0)
     rig = Rig(
         case.base,
         effects,
@@ -169,7 +158,7 @@ def _run(
     gains = 1.0 + case.gain_scatter * rng.standard_normal(m)[which]
     spread = 0.2 * rng.standard_normal(m)[which]
     rig.start(case.base.peep + spread if start is None else start)
-    delay = effects["valve_delay"].parameters["delay"] if "valve_delay" in effects else 0.0
+    delay = parameter(effects, "valve_delay", "delay")
     late = effects.get("exhalation_valve_delay")
     opening = late.parameters["opening"] if late is not None and late.form != "slow opening" else 0
     pressure, u_in = np.zeros((n, samples)), np.zeros((n, samples))
@@ -198,9 +187,9 @@ def _run(
     return pressure, u_in
 
 
-def _events(at: NDArray[np.int64], count: int) -> dict[int, list[tuple[int, NDArray[np.int64]]]]:
+def _events(at: Ints, count: int) -> dict[int, list[tuple[int, Ints]]]:
     """Samples by the step at which they take place, each with its breaths; ``at`` is ``(n, T)``."""
-    events: dict[int, list[tuple[int, NDArray[np.int64]]]] = {}
+    events: dict[int, list[tuple[int, Ints]]] = {}
     for column in range(at.shape[1]):
         for step in np.unique(at[:, column]):
             if step <= count:
@@ -212,16 +201,8 @@ def _events(at: NDArray[np.int64], count: int) -> dict[int, list[tuple[int, NDAr
 def _explored(case: StrangerCase, rng: np.random.Generator, time: Floats, share: float) -> Floats:
     """Commands of exploring breaths: levels of random lengths around what the lung takes, %."""
     assert case.base is not None
-    n, samples = time.shape
     # At this flow the lung fills by 20 cmH2O in the time, and its resistance takes 20 at most.
     base = case.base
     flow = min(20.0 * base.C * 1e-3 / case.inspiration, 20.0 / base.R) / (base.gain * 1e-3)
-    values = np.zeros((n, samples))
-    for b in range(n):
-        at = 0.0
-        while at < case.inspiration:
-            length = rng.uniform(*_HOLD)
-            level = 0.0 if rng.uniform() < 0.25 else share * flow * rng.uniform(0.2, 2.0)
-            values[b, (time[b] >= at) & (time[b] < at + length)] = level
-            at += length
-    return np.clip(values, 0.0, 100.0)
+    levels = held_levels(time, case.inspiration, rng, 0.25, 2.0)
+    return np.clip(share * flow * levels, 0.0, 100.0)

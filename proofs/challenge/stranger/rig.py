@@ -12,11 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Base, Effect
-
-Floats = NDArray[np.float64]
+from proofs.challenge.questions import parameter
+from ventbench.base.arrays import Bools, Floats
 
 #: Flow at which a laminar resistance and another form of friction have the same drop, L/s.
 _FLOW = 0.6
@@ -63,10 +62,8 @@ class Rig:
         self.R = base.R * (1.0 + change_R)
         self.Rex = np.full(n, base.R_ex)
         self.circuit = self.dead_space * 1e-3
-        if "circuit_compliance" in self.effects:
-            self.circuit += self._strength("circuit_compliance", "compliance") * 1e-3
-        if "inertance" in self.effects:
-            self.circuit += self._strength("inertance", "circuit") * 1e-3
+        self.circuit += self._strength("circuit_compliance", "compliance") * 1e-3
+        self.circuit += self._strength("inertance", "circuit") * 1e-3
         self.inertia = self._strength("inertance", "inertance")
         self.gain = base.gain * 1e-3
 
@@ -86,7 +83,7 @@ class Rig:
         self.outlet = np.zeros(n)
         self.reading, self.filter = self.p.copy(), self.p.copy()
 
-    def steady_command(self, u: Floats, due: NDArray[np.bool_]) -> Floats:
+    def steady_command(self, u: Floats, due: Bools) -> Floats:
         """Opening of the inspiratory valve that commands ask for, %; the due breaths move on."""
         effects = self.effects
         if "command_rounding" in effects:
@@ -169,7 +166,7 @@ class Rig:
         return y
 
     def _strength(self, name: str, key: str) -> float:
-        return self.effects[name].parameters[key] if name in self.effects else 0.0
+        return parameter(self.effects, name, key)
 
     def _inflow(self, opening: Floats, time: float, h: float) -> Floats:
         """Flow out of the inspiratory valve, L/s."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +15,9 @@ from ventbench.base.errors import InputError
 from ventbench.recordings.bad_samples import UNUSABLE, clean, left_out
 from ventbench.recordings.breaths import Breaths, arranged, join
 from ventbench.recordings.roles import few_breaths, findings
-from ventbench.recordings.scan import Progress, Scanned, scan
-from ventbench.recordings.schema import ProblemLog, RecordingError, RecordingProblem
-from ventbench.recordings.sources import Source, locate, open_source
+from ventbench.recordings.scan import ProblemLog, Progress, Scanned, scan
+from ventbench.recordings.schema import RecordingError, RecordingProblem
+from ventbench.recordings.sources import Source, open_source
 from ventbench.task.lungs import Lung
 
 if TYPE_CHECKING:
@@ -307,7 +306,7 @@ def role_problems(source: Source, scanned: Scanned) -> dict[str, tuple[Recording
             if samples.column in unusable
             else _ADVICE
         )
-        places = sorted(x for x, _ in locate(source, samples.rows[:6].tolist()).values())
+        places = sorted(x for x, _ in source.locate(samples.rows[:6].tolist()).values())
         message = samples.what(f"{source.place}s", places)
         problem = RecordingProblem(file, message, advice, column=samples.column)
         problems[level] = (problem, *problems[level])
@@ -340,14 +339,14 @@ def check_lengths(scanned: Scanned, log: ProblemLog, *, pad: bool) -> None:
                 f"would make {size} samples of {lengths.sum()}"
             )
             advice = "Put breaths of very different lengths into files of their own."
-            log.add(scanned.starts[at], "breath_id", message, advice, values=ids[at])
+            log.add(scanned.starts[at], "breath_id", message, advice, ids[at])
         return
     usual = int(np.bincount(lengths).argmax())
     for length in np.unique(lengths[lengths != usual]):
         at = np.flatnonzero(lengths == length)
         message = f"breath {{value}} has {length} samples, the others have {usual}"
         advice = "Fix the breath, or pass --pad to fill short ones."
-        log.add(scanned.starts[at], "breath_id", message, advice, values=ids[at])
+        log.add(scanned.starts[at], "breath_id", message, advice, ids[at])
 
 
 def check_inferable(scanned: Scanned, log: ProblemLog) -> None:
@@ -358,7 +357,7 @@ def check_inferable(scanned: Scanned, log: ProblemLog) -> None:
             "breath of the file has times, and u_out does not switch from 0 to 1 in this one"
         )
         advice, first = "Fill in time_step, in seconds.", scanned.starts[at : at + 1]
-        log.add(first, "time_step", message, advice, values=np.array([np.nan]))
+        log.add(first, "time_step", message, advice, np.array([np.nan]))
 
 
 #: Environment variable that names the folder of public recordings.
@@ -410,12 +409,9 @@ def load(
             return _joined((first, *further), clip, missing, progress)
         path = first
     source = open_source(path)
-    log = ProblemLog(source.file)
-    scanned = scan(source, log, clip=clip, missing=missing, progress=progress)
-    check_lengths(scanned, log, pad=pad)
-    check_inferable(scanned, log)
-    log.raise_problems(partial(locate, source), source.place)
-    notes = _report(source, log, scanned).notes()
+    log, scanned = _scanned(source, pad=pad, clip=clip, missing=missing, progress=progress)
+    log.raise_problems()
+    notes = _report(log, scanned).notes()
     breaths = _assemble(scanned, source.file)
     file = None if source.kind == "table" else source.file
     return replace(breaths, source=file, sha256=source.sha256, notes=notes)
@@ -477,13 +473,11 @@ def check(
         without pressure, or whose columns are surely not what they are called, is reported as a
         problem, though `load` takes it.
     """
-    log = ProblemLog(str(path))
     source: Source | None = None
+    options: dict[str, Any] = {"clip": clip, "missing": missing, "progress": progress}
     try:
         source = open_source(path)
-        scanned = scan(source, log, clip=clip, missing=missing, keep=False, progress=progress)
-        check_lengths(scanned, log, pad=pad)
-        check_inferable(scanned, log)
+        log, scanned = _scanned(source, pad=pad, keep=False, **options)
     except RecordingError as error:
         kind = source.kind if source else None
         warnings = source.warnings if source else ()
@@ -495,7 +489,7 @@ def check(
             warnings=warnings,
             warning_count=len(warnings),
         )
-    report = _report(source, log, scanned)
+    report = _report(log, scanned)
     if not report.ok:
         return report
     if report.blank_pressures == report.rows:
@@ -508,18 +502,25 @@ def check(
     return replace(report, problems=refused, problem_count=len(refused), suspicious=suspicious)
 
 
-def _report(source: Source, log: ProblemLog, scanned: Scanned) -> RecordingReport:
-    find = partial(locate, source)
-    sound = log.counts["problem"] == 0
-    roles = role_problems(source, scanned) if sound else {}
-    warnings = source.warnings + log.listed("warning", find, source.place)
+def _scanned(source: Source, *, pad: bool, **options: Any) -> tuple[ProblemLog, Scanned]:
+    """Read a file, and check each row and the whole."""
+    log = ProblemLog(source)
+    scanned = scan(log, **options)
+    check_lengths(scanned, log, pad=pad)
+    check_inferable(scanned, log)
+    return log, scanned
+
+
+def _report(log: ProblemLog, scanned: Scanned) -> RecordingReport:
+    source = log.source
+    roles = {} if log.counts["problem"] else role_problems(source, scanned)
     return RecordingReport(
         source.file,
         source.kind,
         source.sha256,
-        log.listed("problem", find, source.place),
+        log.listed("problem"),
         log.counts["problem"],
-        warnings,
+        source.warnings + log.listed("warning"),
         len(source.warnings) + log.counts["warning"],
         roles.get("refused", ()) + roles.get("suspicious", ()),
         **describe(scanned),

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
@@ -97,7 +99,7 @@ class Saturation:
 
 
 def breath_figures(
-    time: Floats, samples: Mapping[str, np.ndarray], starts: Ints
+    time: Floats, samples: Mapping[str, NDArray[Any]], starts: Ints
 ) -> dict[str, Floats]:
     """Reduce breaths to the numbers that :func:`findings` and :func:`saturations` judge.
 
@@ -156,6 +158,13 @@ def _missing(time: Floats, starts: Ints, breath: Ints) -> Floats:
     return np.add.reduceat(jumps, starts)
 
 
+def _integral(time: Floats, rate: Floats, starts: Ints, breath: Ints) -> Floats:
+    """Integral of a rate, which ends at each sample, from the start of each breath, ``(m,)``."""
+    same = np.diff(breath, prepend=-1) == 0
+    total = np.cumsum(np.where(same, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0) * rate)
+    return total - total[starts][breath]
+
+
 #: Breaths whose commands may stand beside a pressure: its own, the one before, the one after.
 _SHIFTS = (0, -1, 1)
 
@@ -166,9 +175,7 @@ def _commands_of(
     """Cross products of p = a u + b V + c over inspirations, with the commands of three breaths."""
     within = np.arange(len(time)) - starts[breath]
     lengths = np.diff(starts, append=len(time))
-    dt = np.where(within > 0, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0)
-    volume = np.cumsum(np.nan_to_num(u_in) * dt)
-    volume -= volume[starts][breath]
+    volume = _integral(time, np.nan_to_num(u_in), starts, breath)
     products = {}
     for shift in _SHIFTS:
         neighbour = np.clip(breath + shift, 0, len(starts) - 1)
@@ -234,10 +241,7 @@ def _regression(
     """
     finite = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
     q = np.where(finite, flow, 0.0)
-    same = np.diff(breath, prepend=-1) == 0
-    dt = np.where(same, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0)
-    volume = np.cumsum(0.5 * dt * (q + np.roll(q, 1)))
-    volume -= volume[starts][breath]
+    volume = _integral(time, 0.5 * (q + np.roll(q, 1)), starts, breath)
     columns = [q, volume, np.ones(len(q)), pressure]
     figures = {"flow_products": _cross_products(columns, finite, starts)}
     spread = _covariances(figures["flow_products"])
@@ -292,7 +296,6 @@ def findings(
     Takes figures of k breaths, from :func:`breath_figures`, their mean sampling intervals, s, NaN
     if unknown, and labels, cmH2O/(L/s) and mL/cmH2O, ``(k,)`` each.
     """
-    collected: list[Finding] = []
     low, high = -figures["pressure_low"], figures["pressure_high"]
     if not np.isfinite(high).any():
         return ()
@@ -304,7 +307,7 @@ def findings(
         )
         advice = "Say which column is the pressure with --map NAME=pressure."
         return (Finding("pressure", message, advice, "refused", float(np.nanmedian(high))),)
-    collected += _times(interval)
+    collected = [*_times(interval)]
     if _agree(figures.get("correlation", np.zeros(0)), _OPPOSITE):
         message = "flow goes out while pressure is high, so it is counted from the patient"
         collected.append(
@@ -366,29 +369,29 @@ def _agree(values: Floats, limit: float) -> bool:
     return len(finite) > 0 and bool((finite < limit).mean() >= _MOST)
 
 
-def _times(interval: Floats) -> list[Finding]:
+def _times(interval: Floats) -> Iterator[Finding]:
     if not np.isfinite(interval).any():
-        return []
+        return
     median = float(np.nanmedian(interval))
     if _INTERVALS[0] * 0.99 <= median <= _INTERVALS[1] * 1.01:
-        return []
+        return
     message = f"the median sampling interval is {median:g} s"
     unit = "ms" if median > _INTERVALS[1] else "min"
     advice = f"Rates are 20 to 1000 Hz: pass --time-unit {unit} (or --rate) to "
     level = "refused" if median > SLOW else "suspicious"
-    return [Finding("time_step", message, f"{advice}`ventbench data import`.", level, median)]
+    yield Finding("time_step", message, f"{advice}`ventbench data import`.", level, median)
 
 
-def _volumes(figures: Mapping[str, Floats]) -> list[Finding]:
+def _volumes(figures: Mapping[str, Floats]) -> Iterator[Finding]:
     """Volume against the integral of flow: by a unit, or by any other factor."""
     ratio = figures.get("volume_ratio", np.zeros(0))
     ratio = ratio[figures.get("volume_correlation", ratio) > _OF_ONE_LUNG]
     if len(ratio) < 0.5 * len(figures["inspiration"]) or len(ratio) == 0:
-        return []
+        return
     factor = float(np.median(ratio))
     apart = max(factor, 1.0 / factor)
     if apart < _CONTRADICTS:
-        return []
+        return
     units = [
         f"--{role}-unit {unit}"
         for role, sense in (("flow", 1.0), ("volume", -1.0))
@@ -405,10 +408,10 @@ def _volumes(figures: Mapping[str, Floats]) -> list[Finding]:
     )
     advice = "Say which is wrong: --map NAME=unused leaves it out, "
     advice += f"{' or '.join(units) or 'a unit such as --flow-unit L/min'} corrects it."
-    return [Finding("volume", message, advice, "refused", factor)]
+    yield Finding("volume", message, advice, "refused", factor)
 
 
-def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding]:
+def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> Iterator[Finding]:
     """Pressures that follow the commands of the breath before, or after, by far better."""
     residual = dict.fromkeys(_SHIFTS, 0.0)
     rows = dict.fromkeys(_SHIFTS, 0.0)
@@ -419,66 +422,62 @@ def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Find
             residual[shift] += max(float(A[3, 3] - A[:3, 3] @ solved), 0.0)
             rows[shift] += A[2, 2]
     if min(rows.values()) < _NUMBERED:
-        return []
+        return
     variance = {shift: residual[shift] / rows[shift] for shift in _SHIFTS}
     best = min(variance, key=lambda shift: variance[shift])
     if best == 0 or variance[best] > _FOLLOWS * variance[0] or variance[0] < _MOVES**2:
-        return []
+        return
     which = "before" if best < 0 else "after"
     message = (
         f"pressures follow the commands of the breath {which} (to {variance[best] ** 0.5:.2g} "
         f"cmH2O, those of their own to {variance[0] ** 0.5:.2g}), so their numbers are off by one"
     )
     advice = "Put the pressures of each breath beside its own commands."
-    return [Finding("breath_id", message, advice, "refused", float(best))]
+    yield Finding("breath_id", message, advice, "refused", float(best))
 
 
-def _commands(figures: Mapping[str, Floats]) -> list[Finding]:
+def _commands(figures: Mapping[str, Floats]) -> Iterator[Finding]:
     largest = float(figures["u_in"].max())
+    inside, outside = figures["u_in_inside"], figures["u_in_outside"]
     if 0.0 < largest <= 1.0:
         message = f"u_in is {largest:.3g} % at most, so it looks like 0 to 1"
-        return [
-            Finding(
-                "u_in", message, "Pass --u-in-unit 1 to `ventbench data import`.", value=largest
-            )
-        ]
-    inside, outside = figures["u_in_inside"], figures["u_in_outside"]
-    if largest > 0.0 and _agree(inside - outside, 0.0):
+        advice = "Pass --u-in-unit 1 to `ventbench data import`."
+        yield Finding("u_in", message, advice, value=largest)
+    elif largest > 0.0 and _agree(inside - outside, 0.0):
         message = "u_in is larger while the expiratory valve is open than in inspiration"
         advice = "Say which column is the inspiratory valve with --map NAME=u_in, or pass "
-        return [Finding("u_in", message, f"{advice}--invert u_in if 100 % is shut.")]
-    return []
+        yield Finding("u_in", message, f"{advice}--invert u_in if 100 % is shut.")
 
 
 def _phases(
     figures: Mapping[str, Floats], low: Floats, spans: Floats, moves: Bools
-) -> list[Finding]:
+) -> Iterator[Finding]:
     share = float(np.nanmedian(figures["inspiration"]))
     height = _ratio(figures["end"] - low, spans)[moves]
     if _agree(-height, -_PEAK):
         message = "breaths end at their highest pressure, so their number changes at expiration"
-        return [Finding("breath_id", message, "Pass --split-breaths to `ventbench data import`.")]
-    if _INSPIRATION[0] <= share <= _INSPIRATION[1]:
-        return []
-    message = f"inspiration (u_out = 0) is {100 * share:.3g} % of a breath; 10 to 70 % are usual"
-    advice = "Pass --split-breaths, or say which column is the valve with --map NAME=u_out."
-    return [Finding("u_out", message, advice, value=share)]
+        yield Finding("breath_id", message, "Pass --split-breaths to `ventbench data import`.")
+    elif not _INSPIRATION[0] <= share <= _INSPIRATION[1]:
+        message = (
+            f"inspiration (u_out = 0) is {100 * share:.3g} % of a breath; 10 to 70 % are usual"
+        )
+        advice = "Pass --split-breaths, or say which column is the valve with --map NAME=u_out."
+        yield Finding("u_out", message, advice, value=share)
 
 
-def _pressures(peep: float, pip: float) -> list[Finding]:
+def _pressures(peep: float, pip: float) -> Iterator[Finding]:
     if _PEEP[0] <= peep <= _PEEP[1] and _PIP[0] <= pip <= _PIP[1]:
-        return []
+        return
     message = f"PEEP {peep:.2g} and PIP {pip:.3g} cmH2O (medians) are no ventilator's"
     unit = "kPa" if pip < _PIP[0] else "Pa"
     advice = f"If the unit is another one, pass such as --pressure-unit {unit} to "
-    return [Finding("pressure", message, f"{advice}`ventbench data import`.", value=pip)]
+    yield Finding("pressure", message, f"{advice}`ventbench data import`.", value=pip)
 
 
-def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding]:
+def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> Iterator[Finding]:
     """Labels whose R and C are exchanged, by a regression of pressure on flow and volume."""
-    collected = []
     if "flow_products" not in figures:
-        return []
+        return
     for labelled_R, labelled_C, same_lung in _by_label(R, C):
         A = figures["flow_products"][same_lung].sum(axis=0)[_PLACE]
         if A[0, 0] == 0.0 or np.linalg.matrix_rank(A[:3, :3]) < 3:
@@ -496,8 +495,7 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
                 f"and flow ask for R {1000.0 * r:.3g} and C {1.0 / e:.3g}"
             )
             advice = f"Pass --lung R{labelled_C:g}C{labelled_R:g} to `ventbench data import`."
-            collected.append(Finding("R", message, advice, value=float(labelled_R)))
-    return collected
+            yield Finding("R", message, advice, value=float(labelled_R))
 
 
 def _by_label(R: Floats, C: Floats) -> Iterator[tuple[float, float, Bools]]:

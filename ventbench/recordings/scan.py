@@ -14,16 +14,27 @@ ms. If u_out never switches, n says nothing and the median of all breaths is tak
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.recordings.bad_samples import BadSamples, blanked, find_bad_samples
 from ventbench.recordings.roles import breath_figures
-from ventbench.recordings.schema import COLUMNS, OPTIONAL, Column, ProblemLog, fail
+from ventbench.recordings.schema import (
+    COLUMNS,
+    OPTIONAL,
+    SHOWN,
+    Place,
+    RecordingError,
+    RecordingProblem,
+    fail,
+)
 from ventbench.recordings.sources import Source, to_numpy
 
 if TYPE_CHECKING:
@@ -39,9 +50,9 @@ class Rows:
 
     #: arrays by column name, each (m,): int64 for id and breath_id, float64 with NaN for blank
     #: otherwise, in the units of the schema.
-    columns: dict[str, np.ndarray]
+    columns: dict[str, NDArray[Any]]
     #: rows with a blank breath_id, (m,) bool; breath_id then repeats the one before.
-    blank_id: np.ndarray
+    blank_id: Bools
     first: int = 0  #: row of the file that is the first of these.
 
     def part(self, start: int, stop: int) -> Rows:
@@ -50,18 +61,18 @@ class Rows:
         return Rows(columns, self.blank_id[start:stop], self.first + start)
 
     @cached_property
-    def starts(self) -> np.ndarray:
+    def starts(self) -> Ints:
         """Each breath's first row, (k,), k >= 1."""
         ids = self.columns["breath_id"]
         return np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1)
 
     @cached_property
-    def lengths(self) -> np.ndarray:
+    def lengths(self) -> Ints:
         """Rows in each breath, (k,)."""
         return np.diff(self.starts, append=len(self.blank_id))
 
     @cached_property
-    def breath(self) -> np.ndarray:
+    def breath(self) -> Ints:
         """Number of each row's breath, from 0, (m,)."""
         return np.repeat(np.arange(len(self.starts)), self.lengths)
 
@@ -112,11 +123,96 @@ def _joined(parts: list[Rows]) -> Rows:
     return rows
 
 
+Level = Literal["problem", "warning"]
+
+
+@dataclass
+class ProblemLog:
+    """Problems and warnings of one file by row; keeps the first `SHOWN` of each, and counts all.
+
+    Only those that are shown are looked up in the file, for their line and the cell as written.
+    """
+
+    source: Source  #: the file.
+    first: int = 0  #: row of the file that is row 0 of what is added.
+    #: number of problems and of warnings.
+    counts: Counter[Level] = field(default_factory=Counter)
+    #: row of each, another row that it refers to, and the problem without its place.
+    _kept: dict[Level, list[tuple[int, int | None, RecordingProblem]]] = field(
+        default_factory=lambda: {"problem": [], "warning": []}
+    )
+
+    def add(
+        self,
+        rows: Ints,
+        column: str,
+        what: str,
+        advice: str,
+        values: NDArray[Any],
+        *,
+        references: Ints | None = None,
+        level: Level = "problem",
+    ) -> None:
+        """Add a problem, or a warning, for each row.
+
+        Args:
+            rows: data rows, 0 for `first`, shape (k,); k may be 0.
+            column: name of the column.
+            what: a phrase; `{value}` stands for the cell and `{other}` for the other row's line.
+            advice: a sentence.
+            values: the values, shape (k,).
+            references: another row that each problem refers to, shape (k,), or None.
+            level: which of the two.
+        """
+        self.counts[level] += len(rows)
+        kept, file = self._kept[level], self.source.file
+        for i, row in enumerate(rows[:SHOWN].tolist()):
+            problem = RecordingProblem(file, what, advice, column=column, value=_text(values[i]))
+            reference = None if references is None else int(references[i]) + self.first
+            kept.append((row + self.first, reference, problem))
+        kept.sort(key=lambda each: each[0])
+        del kept[SHOWN:]
+
+    def listed(self, level: Level) -> tuple[RecordingProblem, ...]:
+        """Return up to `SHOWN` problems of a level, in file order, each with its line or row."""
+        kept = self._kept[level]
+        rows = {row for each in kept for row in each[:2] if row is not None}
+        places = self.source.locate(rows) if rows else {}
+        return tuple(self._placed(places, *each) for each in kept)
+
+    def raise_problems(self) -> None:
+        """Raise the problems as a RecordingError, if there are any."""
+        if self.counts["problem"]:
+            raise RecordingError(self.listed("problem"), self.counts["problem"])
+
+    def _placed(
+        self,
+        places: Mapping[int, Place],
+        row: int,
+        reference: int | None,
+        problem: RecordingProblem,
+    ) -> RecordingProblem:
+        place, (line, cells) = self.source.place, places.get(row, (None, {}))
+        value = cells.get(problem.column or "", problem.value)
+        message = problem.what.replace("{value}", value or "blank")
+        if reference is not None:
+            referenced = places.get(reference, (None,))[0]
+            message = message.replace("{other}", f"{place} {referenced}")
+        return replace(problem, what=message, line=line, value=value, place=place)
+
+
+def _text(value: np.generic) -> str:
+    number = value.item()
+    if isinstance(number, float):
+        return "" if np.isnan(number) else f"{number!r}".removesuffix(".0")
+    return str(number)
+
+
 #: Rows from which a value that is repeated is reported once.
 _OFTEN = 10
 
 
-def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str, np.ndarray]:
+def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str, NDArray[Any]]:
     """Check each cell: blank, infinite, out of range. Return the columns.
 
     With ``clip``, u_in is clipped to 0..100 % with a warning; otherwise it is a problem.
@@ -133,8 +229,8 @@ def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str
         if infinite.any():
             at = np.flatnonzero(infinite)
             message = "{value} is infinite"
-            log.add(at, name, message, "Fix the row.", values=values[at])
-        outside = _outside(values, column) & ~infinite
+            log.add(at, name, message, "Fix the row.", values[at])
+        outside = column.outside(values) & ~infinite
         if not outside.any():
             continue
         at = np.flatnonzero(outside)
@@ -150,35 +246,27 @@ def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str
         if name in ("R", "C"):  # the label of a whole recording: one mistake, not one a row
             _add_once(at, name, message, advice, values[at], log)
         else:
-            log.add(at, name, message, advice, values=values[at], level=level)
+            log.add(at, name, message, advice, values[at], level=level)
     return columns
 
 
 def _add_once(
-    at: np.ndarray, name: str, message: str, advice: str, values: np.ndarray, log: ProblemLog
+    at: Ints, name: str, message: str, advice: str, values: Floats, log: ProblemLog
 ) -> None:
     """Report a value that many rows repeat once."""
     kinds, first, counts = np.unique(values, return_index=True, return_counts=True)
     often = counts >= _OFTEN
     single = ~np.isin(values, kinds[often])
-    log.add(at[single], name, message, advice, values=values[single])
+    log.add(at[single], name, message, advice, values[single])
     message = f"{message}, here and in more rows"
-    log.add(at[first[often]], name, message, advice, values=kinds[often])
+    log.add(at[first[often]], name, message, advice, kinds[often])
 
 
-def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: np.ndarray) -> None:
+def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: Bools) -> None:
     if blank.any():
         message = f"the cell is blank, but {name} is needed in every row"
         at = np.flatnonzero(blank)
-        values = np.full(len(at), np.nan)
-        log.add(at, name, message, "Fill it in or remove the breath.", values=values)
-
-
-def _outside(values: np.ndarray, column: Column) -> np.ndarray:
-    if column.name == "u_out":
-        return (values != 0.0) & (values != 1.0) & ~np.isnan(values)
-    low = values <= column.low if column.positive else values < column.low
-    return low | (values > column.high)
+        log.add(at, name, message, "Fill it in or remove the breath.", np.full(len(at), np.nan))
 
 
 def check_ids(rows: Rows, log: ProblemLog, first_rows: dict[int, int]) -> None:
@@ -193,7 +281,7 @@ def check_ids(rows: Rows, log: ProblemLog, first_rows: dict[int, int]) -> None:
     advice = "Keep the rows of a breath together, and give each breath an id of its own."
     values = rows.columns["breath_id"][rows.starts[again]]
     at = rows.starts[again]
-    log.add(at, "breath_id", message, advice, values=values, references=earlier[again] - rows.first)
+    log.add(at, "breath_id", message, advice, values, references=earlier[again] - rows.first)
 
 
 def check_lung(rows: Rows, log: ProblemLog) -> None:
@@ -209,7 +297,7 @@ def check_lung(rows: Rows, log: ProblemLog) -> None:
         message = f"{name} changes to {{value}} within the breath, which starts at {{other}}"
         advice = "A breath has one lung: give the second part its own breath_id, or fix the row."
         first_row = rows.starts[rows.breath[at]]
-        log.add(at, name, message, advice, values=values[at], references=first_row)
+        log.add(at, name, message, advice, values[at], references=first_row)
 
 
 def check_single(rows: Rows, log: ProblemLog) -> None:
@@ -217,7 +305,7 @@ def check_single(rows: Rows, log: ProblemLog) -> None:
     at = rows.starts[rows.lengths == 1]
     message = "breath {value} has one sample, at least two are needed"
     advice = "Remove it, or keep the rows of a breath together."
-    log.add(at, "breath_id", message, advice, values=rows.columns["breath_id"][at])
+    log.add(at, "breath_id", message, advice, rows.columns["breath_id"][at])
 
 
 def check_row_ids(rows: Rows, log: ProblemLog, last: int) -> int:
@@ -226,7 +314,7 @@ def check_row_ids(rows: Rows, log: ProblemLog, last: int) -> int:
     at = np.flatnonzero(np.append(rows.first > 0 and ids[0] <= last, ids[1:] <= ids[:-1]))
     message = "id {value} is not greater than the one before"
     advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
-    log.add(at, "id", message, advice, values=ids[at], level="warning")
+    log.add(at, "id", message, advice, ids[at], level="warning")
     return int(ids[-1])
 
 
@@ -251,7 +339,7 @@ def check_times(rows: Rows, log: ProblemLog) -> None:
     _add_repeat(rows, log, at - 1, at, "id", rows.columns["id"])
 
 
-def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, current: np.ndarray) -> None:
+def _add_order(rows: Rows, log: ProblemLog, previous: Ints, current: Ints) -> None:
     time = rows.columns["time_step"]
     equal = time[previous] == time[current]
     names = [name for name in rows.columns if name != "id"]
@@ -262,22 +350,22 @@ def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, current: np.nd
         (~equal, "time goes back to {value} s from {other}"),
     ):
         at, before = current[chosen], previous[chosen]
-        log.add(at, "time_step", message, _SORT, values=time[at], references=before)
+        log.add(at, "time_step", message, _SORT, time[at], references=before)
 
 
 def _add_repeat(
     rows: Rows,
     log: ProblemLog,
-    previous: np.ndarray,
-    current: np.ndarray,
+    previous: Ints,
+    current: Ints,
     column: str,
-    values: np.ndarray,
+    values: NDArray[Any],
 ) -> None:
     message, advice = "the row repeats {other}", "Remove one of the two."
-    log.add(current, column, message, advice, values=values[current], references=previous)
+    log.add(current, column, message, advice, values[current], references=previous)
 
 
-def _same(rows: Rows, first: np.ndarray, second: np.ndarray, names: Iterable[str]) -> np.ndarray:
+def _same(rows: Rows, first: Ints, second: Ints, names: Iterable[str]) -> Bools:
     same = np.ones(len(first), dtype=bool)
     for name in names:
         a, b = rows.columns[name][first], rows.columns[name][second]
@@ -291,9 +379,7 @@ INSPIRATION = 1.0
 """Duration of inspiration, s."""
 
 
-def estimated_intervals(
-    n_inspiratory: np.ndarray, interval: np.ndarray, lengths: np.ndarray
-) -> np.ndarray:
+def estimated_intervals(n_inspiratory: Ints, interval: Floats, lengths: Ints) -> Floats:
     """Sampling interval of each breath by the known ones of the file, s, (k,); see the module.
 
     NaN if no breath has times and u_out does not switch.
@@ -313,7 +399,7 @@ def estimated_intervals(
     return np.where(switches, by_count, pd.Series(interval).median())
 
 
-def leading_zeros(u_out: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def leading_zeros(u_out: NDArray[np.int8], starts: Ints, lengths: Ints) -> Ints:
     """Count the leading samples with u_out = 0, ``(m,)``, of each breath, (k,).
 
     ``starts`` is the first row of each breath, and ``lengths`` the number of its rows, (k,).
@@ -328,13 +414,13 @@ class KnownTimes:
     """Times of breaths, with what follows from each breath alone."""
 
     #: s from the breath's first sample, NaN in all of a breath without times, (m,).
-    time: np.ndarray
-    blank: np.ndarray  #: breaths with fewer than two times, which have none then, (k,) bool.
-    interpolated: np.ndarray  #: number of single times that are interpolated, (k,).
-    shifted: np.ndarray  #: breaths that do not start at 0 in the file, (k,) bool.
+    time: Floats
+    blank: Bools  #: breaths with fewer than two times, which have none then, (k,) bool.
+    interpolated: Ints  #: number of single times that are interpolated, (k,).
+    shifted: Bools  #: breaths that do not start at 0 in the file, (k,) bool.
 
 
-def complete_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> KnownTimes:
+def complete_times(time: Floats, starts: Ints, lengths: Ints) -> KnownTimes:
     """Interpolate single blank times and shift each breath to start at 0.
 
     Blank times between two known ones are linear in the sample number; those before the first or
@@ -356,7 +442,7 @@ def complete_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) ->
     return KnownTimes(time, blank, np.where(partial, n_missing, 0), shifted)
 
 
-def _interpolate(time: np.ndarray) -> np.ndarray:
+def _interpolate(time: Floats) -> Floats:
     at = np.arange(len(time))
     finite = np.flatnonzero(np.isfinite(time))
     first, last = finite[0], finite[-1]
@@ -370,27 +456,26 @@ def _interpolate(time: np.ndarray) -> np.ndarray:
 class Scanned:
     """k whole breaths with m samples in all."""
 
-    breath_id: np.ndarray  #: (k,) int64.
-    R: np.ndarray  #: cmH2O/(L/s), (k,).
-    C: np.ndarray  #: mL/cmH2O, (k,).
-    starts: np.ndarray  #: each breath's first sample, which is its data row in the file, (k,).
-    lengths: np.ndarray  #: samples, (k,).
-    n_inspiratory: np.ndarray  #: leading samples with u_out = 0, (k,).
-    interval: np.ndarray  #: mean sampling interval, s, NaN if times are blank, (k,).
-    time_blank: np.ndarray  #: breaths without times, (k,) bool.
-    time_interpolated: np.ndarray  #: number of single times that are interpolated, (k,).
-    time_shifted: np.ndarray  #: breaths that do not start at 0 in the file, (k,) bool.
-    steps: (
-        np.ndarray
-    )  #: shortest and longest interval between two samples of each breath, s, (k, 2).
-    blank_pressures: np.ndarray  #: samples without pressure, (k,).
+    breath_id: Ints  #: (k,) int64.
+    R: Floats  #: cmH2O/(L/s), (k,).
+    C: Floats  #: mL/cmH2O, (k,).
+    starts: Ints  #: each breath's first sample, which is its data row in the file, (k,).
+    lengths: Ints  #: samples, (k,).
+    n_inspiratory: Ints  #: leading samples with u_out = 0, (k,).
+    interval: Floats  #: mean sampling interval, s, NaN if times are blank, (k,).
+    time_blank: Bools  #: breaths without times, (k,) bool.
+    time_interpolated: Ints  #: number of single times that are interpolated, (k,).
+    time_shifted: Bools  #: breaths that do not start at 0 in the file, (k,) bool.
+    #: shortest and longest interval between two samples of each breath, s, (k, 2).
+    steps: Floats
+    blank_pressures: Ints  #: samples without pressure, (k,).
     optional: tuple[str, ...]  #: optional columns of the file.
-    figures: dict[str, np.ndarray]  #: of :func:`~.roles.breath_figures`, (k, ...) each.
+    figures: dict[str, Floats]  #: of :func:`~.roles.breath_figures`, (k, ...) each.
     bad: tuple[BadSamples, ...]  #: samples that were left out, by rows of the file.
     #: time, s from each breath's first sample, NaN in all of a breath without times; u_in %, u_out
     #: 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file has them, each (m,).
     #: Nothing if only checked.
-    samples: dict[str, np.ndarray]
+    samples: dict[str, NDArray[Any]]
 
     @cached_property
     def inferred(self) -> dict[int, float]:
@@ -400,7 +485,6 @@ class Scanned:
 
 
 def scan(
-    source: Source,
     log: ProblemLog,
     *,
     clip: bool = False,
@@ -417,6 +501,7 @@ def scan(
     Raises:
         RecordingError: the file cannot be parsed, or has no rows.
     """
+    source = log.source
 
     def batches() -> Iterator[pa.RecordBatch]:
         for batch in source.batches():
@@ -446,7 +531,7 @@ def scan(
 
 
 def _scanned(
-    rows: Rows, columns: dict[str, np.ndarray], bad: Sequence[BadSamples], keep: bool
+    rows: Rows, columns: dict[str, NDArray[Any]], bad: Sequence[BadSamples], keep: bool
 ) -> Scanned:
     starts, lengths = rows.starts, rows.lengths
     times = complete_times(columns["time_step"], starts, lengths)
@@ -503,6 +588,6 @@ def _together(parts: Sequence[Scanned]) -> Scanned:
         for (column, kind, _), same in merged.items()
     )
     values: dict[str, Any] = {"bad": bad}
-    for name in {field.name for field in fields(Scanned)} - {"bad"}:
+    for name in {x.name for x in fields(Scanned)} - {"bad"}:
         values[name] = joined([getattr(part, name) for part in parts])
     return Scanned(**values)

@@ -3,20 +3,18 @@
 One row is one sample. The rows of a breath follow one another, in time order. The header is
 `id,breath_id,R,C,time_step,u_in,u_out,pressure`, and `flow` or `volume` may be added. Parquet files
 have columns of the same names.
-
-Checks collect problems by row; only the few that are shown are looked up in the file afterwards,
-for their line and the cell as it is written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from typing import Any, Literal
 
 import numpy as np
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 
 SHOWN = 20
@@ -87,93 +85,8 @@ def fail(file: str, message: str, advice: str, line: int | None = None) -> Recor
     return RecordingError(RecordingProblem(file, message, advice, line))
 
 
-Level = Literal["problem", "warning"]
 Place = tuple[int, Mapping[str, str]]
 """Position of a row in the file: its line and, if they are known, its cells as written."""
-Locate = Callable[[Collection[int]], Mapping[int, Place]]
-
-
-@dataclass(frozen=True)
-class _Entry:
-    row: int
-    column: str | None
-    value: str | None
-    what: str
-    advice: str
-    reference: int | None
-
-
-@dataclass
-class ProblemLog:
-    """Problems and warnings of one file by row; keeps the first `SHOWN` of each, and counts all."""
-
-    file: str  #: the path as the caller wrote it.
-    first: int = 0  #: row of the file that is row 0 of what is added.
-    #: number of problems and of warnings.
-    counts: dict[Level, int] = field(default_factory=lambda: {"problem": 0, "warning": 0})
-    _kept: dict[Level, list[_Entry]] = field(default_factory=lambda: {"problem": [], "warning": []})
-
-    def add(
-        self,
-        rows: np.ndarray,
-        column: str | None,
-        what: str,
-        advice: str,
-        *,
-        values: np.ndarray | None = None,
-        references: np.ndarray | None = None,
-        level: Level = "problem",
-    ) -> None:
-        """Add a problem, or a warning, for each row.
-
-        Args:
-            rows: data rows, 0 for `first`, shape (k,); k may be 0.
-            column: name of the column, or None.
-            what: a phrase; `{value}` stands for the cell and `{other}` for the other row's line.
-            advice: a sentence.
-            values: the values, shape (k,), or None.
-            references: another row that each problem refers to, shape (k,), or None.
-            level: which of the two.
-        """
-        if len(rows) == 0:
-            return
-        self.counts[level] += len(rows)
-        entries = self._kept[level]
-        for i, row in enumerate(rows[:SHOWN]):
-            value = None if values is None else _text(values[i])
-            reference = None if references is None else int(references[i]) + self.first
-            entries.append(_Entry(int(row) + self.first, column, value, what, advice, reference))
-        entries.sort(key=lambda entry: entry.row)
-        del entries[SHOWN:]
-
-    def listed(self, level: Level, locate: Locate, place: str) -> tuple[RecordingProblem, ...]:
-        """Return up to `SHOWN` problems of a level, in file order, each with its line or row."""
-        entries = self._kept[level]
-        rows = {entry.row for entry in entries}
-        rows |= {entry.reference for entry in entries if entry.reference is not None}
-        places = locate(rows) if rows else {}
-        return tuple(self._problem(entry, places, place) for entry in entries)
-
-    def raise_problems(self, locate: Locate, place: str) -> None:
-        """Raise the problems as a RecordingError, if there are any."""
-        if self.counts["problem"]:
-            raise RecordingError(self.listed("problem", locate, place), self.counts["problem"])
-
-    def _problem(self, entry: _Entry, places: Mapping[int, Place], place: str) -> RecordingProblem:
-        line, cells = places.get(entry.row, (None, {}))
-        value = cells.get(entry.column or "", entry.value)
-        message = entry.what.replace("{value}", value or "blank")
-        if entry.reference is not None:
-            referenced = places.get(entry.reference, (None, {}))[0]
-            message = message.replace("{other}", f"{place} {referenced}")
-        return RecordingProblem(self.file, message, entry.advice, line, entry.column, value, place)
-
-
-def _text(value: np.generic) -> str:
-    number = value.item()
-    if isinstance(number, float):
-        return "" if np.isnan(number) else f"{number!r}".removesuffix(".0")
-    return str(number)
 
 
 #: Formats of files, and a table in memory.
@@ -199,6 +112,13 @@ class Column:
         if self.positive:
             return f"the range above {self.low:g} and up to {self.high:g} {self.unit}"
         return f"{self.low:g}..{self.high:g} {self.unit}".rstrip()
+
+    def outside(self, values: Floats) -> Bools:
+        """Whether values are none that the column accepts, ``(m,)``; a blank is not outside."""
+        if self.name == "u_out":
+            return (values != 0.0) & (values != 1.0) & ~np.isnan(values)
+        low = values <= self.low if self.positive else values < self.low
+        return low | (values > self.high)
 
 
 def _label(name: str, unit: str, quantity: str) -> Column:

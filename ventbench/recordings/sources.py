@@ -69,6 +69,10 @@ class Source:
         """
         raise NotImplementedError
 
+    def locate(self, rows: Collection[int]) -> Mapping[int, Place]:
+        """Find data rows, 0 for the first: their lines, or rows from 1, and cells as written."""
+        return {row: (row + 1, {}) for row in rows}
+
 
 @dataclass
 class CsvSource(Source):
@@ -104,6 +108,16 @@ class CsvSource(Source):
             advice = "Copy or download the file again."
             raise fail(self.file, f"the file cannot be read ({error})", advice) from None
         self.sha256 = sha256(Path(self.file))
+
+    def locate(self, rows: Collection[int]) -> Mapping[int, Place]:
+        """Find lines and cells; see :class:`Source`."""
+        places, last = {}, max(rows, default=-1)
+        for row, (number, text) in enumerate(data_lines(self.file, self.kind)):
+            if row in rows:
+                places[row] = (number, dict(zip(self.names, _cells(text) or (), strict=False)))
+            if row >= last:
+                break
+        return places
 
     def _parsed(self, file: IO[bytes]) -> Iterator[pa.RecordBatch]:
         import pyarrow as pa
@@ -161,20 +175,6 @@ def data_lines(file: str, kind: Kind) -> Iterator[tuple[int, bytes]]:
                 number += 1
                 if text and number > 1:
                     yield number, text
-
-
-def locate_rows(
-    file: str, kind: Kind, names: Sequence[str], rows: Collection[int]
-) -> dict[int, Place]:
-    """Find data rows, 0 for the first, in a file: line, and cells as written by column."""
-    places = {}
-    last = max(rows, default=-1)
-    for row, (number, text) in enumerate(data_lines(file, kind)):
-        if row in rows:
-            places[row] = (number, dict(zip(names, _cells(text) or (), strict=False)))
-        if row >= last:
-            break
-    return places
 
 
 def text_problems(
@@ -349,13 +349,6 @@ def _table_source(frame: object) -> ParquetSource:
         message = f"the table cannot be read ({str(error).splitlines()[0]})"
         raise fail(_TABLE, message, "Write numbers in every column.") from None
     return ParquetSource(_TABLE, "table", table)
-
-
-def locate(source: Source, rows: Collection[int]) -> Mapping[int, Place]:
-    """Find data rows (0 for the first) in a file: CSV lines and cells, or Parquet rows from 1."""
-    if isinstance(source, ParquetSource):
-        return {row: (row + 1, {}) for row in rows}
-    return locate_rows(source.file, source.kind, source.names, rows)
 
 
 def kind_of(path: str | os.PathLike[str]) -> Kind:

@@ -41,8 +41,8 @@ from ventbench.recordings.scan import complete_times
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung
 
-#: Roles with units.
-_MEASURED = ("time", "pressure", "flow", "volume", "u_in")
+#: Roles with units, and flows that a sensor counts in one direction.
+_MEASURED, _ONE_WAY = ("time", "pressure", "flow", "volume", "u_in"), ("flow_in", "flow_out")
 
 #: Flow, mL/s, and volume, mL, below which another unit is likely; pressure, cmH2O, from which it
 #: is absolute.
@@ -206,12 +206,10 @@ def import_recording(
     if "time" in raw:
         raw["time"], sentences = _continued(table, raw["time"])
         notes += sentences
-    values = {
-        role: changes[role].apply(x + added[role] if role in added else x)
-        for role, x in raw.items()
-        if role in changes
+    values = raw | {
+        role: changes[role].apply(raw[role] + added[role] if role in added else raw[role])
+        for role in changes.keys() & raw.keys()
     }
-    rest = {role: x for role, x in raw.items() if role not in changes}
     _net_flow(values)
     for role in ("flow", "volume"):
         if role in values and not np.isfinite(values[role]).any():
@@ -222,7 +220,7 @@ def import_recording(
             f"{table.file}, column {by_role['pressure']}: every pressure is blank, so there is "
             "nothing to compare a simulator with"
         )
-    _invert(values, rest, invert)
+    _invert(values, invert)
     _check_signs(table, by_role, values, changes)
     keys = [
         _labels(table.columns[name])
@@ -237,13 +235,11 @@ def import_recording(
     unused += [by_role["time"]] if rate is not None and "time" in by_role else []
     if unused:
         notes.append(f"Columns that are not used: {', '.join(unused)}.")
-    pieces, how = find_breaths(
-        table.file, time, values, rest, keys, groups, spec.lead if spec else 0.0
-    )
+    pieces, how = find_breaths(table.file, time, values, keys, groups, spec.lead if spec else 0.0)
     notes.append(how)
-    R, C, how = _lung(lung, rest, len(table))
+    R, C, how = _lung(lung, values, len(table))
     notes.append(how)
-    u_out, how = expiratory_valve(values, rest, pieces)
+    u_out, how = expiratory_valve(values, pieces)
     notes.append(how)
     u_in = values.get("u_in")
     if u_in is None:
@@ -257,18 +253,25 @@ def import_recording(
             )
         )
     u_in = np.where(np.isfinite(u_in), u_in, 0.0)
-    samples = {
-        "u_in": u_in,
-        "u_out": u_out,
-        "pressure": values["pressure"],
-        **{name: values[name] for name in ("flow", "volume") if name in values},
-    }
+    samples = {"u_in": u_in, "u_out": u_out}
+    samples |= {name: values[name] for name in MEASURED if name in values}
     labelled = {**samples, "R": R, "C": C}
     pieces, dropped = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
     notes += dropped
     warnings += _suspicious(samples, changes)
-    breaths = _breaths(table.file, pieces, time, samples, R, C, notes)
-    breaths = replace(breaths, left_out=left_out(bad))
+    rows, lengths = np.concatenate(pieces), np.array([len(piece) for piece in pieces])
+    starts = np.cumsum(lengths) - lengths
+    breaths = arranged(
+        lengths,
+        complete_times(time[rows], starts, lengths).time,
+        {name: x[rows] for name, x in samples.items()},
+        breath_id=np.arange(1, len(pieces) + 1),
+        R=R[rows[starts]],
+        C=C[rows[starts]],
+        source=table.file,
+        notes=tuple(notes),
+        left_out=left_out(bad),
+    )
     notable(breaths)
     few = few_breaths(len(breaths))
     issues = check_roles(breaths)
@@ -378,7 +381,7 @@ def _roles(
             roles[name] = role
         elif role is not None and role not in assigned:
             candidates.setdefault(role, []).append(name)
-    single = {"flow_in", "flow_out"} & (candidates.keys() | assigned)
+    single = set(_ONE_WAY) & (candidates.keys() | assigned)
     if "flow" in candidates.keys() | assigned or len(single) == 1:
         for role in single:
             candidates.pop(role, None)
@@ -430,7 +433,7 @@ def _check_needed(
         if has & set(accepted) or (accepted == ("time",) and timed):
             continue
         headers = {name: table.header(name) for name in table.columns if name not in roles}
-        headers = {n: x for n, x in headers.items() if table.columns[n].dtype.kind in "fiub"}
+        headers = {n: x for n, x in headers.items() if table.is_numeric(n)}
         likely = [name for name, header in headers.items() if header.role in accepted]
         open_ = likely or [name for name, x in headers.items() if not (x.role or x.excluded)]
         if len(accepted) > 1 and (not open_ or layout is not None):
@@ -458,7 +461,7 @@ def _check_duplicates(table: Table, role: str, names: Sequence[str]) -> None:
     first = table.columns[names[0]]
     for name in names[1:]:
         second = table.columns[name]
-        if first.dtype.kind not in "fiub" or second.dtype.kind not in "fiub":
+        if not (table.is_numeric(names[0]) and table.is_numeric(name)):
             continue
         apart = np.abs(np.asarray(first, float) - np.asarray(second, float))
         if np.isfinite(apart).any() and np.nanmax(apart) > 1e-9 * np.nanmax(np.abs(first)):
@@ -482,13 +485,11 @@ def _conversions(
         unit = units.get(role) or layout_units.get(role) or header or table.units.get(name)
         return unit or (epoch_unit(table.columns[name]) if role == "time" else None)
 
+    quantities = {role: role for role in _MEASURED} | dict.fromkeys(_ONE_WAY, "flow")
     return {
-        role: conversion(
-            role.partition("_")[0] if "flow" in role else role,
-            unit(role.partition("_")[0] if "flow" in role else role, name),
-        )
+        role: conversion(quantities[role], unit(quantities[role], name))
         for role, name in by_role.items()
-        if role in _MEASURED or role in ("flow_in", "flow_out")
+        if role in quantities
     }
 
 
@@ -524,7 +525,7 @@ def _states(
 def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:
     """Numbers of a column, in which words may stand for some."""
     values = table.columns[name]
-    if values.dtype.kind in "fiub":
+    if table.is_numeric(name):
         return np.asarray(values, float)
     spoken = {word.casefold(): number for word, number in words.items()}
     kinds, which = np.unique(np.char.lower(values.astype(str)), return_inverse=True)
@@ -707,35 +708,33 @@ def _plain(rate: float, precision: float) -> str:
 
 
 def _lung(
-    label_id: str | None, rest: Mapping[str, Floats], count: int
+    label_id: str | None, values: Mapping[str, Floats], count: int
 ) -> tuple[Floats, Floats, str]:
     """R and C of each row."""
     from ventbench.task.lungs import lung as parse
 
     if label_id is not None:
         label: Lung = parse(label_id)
-        over = " in place of R and C of the file" if "R" in rest and "C" in rest else ""
+        over = " in place of R and C of the file" if {"R", "C"} <= values.keys() else ""
         how = f"Lung {label.id}, as given{over}."
         return np.full(count, label.R), np.full(count, label.C), how
-    if "R" in rest and "C" in rest:
-        pairs = np.unique(np.stack([rest["R"], rest["C"]], axis=1), axis=0)
+    if {"R", "C"} <= values.keys():
+        pairs = np.unique(np.stack([values["R"], values["C"]], axis=1), axis=0)
         ids = ", ".join(f"R{R:g}C{C:g}" for R, C in pairs[:9].tolist())
-        return rest["R"], rest["C"], f"Lungs of the file: {ids}."
+        return values["R"], values["C"], f"Lungs of the file: {ids}."
     raise InputError(
         "no columns hold R and C of the lung; give --lung R20C50 (a guess is enough: R in "
         "cmH2O/(L/s) and C in mL/cmH2O are fitted again), or map the columns"
     )
 
 
-def _invert(values: dict[str, Floats], rest: dict[str, Floats], roles: Iterable[str]) -> None:
+def _invert(values: dict[str, Floats], roles: Iterable[str]) -> None:
     """Change signs; of a valve, what is open."""
+    open_at = {"u_in": 100.0, "u_out": 1.0}
     for role in roles:
-        if role == "u_out" and role in rest:
-            rest[role] = 1.0 - rest[role]
-        elif role in values:
-            values[role] = 100.0 - values[role] if role == "u_in" else -values[role]
-        else:
+        if role not in values or role not in (*_MEASURED, "u_out"):
             raise InputError(f"--invert {role}: no column is {role}")
+        values[role] = open_at.get(role, 0.0) - values[role]
 
 
 def _check_signs(
@@ -776,8 +775,7 @@ def _sound(
     owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     for name, values in samples.items():
         column, cells = COLUMNS[name], np.asarray(values, float)[rows]
-        low = cells <= column.low if column.positive else cells < column.low
-        wrong = np.flatnonzero(low | (cells > column.high) | (np.isnan(cells) & (not column.blank)))
+        wrong = np.flatnonzero(column.outside(cells) | (np.isnan(cells) & (not column.blank)))
         if len(wrong):
             problems.append(
                 f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(cells)} "
@@ -827,30 +825,3 @@ def _suspicious(
                     f"the unit right ({advice})?"
                 )
     return warnings
-
-
-def _breaths(
-    source: str,
-    pieces: list[Ints],
-    time: Floats,
-    samples: Mapping[str, NDArray[Any]],
-    R: Floats,
-    C: Floats,
-    notes: list[str],
-) -> Breaths:
-    rows, lengths = np.concatenate(pieces), np.array([len(piece) for piece in pieces])
-    starts = np.cumsum(lengths) - lengths
-    columns = {
-        name: values[rows].astype(np.int8 if name == "u_out" else float)
-        for name, values in samples.items()
-    }
-    return arranged(
-        lengths,
-        complete_times(time[rows], starts, lengths).time,
-        columns,
-        breath_id=np.arange(1, len(pieces) + 1),
-        R=R[rows[starts]].astype(float),
-        C=C[rows[starts]].astype(float),
-        source=source,
-        notes=tuple(notes),
-    )

@@ -24,7 +24,6 @@ def find_breaths(
     file: str,
     time: Floats,
     values: Mapping[str, Floats],
-    rest: Mapping[str, Floats],
     keys: list[Ints],
     groups: list[Ints],
     lead: float,
@@ -34,8 +33,7 @@ def find_breaths(
     Args:
         file: names the recording in messages.
         time: times, s, shape ``(N,)``; NaN where there is none.
-        values: measured columns by role, in the units of the schema, ``(N,)`` each.
-        rest: further columns by role, ``(N,)`` each.
+        values: columns by role, in the units of the schema, ``(N,)`` each.
         keys: columns a change of which begins a breath.
         groups: those of them that only tell recordings apart.
         lead: time before the number of a breath changes at which its samples begin, s.
@@ -66,7 +64,7 @@ def find_breaths(
     else:
         gaps = (steps < 0) | (steps > _GAP * max(usual, 1e-9))
         broken[1:] |= gaps[1:]
-        onsets, how = _onsets(file, time, values, rest)
+        onsets, how = _onsets(file, time, values)
         starts = broken.copy()
         starts[onsets] = True
     pieces = np.split(rows, np.flatnonzero(starts)[1:])
@@ -98,19 +96,18 @@ def find_breaths(
 
 
 def expiratory_valve(
-    values: Mapping[str, Floats], rest: Mapping[str, Floats], pieces: list[Ints]
+    values: Mapping[str, Floats], pieces: list[Ints]
 ) -> tuple[NDArray[np.int8], str]:
     """Return u_out of each row, ``(N,)``, and a sentence that says where it is from.
 
     Args:
-        values: measured columns by role, in the units of the schema, ``(N,)`` each.
-        rest: further columns by role, ``(N,)`` each.
+        values: columns by role, in the units of the schema, ``(N,)`` each.
         pieces: rows of each breath.
     """
-    if "u_out" in rest:
-        return (rest["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
-    if "target" in rest:
-        u_out = (~_is_high(rest["target"])).astype(np.int8)
+    if "u_out" in values:
+        return (values["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
+    if "target" in values:
+        u_out = (~_is_high(values["target"])).astype(np.int8)
         return u_out, "u_out is 1 where the target is low."
     u_out = np.zeros(len(values["pressure"]), np.int8)
     if "flow" in values:
@@ -133,15 +130,13 @@ def expiratory_valve(
     return u_out, "u_out is 1 from where pressure has fallen half-way from its peak (a guess)."
 
 
-def _onsets(
-    file: str, time: Floats, values: Mapping[str, Floats], rest: Mapping[str, Floats]
-) -> tuple[Ints, str]:
+def _onsets(file: str, time: Floats, values: Mapping[str, Floats]) -> tuple[Ints, str]:
     """Rows at which inspirations begin, and what shows them."""
-    if "u_out" in rest:
-        shut = rest["u_out"] < 0.5
+    if "u_out" in values:
+        shut = values["u_out"] < 0.5
         return np.flatnonzero(shut[1:] & ~shut[:-1]) + 1, "where the expiratory valve closes"
-    if "target" in rest:
-        high = _is_high(rest["target"])
+    if "target" in values:
+        high = _is_high(values["target"])
         return np.flatnonzero(high[1:] & ~high[:-1]) + 1, "where the target rises"
     if "u_in" in values and np.nanmax(values["u_in"]) > 0:
         on = np.nan_to_num(values["u_in"]) > 0

@@ -100,22 +100,9 @@ def _parquet(file: str) -> Table:
         frame = parquet.read_table(file).to_pandas()
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{file} cannot be read ({str(error).splitlines()[0]})") from None
-    names = named([str(header) for header in frame.columns])
-    columns = {}
-    for name, header in zip(names, frame.columns, strict=True):
-        values = frame[header]
-        kind = values.dtype.kind
-        if kind == "M":
-            columns[name] = values.to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
-        elif kind in "iufb":
-            columns[name] = values.to_numpy(float)
-        elif (lists := listed(values)) is not None:
-            columns[name] = lists
-        else:
-            columns[name] = values.astype(str).to_numpy(str)
-    if not columns or len(frame) == 0:
+    if frame.empty:
         raise InputError(f"{file} holds no rows")
-    return Table(file, columns, notes=("Parquet.",), headers=names)
+    return _of_values(file, {str(header): frame[header] for header in frame}, "Parquet")
 
 
 def _matlab(file: str) -> Table:
@@ -350,15 +337,15 @@ def _of_values(file: str, columns: dict[str, Sequence[Any]], kind: str) -> Table
     names, units = named(list(columns)), dict[str, str]()
     arrays: dict[str, NDArray[Any]] = {}
     for name, header in names.items():
-        values = ["" if value is None else value for value in columns[header]]
+        values = Series(columns[header])
+        if values.dtype.kind == "M":
+            arrays[name] = values.to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
+            continue
         try:
-            array = np.array([np.nan if value == "" else value for value in values], float)
-            if array.ndim > 1:
-                raise ValueError
-            arrays[name] = array
+            arrays[name] = values.where(values != "").to_numpy(float, na_value=np.nan)
         except (TypeError, ValueError):
-            lists = listed(values)
-            words = Series(list(map(str, values)))
+            lists = listed(list(values))
+            words = values.fillna("").astype(str)
             clock = clock_seconds(words) if lists is None else None
             units |= {name: "s"} if clock is not None else {}
             arrays[name] = next(x for x in (lists, clock, words.to_numpy(str)) if x is not None)

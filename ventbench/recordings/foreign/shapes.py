@@ -68,7 +68,7 @@ def _role(table: Table, name: str, mapped: Mapping[str, str]) -> str | None:
 
 def _clock(table: Table, mapped: Mapping[str, str]) -> str | None:
     """The column of numbers that is the time."""
-    numeric = (name for name, x in table.columns.items() if x.dtype.kind in "fiu")
+    numeric = filter(table.is_numeric, table.columns)
     return next((name for name in numeric if _role(table, name, mapped) == "time"), None)
 
 
@@ -76,7 +76,7 @@ def _pivoted(table: Table, mapped: Mapping[str, str]) -> Table:
     """A column each of what a long table measures; a row each time, in the order of time."""
     import pandas as pd
 
-    numeric = [name for name, x in table.columns.items() if x.dtype.kind in "fiu"]
+    numeric = list(filter(table.is_numeric, table.columns))
     if any(_role(table, name, mapped) == "pressure" for name in numeric):
         return table
     values = next((n for n in numeric if n.strip("_ ").casefold() in _VALUES), None)
@@ -187,7 +187,7 @@ def _interval(table: Table, starts: Floats | None, lengths: Floats) -> Floats | 
     """Time between samples in each row, s: as a column says, the file, or the starts of rows."""
     for name, x in table.columns.items():
         key = re.sub(r"[^a-z]", "", table.headers.get(name, name).lower())
-        if x.dtype.kind not in "fiu" or not (x > 0).all():
+        if not table.is_numeric(name) or not (x > 0).all():
             continue
         if key.replace("hz", "") in FREQUENCIES or (key.endswith("hz") and "rate" in key):
             return 1.0 / np.asarray(x, float)

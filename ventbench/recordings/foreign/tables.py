@@ -95,6 +95,10 @@ class Table:
         """Number of rows."""
         return len(next(iter(self.columns.values())))
 
+    def is_numeric(self, name: str) -> bool:
+        """Whether a column holds numbers."""
+        return self.columns[name].dtype.kind in "fiub"
+
     def header(self, name: str) -> Header:
         """What the header of a column says, with the unit beside it."""
         text, unit = self.headers.get(name, name), self.units.get(name)

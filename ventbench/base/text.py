@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 from ventbench.base.errors import require
@@ -25,6 +26,12 @@ def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
         return "failed"
     # + 0.0 turns -0.0, which rounding may leave, into 0.0.
     return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "−")
+
+
+def suggestion(word: str, choices: Iterable[str], cutoff: float = 0.6) -> str:
+    """The nearest of some choices as the end of a message; empty if none is near."""
+    close = get_close_matches(word, list(choices), 1, cutoff)
+    return f"; did you mean {close[0]}?" if close else ""
 
 
 def plain(text: str) -> str:

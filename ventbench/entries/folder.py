@@ -6,7 +6,6 @@ of weights that are plain numbers run and import nothing, and unpickle no array.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import inspect
 import json
@@ -25,8 +24,9 @@ import msgspec
 import numpy as np
 
 from ventbench.base import files
-from ventbench.entries.manifest import MANIFEST, TRACKS, Finding, Manifest
-from ventbench.sandbox.child.cell import SubmissionError, printable
+from ventbench.base.text import suggestion
+from ventbench.entries.manifest import MANIFEST, RULES, TRACKS, Finding, Manifest, by_word
+from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.sandbox.child.sources import CONTROLLER as CONTROLLER
 from ventbench.sandbox.child.sources import walk
 from ventbench.sandbox.reader import UnreadableError, read_apart
@@ -77,9 +77,8 @@ def resolve(name: str) -> Path:
         raise SubmissionError(f"{name} is a file; give the folder that holds {CONTROLLER}")
     if name in bundled():
         return files.submissions_folder() / name
-    close = difflib.get_close_matches(path.name, bundled(), n=1)
-    hint = f"did you mean {close[0]}?" if close else f"bundled are {', '.join(bundled())}"
-    raise SubmissionError(f"{name}: no such folder and no bundled submission of that name; {hint}")
+    hint = suggestion(path.name, bundled()) or f"; bundled are {', '.join(bundled())}"
+    raise SubmissionError(f"{name}: no such folder and no bundled submission of that name{hint}")
 
 
 def seeds(folder: Path) -> list[Path]:
@@ -95,25 +94,8 @@ def open_submission(name: str) -> Submission:
         SubmissionError: naming every problem.
     """
     folder = resolve(name)
-    problems = []
-    count, size = 0, 0
-    for path in _walk(folder):
-        relative = printable(path.relative_to(folder).as_posix())
-        if path.is_symlink():
-            problems.append(f"{name}: {relative} is a symbolic link; put the file itself there")
-        elif path.is_dir():
-            problems.append(f"{name}: {relative} lies in too many folders")
-        elif not path.is_file():
-            problems.append(f"{name}: {relative} is neither a file nor a folder")
-        else:
-            count += 1
-            size += path.stat().st_size
-        if count > MAX_FILES:
-            problems.append(f"{name}: more than {MAX_FILES} files")
-            break
-    if size > MAX_BYTES:
-        problems.append(f"{name}: {size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:g} MB are accepted")
-    problems.extend(f"{name}: {problem}" for problem in _seed_problems(folder))
+    _, findings = _inventory(folder, _walk(folder))
+    problems = [f"{name}: {f.file} {f.what}; {f.advice}" for f in findings]
     problems.extend(
         f"{name}: {required} is missing"
         for required in (CONTROLLER, MANIFEST)
@@ -268,20 +250,16 @@ def with_seed(submission: Submission, seed: str, place: Path) -> Submission:
     return open_submission(str(copy))
 
 
-def _seed_problems(folder: Path) -> list[str]:
+def _seed_problems(folder: Path) -> Iterator[tuple[str, str]]:
     """Files of seeds that are no weights of the submission, and seeds that are too many."""
-    seed_folders, problems = seeds(folder), []
-    if len(seed_folders) > MAX_SEEDS:
-        problems.append(f"{SEEDS} has more than {MAX_SEEDS} folders")
-    inside = [path for path in _walk(folder / SEEDS) if (folder / SEEDS).is_dir()]
-    for path in inside:
+    if len(seeds(folder)) > MAX_SEEDS:
+        yield SEEDS, f"has more than {MAX_SEEDS} folders"
+    for path in _walk(folder / SEEDS):
         parts = path.relative_to(folder / SEEDS).parts
         stands_for = folder.joinpath(*parts[1:])
-        weights = ending(path.name) in ARRAYS and stands_for.is_file() and len(parts) > 1
-        if not weights:
-            name = printable(path.relative_to(folder).as_posix())
-            problems.append(f"{name} stands for no weights of the submission: seeds hold no code")
-    return problems
+        if not (ending(path.name) in ARRAYS and stands_for.is_file() and len(parts) > 1):
+            name = path.relative_to(folder).as_posix()
+            yield name, "stands for no weights of the submission: seeds hold no code"
 
 
 def combined_hash(hashes: dict[str, str]) -> str:
@@ -303,27 +281,35 @@ _REQUIRED = {
 
 def check_files(folder: Path) -> list[Finding]:
     """Look at every file of a submission's folder."""
-    findings: list[Finding] = []
-    sizes: dict[str, int] = {}
-    for path in _members(folder):
-        name = path.relative_to(folder).as_posix()
-        if len(sizes) >= MAX_FILES:
-            advice = "put what belongs together into one file"
-            findings.append(_problem("the folder", f"has more than {MAX_FILES} files", advice))
-            break
-        status = path.lstat()
-        if stat.S_ISREG(status.st_mode):
-            sizes[name] = status.st_size
-            findings += _file(path, name, status)
-        else:
-            findings.append(_irregular(name, status.st_mode))
-    findings += _size(sizes)
-    advice = "put there only what another seed of the training changes"
-    findings += [_problem(SEEDS, message, advice) for message in _seed_problems(folder)]
-    for first, second in collisions(sizes):
+    regular, findings = _inventory(folder, _members(folder))
+    for name, status in regular.items():
+        findings += _file(folder / name, name, status)
+    for first, second in collisions(regular):
         message = f"differs from {first} only in upper and lower case"
         findings.append(_problem(second, message, "rename one of them"))
     return findings + list(_required(folder))
+
+
+def _inventory(
+    folder: Path, paths: Iterable[Path]
+) -> tuple[dict[str, os.stat_result], list[Finding]]:
+    """Status of each regular file, by name; and what is wrong with their number, size and kinds."""
+    findings: list[Finding] = []
+    regular: dict[str, os.stat_result] = {}
+    for path in paths:
+        name, status = path.relative_to(folder).as_posix(), path.lstat()
+        if len(regular) >= MAX_FILES:
+            advice = "put what belongs together into one file"
+            findings.append(_problem("the folder", f"has more than {MAX_FILES} files", advice))
+            break
+        if stat.S_ISREG(status.st_mode):
+            regular[name] = status
+        else:
+            findings.append(_irregular(name, status.st_mode))
+    findings += _size({name: status.st_size for name, status in regular.items()})
+    advice = "put there only what another seed of the training changes"
+    findings += [_problem(*problem, advice) for problem in _seed_problems(folder)]
+    return regular, findings
 
 
 def _problem(file: str, message: str, advice: str) -> Finding:
@@ -347,7 +333,9 @@ def _irregular(name: str, mode: int) -> Finding:
         advice = "put the file itself there; nothing outside of the folder can be read anyway"
         return _problem(name, "is a symbolic link", advice)
     if stat.S_ISDIR(mode):
-        return _problem(name, "is a hidden folder", "move or remove it")
+        hidden = Path(name).name.startswith(".")
+        wrong = "is a hidden folder" if hidden else "lies in too many folders"
+        return _problem(name, wrong, "move or remove it")
     return _problem(name, "is neither a file nor a folder", "remove it")
 
 
@@ -424,29 +412,14 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 _WINDOWS = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 
 #: Endings of text, weights and pictures: all others are refused.
-TEXT = {".py", ".toml", ".md", ".txt", ".rst", ".json", ".csv", ".svg", ".cff"}
-ARRAYS = {".npz", ".npy", ".safetensors"}
-PICTURES = {".png", ".jpg", ".jpeg"}
-#: Names without an ending that are accepted as text.
-TEXT_NAMES = {"LICENSE", "LICENCE", "COPYING", "NOTICE", "AUTHORS"}
-
+TEXT, ARRAYS, PICTURES, _NAMES = (set(words.split()) for words in RULES["accepted"].values())
+_COMPILED = RULES["compiled"].split()
 _CODE = "compiled code is not reviewed and not run; submit the Python source"
-_PICKLE = "pickles run code when they are read; save arrays as .npz or .safetensors"
-_ARCHIVE = "archives are not reviewed; put the files themselves there"
-_SCRIPT = "scripts of that kind are never run"
+_KIND_ADVICE = dict.fromkeys(_COMPILED, _CODE) | by_word(RULES["refused"])
 _UNSUPPORTED_KIND = (
     "leave it out: only Python sources, text, pictures (.png, .jpg, .svg) "
     "and weights (.npz, .npy, .safetensors) are accepted"
 )
-_COMPILED = (".pyc", ".pyo", ".pyd", ".so", ".dll", ".dylib", ".a", ".o", ".exe")
-_KIND_ADVICE = {
-    **dict.fromkeys(_COMPILED, _CODE),
-    **dict.fromkeys((".pkl", ".pickle", ".joblib", ".dill", ".pt", ".ckpt", ".h5"), _PICKLE),
-    **dict.fromkeys(
-        (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".whl", ".egg"), _ARCHIVE
-    ),
-    **dict.fromkeys((".pth", ".sh", ".bat", ".cmd", ".ps1"), _SCRIPT),
-}
 
 
 def path_problem(path: str) -> str | None:
@@ -483,7 +456,7 @@ def ending(path: str) -> str:
 def kind_problem(path: str) -> str | None:
     """Return what to do about a file of a kind that is not accepted; None if it is accepted."""
     kind = ending(path)
-    if kind in TEXT | ARRAYS | PICTURES or path.rpartition("/")[2] in TEXT_NAMES:
+    if kind in TEXT | ARRAYS | PICTURES or path.rpartition("/")[2] in _NAMES:
         return None
     return _KIND_ADVICE.get(kind, _UNSUPPORTED_KIND)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import re
 import tomllib
 from collections.abc import Iterator
@@ -13,8 +12,18 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import msgspec
 
+from ventbench.base.text import suggestion
 from ventbench.sandbox.child.cell import SubmissionError, printable
 from ventbench.task.interfaces import API_VERSION
+
+#: What submissions hold and import: what is said of words, and the words.
+RULES: dict[str, Any] = tomllib.loads(Path(__file__).with_name("rules.toml").read_text("utf-8"))
+
+
+def by_word(table: dict[str, str]) -> dict[str, str]:
+    """What a table of :data:`RULES` says of each word."""
+    return {word: said for said, words in table.items() for word in words.split()}
+
 
 #: Name of the file.
 MANIFEST = "submission.toml"
@@ -128,9 +137,7 @@ def _check_text(text: str) -> None:
 
 
 def _hint(value: Any, choices: tuple[str, ...]) -> str:
-    text = value[:_MAX_QUOTED] if isinstance(value, str) else ""
-    close = difflib.get_close_matches(text, choices, n=1)
-    return f"; did you mean {close[0]}?" if close else ""
+    return suggestion(value[:_MAX_QUOTED], choices) if isinstance(value, str) else ""
 
 
 #: What is wrong with a key that is none of the manifest's begins so.
@@ -248,13 +255,7 @@ class Finding:
 
 
 #: SPDX identifiers that most authors use.
-LICENCES = (
-    *("0BSD", "AGPL-3.0-only", "AGPL-3.0-or-later", "Apache-2.0", "Artistic-2.0", "BSD-2-Clause"),
-    *("BSD-3-Clause", "BSL-1.0", "CC-BY-4.0", "CC-BY-SA-4.0", "CC0-1.0", "ECL-2.0", "EPL-2.0"),
-    *("EUPL-1.2", "GPL-2.0-only", "GPL-2.0-or-later", "GPL-3.0-only", "GPL-3.0-or-later", "ISC"),
-    *("LGPL-2.1-only", "LGPL-2.1-or-later", "LGPL-3.0-only", "LGPL-3.0-or-later", "MIT", "MIT-0"),
-    *("MPL-2.0", "MulanPSL-2.0", "NCSA", "OSL-3.0", "PostgreSQL", "UPL-1.0", "Unlicense", "Zlib"),
-)
+LICENCES = RULES["licences"].split()
 _SPDX = re.compile(r"\(?[A-Za-z0-9.+-]+\)?( (AND|OR|WITH) \(?[A-Za-z0-9.+-]+\)?)*")
 
 _EXAMPLES = {
@@ -348,5 +349,4 @@ def _consistency(manifest: Manifest, folder: Path, lines: list[str]) -> Iterator
 
 
 def _licence_hint(licence: str) -> str:
-    close = difflib.get_close_matches(licence.strip("()"), LICENCES, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]}?" if close else ""
+    return suggestion(licence.strip("()"), LICENCES, 0.5)

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from ventbench.entries.folder import CONTROLLER, MAX_BYTES, check_files
-from ventbench.entries.manifest import Finding, check_manifest
+from ventbench.entries.manifest import RULES, Finding, by_word, check_manifest
 from ventbench.sandbox.child.cell import source_text
 from ventbench.sandbox.child.sources import Import, imports, module_files, sources
 from ventbench.sandbox.pipes import OPTIONAL
@@ -90,14 +90,8 @@ def _declared(content: bytes) -> str:
 #: Packages beyond the standard library.
 ALLOWED = ("numpy", *OPTIONAL)
 
-#: Modules of the standard library that cannot do anything in the sandbox.
-_USELESS = {
-    **dict.fromkeys(("socket", "ssl", "urllib", "http", "ftplib", "smtplib"), "the network"),
-    **dict.fromkeys(("socketserver", "xmlrpc", "imaplib", "poplib", "webbrowser"), "the network"),
-    **dict.fromkeys(("subprocess", "multiprocessing", "pty"), "other processes"),
-    **dict.fromkeys(("shelve", "dbm", "sqlite3", "tempfile", "shutil"), "files to write"),
-    **dict.fromkeys(("ctypes", "_ctypes", "ptrace"), "memory beside its own"),
-}
+#: Modules of the standard library that cannot do anything in the sandbox, with what it closes.
+_USELESS = by_word(RULES["closed"])
 _SANDBOX = "leave it out: a submission has its folder to read, its observations, and nothing else"
 _LATE = "import it at the top of the file; later the folder is not searched any more"
 
@@ -143,35 +137,9 @@ def _import_finding(imported: Import, name: str, local_modules: set[str]) -> Fin
     return Finding("source", name, message, advice, *place, problem=not imported.optional)
 
 
-_MODULES = {
-    **dict.fromkeys(("gc", "inspect", "traceback"), "looks into Python's own objects and frames"),
-    **dict.fromkeys(("ctypes", "mmap", "cffi"), "reaches memory beside Python's objects"),
-    **dict.fromkeys(("os", "posix", "fcntl", "resource"), "calls the system"),
-    **dict.fromkeys(("signal", "socket", "select", "selectors"), "calls the system"),
-    **dict.fromkeys(
-        ("threading", "_thread", "concurrent", "asyncio"), "runs beside the controller"
-    ),
-    **dict.fromkeys(("importlib", "runpy", "pkgutil", "imp", "zipimport"), "imports by name"),
-    **dict.fromkeys(("pickle", "marshal", "codeop", "code"), "makes objects or code of bytes"),
-    **dict.fromkeys(("time", "datetime"), "sees the clock"),
-    "builtins": "changes or finds what Python offers",
-}
-_CALLS = {
-    **dict.fromkeys(("exec", "eval", "compile"), "runs code made of text or bytes"),
-    **dict.fromkeys(("__import__", "globals", "locals", "vars"), "finds or imports by name"),
-}
-_FRAMES = (
-    *("_getframe", "_current_frames", "settrace", "setprofile", "f_back", "f_locals"),
-    *("f_globals", "tb_frame", "gi_frame", "cr_frame", "ag_frame"),
-)
-_ATTRIBUTES = {
-    **dict.fromkeys(_FRAMES, "looks into frames"),
-    **dict.fromkeys(
-        ("__subclasses__", "__globals__", "__builtins__"), "finds what it never imported"
-    ),
-    **dict.fromkeys(("__code__", "CodeType", "FunctionType"), "makes or changes code"),
-    **dict.fromkeys(("import_module", "exec_module", "load_module"), "imports by name"),
-}
+#: What each module, call and attribute does that a reviewer should look at.
+_MODULES, _CALLS, _ATTRIBUTES = (by_word(RULES[k]) for k in ("modules", "calls", "attributes"))
+_NAMES = _ATTRIBUTES | _CALLS
 _ADVICE = "for the reviewer: make sure that it is what it seems to be"
 
 
@@ -233,10 +201,8 @@ def _uses(node: ast.AST) -> Iterator[tuple[str, str]]:
     elif isinstance(node, ast.Attribute):
         if node.attr in _ATTRIBUTES:
             yield node.attr, _ATTRIBUTES[node.attr]
-    elif isinstance(node, ast.Name) and node.id in _CALLS:
-        yield node.id, _CALLS[node.id]
-    elif isinstance(node, ast.Name) and node.id in _ATTRIBUTES:
-        yield node.id, _ATTRIBUTES[node.id]
+    elif isinstance(node, ast.Name) and node.id in _NAMES:
+        yield node.id, _NAMES[node.id]
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
         if node.func.attr in ("tobytes", "decode") and isinstance(node.func.value, ast.Subscript):
             yield f".{node.func.attr}()", "makes text or code of an array's bytes"

@@ -14,6 +14,7 @@ from typing import IO, TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError, require
 from ventbench.base.files import write_atomically
 from ventbench.recordings.schema import COLUMNS, OPTIONAL
@@ -33,20 +34,20 @@ class Breaths:
     NaN, and time continues at the last interval.
     """
 
-    breath_id: np.ndarray  #: int64, (n,).
-    R: np.ndarray  #: resistance, cmH2O/(L/s), float64, (n,).
-    C: np.ndarray  #: compliance, mL/cmH2O, float64, (n,).
-    time: np.ndarray  #: s from each breath's first sample, float64, (n, T).
+    breath_id: Ints  #: int64, (n,).
+    R: Floats  #: resistance, cmH2O/(L/s), float64, (n,).
+    C: Floats  #: compliance, mL/cmH2O, float64, (n,).
+    time: Floats  #: s from each breath's first sample, float64, (n, T).
     #: s, `dt[:, i] = time[:, i+1] - time[:, i]`, the last repeated, float64, (n, T).
-    dt: np.ndarray
-    u_in: np.ndarray  #: opening of the inspiratory valve, %, float64, (n, T).
+    dt: Floats
+    u_in: Floats  #: opening of the inspiratory valve, %, float64, (n, T).
     u_out: np.ndarray  #: 1 while the expiratory valve is open, int8, (n, T).
-    pressure: np.ndarray  #: cmH2O, NaN where blank, float64, (n, T).
-    valid: np.ndarray  #: True for a sample, False for padding, bool, (n, T).
+    pressure: Floats  #: cmH2O, NaN where blank, float64, (n, T).
+    valid: Bools  #: True for a sample, False for padding, bool, (n, T).
     #: True if a breath's times were blank and are an estimate, bool, (n,).
-    time_inferred: np.ndarray
-    flow: np.ndarray | None = None  #: mL/s, NaN where blank, float64, (n, T), or None.
-    volume: np.ndarray | None = None  #: mL, NaN where blank, float64, (n, T), or None.
+    time_inferred: Bools
+    flow: Floats | None = None  #: mL/s, NaN where blank, float64, (n, T), or None.
+    volume: Floats | None = None  #: mL, NaN where blank, float64, (n, T), or None.
     source: str | None = None  #: path of the file, or None.
     #: SHA-256 of the file, hex, or None if the breaths are not those of a whole file.
     sha256: str | None = None
@@ -148,14 +149,14 @@ class Breaths:
         return np.array([Lung(r, c).id for r, c in pairs], dtype=str)
 
     @cached_property
-    def by_lung_index(self) -> dict[str, np.ndarray]:
+    def by_lung_index(self) -> dict[str, Ints]:
         """Indices of the breaths of each lung, int64, by R then C."""
         order = np.lexsort((self.C, self.R))
         names = dict.fromkeys(self.lung_ids[order].tolist())
         return {name: np.flatnonzero(self.lung_ids == name) for name in names}
 
     @cached_property
-    def inspiratory(self) -> np.ndarray:
+    def inspiratory(self) -> Bools:
         """Samples of inspiration: u_out is 0 and valid, bool, (n, T)."""
         mask = (self.u_out == 0) & self.valid
         mask.setflags(write=False)
@@ -185,7 +186,7 @@ class Breaths:
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
-def _over(of: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+def _over(of: Callable[[Floats], float], values: Floats) -> float:
     """Figure of what is not blank; NaN if all is."""
     return float("nan") if np.isnan(values).all() else float(of(values))
 
@@ -194,9 +195,7 @@ FILL = {"u_in": 0.0, "u_out": 1, "pressure": np.nan, "flow": np.nan, "volume": n
 """Values of padding."""
 
 
-def stack(
-    values: np.ndarray, lengths: np.ndarray, fill: float, width: int | None = None
-) -> np.ndarray:
+def stack(values: np.ndarray, lengths: Ints, fill: float, width: int | None = None) -> np.ndarray:
     """Arrange samples (m,) of consecutive breaths of lengths (n,) in rows, (n, T).
 
     A value fills short breaths. T is the width, or the longest length; a view if all lengths are T.
@@ -210,9 +209,7 @@ def stack(
     return out
 
 
-def stack_times(
-    time: np.ndarray, lengths: np.ndarray, width: int | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def stack_times(time: Floats, lengths: Ints, width: int | None = None) -> tuple[Floats, Floats]:
     """Times, s, (m,) in rows, and intervals, each (n, T); lengths of at least 2, as of `stack`.
 
     In padding, time continues at the last interval.
@@ -230,15 +227,15 @@ def stack_times(
     return padded, dt
 
 
-def valid_mask(lengths: np.ndarray, width: int | None = None) -> np.ndarray:
+def valid_mask(lengths: Ints, width: int | None = None) -> Bools:
     """True for samples, False for padding, (n, T)."""
     width = int(lengths.max(initial=0)) if width is None else width
     return np.arange(width) < lengths[:, None]
 
 
 def arranged(
-    lengths: np.ndarray,
-    time: np.ndarray,
+    lengths: Ints,
+    time: Floats,
     samples: Mapping[str, np.ndarray],
     width: int | None = None,
     **rest: Any,
@@ -312,27 +309,23 @@ def join(parts: Sequence[Breaths]) -> Breaths:
     if not parts:
         raise InputError("there are no recordings to join")
 
-    def together(name: str, *, samples: bool) -> np.ndarray:
-        arrays = [getattr(part, name) for part in parts]
-        if samples:
-            arrays = [values[part.valid] for values, part in zip(arrays, parts, strict=True)]
-        return np.concatenate(arrays)
-
-    labels = ("breath_id", "R", "C", "time_inferred")
-    signals = [
-        name
-        for name in ("u_in", "u_out", "pressure", *OPTIONAL)
+    rest: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("breath_id", "R", "C", "time_inferred")
+    }
+    samples = {
+        name: np.concatenate([getattr(part, name)[part.valid] for part in parts])
+        for name in ("time", "u_in", "u_out", "pressure", *OPTIONAL)
         if all(getattr(part, name) is not None for part in parts)
-    ]
-    rest: dict[str, Any] = {name: together(name, samples=False) for name in labels}
+    }
     sizes = np.array([part.valid.sum() for part in parts])
     shares = {name: 0.0 for part in parts for name in part.left_out}
     for name in shares:
         shares[name] = float(np.average([p.left_out.get(name, 0.0) for p in parts], weights=sizes))
     return arranged(
         np.concatenate([part.valid.sum(axis=1) for part in parts]),
-        together("time", samples=True),
-        {name: together(name, samples=True) for name in signals},
+        samples.pop("time"),
+        samples,
         notes=tuple(note for part in parts for note in part.notes),
         left_out=shares,
         **rest,

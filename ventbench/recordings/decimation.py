@@ -8,14 +8,13 @@ is exact. Readings are those of the kept samples, never averages.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
-from ventbench.recordings.breaths import Breaths, arranged
+from ventbench.recordings.bad_samples import MEASURED
+from ventbench.recordings.breaths import Breaths, arranged, valid_mask
 
 #: Median sampling interval, s, below which a recording is decimated. The dynamics that pressure can
 #: show have time constants of 10 ms and more.
@@ -73,37 +72,21 @@ def decimate(breaths: Breaths) -> Decimation:
     lengths = breaths.valid.sum(axis=1)
     grids = [_nodes(breaths, i, int(length)) for i, length in enumerate(lengths)]
     counts = np.array([len(nodes) for nodes, _ in grids])
-    columns: dict[str, list[NDArray]] = defaultdict(list)
-    for i, (nodes, _) in enumerate(grids):
-        time = breaths.time[i, nodes]
-        columns["time"].append(time)
-        columns["u_out"].append(breaths.u_out[i, nodes])
-        columns["u_in"].append(_means(breaths.u_in[i], breaths.dt[i], nodes))
-        reading = breaths.pressure[i, nodes].copy()
-        reading[~np.isin(nodes, grids[i][1])] = np.nan
-        columns["pressure"].append(reading)
-        for name in ("flow", "volume"):
-            if (values := getattr(breaths, name)) is not None:
-                columns[name].append(values[i, nodes])
     width = -(-int(counts.max()) // _MULTIPLE) * _MULTIPLE
-    flat = {name: np.concatenate(parts) for name, parts in columns.items()}
-    fewer = arranged(
-        counts,
-        flat.pop("time"),
-        flat,
-        width,
-        breath_id=breaths.breath_id,
-        R=breaths.R,
-        C=breaths.C,
-        time_inferred=breaths.time_inferred,
-        source=breaths.source,
-        sha256=breaths.sha256,
-        notes=breaths.notes,
-    )
-    index = np.stack(
-        [np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes, _ in grids]
-    )
-    return Decimation(fewer, index)
+    index = np.stack([np.pad(nodes, (0, width - len(nodes)), mode="edge") for nodes, _ in grids])
+    kept = valid_mask(counts, width)
+    flat = {
+        name: np.take_along_axis(values, index, axis=1)[kept]
+        for name in ("time", "u_out", *MEASURED)
+        if (values := getattr(breaths, name)) is not None
+    }
+    means = [_means(breaths.u_in[i], breaths.dt[i], nodes) for i, (nodes, _) in enumerate(grids)]
+    read = [np.isin(nodes, readings) for nodes, readings in grids]
+    flat |= {"u_in": np.concatenate(means)}
+    flat["pressure"][~np.concatenate(read)] = np.nan
+    same = ("breath_id", "R", "C", "time_inferred", "source", "sha256", "notes")
+    rest = {name: getattr(breaths, name) for name in same}
+    return Decimation(arranged(counts, flat.pop("time"), flat, width, **rest), index)
 
 
 def _nodes(breaths: Breaths, i: int, length: int) -> tuple[Ints, Ints]:

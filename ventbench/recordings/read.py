@@ -56,6 +56,8 @@ def simulated_pressures(
         InputError: if a column or a breath is missing, the rows do not cover a breath, or they are
             those of another lung or command.
     """
+    import pandas as pd
+
     names = [column for column in COLUMNS if column in table]
     if "breath_id" not in table and "id" in table and names:  # as the competition's submissions
         table = _by_rows(table, name, breaths)
@@ -70,15 +72,13 @@ def simulated_pressures(
     times = next((_numbers(table[key], name, key) for key in _TIMES if key in table), None)
     columns = {key: _numbers(table[key], name, key) for key in ("R", "C", "u_in") if key in table}
     ids = _numbers(table["breath_id"], name, "breath_id")
-    order = np.argsort(ids, kind="stable")
-    starts = np.searchsorted(ids[order], breaths.breath_id)
-    ends = np.searchsorted(ids[order], breaths.breath_id, side="right")
+    rows_of = pd.Series(ids).groupby(ids).indices
     answers = np.full(breaths.pressure.shape, np.nan)
     for i, number in enumerate(breaths.breath_id.tolist()):
-        rows = order[starts[i] : ends[i]]
         sampled = breaths.time[i, breaths.valid[i]]
-        if len(rows) == 0:
+        if number not in rows_of:
             raise InputError(f"{name} has no breath {number} of the recording")
+        rows = rows_of[number]
         simulated, at = values[rows], None if times is None else times[rows] - times[rows][0]
         if not np.all(np.isfinite(simulated)):
             raise InputError(

@@ -12,7 +12,7 @@ import warnings
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -330,7 +330,7 @@ def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _of_values(file: str, columns: dict[str, Sequence[Any]], kind: str) -> Table:
+def _of_values(file: str, columns: Mapping[str, Any], kind: str) -> Table:
     """Columns of any values: numbers where they are, words elsewhere."""
     from pandas import Series
 
@@ -408,25 +408,21 @@ def _fields(message: Any) -> dict[str, Any]:
 
 def _of_topics(file: str, topics: dict[str, list[dict[str, Any]]], kind: str) -> Table:
     """The topics of the most messages as one table: a row a time, the last value of each."""
+    from pandas import DataFrame, concat
+
     if not topics:
         raise InputError(f"{file} holds no messages")
     most = max(map(len, topics.values()))
     used = {topic: rows for topic, rows in topics.items() if 2 * len(rows) >= most}
     names = {key for rows in used.values() for key in rows[0]} - {"time"}
     unique = len(used) == 1 or sum(len(rows[0]) - 1 for rows in used.values()) == len(names)
-    at: dict[float, dict[str, Any]] = {}
+    frames = []
     for topic, messages in used.items():
-        for row in messages:
-            named_columns = {
-                k if unique or k == "time" else f"{topic}/{k}": x for k, x in row.items()
-            }
-            at.setdefault(row["time"], {}).update(named_columns)
-    rows = [at[time] for time in sorted(at)]
-    columns = dict.fromkeys(key for row in rows for key in row)
-    omitted = [topic for topic in topics if topic not in used]
-    table = _of_values(file, {key: [row.get(key) for row in rows] for key in columns}, kind)
-    notes = [
-        *table.notes,
-        *([f"Topics of fewer messages were left out ({', '.join(omitted)})."] if omitted else []),
-    ]
-    return replace(table, notes=tuple(notes))
+        prefix = "" if unique else f"{topic}/"
+        frames.append(DataFrame(messages).set_index("time").add_prefix(prefix).reset_index())
+    merged = concat(frames).groupby("time").last().reset_index()
+    table = _of_values(file, {str(key): x for key, x in merged.items()}, kind)
+    if not (omitted := [topic for topic in topics if topic not in used]):
+        return table
+    note = f"Topics of fewer messages were left out ({', '.join(omitted)})."
+    return replace(table, notes=(*table.notes, note))

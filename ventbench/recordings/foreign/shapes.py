@@ -96,16 +96,13 @@ def _pivoted(table: Table, mapped: Mapping[str, str]) -> Table:
     kind, time = max(kinds, key=understood), _clock(table, mapped)
     if understood(kind) < (0, 2):
         return table
-    code = pd.factorize(table.columns[kind])[0]
-    clock = np.arange(len(table)) if time is None else table.columns[time]
-    again = pd.Series(code).groupby([code, clock] if time is not None else [code]).cumcount()
-    place = pd.MultiIndex.from_arrays([clock if time is not None else again, again])
-    row = pd.factorize(place)[0]
+    clock = np.zeros(len(table)) if time is None else table.columns[time]
+    frame = pd.DataFrame({"kind": table.columns[kind], "clock": clock})
+    frame["again"] = frame.groupby(["kind", "clock"], dropna=False).cumcount()
+    onwards = bool(frame.groupby("kind")["clock"].is_monotonic_increasing.all())
+    places = frame.groupby(["clock", "again"], sort=onwards, dropna=False)
+    row = places.ngroup().to_numpy()
     first = np.unique(row, return_index=True)[1]
-    steps = [np.diff(clock[code == k]) for k in range(code.max() + 1)]
-    if time is not None and all((x >= 0).all() for x in steps):
-        order = np.argsort(clock[first], kind="stable")
-        row, first = np.argsort(order)[row], first[order]
     unit_column = next((name for name, x in words.items() if _units(x)), None)
     headers, columns, units = named(kinds[kind]), {}, {}
     for name, written in headers.items():

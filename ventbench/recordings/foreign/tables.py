@@ -511,7 +511,8 @@ def listed(cells: Sequence[Any], mark: str = ".") -> NDArray[Any] | None:
             cell = re.split(r"[\s;|]+" if mark == "," else r"[\s,;|]+", cell.strip("[](){} \t"))
             cell = [x.replace(",", ".").replace("null", "nan") for x in cell if x]
         try:
-            lists[k] = np.array(() if cell is None else cell, float)
+            blank = cell is None or (isinstance(cell, float) and np.isnan(cell))
+            lists[k] = np.array(() if blank else cell, float)
         except (TypeError, ValueError):
             return None
         if lists[k].ndim != 1:

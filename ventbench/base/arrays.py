@@ -1,9 +1,14 @@
-"""Types of arrays that stand everywhere, and runs of a mask.
+"""Types of arrays that stand everywhere, runs of a mask, and pieces of an array.
 
 Each field and argument says its shape and unit.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,3 +22,36 @@ def runs(mask: Bools) -> list[tuple[int, int]]:
     """Starts and ends of the runs of True in a mask ``(n,)``; a run ends before its end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """k pieces of m samples that follow one another, such as the breaths of a recording."""
+
+    starts: Ints  #: first sample of each, ``(k,)``.
+    total: int  #: samples in all, m.
+
+    @classmethod
+    def of(cls, lengths: Sequence[int] | Ints) -> Pieces:
+        """Pieces of given lengths, ``(k,)``."""
+        ends = np.cumsum(lengths, dtype=np.int64)
+        return cls(ends - lengths, int(ends[-1]))
+
+    @cached_property
+    def lengths(self) -> Ints:
+        """Samples of each, ``(k,)``."""
+        return np.diff(self.starts, append=self.total)
+
+    @cached_property
+    def owner(self) -> Ints:
+        """Number of each sample's piece, from 0, ``(m,)``."""
+        return np.repeat(np.arange(len(self.starts)), self.lengths)
+
+    @cached_property
+    def within(self) -> Ints:
+        """Number of each sample in its piece, from 0, ``(m,)``."""
+        return np.arange(self.total) - self.starts[self.owner]
+
+    def sums(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Sums of values or counts of flags ``(m,)`` over each piece, ``(k,)``."""
+        return np.add.reduceat(values * 1, self.starts)

@@ -203,9 +203,8 @@ def stack(values: np.ndarray, lengths: Ints, fill: float, width: int | None = No
     width = int(lengths.max(initial=0)) if width is None else width
     if (lengths == width).all():
         return values.reshape(len(lengths), width)
-    rows = np.repeat(np.arange(len(lengths)), lengths)
     out = np.full((len(lengths), width), fill, dtype=values.dtype)
-    out[rows, np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)] = values
+    out[valid_mask(lengths, width)] = values
     return out
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats, Pieces
 from ventbench.base.errors import InputError
 from ventbench.base.linear import solve
 from ventbench.recordings.bad_samples import MEASURED, notable
@@ -99,7 +99,7 @@ class Saturation:
 
 
 def breath_figures(
-    time: Floats, samples: Mapping[str, NDArray[Any]], starts: Ints
+    time: Floats, samples: Mapping[str, NDArray[Any]], breaths: Pieces
 ) -> dict[str, Floats]:
     """Reduce breaths to the numbers that :func:`findings` and :func:`saturations` judge.
 
@@ -107,62 +107,57 @@ def breath_figures(
         time: s, NaN where unknown, ``(m,)``.
         samples: ``pressure`` (cmH2O), ``u_in`` (%), ``u_out`` and perhaps ``flow`` (mL/s), NaN
             where blank, ``(m,)`` each.
-        starts: first sample of each breath, ``(k,)``.
+        breaths: samples of each of k breaths.
 
     Returns:
         Figures by name, ``(k,)`` each; cross products of four columns, ``(k, 10)``.
     """
-    lengths = np.diff(starts, append=len(time))
-    breath = np.repeat(np.arange(len(starts)), lengths)
-    remaining = (starts + lengths)[breath] - np.arange(
-        len(time)
-    )  # samples to the end of the breath
+    lengths = breaths.lengths[breaths.owner]
     pressure, u_in = samples["pressure"], np.nan_to_num(samples["u_in"])
     inside = samples["u_out"] == 0
 
     def mean(values: Floats, where: Bools) -> Floats:
         where = where & np.isfinite(values)
-        count = np.add.reduceat(where.astype(float), starts)
-        return _ratio(np.add.reduceat(np.where(where, values, 0.0), starts), count)
+        return _ratio(breaths.sums(np.where(where, values, 0.0)), breaths.sums(where))
 
     out = {
-        "inspiration": np.add.reduceat(inside.astype(float), starts) / lengths,
-        "end": mean(pressure, remaining <= _END * lengths[breath]),
+        "inspiration": breaths.sums(inside) / breaths.lengths,
+        "end": mean(pressure, lengths - breaths.within <= _END * lengths),
         "inside": mean(pressure, inside),
         "outside": mean(pressure, ~inside),
         "u_in_inside": mean(u_in, inside),
         "u_in_outside": mean(u_in, ~inside),
-        "u_in": np.maximum.reduceat(u_in, starts),
-        "missing": _missing(time, starts, breath),
+        "u_in": np.maximum.reduceat(u_in, breaths.starts),
+        "missing": _missing(time, breaths),
     }
-    out |= _commands_of(time, pressure, np.where(inside, u_in, np.nan), starts, breath)
+    out |= _commands_of(time, pressure, np.where(inside, u_in, np.nan), breaths)
     for name in ("pressure", "flow"):
         if name in samples:
             for side, sign in (("high", 1.0), ("low", -1.0)):
-                for key, values in _ends(sign * samples[name], starts, breath).items():
+                for key, values in _ends(sign * samples[name], breaths).items():
                     out[f"{name}_{side}{key}"] = values
-            out[f"{name}_count"] = np.add.reduceat(np.isfinite(samples[name]) * 1.0, starts)
+            out[f"{name}_count"] = breaths.sums(np.isfinite(samples[name]))
     if "flow" in samples:
-        out |= _regression(time, pressure, samples["flow"], samples.get("volume"), starts, breath)
+        out |= _regression(time, pressure, samples["flow"], samples.get("volume"), breaths)
     return out
 
 
-def _missing(time: Floats, starts: Ints, breath: Ints) -> Floats:
+def _missing(time: Floats, breaths: Pieces) -> Floats:
     """Rows that the clock of each breath jumps over."""
-    steps = np.where(np.diff(breath, prepend=-1) == 0, np.diff(time, prepend=np.nan), np.nan)
+    steps = np.where(breaths.within > 0, np.diff(time, prepend=np.nan), np.nan)
     finite = steps[np.isfinite(steps)]
     if len(finite) == 0:
-        return np.zeros(len(starts))
+        return np.zeros(len(breaths.starts))
     usual = float(np.median(finite))
     jumps = np.where(steps > _JUMP * usual, np.round(steps / max(usual, 1e-9)) - 1.0, 0.0)
-    return np.add.reduceat(jumps, starts)
+    return breaths.sums(jumps)
 
 
-def _integral(time: Floats, rate: Floats, starts: Ints, breath: Ints) -> Floats:
+def _integral(time: Floats, rate: Floats, breaths: Pieces) -> Floats:
     """Integral of a rate, which ends at each sample, from the start of each breath, ``(m,)``."""
-    same = np.diff(breath, prepend=-1) == 0
-    total = np.cumsum(np.where(same, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0) * rate)
-    return total - total[starts][breath]
+    steps = np.nan_to_num(np.diff(time, prepend=time[:1]))
+    total = np.cumsum(np.where(breaths.within > 0, steps, 0.0) * rate)
+    return total - total[breaths.starts][breaths.owner]
 
 
 #: Breaths whose commands may stand beside a pressure: its own, the one before, the one after.
@@ -170,20 +165,19 @@ _SHIFTS = (0, -1, 1)
 
 
 def _commands_of(
-    time: Floats, pressure: Floats, u_in: Floats, starts: Ints, breath: Ints
+    time: Floats, pressure: Floats, u_in: Floats, breaths: Pieces
 ) -> dict[str, Floats]:
     """Cross products of p = a u + b V + c over inspirations, with the commands of three breaths."""
-    within = np.arange(len(time)) - starts[breath]
-    lengths = np.diff(starts, append=len(time))
-    volume = _integral(time, np.nan_to_num(u_in), starts, breath)
+    volume = _integral(time, np.nan_to_num(u_in), breaths)
     products = {}
     for shift in _SHIFTS:
-        neighbour = np.clip(breath + shift, 0, len(starts) - 1)
-        at = np.minimum(starts[neighbour] + within, len(time) - 1)
-        good = (neighbour == breath + shift) & (within < lengths[neighbour])
+        neighbour = np.clip(breaths.owner + shift, 0, len(breaths.starts) - 1)
+        at = np.minimum(breaths.starts[neighbour] + breaths.within, len(time) - 1)
+        good = neighbour == breaths.owner + shift
+        good &= breaths.within < breaths.lengths[neighbour]
         good &= np.isfinite(u_in[at]) & np.isfinite(pressure) & np.isfinite(u_in)
         columns = (u_in[at], volume[at], np.ones(len(time)), pressure)
-        products[f"shift{shift}"] = _cross_products(columns, good, starts)
+        products[f"shift{shift}"] = _cross_products(columns, good, breaths)
     return products
 
 
@@ -192,11 +186,11 @@ _PAIRS, _PLACE = np.triu_indices(4), np.zeros((4, 4), int)
 _PLACE[_PAIRS] = _PLACE.T[_PAIRS] = np.arange(10)
 
 
-def _cross_products(columns: Sequence[Floats], use: Bools, starts: Ints) -> Floats:
+def _cross_products(columns: Sequence[Floats], use: Bools, breaths: Pieces) -> Floats:
     """Cross products of four columns ``(m,)`` over the used samples of each breath, ``(n, 10)``."""
     used = [np.where(use, column, 0.0) for column in columns]
     pairs = zip(*_PAIRS, strict=True)
-    return np.stack([np.add.reduceat(used[i] * used[j], starts) for i, j in pairs], axis=1)
+    return np.stack([breaths.sums(used[i] * used[j]) for i, j in pairs], axis=1)
 
 
 def _covariances(products: Floats) -> Floats:
@@ -207,8 +201,9 @@ def _covariances(products: Floats) -> Floats:
     return products / count[..., None] - mean[:, :, None] * mean[:, None, :]
 
 
-def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
+def _ends(values: Floats, breaths: Pieces) -> dict[str, Floats]:
     """Largest value of each breath, how often, the next one, how often, and the step to the top."""
+    starts, breath = breaths.starts, breaths.owner
     with np.errstate(invalid="ignore"):
         top = np.fmax.reduceat(values, starts)
         at = values == top[breath]
@@ -221,8 +216,8 @@ def _ends(values: Floats, starts: Ints, breath: Ints) -> dict[str, Floats]:
         step = np.fmin.reduceat(steps, starts)
     return {
         "": top,
-        "_often": np.add.reduceat(at * 1.0, starts),
-        "_next": np.add.reduceat(adjacent * 1.0, starts),
+        "_often": breaths.sums(at),
+        "_next": breaths.sums(adjacent),
         "_step": step,
     }
 
@@ -232,8 +227,7 @@ def _regression(
     pressure: Floats,
     flow: Floats,
     measured: Floats | None,
-    starts: Ints,
-    breath: Ints,
+    breaths: Pieces,
 ) -> dict[str, Floats]:
     """Correlation of pressure and flow, and cross products of Q, V, 1 and p (p = R Q + V / C + p0).
 
@@ -241,14 +235,14 @@ def _regression(
     """
     finite = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
     q = np.where(finite, flow, 0.0)
-    volume = _integral(time, 0.5 * (q + np.roll(q, 1)), starts, breath)
+    volume = _integral(time, 0.5 * (q + np.roll(q, 1)), breaths)
     columns = [q, volume, np.ones(len(q)), pressure]
-    figures = {"flow_products": _cross_products(columns, finite, starts)}
+    figures = {"flow_products": _cross_products(columns, finite, breaths)}
     spread = _covariances(figures["flow_products"])
     figures["correlation"] = _correlation(spread, 0, 3)
     if measured is not None:
         columns[3] = measured
-        spread = _covariances(_cross_products(columns, finite & np.isfinite(measured), starts))
+        spread = _covariances(_cross_products(columns, finite & np.isfinite(measured), breaths))
         figures["volume_ratio"] = _ratio(spread[:, 1, 3], spread[:, 1, 1])
         figures["volume_correlation"] = _correlation(spread, 1, 3)
     return figures
@@ -545,7 +539,5 @@ def _figures_of(breaths: Breaths) -> dict[str, Floats]:
         valid = breaths.valid[some]
         arrays = {name: getattr(breaths, name) for name in ("u_in", "u_out", *MEASURED)}
         flat = {name: a[some][valid] for name, a in arrays.items() if a is not None}
-        lengths = valid.sum(axis=1)
-        starts = (np.cumsum(lengths) - lengths).astype(np.int64)
-        parts.append(breath_figures(breaths.time[some][valid], flat, starts))
+        parts.append(breath_figures(breaths.time[some][valid], flat, Pieces.of(valid.sum(axis=1))))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats, Ints, Pieces
 from ventbench.recordings.bad_samples import BadSamples, blanked, find_bad_samples
 from ventbench.recordings.roles import breath_figures
 from ventbench.recordings.schema import (
@@ -61,20 +61,10 @@ class Rows:
         return Rows(columns, self.blank_id[start:stop], self.first + start)
 
     @cached_property
-    def starts(self) -> Ints:
-        """Each breath's first row, (k,), k >= 1."""
+    def breaths(self) -> Pieces:
+        """Rows of each breath; there is one at least."""
         ids = self.columns["breath_id"]
-        return np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1)
-
-    @cached_property
-    def lengths(self) -> Ints:
-        """Rows in each breath, (k,)."""
-        return np.diff(self.starts, append=len(self.blank_id))
-
-    @cached_property
-    def breath(self) -> Ints:
-        """Number of each row's breath, from 0, (m,)."""
-        return np.repeat(np.arange(len(self.starts)), self.lengths)
+        return Pieces(np.append(0, np.flatnonzero(ids[1:] != ids[:-1]) + 1), len(ids))
 
 
 #: Rows that are checked at a time, about: enough to tell a mark of missing from a reading.
@@ -98,7 +88,8 @@ def blocks_of(batches: Iterable[pa.RecordBatch]) -> Iterator[Rows]:
         if waiting < 2 * ROWS:
             continue
         rows = _joined(pending)
-        starts = rows.starts[(rows.starts >= ROWS) & (rows.starts < waiting)]
+        starts = rows.breaths.starts
+        starts = starts[(starts >= ROWS) & (starts < waiting)]
         if len(starts):
             cut = int(starts[-1])
             yield rows.part(0, cut)
@@ -271,38 +262,37 @@ def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: Bools) -> None:
 
 def check_ids(rows: Rows, log: ProblemLog, first_rows: dict[int, int]) -> None:
     """Check that the rows of each breath follow one another; ``seen`` are first rows by id."""
-    starts = rows.starts + rows.first
-    ids = rows.columns["breath_id"][rows.starts].tolist()
-    earlier = np.array(
-        [first_rows.setdefault(id_, at) for id_, at in zip(ids, starts.tolist(), strict=True)]
-    )
+    starts = rows.breaths.starts
+    ids = rows.columns["breath_id"][starts].tolist()
+    at = (starts + rows.first).tolist()
+    earlier = np.array(list(map(first_rows.setdefault, ids, at))) - rows.first
     again = np.flatnonzero(earlier != starts)
     message = "breath {value} comes again, it is already at {other}"
     advice = "Keep the rows of a breath together, and give each breath an id of its own."
-    values = rows.columns["breath_id"][rows.starts[again]]
-    at = rows.starts[again]
-    log.add(at, "breath_id", message, advice, values, references=earlier[again] - rows.first)
+    values = rows.columns["breath_id"][starts[again]]
+    log.add(starts[again], "breath_id", message, advice, values, references=earlier[again])
 
 
 def check_lung(rows: Rows, log: ProblemLog) -> None:
     """Check that R and C stay the same within each breath."""
+    breaths = rows.breaths
     for name in ("R", "C"):
         values = rows.columns[name]
-        first = np.repeat(values[rows.starts], rows.lengths)
+        first = values[breaths.starts][breaths.owner]
         with np.errstate(invalid="ignore"):
             at = np.flatnonzero((values != first) & ~np.isnan(values) & ~np.isnan(first))
         if len(at) == 0:
             continue
-        at = at[np.unique(rows.breath[at], return_index=True)[1]]
+        at = at[np.unique(breaths.owner[at], return_index=True)[1]]
         message = f"{name} changes to {{value}} within the breath, which starts at {{other}}"
         advice = "A breath has one lung: give the second part its own breath_id, or fix the row."
-        first_row = rows.starts[rows.breath[at]]
+        first_row = breaths.starts[breaths.owner[at]]
         log.add(at, name, message, advice, values[at], references=first_row)
 
 
 def check_single(rows: Rows, log: ProblemLog) -> None:
     """Check that each breath has at least two samples."""
-    at = rows.starts[rows.lengths == 1]
+    at = rows.breaths.starts[rows.breaths.lengths == 1]
     message = "breath {value} has one sample, at least two are needed"
     advice = "Remove it, or keep the rows of a breath together."
     log.add(at, "breath_id", message, advice, rows.columns["breath_id"][at])
@@ -327,7 +317,7 @@ def check_times(rows: Rows, log: ProblemLog) -> None:
     Repeated rows are reported as such. In breaths without times, a row is a repeat if it equals the
     row before in every column, including `id`.
     """
-    time, breath = rows.columns["time_step"], rows.breath
+    time, breath = rows.columns["time_step"], rows.breaths.owner
     finite = np.flatnonzero(np.isfinite(time))
     previous, current = finite[:-1], finite[1:]
     late = (time[current] <= time[previous]) & (breath[current] == breath[previous])
@@ -399,14 +389,10 @@ def estimated_intervals(n_inspiratory: Ints, interval: Floats, lengths: Ints) ->
     return np.where(switches, by_count, pd.Series(interval).median())
 
 
-def leading_zeros(u_out: NDArray[np.int8], starts: Ints, lengths: Ints) -> Ints:
-    """Count the leading samples with u_out = 0, ``(m,)``, of each breath, (k,).
-
-    ``starts`` is the first row of each breath, and ``lengths`` the number of its rows, (k,).
-    """
-    within = np.arange(len(u_out)) - np.repeat(starts, lengths)
-    switched = np.where(u_out != 0, within, len(u_out))
-    return np.minimum(np.minimum.reduceat(switched, starts), lengths)
+def leading_zeros(u_out: NDArray[np.int8], breaths: Pieces) -> Ints:
+    """Count the leading samples with u_out = 0, ``(m,)``, of each breath, (k,)."""
+    switched = np.where(u_out != 0, breaths.within, len(u_out))
+    return np.minimum(np.minimum.reduceat(switched, breaths.starts), breaths.lengths)
 
 
 @dataclass(frozen=True)
@@ -420,25 +406,24 @@ class KnownTimes:
     shifted: Bools  #: breaths that do not start at 0 in the file, (k,) bool.
 
 
-def complete_times(time: Floats, starts: Ints, lengths: Ints) -> KnownTimes:
+def complete_times(time: Floats, breaths: Pieces) -> KnownTimes:
     """Interpolate single blank times and shift each breath to start at 0.
 
     Blank times between two known ones are linear in the sample number; those before the first or
     after the last known one are extrapolated at the breath's mean interval. Times are as in the
-    file, s, NaN where blank, (m,); starts and lengths as of :func:`leading_zeros`.
+    file, s, NaN where blank, (m,).
     """
-    missing = np.isnan(time)
-    n_missing = np.add.reduceat(missing.astype(np.int64), starts)
-    blank = lengths - n_missing < 2
+    starts, n_missing = breaths.starts, breaths.sums(np.isnan(time))
+    blank = breaths.lengths - n_missing < 2
     partial = (n_missing > 0) & ~blank
     if partial.any():
         time = time.copy()
         for breath in np.flatnonzero(partial):
-            span = slice(starts[breath], starts[breath] + lengths[breath])
+            span = slice(starts[breath], starts[breath] + breaths.lengths[breath])
             time[span] = _interpolate(time[span])
     first = time[starts]
     shifted = np.isfinite(first) & (first != 0.0) & ~blank
-    time = time - np.repeat(np.where(blank, np.nan, first), lengths)
+    time = time - np.where(blank, np.nan, first)[breaths.owner]
     return KnownTimes(time, blank, np.where(partial, n_missing, 0), shifted)
 
 
@@ -533,8 +518,8 @@ def scan(
 def _scanned(
     rows: Rows, columns: dict[str, NDArray[Any]], bad: Sequence[BadSamples], keep: bool
 ) -> Scanned:
-    starts, lengths = rows.starts, rows.lengths
-    times = complete_times(columns["time_step"], starts, lengths)
+    starts, lengths = rows.breaths.starts, rows.breaths.lengths
+    times = complete_times(columns["time_step"], rows.breaths)
     names = ("u_in", "pressure", *OPTIONAL)
     samples = {name: columns[name] for name in names if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
@@ -547,15 +532,15 @@ def _scanned(
         C=columns["C"][starts],
         starts=starts + rows.first,
         lengths=lengths,
-        n_inspiratory=leading_zeros(samples["u_out"], starts, lengths),
+        n_inspiratory=leading_zeros(samples["u_out"], rows.breaths),
         interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
         time_blank=times.blank,
         time_interpolated=times.interpolated,
         time_shifted=times.shifted,
         steps=np.stack([x.reduceat(inside, starts) for x in (np.fmin, np.fmax)], axis=1),
-        blank_pressures=np.add.reduceat(np.isnan(samples["pressure"]).astype(int), starts),
+        blank_pressures=rows.breaths.sums(np.isnan(samples["pressure"])),
         optional=tuple(name for name in OPTIONAL if name in samples),
-        figures=breath_figures(times.time, samples, starts),
+        figures=breath_figures(times.time, samples, rows.breaths),
         bad=tuple(replace(bad_samples, rows=bad_samples.rows + rows.first) for bad_samples in bad),
         samples={"time": times.time, **samples} if keep else {},
     )

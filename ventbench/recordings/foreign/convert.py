@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats, Ints, Pieces
 from ventbench.base.errors import InputError
 from ventbench.recordings.bad_samples import (
     MEASURED,
@@ -259,15 +259,14 @@ def import_recording(
     pieces, dropped = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
     notes += dropped
     warnings += _suspicious(samples, changes)
-    rows, lengths = np.concatenate(pieces), np.array([len(piece) for piece in pieces])
-    starts = np.cumsum(lengths) - lengths
+    rows, parts = np.concatenate(pieces), Pieces.of(list(map(len, pieces)))
     breaths = arranged(
-        lengths,
-        complete_times(time[rows], starts, lengths).time,
+        parts.lengths,
+        complete_times(time[rows], parts).time,
         {name: x[rows] for name, x in samples.items()},
         breath_id=np.arange(1, len(pieces) + 1),
-        R=R[rows[starts]],
-        C=C[rows[starts]],
+        R=R[rows[parts.starts]],
+        C=C[rows[parts.starts]],
         source=table.file,
         notes=tuple(notes),
         left_out=left_out(bad),
@@ -772,7 +771,7 @@ def _sound(
 ) -> tuple[list[Ints], list[str]]:
     """Breaths that the schema can hold; refuse the others, or leave them out and name them."""
     rows, bad, problems = np.concatenate(pieces), dict[int, str](), list[str]()
-    owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    owner = Pieces.of(list(map(len, pieces))).owner
     for name, values in samples.items():
         column, cells = COLUMNS[name], np.asarray(values, float)[rows]
         wrong = np.flatnonzero(column.outside(cells) | (np.isnan(cells) & (not column.blank)))

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ventbench.base.arrays import Floats
+from ventbench.base.arrays import Floats, Pieces
 from ventbench.base.errors import InputError
 from ventbench.recordings.foreign.tables import FREQUENCIES, INTERVALS, Table, named
 from ventbench.recordings.headers import Conversion, conversion, is_unit
@@ -152,16 +152,15 @@ def _unpacked(
                 f"{table.file}, {table.place(int(odd[0]))}: column {name} lists {size[odd[0]]} "
                 f"samples, another one {lengths[odd[0]]}; leave one out with --map {name}=unused"
             )
-    rows = np.repeat(np.arange(len(lengths)), lengths)
-    within = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    columns = {name: x[rows] for name, x in table.columns.items() if x.dtype.kind != "O"}
+    rows = Pieces.of(lengths)
+    columns = {name: x[rows.owner] for name, x in table.columns.items() if x.dtype.kind != "O"}
     for name, x in packed.items():
-        blank = (np.full(n, np.nan) for n in np.where(sizes[name] == 0, lengths, 0))
-        columns[name] = np.concatenate(
-            [part for pair in zip(x, blank, strict=True) for part in pair]
+        filled = (
+            cell if len(cell) else np.full(n, np.nan) for cell, n in zip(x, lengths, strict=True)
         )
+        columns[name] = np.concatenate(list(filled))
     note = f"{len(lengths)} rows of lists, of {np.median(lengths):g} samples (median)."
-    lines = None if table.lines is None else table.lines[rows]
+    lines = None if table.lines is None else table.lines[rows.owner]
     unrolled = replace(table, columns=columns, lines=lines, notes=(*table.notes, note))
     if rate is not None or any(_role(table, name, mapped) == "time" for name in packed):
         return unrolled
@@ -176,7 +175,7 @@ def _unpacked(
         )
     if starts is None:
         starts = np.cumsum(interval * lengths) - interval * lengths
-    columns[time or "time"] = (starts[rows] + interval[rows] * within) / factor
+    columns[time or "time"] = (starts[rows.owner] + interval[rows.owner] * rows.within) / factor
     return unrolled
 
 

@@ -171,35 +171,38 @@ def import_recording(
     table = path
     if not isinstance(table, Table):
         table = read_table(table, separator=separator, decimal=decimal)
-    table, selected = _selected(table, dict(select or {}))
+    table = _selected(table, dict(select or {}))
     mapped, units = dict(columns or {}), dict(units or {})
     table = one_row_a_sample(table, mapped, units.get("time"), rate)
     layout = layout or recognise(table.columns)
     spec = _layout(layout, table)
     roles = _roles(table, mapped, spec, rate)
     spoken = (spec.words if spec is not None else {}) | dict(words or {})
-    table, roles, states = _states(table, roles, spoken)
+    table, roles = _states(table, roles, spoken)
     by_role = {role: name for name, role in roles.items() if role not in ("group", "unused")}
     changes = _conversions(table, by_role, units, spec)
-    notes, warnings = [*table.notes, *selected, *states], []
     if spec is not None:
-        notes.append(f"Layout {layout}: {spec.about}.")
+        table = table.noted(f"Layout {layout}: {spec.about}.")
     clock = by_role.get("time")
     if clock is not None and (unit := epoch_unit(table.columns[clock])) not in (None, "s"):
-        notes.append(f"{clock} counts {unit} since 1970, by the size of its values.")
+        table = table.noted(f"{clock} counts {unit} since 1970, by the size of its values.")
     raw = {
         role: _numbers(table, name, spoken)
         for role, name in by_role.items()
         if role != "breath" and not (role == "time" and rate is not None)
     }
-    for step in (_once, _together):
-        table, raw, sentences = step(table, raw)
-        notes += sentences
+    for reason in (_repeats, _knows_little):
+        omitted, why = reason(raw)
+        if omitted.any():
+            first = table.place(int(np.argmax(omitted)))
+            raw = {role: x[~omitted] for role, x in raw.items()}
+            sentence = f"{int(omitted.sum())} rows {why}, the first in {first}."
+            table = table.rows(~omitted).noted(sentence)
+    notes = list(table.notes)
     measured = {role: raw[role] for role in (*MEASURED, "u_in") if role in raw}
     bad = find_bad_samples(measured, tuple(missing))
     raw |= blanked(measured, bad)
-    sentences = [_of_file(bad_samples, table, by_role) for bad_samples in bad]
-    warnings += sentences
+    warnings = [_of_file(bad_samples, table, by_role) for bad_samples in bad]
     added = dict(offsets or {})
     if unknown := set(added) - set(raw):
         raise InputError(f"--offset {min(unknown)}: no column is {min(unknown)}")
@@ -309,12 +312,12 @@ def import_runs(path: str | Path) -> dict[str, Breaths]:
     )
     keys = np.array([" ".join(row) for row in zip(*cells, strict=True)])
     return {
-        key: import_recording(_rows(table, keys == key)).breaths
+        key: import_recording(table.rows(keys == key)).breaths
         for key in dict.fromkeys(keys.tolist())
     }
 
 
-def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
+def _selected(table: Table, select: dict[str, str]) -> Table:
     """Rows whose columns have given values."""
     keep = np.ones(len(table), bool)
     for name, value in select.items():
@@ -328,14 +331,8 @@ def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
         conditions = ", ".join(f"{n}={v}" for n, v in select.items())
         raise InputError(f"{table.file}: no row has {conditions}")
     if keep.all():
-        return table, []
-    return _rows(table, keep), [f"{int(keep.sum())} of {len(keep)} rows were selected."]
-
-
-def _rows(table: Table, keep: Bools) -> Table:
-    columns = {name: values[keep] for name, values in table.columns.items()}
-    lines = None if table.lines is None else table.lines[keep]
-    return replace(table, columns=columns, lines=lines)
+        return table
+    return table.rows(keep).noted(f"{int(keep.sum())} of {len(keep)} rows were selected.")
 
 
 def _same(cell: Any, value: str) -> bool:
@@ -494,7 +491,7 @@ def _conversions(
 
 def _states(
     table: Table, roles: dict[str, str], spoken: Mapping[str, float]
-) -> tuple[Table, dict[str, str], list[str]]:
+) -> tuple[Table, dict[str, str]]:
     """Numbers in place of a pair of words such as open and closed in the columns of valves.
 
     A column of inspiration and expiration is that of the expiratory valve if there is no other.
@@ -518,7 +515,7 @@ def _states(
             units[name] = "1"
         columns[name] = np.where(values == "", np.nan, np.where(values == one, 1.0, 0.0))
         sentences.append(f"{name}: {one} is 1 (open) and {zero} is 0; else give --map-values.")
-    return replace(table, columns=columns, units=units), roles, sentences
+    return replace(table, columns=columns, units=units).noted(*sentences), roles
 
 
 def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:
@@ -549,32 +546,23 @@ def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:
     return numbers[which.reshape(-1)]
 
 
-def _once(table: Table, raw: dict[str, Floats]) -> tuple[Table, dict[str, Floats], list[str]]:
-    """Rows, without those that are there twice."""
-    repeats = repeated_rows(raw)
-    if not repeats.any():
-        return table, raw, []
-    count, first = int(repeats.sum()), table.place(int(np.argmax(repeats)))
-    sentence = f"{count} rows that repeat the row before were left out, the first in {first}."
-    return _rows(table, ~repeats), {k: x[~repeats] for k, x in raw.items()}, [sentence]
+def _repeats(raw: Mapping[str, Floats]) -> tuple[Bools, str]:
+    """Rows that are there twice, and what they are in words."""
+    return repeated_rows(raw), "that repeat the row before were left out"
 
 
-def _together(table: Table, raw: dict[str, Floats]) -> tuple[Table, dict[str, Floats], list[str]]:
-    """The rows of the slowest measured column, where it comes more slowly than the others.
+def _knows_little(raw: Mapping[str, Floats]) -> tuple[Bools, str]:
+    """Rows without the slowest measured column, where it comes more slowly than the others.
 
     Between, it would be invented, and would lag behind the others where it jumps. Commands are not
     thinned, and without a clock no rows can be missed.
     """
     finite = [np.isfinite(raw[role]) for role in MEASURED if role in raw]
-    shares = [float(x.mean()) for x in finite if x.any()]
-    if not shares or min(shares) > 1.0 - _SPARSE or "u_in" in raw or "time" not in raw:
-        return table, raw, []
-    both = np.logical_and.reduce([x for x in finite if x.any()])
-    if both.mean() < 0.9 * min(shares):
-        return table, raw, []
-    count = len(both) - int(both.sum())
-    sentence = [f"{count} rows were left out in which only some of the measured columns are known."]
-    return _rows(table, both), {name: x[both] for name, x in raw.items()}, sentence
+    finite = [x for x in finite if x.any()] or [np.ones(1, bool)]
+    least, both = min(x.mean() for x in finite), np.logical_and.reduce(finite)
+    slow = least <= 1.0 - _SPARSE and both.mean() >= 0.9 * least
+    omitted = ~both & (slow and "u_in" not in raw and "time" in raw)
+    return omitted, "were left out in which only some of the measured columns are known"
 
 
 def _of_file(bad: BadSamples, table: Table, by_role: Mapping[str, str]) -> str:

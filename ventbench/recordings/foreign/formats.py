@@ -13,7 +13,6 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -425,4 +424,4 @@ def _of_topics(file: str, topics: dict[str, list[dict[str, Any]]], kind: str) ->
     if not (omitted := [topic for topic in topics if topic not in used]):
         return table
     note = f"Topics of fewer messages were left out ({', '.join(omitted)})."
-    return replace(table, notes=(*table.notes, note))
+    return table.noted(note)

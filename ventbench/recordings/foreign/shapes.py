@@ -117,16 +117,9 @@ def _pivoted(table: Table, mapped: Mapping[str, str]) -> Table:
             columns[name] = x[first]
             headers[name] = table.headers.get(name, name)
             units |= {name: table.units[name]} if name in table.units else {}
-    notes = f"A row a measurement: {kind} names it, {values} is its value ({', '.join(headers)})."
-    lines = None if table.lines is None else table.lines[first]
-    return replace(
-        table,
-        columns=columns,
-        units=units,
-        lines=lines,
-        notes=(*table.notes, notes),
-        headers=headers,
-    )
+    note = f"A row a measurement: {kind} names it, {values} is its value ({', '.join(headers)})."
+    shorter = table.rows(first).noted(note)
+    return replace(shorter, columns=columns, units=units, headers=headers)
 
 
 def _units(words: list[str]) -> bool:
@@ -153,15 +146,15 @@ def _unpacked(
                 f"samples, another one {lengths[odd[0]]}; leave one out with --map {name}=unused"
             )
     rows = Pieces.of(lengths)
-    columns = {name: x[rows.owner] for name, x in table.columns.items() if x.dtype.kind != "O"}
+    unrolled = table.rows(rows.owner)
+    columns = unrolled.columns
     for name, x in packed.items():
         filled = (
             cell if len(cell) else np.full(n, np.nan) for cell, n in zip(x, lengths, strict=True)
         )
         columns[name] = np.concatenate(list(filled))
     note = f"{len(lengths)} rows of lists, of {np.median(lengths):g} samples (median)."
-    lines = None if table.lines is None else table.lines[rows.owner]
-    unrolled = replace(table, columns=columns, lines=lines, notes=(*table.notes, note))
+    unrolled = unrolled.noted(note)
     if rate is not None or any(_role(table, name, mapped) == "time" for name in packed):
         return unrolled
     time = _clock(table, mapped)

@@ -95,6 +95,17 @@ class Table:
         """Number of rows."""
         return len(next(iter(self.columns.values())))
 
+    def noted(self, *sentences: str) -> Table:
+        """The table with more of what was understood."""
+        return replace(self, notes=(*self.notes, *sentences))
+
+    def rows(self, which: Bools | Ints) -> Table:
+        """Some of its rows."""
+        columns = {name: values[which] for name, values in self.columns.items()}
+        return replace(
+            self, columns=columns, lines=None if self.lines is None else self.lines[which]
+        )
+
     def is_numeric(self, name: str) -> bool:
         """Whether a column holds numbers."""
         return self.columns[name].dtype.kind in "fiub"

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from ventbench.entries.cells import Progress
     from ventbench.entries.folder import Submission
     from ventbench.entries.result import Score
-    from ventbench.entries.scoring import Progress
 
 Track = Literal["performance", "robustness", "all"]
 

@@ -9,6 +9,7 @@ batches of observations, :data:`~ventbench.sandbox.child.cell.ROW` floats each, 
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -293,6 +294,19 @@ class InProcessRunner:
         return InProcessSession(submission, tasks)
 
 
+#: Called with rounds of commands that are done, and all of them.
+Progress = Callable[[int, int], object]
+
+#: Rounds of a run: a command of each cell.
+ROUNDS = protocol.BREATHS * protocol.INSPIRATION_STEPS
+
+
+def counted(progress: Progress | None, total: int) -> Callable[[], object]:
+    """What counts rounds, and tells how many of all are done."""
+    rounds = itertools.count(1)
+    return lambda: progress and progress(next(rounds), total)
+
+
 def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
     """Choose how a submission runs: a folder in locked-down processes unless ``sandbox`` is False.
 
@@ -437,8 +451,7 @@ def step_through(
     """
     batch = np.shape(scenario.pip)
     cells, steps = int(np.prod(batch)), protocol.INSPIRATION_STEPS
-    total = protocol.BREATHS * steps
-    pressure, requested, applied, volume = (np.zeros((cells, total)) for _ in range(4))
+    pressure, requested, applied, volume = (np.zeros((cells, ROUNDS)) for _ in range(4))
     cell_tasks = [task for task in tasks for _ in range(cells // len(tasks))]
     breaths = range(protocol.BREATHS)
     parts = [jax.tree.map(lambda x, k=k: x[:, k], plants) if changing else plants for k in breaths]
@@ -451,8 +464,8 @@ def step_through(
     with compilation.float32():  # a submission that uses JAX finds it as it is elsewhere
         session = runner.start(submission, cell_tasks)
     try:
-        while (answered < total).any():
-            at = np.minimum(answered, total - 1).reshape(batch)
+        while (answered < ROUNDS).any():
+            at = np.minimum(answered, ROUNDS - 1).reshape(batch)
             rows = pack(_observe(scenario, loop, at // steps, at % steps))
             pressure[ready, answered[ready]] = _of_cells(loop.signals.scored, batch)[ready]
             if has_volume:
@@ -484,7 +497,7 @@ def step_through(
                     loop = (
                         _select(finished, initial[k + 1][1], loop) if k + 1 < len(initial) else loop
                     )
-            ready = ready[answered[ready] < total]
+            ready = ready[answered[ready] < ROUNDS]
         failures = dict(session.failures)
     finally:
         session.close()

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ventbench.base.arrays import Floats
-from ventbench.entries.cells import ControllerSession, Runner
+from ventbench.entries.cells import ControllerSession, Progress, Runner, counted
 from ventbench.entries.folder import (
     CONTROLLER,
     SEEDS,
@@ -159,12 +159,9 @@ def run_all(
     submission: Submission,
     runs: Sequence[ContractRun],
     runner: Runner,
-    clock: Callable[[ControllerSession], float] = processor_time,
-    count: Callable[[], None] = lambda: None,
+    count: Callable[[], object] = lambda: None,
 ) -> Answers:
     """Run fresh runs of a submission's controller side by side; each round is counted.
-
-    ``clock`` times the calls of ``act``, s; by default as the system counts a process's time.
 
     Raises:
         SubmissionError: if the code cannot be imported.
@@ -179,9 +176,9 @@ def run_all(
         while waiting:
             batch = np.array(rows)
             live = max(1, len(runs) - len(session.failures))
-            start = clock(session)
+            start = processor_time(session)
             answers = session.act(batch)
-            seconds.append((clock(session) - start) / live)
+            seconds.append((processor_time(session) - start) / live)
             count()
             for k in sorted(waiting):
                 if k in session.failures:
@@ -287,8 +284,7 @@ _ROUNDS = STEPS + STEPS
 def check(
     name: str,
     runner: Runner | None = None,
-    clock: Callable[[ControllerSession], float] = processor_time,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> CheckReport:
     """Find everything that is wrong with a submission.
 
@@ -298,7 +294,6 @@ def check(
     Args:
         name: path of a folder, or the name of a bundled submission.
         runner: runs the controller; the sandbox if not given.
-        clock: times the calls of ``act``, s; by default their processor time.
         progress: called with rounds of the runs that are done, and all of them.
 
     Raises:
@@ -317,15 +312,7 @@ def check(
         opened = open_submission(name)
     if opened is None or any(f.problem for f in findings if f.group == "source"):
         return _report(name, findings, skipped=_TO_RUN)
-    completed = 0
-
-    def count() -> None:
-        nonlocal completed
-        completed += 1
-        if progress is not None:
-            progress(completed, _ROUNDS)
-
-    return _ran(opened, runner, findings, clock, count)
+    return _ran(opened, runner, findings, counted(progress, _ROUNDS))
 
 
 def assert_ready(name: str, runner: Runner | None = None) -> None:
@@ -343,8 +330,7 @@ def _ran(
     submission: Submission,
     runner: Runner,
     findings: list[Finding],
-    clock: Callable[[ControllerSession], float],
-    count: Callable[[], None],
+    count: Callable[[], object],
 ) -> CheckReport:
     name, tracks = submission.label, submission.manifest.tracks
     plain_runs = plain(tracks)
@@ -352,10 +338,10 @@ def _ran(
     runs = [*plain_runs, ContractRun(run_task, breaths()), *unusual(run_task)]
     sandbox = None if runner.sandbox is None else dict(runner.sandbox)
     try:
-        answers = run_all(submission, runs, runner, clock, count)
+        answers = run_all(submission, runs, runner, count)
         # By itself, so that the time does not depend on how many run beside it.
         timed_run = plain_runs[0]._replace(script=breaths())
-        timed_answers = run_all(submission, [timed_run], runner, clock, count)
+        timed_answers = run_all(submission, [timed_run], runner, count)
     except SubmissionError as error:
         # Each begins with the label.
         for problem in str(error).split("\n"):
@@ -368,7 +354,7 @@ def _ran(
     if timed_answers.failures or set(repeats) & set(answers.failures):
         return _report(name, findings, skipped=_TO_RUN[1:], sandbox=sandbox)
     findings += repetition_findings(*(answers.commands[k] for k in repeats))
-    findings += _seed_findings(submission, plain_runs, runner, clock)
+    findings += _seed_findings(submission, plain_runs, runner)
     acts = ACTS * len(tracks) * (1 + len(seeds(submission.folder)))
     acts += STRESSED_ACTS * ("robustness" in tracks)
     findings += time_findings(timed_answers.act_seconds, acts)
@@ -383,7 +369,6 @@ def _seed_findings(
     submission: Submission,
     runs: Sequence[ContractRun],
     runner: Runner,
-    clock: Callable[[ControllerSession], float],
 ) -> Iterator[Finding]:
     """What fails with the weights of a seed, in the first of some runs."""
     for seed in seeds(submission.folder):
@@ -391,7 +376,7 @@ def _seed_findings(
             seeded = with_seed(submission, seed.name, Path(folder))
             run = runs[0]._replace(script=breaths())
             try:
-                findings = _failure_findings([run], run_all(seeded, [run], runner, clock))
+                findings = _failure_findings([run], run_all(seeded, [run], runner))
             except SubmissionError as error:
                 findings = [Finding("run", CONTROLLER, str(error), _IMPORT_ADVICE)]
         for finding in findings:

@@ -11,7 +11,7 @@ import functools
 import io
 import json
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -290,13 +290,13 @@ def _part(
     lungs, _, pips = np.shape(cells.pip)
     pid = pid_errors(plants, cells, gains)[:, 0]
     bounds: list[attainable.Attainable] = []
-    for breath in range(len(protocol.SCORED_BREATHS)):
+    for breath, inspirations in enumerate(_scored(plants, cells)):
         if isinstance(starts, np.ndarray):
             begin = list(starts[..., breath, :].reshape(len(starts), lungs * pips, -1))
         else:
             # Another gain moves the best commands but little: the next breath begins there.
             begin = [bounds[0].commands, _FEW_STEPS] if bounds else list(starts)
-        bounds.append(attainable.attainable(*_inspirations(plants, cells, breath), starts=begin))
+        bounds.append(attainable.attainable(*inspirations, starts=begin))
     columns = [np.mean([getattr(b, k) for b in bounds], axis=0) for k in ("error", "lower")]
     columns += [np.max([b.stationarity for b in bounds], axis=0), pid.ravel()]
     commands = np.concatenate([b.commands for b in bounds], axis=-1)
@@ -327,18 +327,18 @@ def _neighbours(stacked: Floats) -> Floats:
     return starts.reshape(*starts.shape[:4], len(protocol.SCORED_BREATHS), -1)
 
 
-def _inspirations(plants: Plant, cells: Scenario, breath: int) -> tuple[Plant, Scenario]:
-    """One scored inspiration of each cell ``(L, n, P)``, on one axis, with its plant."""
+def _scored(plants: Plant, cells: Scenario) -> Iterator[tuple[Plant, Scenario]]:
+    """Each scored inspiration of all cells ``(L, n, P)``, on one axis, with their plants."""
     shape = np.shape(cells.pip)
-    size, at = int(np.prod(shape)), protocol.SCORED_BREATHS[breath]
+    size = int(np.prod(shape))
     flat_plants = jax.tree.map(
         lambda x: np.broadcast_to(x, (*shape, *np.shape(x)[3:])).reshape(size, *np.shape(x)[3:]),
         plants,
     )
     flat_cells = jax.tree.map(lambda x: np.asarray(x).reshape(size, *np.shape(x)[3:]), cells)
-    return flat_plants, flat_cells.replace(
-        gain=flat_cells.gain[:, [at]], noise=np.zeros((size, 1, 1))
-    )
+    for at in protocol.SCORED_BREATHS:
+        gain, noise = flat_cells.gain[:, [at]], np.zeros((size, 1, 1))
+        yield flat_plants, flat_cells.replace(gain=gain, noise=noise)
 
 
 def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floats:
@@ -347,8 +347,7 @@ def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floa
     Plants and cells as of :func:`compute`.
     """
     errors = []
-    for breath in range(len(protocol.SCORED_BREATHS)):
-        flat_plants, flat_cells = _inspirations(plants, cells, breath)
+    for breath, (flat_plants, flat_cells) in enumerate(_scored(plants, cells)):
         commands = reference.commands[..., breath, :].reshape(len(flat_cells.pip), -1)
         with compilation.float64():
             pressure = attainable.pressures(flat_plants, flat_cells, commands)
@@ -364,18 +363,14 @@ def second_errors(plants: Plant, cells: Scenario, index: Ints) -> Floats:
         cells: as of :func:`compute`.
         index: of these cells in the flat table of all, ``(m,)``.
     """
-    breaths = range(len(protocol.SCORED_BREATHS))
-    inspirations = [
-        jax.tree.map(lambda x: x[index], _inspirations(plants, cells, k)) for k in breaths
-    ]
-    errors = second_optimum(*jax.tree.map(lambda *x: np.concatenate(x), *inspirations))
-    return errors.reshape(len(breaths), -1).mean(axis=0)
+    some = [jax.tree.map(lambda x: x[index], breath) for breath in _scored(plants, cells)]
+    errors = second_optimum(*jax.tree.map(lambda *x: np.concatenate(x), *some))
+    return errors.reshape(len(some), -1).mean(axis=0)
 
 
 def rise_errors(plants: Plant, cells: Scenario) -> Floats:
     """Errors that no commands can be below, cmH2O, ``(L, 1 + K, P)``; arguments as of above."""
-    breaths = range(len(protocol.SCORED_BREATHS))
-    by_breath = [attainable.rise_error(*_inspirations(plants, cells, k)) for k in breaths]
+    by_breath = [attainable.rise_error(*breath) for breath in _scored(plants, cells)]
     return np.mean(by_breath, axis=0).reshape(np.shape(cells.pip))
 
 

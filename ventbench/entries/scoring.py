@@ -6,9 +6,8 @@ Scored is the airway pressure; controllers see readings of the sensor.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,12 @@ import numpy as np
 from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.entries.cells import (
+    ROUNDS,
     Cells,
+    Progress,
     ProtocolRun,
     Runner,
+    counted,
     protocol_of,
     run_cells,
     runner_of,
@@ -47,9 +49,6 @@ from ventbench.task.metrics.score import (
 from ventbench.task.stressors import Condition
 from ventbench.task.waveform import expiratory_command
 from ventbench.trajectories import end_to_end
-
-#: Called with rounds of commands that are done, and all of them.
-Progress = Callable[[int, int], None]
 
 
 def score(
@@ -162,7 +161,7 @@ def run_protocol(
         stressors=stressors,
         reference=reference,
     )
-    count = _counted(progress, 1 + stress)
+    count = counted(progress, (1 + stress) * ROUNDS)
     with compilation.float64():
         run = run_cells(scoring_protocol.cells, runner, submission, tasks, count)
         under_stress = None
@@ -208,12 +207,6 @@ def run_protocol(
             "act_max_us": 1e6 * float(np.max(run.act_seconds)),
         },
     )
-
-
-def _counted(progress: Progress | None, sessions: int) -> Callable[[], object]:
-    """What counts the rounds of some runs of all breaths, and tells how far they are."""
-    rounds, total = itertools.count(1), sessions * protocol.BREATHS * protocol.INSPIRATION_STEPS
-    return lambda: progress and progress(next(rounds), total)
 
 
 def enter(
@@ -341,7 +334,7 @@ def transfer(
         plants = draws.plants_of(rigs.plants, rig, member)
         scenario, draw = nominal_scenario(pips), np.zeros(width, np.int64)
         cells = Cells(rigs.lungs, (Condition(),), plants, scenario, pips, draw, rig, member)
-        run = run_cells(cells, runner, submission, tasks, _counted(progress, 1))
+        run = run_cells(cells, runner, submission, tasks, counted(progress, ROUNDS))
     return dataclasses.replace(runs_of(run, cells, submission, tasks), requested=None)
 
 

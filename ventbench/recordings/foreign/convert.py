@@ -177,11 +177,11 @@ def import_recording(
     layout = layout or recognise(table.columns)
     spec = _layout(layout, table)
     roles = _roles(table, mapped, spec, rate)
-    spoken = (spec.words if spec is not None else {}) | dict(words or {})
+    spoken = spec.words | dict(words or {})
     table, roles = _states(table, roles, spoken)
     by_role = {role: name for name, role in roles.items() if role not in ("group", "unused")}
     changes = _conversions(table, by_role, units, spec)
-    if spec is not None:
+    if spec.about:
         table = table.noted(f"Layout {layout}: {spec.about}.")
     clock = by_role.get("time")
     if clock is not None and (unit := epoch_unit(table.columns[clock])) not in (None, "s"):
@@ -238,7 +238,7 @@ def import_recording(
     unused += [by_role["time"]] if rate is not None and "time" in by_role else []
     if unused:
         notes.append(f"Columns that are not used: {', '.join(unused)}.")
-    pieces, how = find_breaths(table.file, time, values, keys, groups, spec.lead if spec else 0.0)
+    pieces, how = find_breaths(table.file, time, values, keys, groups, spec.lead)
     notes.append(how)
     R, C, how = _lung(lung, values, len(table))
     notes.append(how)
@@ -344,9 +344,9 @@ def _same(cell: Any, value: str) -> bool:
         return False
 
 
-def _layout(name: str | None, table: Table) -> Layout | None:
+def _layout(name: str | None, table: Table) -> Layout:
     if name is None:
-        return None
+        return Layout()
     if name not in LAYOUTS:
         raise InputError(f"--layout {name}: choose one of {', '.join(LAYOUTS)}")
     missing = [c for c in LAYOUTS[name].required if c not in table.columns]
@@ -358,7 +358,7 @@ def _layout(name: str | None, table: Table) -> Layout | None:
 
 
 def _roles(
-    table: Table, mapped: dict[str, str], layout: Layout | None, rate: float | None
+    table: Table, mapped: dict[str, str], layout: Layout, rate: float | None
 ) -> dict[str, str]:
     """Role of each column: as mapped, by the layout, by its header; the first of each role."""
     roles = _mapped(table, mapped)
@@ -367,7 +367,7 @@ def _roles(
     for name in table.columns:
         if name in roles:
             continue
-        if layout is not None:
+        if layout.columns:
             role = layout.columns.get(name)
         else:
             header = table.header(name)
@@ -420,7 +420,7 @@ _NEEDED = {
 
 
 def _check_needed(
-    table: Table, roles: Mapping[str, str], layout: Layout | None, rate: float | None
+    table: Table, roles: Mapping[str, str], layout: Layout, rate: float | None
 ) -> None:
     """Ask for a column that is needed and not understood, with the option that says it."""
     has = set(roles.values())
@@ -432,7 +432,7 @@ def _check_needed(
         headers = {n: x for n, x in headers.items() if table.is_numeric(n)}
         likely = [name for name, header in headers.items() if header.role in accepted]
         open_ = likely or [name for name, x in headers.items() if not (x.role or x.excluded)]
-        if len(accepted) > 1 and (not open_ or layout is not None):
+        if len(accepted) > 1 and (not open_ or layout.columns):
             continue
         columns = (
             f"{table.file}: no column is {quantity}; the columns are {', '.join(table.columns)}"
@@ -469,16 +469,15 @@ def _check_duplicates(table: Table, role: str, names: Sequence[str]) -> None:
 
 
 def _conversions(
-    table: Table, by_role: Mapping[str, str], units: dict[str, str], layout: Layout | None
+    table: Table, by_role: Mapping[str, str], units: dict[str, str], layout: Layout
 ) -> dict[str, Conversion]:
     for role in units:
         if role not in _MEASURED:
             raise InputError(f"{role} has no unit; units are for {', '.join(_MEASURED)}")
-    layout_units = layout.units if layout is not None else {}
 
     def unit(role: str, name: str) -> str | None:
-        header = table.header(name).unit if layout is None else None
-        unit = units.get(role) or layout_units.get(role) or header or table.units.get(name)
+        header = None if layout.columns else table.header(name).unit
+        unit = units.get(role) or layout.units.get(role) or header or table.units.get(name)
         return unit or (epoch_unit(table.columns[name]) if role == "time" else None)
 
     quantities = {role: role for role in _MEASURED} | dict.fromkeys(_ONE_WAY, "flow")

@@ -16,11 +16,11 @@ ROLES = (
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of a known kind of file."""
+    """Columns of a known kind of file; of any other, none."""
 
-    about: str  #: what writes such files.
-    columns: dict[str, str]  #: role of each column.
-    required: tuple[str, ...]  #: columns by which a file is recognised.
+    about: str = ""  #: what writes such files.
+    columns: dict[str, str] = field(default_factory=dict)  #: role of each column.
+    required: tuple[str, ...] = ()  #: columns by which a file is recognised.
     #: units by role, where they are not those of the schema.
     units: dict[str, str] = field(default_factory=dict)
     words: dict[str, float] = field(default_factory=dict)  #: numbers that words stand for.

@@ -169,18 +169,21 @@ def groups_of(breaths: Breaths, sessions: Sessions, labels: Sequence[Lung]) -> G
     Raises:
         InputError: a lung was never recorded.
     """
-    session = sessions.assign(breaths)
-    ids = [lung.id for lung in labels]
-    lung = np.array([ids.index(name) for name in breaths.lung_ids.tolist()], np.int64)
-    return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()[session]), jnp.asarray(session))
+    return _groups(sessions.assign(breaths), breaths.lung_ids.tolist(), sessions, labels)
 
 
 def groups_of_sessions(sessions: Sessions, labels: Sequence[Lung]) -> Groups:
     """Groups of one breath of each session, to build the sessions' plants."""
+    names = [session.lung for session in sessions.table]
+    return _groups(np.arange(len(sessions)), names, sessions, labels)
+
+
+def _groups(
+    session: Ints, lungs: Sequence[str], sessions: Sessions, labels: Sequence[Lung]
+) -> Groups:
     ids = [lung.id for lung in labels]
-    lung = np.array([ids.index(session.lung) for session in sessions.table])
-    index = np.arange(len(sessions))
-    return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()), jnp.asarray(index))
+    lung = np.array([ids.index(name) for name in lungs], np.int64)
+    return Groups(*map(jnp.asarray, (lung, sessions.rigs()[session], session)))
 
 
 def inspirations(

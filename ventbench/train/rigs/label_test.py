@@ -261,26 +261,12 @@ def label_errors(
     out: dict[int, list[float]] = {index: [] for index in held_out}
     for number in range(len(labels)):
         groups = dataclasses.replace(data.groups, lung=jnp.full_like(data.groups.lung, number))
-        error = np.array(
-            [
-                np.min(
-                    [
-                        np.asarray(
-                            _errors(
-                                pooled,
-                                groups,
-                                jnp.asarray(gain * scales.rig_gain),
-                                jnp.asarray(start),
-                                data,
-                            )
-                        )
-                        for start in _STARTS
-                    ],
-                    axis=0,
-                )
-                for gain in _GAINS
-            ]
-        )
+        each = [
+            _errors(pooled, groups, jnp.asarray(gain * scales.rig_gain), jnp.asarray(start), data)
+            for gain in _GAINS
+            for start in _STARTS
+        ]
+        error = np.reshape(each, (len(_GAINS), len(_STARTS), -1)).min(axis=1)
         for index in held_out:
             medians = np.median(error[:, session == index], axis=1)
             out[index].append(float(np.min(medians + _GAIN_COST * np.abs(_GAINS))))
@@ -308,21 +294,14 @@ def label_tests(
         laminar_share: see :class:`LabelTest`.
     """
     values = resistance_and_compliance(fitted)
-    resampled_values = np.array([resistance_and_compliance(part) for part in resampled])
+    refits = [resistance_and_compliance(part) for part in resampled]
+    refits = np.reshape(refits, (-1, *values.shape))
     ids = [lung.id for lung in labels]
     tests = []
     for index, row in enumerate(sessions.table):
         labelled = ids.index(row.lung)
-        (r, c), limits = (
-            values[:, index],
-            [
-                interval(
-                    values[k, index],
-                    resampled_values[:, k, index] if len(resampled_values) else np.empty(0),
-                )
-                for k in range(2)
-            ],
-        )
+        r, c = values[:, index]
+        limits = [interval(values[k, index], refits[:, k, index]) for k in range(2)]
         alternatives = np.where(np.arange(len(ids)) == labelled, np.inf, errors[index])
         best = int(np.argmin(alternatives)) if len(ids) > 1 else None
         tests.append(

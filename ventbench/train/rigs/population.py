@@ -21,7 +21,7 @@ Biometrics 38 (1982), 963.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -270,14 +270,7 @@ def _fit_breaths(breaths: _Breaths, rigs: Floats, scale: float, steps: int) -> _
         right = np.einsum("bt,bti->bi", weight * residual, by) - prior * posterior
         change = np.linalg.solve(normal, right[..., None])[..., 0]
         gain, start = np.clip(change, -LARGEST, LARGEST).T
-        breaths = _Breaths(
-            breaths.data,
-            breaths.at,
-            breaths.weight,
-            breaths.noise,
-            breaths.gain + gain,
-            breaths.start + start,
-        )
+        breaths = replace(breaths, gain=breaths.gain + gain, start=breaths.start + start)
     return breaths
 
 

@@ -534,16 +534,13 @@ def listed(cells: Sequence[Any], mark: str = ".") -> NDArray[Any] | None:
 def clock_seconds(cells: Any) -> Floats | None:
     """Seconds of times of day, on over midnight; None if hardly any cell is one."""
     parts = cells.str.extract(rf"^{_CLOCK.pattern}$")
-    hours, minutes = (parts[k].astype(float).to_numpy(float, na_value=np.nan) for k in (0, 1))
-    if np.isfinite(hours).mean() < 0.9:
+    times = parts[[0, 1, 2]].astype(float).to_numpy(float, na_value=np.nan)
+    if np.isfinite(times[:, 0]).mean() < 0.9:
         return None
-    seconds = parts[2].astype(float).to_numpy(float, na_value=np.nan)
-    stopwatch = np.isnan(seconds)  # 05:23.450 is minutes and seconds
-    hours, minutes, seconds = (
-        np.where(stopwatch, 0.0, hours),
-        np.where(stopwatch, hours, minutes),
-        np.where(stopwatch, minutes, seconds),
-    )
+    stopwatch = np.isnan(times[:, 2])  # 05:23.450 is minutes and seconds
+    times[stopwatch] = np.roll(times[stopwatch], 1, axis=1)
+    times[stopwatch, 0] = 0.0
+    hours, minutes, seconds = times.T
     digits = parts[4].fillna("0")
     # After a colon stand milliseconds, after a mark decimals.
     scale = np.where(parts[3] == ":", 1000.0, 10.0 ** digits.str.len().to_numpy(float))

@@ -181,37 +181,35 @@ def read_header(text: str) -> Header:
     if (sampled := _SAMPLED.fullmatch(plain)) is not None:
         number, plain = float(sampled[2]), sampled[1]
         interval = 1.0 / number if sampled[3].lower() == "hz" else 0.001 * number
+    name, rest, unit = _unit_apart(text, plain)
+    role, side, certain = _meaning(rest, unit)
+    tables = [_spelled(q) for q in ([role] if role in UNITS else UNITS)]
+    canonical = next((t[_key(unit)] for t in tables if unit and _key(unit) in t), unit)
+    return Header(name, role, canonical, side, certain, interval)
+
+
+def _unit_apart(text: str, plain: str) -> tuple[str, str, str | None]:
+    """Name of a header, its text without a unit, and the unit: in brackets, or its last words."""
     bracketed = [inside for inside in _BRACKETS.findall(plain) if inside.strip()]
-    name = _BRACKETS.sub(" ", plain).strip(" ,;")
     units = [inside for inside in bracketed if is_unit(inside)]
-    rest = " ".join([name, *(inside for inside in bracketed if inside not in units)])
+    bare = _BRACKETS.sub(" ", plain).strip(" ,;")
+    rest = " ".join([bare, *(inside for inside in bracketed if inside not in units)])
     stripped = text.strip()
     if units:
         matched = next(x for x in _BRACKETS.finditer(text) if is_unit(x[1]))
-        stripped = (text[: matched.start()] + text[matched.end() :]).strip(" _,;") or stripped
-        role, side, certain = _meaning(rest, units[0])
-        return _header(stripped, role, units[0], side, certain, interval)
+        short = (text[: matched.start()] + text[matched.end() :]).strip(" _,;")
+        return short or stripped, rest, units[0]
     for at in sorted(
         {matched.start() for matched in re.finditer(r"(?<![^\W_])\w|(?<=[a-z])[A-Z]|%", rest)}
     ):
         tail, before = rest[at:], rest[:at]
         alone = not before.strip(" _,;:.-/")
-        if is_unit(tail) and not (alone and (len(tail) < 2 or tail.lower() in _KINDS)):
-            role, side, certain = _meaning(before, tail)
-            if certain:
-                comma = re.search(r"[,;]\s*$|\s$", before) is not None
-                short = before.strip(" ,;") if comma and before.strip(" ,;") in text else stripped
-                return _header(short, role, tail, side, certain, interval)
-    role, side, certain = _meaning(rest, None)
-    return _header(stripped, role, None, side, certain, interval)
-
-
-def _header(
-    name: str, role: str | None, unit: str | None, side: str, certain: bool, interval: float | None
-) -> Header:
-    tables = [_spelled(q) for q in ([role] if role in UNITS else UNITS)]
-    canonical = next((t[_key(unit)] for t in tables if unit and _key(unit) in t), unit)
-    return Header(name, role, canonical, side, certain, interval)
+        spelled = is_unit(tail) and not (alone and (len(tail) < 2 or tail.lower() in _KINDS))
+        if spelled and _meaning(before, tail)[2]:
+            comma = re.search(r"[,;]\s*$|\s$", before) is not None
+            short = before.strip(" ,;") if comma and before.strip(" ,;") in text else stripped
+            return short, before, tail
+    return stripped, rest, None
 
 
 def _meaning(text: str, unit: str | None) -> tuple[str | None, str, bool]:

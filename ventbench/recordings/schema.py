@@ -7,9 +7,11 @@ have columns of the same names.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -95,7 +97,7 @@ Kind = Literal["csv", "csv.gz", "parquet", "table"]
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a recording."""
+    """One column of a recording; ``columns.toml`` has them."""
 
     name: str  #: name in the header.
     unit: str  #: unit of every value, as it is printed.
@@ -121,30 +123,11 @@ class Column:
         return low | (values > self.high)
 
 
-def _label(name: str, unit: str, quantity: str) -> Column:
-    advice = f"Write the {quantity} of the test lung in {unit}."
-    return Column(name, unit, 0.0, 500.0, positive=True, advice=advice)
-
-
-def _measured(name: str, unit: str, low: float, high: float) -> Column:
-    advice = f"Write the {name} in {unit}, or leave the cell blank."
-    return Column(name, unit, low, high, blank=True, advice=advice)
-
-
 COLUMNS: dict[str, Column] = {
-    column.name: column
-    for column in (
-        Column("id", "", blank=True, integer=True),
-        Column("breath_id", "", integer=True),
-        _label("R", "cmH2O/(L/s)", "resistance"),
-        _label("C", "mL/cmH2O", "compliance"),
-        Column("time_step", "s", blank=True),
-        Column("u_in", "%", 0.0, 100.0, advice="Fix the row or pass --clip."),
-        Column("u_out", "", 0.0, 1.0, advice="Write 1 while the expiratory valve is open, else 0."),
-        _measured("pressure", "cmH2O", -20.0, 120.0),
-        _measured("flow", "mL/s", -10_000.0, 10_000.0),
-        _measured("volume", "mL", -20_000.0, 20_000.0),
-    )
+    name: Column(name, **column)
+    for name, column in tomllib.loads(
+        Path(__file__).with_name("columns.toml").read_text("utf-8")
+    ).items()
 }
 
 OPTIONAL: tuple[str, ...] = ("flow", "volume")

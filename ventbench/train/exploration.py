@@ -7,12 +7,15 @@ second one. Where the paper's text ends at "t_min", t_max is meant.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
@@ -40,14 +43,10 @@ class ExplorationRanges:
 
 
 #: The paper's table, by lung id.
-RANGES = {
-    "R5C10": ExplorationRanges((1.0, 0.5, 0.0), (50.0, 100.0), (0.3, 0.6), (-20.0, 40.0)),
-    "R5C20": ExplorationRanges((1.0, 3.0, 0.0), (50.0, 100.0), (0.4, 0.8), (-20.0, 60.0)),
-    "R5C50": ExplorationRanges((2.0, 4.0, 0.0), (75.0, 100.0), (1.0, 1.5), (-20.0, 60.0)),
-    "R20C10": ExplorationRanges((1.0, 0.5, 0.0), (50.0, 100.0), (0.3, 0.6), (-20.0, 40.0)),
-    "R20C20": ExplorationRanges((0.0, 3.0, 0.0), (30.0, 60.0), (0.5, 1.0), (-20.0, 40.0)),
-    "R20C50": ExplorationRanges((0.0, 4.0, 0.0), (70.0, 100.0), (1.0, 1.5), (-20.0, 40.0)),
-}
+RANGES = msgspec.convert(
+    tomllib.loads(Path(__file__).with_name("exploration.toml").read_text("utf-8")),
+    dict[str, ExplorationRanges],
+)
 
 
 @dataclass(frozen=True, eq=False)

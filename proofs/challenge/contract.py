@@ -11,7 +11,6 @@ answer is a name of it, or ``unknown:PLACE`` for an effect without a name.
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +50,7 @@ class Name(msgspec.Struct, frozen=True):
 
 
 #: The vocabulary as JSON values, as every case holds it.
-PUBLISHED: dict[str, Any] = tomllib.loads(
-    Path(__file__).with_name("vocabulary.toml").read_text("utf-8")
-)
+PUBLISHED = files.data_beside(__file__, "vocabulary.toml")
 
 #: Parts of the rig, from the supply to the log.
 PLACES: tuple[str, ...] = tuple(PUBLISHED["places"])

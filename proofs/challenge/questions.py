@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import msgspec
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 
 from hardware_eval.emulation.cases import Case, Effect, EffectFamily
 from ventbench.base.arrays import Floats, Ints
+from ventbench.base.files import data_beside
 from ventbench.recordings.breaths import Breaths, make_breaths
 
 Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked"]
@@ -41,8 +40,7 @@ class Family(EffectFamily):
 
 def read_families(module: str) -> dict[str, Family]:
     """Effects by name, from ``effects.toml`` beside a module's file."""
-    text = Path(module).with_name("effects.toml").read_text("utf-8")
-    return msgspec.convert(tomllib.loads(text), dict[str, Family])
+    return msgspec.convert(data_beside(module, "effects.toml"), dict[str, Family])
 
 
 def parameter(effects: Mapping[str, Effect], name: str, key: str, absent: float = 0.0) -> float:

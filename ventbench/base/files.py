@@ -16,6 +16,7 @@ import json
 import math
 import os
 import tempfile
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -186,6 +187,11 @@ def submissions_folder() -> Path:
 def leaderboard_folder() -> Path:
     """Folder of the leaderboard of the last round, which travels with ventbench."""
     return _folder("leaderboard")
+
+
+def data_beside(module: str, name: str) -> dict[str, Any]:
+    """Content of a TOML file that lies beside a module, of which this is the file's path."""
+    return tomllib.loads(Path(module).with_name(name).read_text("utf-8"))
 
 
 def example(name: str) -> Path:

@@ -12,12 +12,13 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import msgspec
 
+from ventbench.base.files import data_beside
 from ventbench.base.text import suggestion
 from ventbench.sandbox.child.cell import SubmissionError, printable
 from ventbench.task.interfaces import API_VERSION
 
 #: What submissions hold and import: what is said of words, and the words.
-RULES: dict[str, Any] = tomllib.loads(Path(__file__).with_name("rules.toml").read_text("utf-8"))
+RULES = data_beside(__file__, "rules.toml")
 
 
 def by_word(table: dict[str, str]) -> dict[str, str]:

@@ -9,22 +9,19 @@ never guessed. Words and units are data: ``headers.toml``.
 from __future__ import annotations
 
 import re
-import tomllib
 import unicodedata
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
-from importlib.resources import files
 from itertools import product
 
 import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.base.files import data_beside
 
-_DATA = tomllib.loads(
-    files(__package__ or "ventbench.recordings").joinpath("headers.toml").read_text("utf-8")
-)
+_DATA = data_beside(__file__, "headers.toml")
 
 #: Factors to the schema's unit, which is the first of each quantity; they are exact.
 UNITS: dict[str, dict[str, Fraction]] = {

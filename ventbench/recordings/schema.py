@@ -7,17 +7,16 @@ have columns of the same names.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
+from ventbench.base.files import data_beside
 
 SHOWN = 20
 """Number of problems that are kept and shown; further ones are only counted."""
@@ -124,10 +123,7 @@ class Column:
 
 
 COLUMNS: dict[str, Column] = {
-    name: Column(name, **column)
-    for name, column in tomllib.loads(
-        Path(__file__).with_name("columns.toml").read_text("utf-8")
-    ).items()
+    name: Column(name, **column) for name, column in data_beside(__file__, "columns.toml").items()
 }
 
 OPTIONAL: tuple[str, ...] = ("flow", "volume")

@@ -7,10 +7,8 @@ second one. Where the paper's text ends at "t_min", t_max is meant.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Protocol
 
 import jax
@@ -20,6 +18,7 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
+from ventbench.base.files import data_beside
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.recordings import Breaths, make_breaths
 from ventbench.task import protocol, waveform
@@ -43,10 +42,7 @@ class ExplorationRanges:
 
 
 #: The paper's table, by lung id.
-RANGES = msgspec.convert(
-    tomllib.loads(Path(__file__).with_name("exploration.toml").read_text("utf-8")),
-    dict[str, ExplorationRanges],
-)
+RANGES = msgspec.convert(data_beside(__file__, "exploration.toml"), dict[str, ExplorationRanges])
 
 
 @dataclass(frozen=True, eq=False)

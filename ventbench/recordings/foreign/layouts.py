@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from importlib.resources import files
+
+from ventbench.base.files import data_beside
 
 #: What a column may stand for.
 ROLES = (
@@ -28,12 +28,7 @@ class Layout:
 
 
 LAYOUTS: dict[str, Layout] = {
-    name: Layout(**layout)
-    for name, layout in tomllib.loads(
-        files(__package__ or "ventbench.recordings.foreign")
-        .joinpath("layouts.toml")
-        .read_text("utf-8")
-    ).items()
+    name: Layout(**layout) for name, layout in data_beside(__file__, "layouts.toml").items()
 }
 
 

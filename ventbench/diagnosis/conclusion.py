@@ -18,6 +18,7 @@ from ventbench.diagnosis import evidence
 from ventbench.diagnosis.evaluator import (
     Evaluator,
     cross_validated_gain,
+    estimate_noise,
     fit_with_noise,
 )
 from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior, Scored
@@ -33,7 +34,7 @@ from ventbench.diagnosis.validation import (
 )
 from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.system_id.data import Noise, robust_noise
+from ventbench.system_id.data import Noise
 
 #: Receives the current step, in words.
 Progress: TypeAlias = Callable[[str], None]
@@ -113,11 +114,8 @@ class Conclusion:
     @property
     def likely_events(self) -> tuple[str, ...]:
         """Effects of some breaths that may act."""
-
-        def share(name: str) -> float:
-            return sum(p for names, p in self.posterior.items() if name in names)
-
-        return tuple(name for name in (*EVENTS, *COMMANDS) if share(name) > _LOOKED_FOR)
+        posterior = Posterior((), self.posterior)
+        return tuple(n for n in (*EVENTS, *COMMANDS) if posterior.marginal(n) > _LOOKED_FOR)
 
 
 def component_of(term: str) -> str:
@@ -264,8 +262,7 @@ def _supported(
 
     def compared(name: str) -> tuple[Floats, float, bool]:
         reduced = evaluator.fit(model.hypothesis.minus(name), model.noise, model)
-        held_out = evaluator.held_out_log_likelihood(model)
-        gains = held_out - evaluator.held_out_log_likelihood(reduced)
+        gains = evaluator.held_out_gain(model, reduced)
         before, after = _square(evaluator, reduced), _square(evaluator, model)
         worth = float(np.sqrt(before) - np.sqrt(after))
         if not is_needed(evaluator, model, reduced):
@@ -323,12 +320,8 @@ def _marginal_gains(
 
 def _gain_sd(evaluator: Evaluator, fitted: FittedModel, sd: float) -> float:
     """Standard deviation of the logarithm of the breaths' gains if held-out breaths ask for it."""
-    partition = evaluator.held_out
-    values = evaluator.transferred_values(fitted, partition)
-    gain = partition.predictor.names.index("gain")
-    slopes = partition.predictor.derivatives(values, (gain,))[1][:, :, 0]
-    slopes = slopes * values[:, gain, None, None]
-    gains = _marginal_gains(evaluator, fitted, partition, slopes, np.array([sd]))[0]
+    slopes = evaluator.sensitivities(fitted, evaluator.held_out)[0][:, None]
+    gains = _marginal_gains(evaluator, fitted, evaluator.held_out, slopes, np.array([sd]))[0]
     return sd if passes_heldout_test(gains, evaluator.settings.held_out_test) else 0.0
 
 
@@ -356,7 +349,7 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
         change = at(frequency, beside, training)[2][:, None]
         remainder = Partition(replace(data, measured=data.measured - change), training.predictor)
         refit = evaluator.fit(fitted.hypothesis, beside.noise, beside, partition=remainder)
-        noise = robust_noise(refit.residual, data.weight)
+        noise = estimate_noise(refit)
         beside = replace(refit, problem=replace(refit.problem, data=data, noise=noise))
     step = 0.02 * frequency
     frequencies = frequency + step * np.arange(-4, 5)
@@ -420,7 +413,7 @@ def _is_unresolved(evaluator: Evaluator, candidate: FittedModel) -> bool:
     much = (
         evaluator.criterion(base) - evaluator.criterion(candidate) > evaluator.settings.search.much
     )
-    gains = evaluator.held_out_log_likelihood(candidate) - evaluator.held_out_log_likelihood(base)
+    gains = evaluator.held_out_gain(candidate, base)
     return much and float(gains.sum()) > evaluator.settings.held_out_test.threshold
 
 

@@ -93,7 +93,7 @@ def correct(
         pressures, plants, notes = _any_model(
             breaths, data, split, before, recording_model, simulator_model
         )
-    fitted = breaths.valid & (breaths.time > 0) & split.fitted[:, None]
+    fitted = _compared(breaths, split.fitted)
     errors = (
         open_loop_error(breaths.pressure, before, fitted).mae,
         open_loop_error(breaths.pressure, pressures["after"], fitted).mae,
@@ -182,6 +182,11 @@ def choose(
     return refitted, corrected
 
 
+def _compared(breaths: Breaths, mask: Bools) -> Bools:
+    """Readings of some breaths but for the first, where every simulation starts, ``(n, T)``."""
+    return breaths.valid & (breaths.time > 0) & mask[:, None]
+
+
 def _is_no_worse(judge: Judge, trial: Floats, current: Floats, mask: Bools) -> bool:
     """Whether neither error rises; a simulator whose pressures are unknown never wins."""
     new, old = (judge.error(pressure, mask) for pressure in (trial, current))
@@ -212,7 +217,7 @@ def _base_model(
     first = breaths.pressure[:, 0]
     evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
     settings = evaluator.settings.correction
-    of_fits = breaths.valid & (breaths.time > 0) & split.fitted[:, None]
+    of_fits = _compared(breaths, split.fitted)
 
     def error(pressure: Floats) -> float:
         return open_loop_error(breaths.pressure, pressure, of_fits).rmse
@@ -279,7 +284,7 @@ def _gains_of_rigs(
     points[:, :, gain] *= np.exp(_GAINS)[:, None]
     points[:, :, gain] = np.clip(points[:, :, gain], bounds.low, bounds.high)
     predicted = partition.predictor.predict_all(points)[:, :, 0]  # (k, n, T)
-    judged = breaths.valid & (breaths.time > 0) & fitted[:, None] & np.isfinite(breaths.pressure)
+    judged = _compared(breaths, fitted) & np.isfinite(breaths.pressure)
     off = np.where(judged, np.abs(predicted - breaths.pressure), 0.0)
     errors = off.sum(axis=2) / np.maximum(judged.sum(axis=1), 1)  # (k, n)
     unchanged = len(_GAINS) // 2
@@ -341,7 +346,7 @@ def _any_model(
     plants_after, notes = recording_model.plants(), []
     again = _least_error_model(data, split, before, recording_model, simulator_model)
     if again is not None:
-        of_fits = breaths.valid & (breaths.time > 0) & split.fitted[:, None]
+        of_fits = _compared(breaths, split.fitted)
         pressure = before + recording_model.pressures(again, data, first) - identified
         errors = [open_loop_error(breaths.pressure, p, of_fits).rmse for p in (pressure, after)]
         if errors[0] < evaluator.settings.correction.drift_ratio * errors[1]:
@@ -454,8 +459,7 @@ def compare_open_loop(
         start: change of the pressure by the reading that a breath starts from, ``(n, T)``; None if
             that is exact.
     """
-    # The first sample is where every simulation starts.
-    judged = breaths.valid & (breaths.time > 0) & judge.judging[:, None]
+    judged = _compared(breaths, judge.judging)
     inspiration = breaths.inspiratory & judged
 
     def by_stage(mask: Bools) -> dict[str, OpenLoopError]:

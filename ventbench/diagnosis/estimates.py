@@ -61,7 +61,7 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     term_paths = [path for path in paths(hypothesis.names) if "." in path]
     free = [path for path in term_paths if parameter(path).uncertain]
     data, reference = partition.data, fitted.problem.data
-    same = (data.R[:, None] == reference.R) & (data.C[:, None] == reference.C)
+    same = data.shares_label(reference)
     start: dict[str, Any] = {}
     for path in fitted.problem.unknowns.paths:
         if path != START and not ("." in path and varies_by_breath(path.rpartition(".")[0])):
@@ -199,12 +199,11 @@ def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     names.remove("position")
     columns = [predictor.names.index(name) for name in names]
     result: dict[str, Plant] = {}
-    for R, C in np.unique(np.stack([data.R, data.C], axis=1), axis=0):
-        breath = int(np.flatnonzero((data.R == R) & (data.C == C))[0])
+    for breath in np.unique(data.lung, return_index=True)[1]:
         parameters = dict(zip(names, values[breath, columns], strict=True))
         if any(mechanism(name).uses_position for name in fitted.names):
             parameters["position"] = 1.0
-        result[f"R{R:g}C{C:g}"] = predictor.plant(parameters)
+        result[f"R{data.R[breath]:g}C{data.C[breath]:g}"] = predictor.plant(parameters)
     return result
 
 

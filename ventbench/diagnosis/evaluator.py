@@ -219,6 +219,21 @@ class Evaluator:
             self._held_out[fitted] = self.log_likelihood(fitted, self.held_out)
         return self._held_out[fitted]
 
+    def held_out_gain(self, full: FittedModel, reduced: FittedModel) -> Floats:
+        """Log-likelihood that each held-out breath gains by one model over another, ``(n,)``."""
+        return self.held_out_log_likelihood(full) - self.held_out_log_likelihood(reduced)
+
+    def sensitivities(self, fitted: FittedModel, partition: Partition) -> tuple[Floats, Floats]:
+        """Change of the pressures of n breaths by what is a breath's own, cmH2O, ``(n, T)`` each.
+
+        Returns:
+            By the logarithm of the valve's gain, and by the pressure that the breath starts from.
+        """
+        values, names = self.transferred_values(fitted, partition), partition.predictor.names
+        gain = names.index("gain")
+        slopes = partition.predictor.derivatives(values, (gain, len(names)))[1][:, :, 0]
+        return slopes[:, 0] * values[:, gain, None], slopes[:, 1]
+
     def log_likelihood(self, fitted: FittedModel, partition: Partition) -> Floats:
         """Log-likelihood of each of other breaths; see :meth:`held_out_log_likelihood`."""
         problem, x = self.refit_breath_parameters(fitted, partition)
@@ -247,7 +262,7 @@ class Evaluator:
         behind a low resistance, may describe the breaths equally well with different lungs.
         """
         data, tolerance = self.training.data, self.settings.data.label_tolerance
-        lungs = np.unique(np.stack([data.R, data.C]), axis=1, return_index=True)[1]
+        lungs = np.unique(data.lung, return_index=True)[1]
         ratios = (fitted.column("R") / data.R, fitted.column("C") / data.C)
         off = np.log(np.stack(ratios)[:, lungs]) / tolerance
         return -float(np.log1p(off**2).sum())
@@ -306,7 +321,7 @@ class Evaluator:
         data, reference = partition.data, fitted.problem.data
         names = fitted.problem.predictor.names
         values = parameter_values(data, partition.predictor.names, {})
-        same = (data.R[:, None] == reference.R) & (data.C[:, None] == reference.C)
+        same = data.shares_label(reference)
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
         for column, name in enumerate(partition.predictor.names):
@@ -390,8 +405,7 @@ def cross_validated_gain(evaluator: Evaluator, full: FittedModel, reduced: Fitte
 
     likelihoods = parallel_map(evaluate, product(evaluator.folds, (full, reduced)))
     pairs = zip(likelihoods[::2], likelihoods[1::2], strict=True)
-    first = evaluator.held_out_log_likelihood(full)
-    first = first - evaluator.held_out_log_likelihood(reduced)
+    first = evaluator.held_out_gain(full, reduced)
     return np.concatenate([first, *(nats_full - nats_reduced for nats_full, nats_reduced in pairs)])
 
 

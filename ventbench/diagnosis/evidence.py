@@ -334,12 +334,10 @@ class _Search:
             model = self.linear_model(around, chosen.fitted, noise, chosen.terms)
             more = enumerate_sets(model, self.events(model), 1, self.settings.beam)
             for terms in [t for _, t in more if t and not names_of(t) & names][:3]:
-                if names_of(terms) | names not in self.scored:
-                    self.attempt(around, noise, (*chosen.terms, *terms), chosen.fitted)
+                self.attempt(around, noise, (*chosen.terms, *terms), chosen.fitted, new=True)
         for term in chosen.terms:
             rest = tuple(t for t in chosen.terms if t is not term)
-            if names_of(rest) not in self.scored:
-                self.attempt(around, noise, rest, chosen.fitted)
+            self.attempt(around, noise, rest, chosen.fitted, new=True)
             if term.name in basis_terms():
                 self.name(term.name, rest, noise)
             if term.name in EVENTS and names_of(rest) in self.scored:
@@ -350,8 +348,7 @@ class _Search:
                     if alternative.name == term.name:
                         self.attempt(model.around, noise, (*rest, alternative), reduced.fitted)
             for alternative in self.muscles if term.name == MUSCLES[-1] else ():
-                if names_of((*rest, alternative)) not in self.scored:
-                    self.attempt(around, noise, (*rest, alternative), self.base)
+                self.attempt(around, noise, (*rest, alternative), self.base, new=True)
         return around, noise
 
     def name(self, unknown: str, rest: Set, noise: Noise) -> None:
@@ -366,8 +363,7 @@ class _Search:
         } - names_of(rest)
         terms = [t[0] for _, t in enumerate_sets(model, (), 1, 1) if t and t[0].name in special]
         for term in terms[: self.settings.fits - 1]:
-            if names_of(rest) | {term.name} not in self.scored:
-                self.attempt(around, noise, (*rest, term), reduced.fitted)
+            self.attempt(around, noise, (*rest, term), reduced.fitted, new=True)
 
     def events(self, model: LinearModel) -> list[Term]:
         """Effects of some breaths beside a fit, and swings that commands predicted before it."""
@@ -464,10 +460,19 @@ class _Search:
         )
 
     def attempt(
-        self, around: CandidateEffects, noise: Noise, terms: Set, start: FittedModel
+        self,
+        around: CandidateEffects,
+        noise: Noise,
+        terms: Set,
+        start: FittedModel,
+        *,
+        new: bool = False,
     ) -> None:
-        """Fit a set; what acts in time is taken from the readings before a second fit."""
-        if not terms:
+        """Fit a set, or only a new one.
+
+        What acts in time is taken from the readings before a second fit.
+        """
+        if not terms or (new and names_of(terms) in self.scored):
             return
         fitted, reduced, latent = start, self.data, latent_of(terms)
         for k in range(2 if latent else 1):

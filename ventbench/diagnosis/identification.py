@@ -54,20 +54,9 @@ class IdentifiedModel:
         return self.evaluator.predict(fitted, self.evaluator.partition(data), first)[:, 0]
 
     def sensitivities(self, data: Data) -> tuple[Floats, Floats]:
-        """Change of the pressures of n breaths by what is a breath's own, cmH2O, ``(n, T)`` each.
-
-        Args:
-            data: breaths of the model's lungs.
-
-        Returns:
-            By the logarithm of the valve's gain, and by the pressure that the breath starts from.
-        """
-        evaluator, model = self.evaluator, self.conclusion.full
-        partition = evaluator.partition(data)
-        values, names = evaluator.transferred_values(model, partition), partition.predictor.names
-        gain = names.index("gain")
-        slopes = partition.predictor.derivatives(values, (gain, len(names)))[1][:, :, 0]
-        return slopes[:, 0] * values[:, gain, None], slopes[:, 1]
+        """Of breaths of the model's lungs; see :meth:`Evaluator.sensitivities`."""
+        partition = self.evaluator.partition(data)
+        return self.evaluator.sensitivities(self.conclusion.full, partition)
 
     def effort_spread(self, data: Data) -> Floats:
         """Standard deviation of the pressures of breaths to come, as efforts differ, cmH2O.

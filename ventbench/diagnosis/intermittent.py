@@ -35,6 +35,7 @@ from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, linearise
 from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.in_time import EXCHANGEABLE, Paths, command_p_value, follow
+from ventbench.diagnosis.unknown import mixture
 from ventbench.diagnosis.validation import order_p_value
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism
@@ -401,22 +402,19 @@ class _Evidence:
     def likeliest(self) -> tuple[int, float, float]:
         """The likeliest common strength, by its index, share of the breaths, and their gain."""
         share = _SHARES[:, None, None]
-        total = np.logaddexp(np.log1p(-share), np.log(share) + self.acting()).sum(axis=2)
+        total = mixture(share, self.acting()).sum(axis=2)
         best = np.unravel_index(int(np.argmax(total)), total.shape)
         return int(best[1]), float(_SHARES[best[0]]), float(total.max())
 
     def gains(self, strength: int, share: float) -> tuple[Floats, float]:
         """Gain of each breath by the mixture, ``(n,)``, and how far that is ahead of rough ones."""
-        gained, rough = (
-            np.logaddexp(np.log1p(-share), np.log(share) + gain)
-            for gain in (self.acting()[strength], self.rough)
-        )
+        gained, rough = mixture(share, self.acting()[strength]), mixture(share, self.rough)
         return gained, float(np.sum(gained - rough))
 
     def chances(self, strength: int, share: float) -> Floats:
         """Posterior probability that the effect acts in each breath, ``(n,)``."""
         acting = self.acting()[strength]
-        against = np.logaddexp(np.log1p(-share), np.log(share) + self.rough)
+        against = mixture(share, self.rough)
         return 1.0 / (1.0 + np.exp(np.clip(against - np.log(share) - acting, -50.0, 50.0)))
 
     def acts(self, strength: int, share: float) -> Bools:

@@ -314,8 +314,11 @@ class LinearModel:
 
     def rows(self, columns: Floats) -> Floats:
         """Whitened ``(n, m, T)`` as ``(n T, m)``."""
-        white = self.noise.whiten(columns[:, :, None], self.around.data.weight)[:, :, 0]
+        white = self._white(columns)
         return np.moveaxis(white, 1, 2).reshape(-1, white.shape[1])
+
+    def _white(self, columns: Floats) -> Floats:
+        return self.noise.whiten(columns[:, :, None], self.around.data.weight)[:, :, 0]
 
     def products(self, X: Floats) -> tuple[Floats, Floats]:
         """``X' K^-1 X`` and ``X' K^-1 y``, ``K = 1 + Z Z'``."""
@@ -324,7 +327,7 @@ class LinearModel:
 
     def of_breaths(self, columns: Floats) -> tuple[Floats, Floats]:
         """The same of columns ``(n, m, T)`` with coefficients of each breath, ``(n m, n m)``."""
-        P = self.noise.whiten(columns[:, :, None], self.around.data.weight)[:, :, 0]
+        P = self._white(columns)
         ZP = np.matmul(P, self.Z.reshape(self.n, P.shape[2], -1)).reshape(-1, self.Z.shape[1])
         b = np.einsum("nmt,nt->nm", P, self.y.reshape(self.n, -1)).reshape(-1) - ZP @ self.mean
         G = linalg.block_diag(*np.matmul(P, P.swapaxes(1, 2)))
@@ -332,7 +335,7 @@ class LinearModel:
 
     def breath_diagonal(self, course: Floats) -> tuple[Floats, Floats]:
         """Diagonal of the same, and products with the residual, of a course ``(n, T)``."""
-        P = self.noise.whiten(course[:, None, None], self.around.data.weight)[:, 0, 0]
+        P = self._white(course[:, None])[:, 0]
         ZP = np.einsum("nt,ntz->nz", P, self.Z.reshape(self.n, P.shape[1], -1))
         b = np.einsum("nt,nt->n", P, self.y.reshape(self.n, -1)) - ZP @ self.mean
         return np.sum(P**2, axis=1) - np.sum(ZP * linalg.cho_solve(self.factor, ZP.T).T, axis=1), b

@@ -282,6 +282,11 @@ def _mean_over_breaths(error: Floats, inside: Bools) -> float:
 def _breath_means(axis: Axis, values: Floats, usable: Bools) -> Floats:
     """Mean over the samples of each breath and range, NaN where there is none, ``(n, k)``."""
     total, count = _sums(axis, values, usable)
+    return _ratio(total, count)
+
+
+def _ratio(total: Floats, count: Floats) -> Floats:
+    """Means of so many values, NaN of none."""
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 
@@ -303,15 +308,10 @@ def _test_columns(axis: Axis, error: Floats, usable: Bools) -> tuple[Floats, Flo
     """
     square = np.where(usable, shared_square(error, usable), 0.0)
     total, count = _sums(axis, square, usable)
-    inside = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    inside = _ratio(total, count)
     all_count = usable.sum(axis=1, keepdims=True)
     rest = all_count - count
-    outside = np.divide(
-        square.sum(axis=1, keepdims=True) - total,
-        rest,
-        out=np.full(total.shape, np.nan),
-        where=rest > 0,
-    )
+    outside = _ratio(square.sum(axis=1, keepdims=True) - total, rest)
     weight = np.ones((1, len(axis)))
     for k in range(len(axis)):
         have = count[:, k] > 0
@@ -420,7 +420,7 @@ def _nanmean(values: Floats) -> Floats:
     """Mean over the first axis without NaN; unlike NumPy's it does not warn of empty columns."""
     finite = np.isfinite(values)
     total, count = np.where(finite, values, 0.0).sum(axis=0), finite.sum(axis=0)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return _ratio(total, count)
 
 
 def _runs(significant: Bools, sign: Floats, merge: bool) -> list[tuple[int, int]]:

@@ -118,7 +118,7 @@ def with_mechanisms_of(
     fitted = drop_redundant_terms(evaluator, fitted, added)
     full = fit_with_noise(evaluator, fitted.hypothesis, fitted)
     against = evaluator.fit(simulator_fit.hypothesis, full.noise, simulator_fit)
-    gains = evaluator.held_out_log_likelihood(full) - evaluator.held_out_log_likelihood(against)
+    gains = evaluator.held_out_gain(full, against)
     if evaluator.criterion(full) >= evaluator.criterion(against) or not passes_heldout_test(
         gains, evaluator.settings.held_out_test
     ):

@@ -62,11 +62,13 @@ def unplaced_gain(evaluator: Evaluator, fitted: FittedModel, partition: Partitio
         after = noise.loss(residual).sum(axis=1) + 0.5 * np.sum(course**2, axis=1) / size**2
         volume = 0.5 * np.linalg.slogdet(curvature * size**2)[1]
         totals.append(before - after - volume)
-    log_evidence = [
-        np.logaddexp(np.log1p(-share), np.log(share) + gained).sum()
-        for gained, share in product(totals, _SHARES)
-    ]
+    log_evidence = [mixture(share, gained).sum() for gained, share in product(totals, _SHARES)]
     return float(np.logaddexp.reduce(log_evidence) - np.log(len(log_evidence)))
+
+
+def mixture(share: Floats | float, gained: Floats) -> Floats:
+    """Log-likelihood that breaths gain if an effect acts in a share of them, of what it gains."""
+    return np.logaddexp(np.log1p(-share), np.log(share) + gained)
 
 
 def preference(nats: float) -> float:

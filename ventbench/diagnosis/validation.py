@@ -194,8 +194,7 @@ def is_needed(evaluator: Evaluator, full: FittedModel, reduced: FittedModel) -> 
     gained = evaluator.criterion(reduced) - evaluator.criterion(full)
     if gained < 0:
         return False
-    held_out = evaluator.held_out_log_likelihood(full)
-    if passes_heldout_test(held_out - evaluator.held_out_log_likelihood(reduced), settings):
+    if passes_heldout_test(evaluator.held_out_gain(full, reduced), settings):
         return True
     return gained > settings.clear_criterion and passes_heldout_test(
         cross_validated_gain(evaluator, full, reduced),

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.base.arrays import Floats, Ints
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
@@ -49,6 +49,10 @@ class Data:
         """Select breaths by mask, index or slice; they keep their positions."""
         index = which if isinstance(which, slice) else np.asarray(which)
         return Data(**{name: array[index] for name, array in vars(self).items()})
+
+    def shares_label(self, other: Data) -> Bools:
+        """Which of m other breaths have the label of each, ``(n, m)``."""
+        return (self.R[:, None] == other.R) & (self.C[:, None] == other.C)
 
     def with_pressure(self, pressure: ArrayLike) -> Data:
         """Replace the pressure, cmH2O, ``(n, T)``; blank samples keep their weight of zero.

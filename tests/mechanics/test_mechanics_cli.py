@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,6 +49,22 @@ def recording(tmp_path: Path) -> Path:
     flow = np.concatenate([x.flow for x in (first, other) if x.flow is not None])
     write(replace(join([first, other]), flow=flow), tmp_path / "lab.csv")
     return tmp_path / "lab.csv"
+
+
+def test_what_a_lung_needs_is_told_with_its_size_and_its_rival(tmp_path):
+    plain = recorded("R20C20")
+    assert plain.flow is not None
+    write(replace(plain, flow=plain.flow + 5.0 * plain.pressure), tmp_path / "leak.csv")
+    text = run(tmp_path / "leak.csv")
+    found = re.search(
+        r"R20C20 needs beyond R and C: leak or flow_sensor_zero \(conductance (\S+) mL/s per "
+        r"cmH2O \[(\S+), (\S+)\]\)",
+        " ".join(text.split()),
+    )
+    assert found is not None, text
+    value, low, high = map(float, found.groups())
+    assert low < 5.0 < high
+    assert abs(value - 5.0) < 0.5
 
 
 def test_lungs_of_the_public_schema(recording, tmp_path):

@@ -26,6 +26,7 @@ from ventbench.cli.options import (
 
 if TYPE_CHECKING:
     from ventbench.mechanics import Mechanics
+    from ventbench.mechanics.identify import Term
 
 
 def mechanics(
@@ -53,6 +54,8 @@ def mechanics(
     console = written_console([{"name": name} | _lung(lung) for name, lung in named.items()], json)
     console.print(_table(named))
     for name, lung in named.items():
+        if lung.terms:
+            console.print(f"{name} needs beyond R and C: {', '.join(map(_term, lung.terms))}.")
         for note in lung.notes:
             console.print(f"{name}: {note}")
 
@@ -126,17 +129,26 @@ def _lung(mechanics: Mechanics) -> dict[str, Any]:
     return files.json_values(plain)
 
 
+def _term(term: Term) -> str:
+    """A term with its parameters, and what explains nearly as much, in words."""
+    values = [
+        f"{name} {estimate.value:.3g} {estimate.unit} "
+        f"[{estimate.ci95[0]:.3g}, {estimate.ci95[1]:.3g}]"
+        for name, estimate in term.parameters.items()
+    ]
+    return f"{' or '.join((term.name, *term.alternatives))} ({', '.join(values)})"
+
+
 def _table(lungs: dict[str, Mechanics]) -> Any:
     from ventbench.mechanics.labels import label_texts, tolerance_text, value_text
 
-    columns = ("label", "R", "C", "label holds", "may be", "also needs")
+    columns = ("label", "R", "C", "label holds", "may be")
     rows = (
         (
             label,
             value_text(lung.match.fitted_R, lung.match.ci95_R),
             value_text(lung.match.fitted_C, lung.match.ci95_C),
             *label_texts(lung.match),
-            ", ".join(term.name for term in lung.terms) or "-",
         )
         for label, lung in lungs.items()
     )

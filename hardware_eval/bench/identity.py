@@ -154,9 +154,9 @@ def measured_lung(
 ) -> tuple[KnownLung, float, float, float]:
     """R, C and the valve's flow over nominal, from ``p = p0 + R Q + V / C`` by least squares.
 
-    Of measured flows whole breaths are taken, with a resistance of the expiration of its own:
-    volumes that come and go halve the error of C. Else the nominal valve's flow is, of the
-    inspirations, two steps delayed as in the recordings, and the valve's is what makes C the
+    R is that of the inspirations. Of measured flows C is that of whole breaths, with a resistance
+    of the expiration of its own: volumes that come and go halve its error. Else the nominal valve's
+    flow is taken, two steps delayed as in the recordings, and the valve's is what makes C the
     label's.
 
     Args:
@@ -165,7 +165,7 @@ def measured_lung(
         noise: standard deviation of the sensor's, cmH2O.
     """
     steps = protocol.INSPIRATION_STEPS
-    rows, pressures, given, nominal = [], [], 0.0, 0.0
+    rows, pressures, masks, given, nominal = [], [], [], 0.0, 0.0
     measured = all(np.isfinite(probe.flow).all() for probe in probes)
     for index, probe in enumerate(probes):
         valve = 1e-3 * VALVE_GAIN * probe.u_in  # L/s, from each sample to the next
@@ -177,21 +177,31 @@ def measured_lung(
         expired = np.arange(len(flow)) >= steps
         own = np.zeros((len(flow), len(probes)))
         own[:, index] = 1.0
-        used = measured | ~expired
-        columns = np.column_stack([flow * ~expired, volume, flow * expired, own])
-        rows.append(columns[used])
-        pressures.append(probe.pressure[used])
-    design = np.concatenate(rows)
-    solution, *_ = np.linalg.lstsq(design, np.concatenate(pressures), rcond=None)
-    R, elastance = float(solution[0]), float(solution[1])
+        rows.append(np.column_stack([flow * ~expired, volume, flow * expired, own]))
+        pressures.append(probe.pressure)
+        masks.append(~expired)
+    design, pressure, inspired = map(np.concatenate, (rows, pressures, masks))
+    every = np.ones(len(design), bool) if measured else inspired
+    (R, R_error), (elastance, elastance_error) = (
+        _coefficient(design[used], pressure[used], column, noise)
+        for column, used in enumerate((inspired, every))
+    )
     C = 1000.0 / elastance if elastance > 0.0 else math.inf
     gain = given / max(nominal, 1e-9) if measured else parse_lung(lung).C / C
-    errors = noise * np.sqrt(np.diag(np.linalg.pinv(design.T @ design))[:2])
     logs, relative = [math.nan] * 2, [math.nan] * 2
-    for k, value in enumerate((R, elastance)):
+    for k, (value, error) in enumerate(((R, R_error), (elastance, elastance_error))):
         if value > 0.0:
-            logs[k], relative[k] = math.log(value), float(errors[k]) / value
+            logs[k], relative[k] = math.log(value), error / value
     return KnownLung(lung, (logs[0], logs[1]), (relative[0], relative[1])), R, C, gain
+
+
+def _coefficient(
+    design: Floats, pressure: Floats, column: int, noise: float
+) -> tuple[float, float]:
+    """A coefficient of a least-squares fit to pressures, cmH2O, ``(n,)``, and its error."""
+    solution, *_ = np.linalg.lstsq(design, pressure, rcond=None)
+    variance = np.linalg.pinv(design.T @ design)[column, column]
+    return float(solution[column]), noise * float(np.sqrt(variance))
 
 
 #: What a tight lung may creep: this share of its recoil relaxes, with one of these times, s. Rubber

@@ -13,6 +13,7 @@ import re
 import shutil
 import tempfile
 import unicodedata
+from collections.abc import Callable
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -55,16 +56,23 @@ _EXPORTED = """
 `weights.npz` and `network.py` give the {count} actions of `{file}` to {off:.0e}.
 """
 
-#: What may stand between layers, and behind the last one.
-ACTIVATIONS = {
-    "tanh": "np.tanh(x)",
-    "relu": "np.maximum(x, 0.0)",
-    "elu": "np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))",
-    "leaky relu": "np.maximum(x, 0.01 * x)",
-    "silu": "x / (1.0 + np.exp(-x))",
-    "sigmoid": "1.0 / (1.0 + np.exp(-x))",
+#: What may stand between layers, and behind the last one: as a function, and as numpy says it.
+ACTIVATIONS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "tanh": (np.tanh, "np.tanh(x)"),
+    "relu": (lambda x: np.maximum(x, 0.0), "np.maximum(x, 0.0)"),
+    "elu": (
+        lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
+        "np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))",
+    ),
+    "leaky relu": (lambda x: np.maximum(x, 0.01 * x), "np.maximum(x, 0.01 * x)"),
+    "silu": (lambda x: x / (1.0 + np.exp(-x)), "x / (1.0 + np.exp(-x))"),
+    "sigmoid": (lambda x: 1.0 / (1.0 + np.exp(-x)), "1.0 / (1.0 + np.exp(-x))"),
 }
-OUTPUTS = {"nothing": "x", "tanh": "np.tanh(x)", "clip": "np.clip(x, -1.0, 1.0)"}
+OUTPUTS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "nothing": (lambda x: x, "x"),
+    "tanh": (np.tanh, "np.tanh(x)"),
+    "clip": (lambda x: np.clip(x, -1.0, 1.0), "np.clip(x, -1.0, 1.0)"),
+}
 
 #: Numbers of an observation of ``ventbench/Ventilator-v1``; largest deviation of the copy.
 _OBSERVED, _TOLERANCE = 15, 1e-6
@@ -252,9 +260,8 @@ def exported(path: Path) -> tuple[dict[str, NDArray[np.floating]], str, float, i
         x = check_input
         with np.errstate(over="ignore"):
             for k in range(depth):
-                activation = ACTIVATIONS[hidden] if k < depth - 1 else OUTPUTS[last]
-                x = x @ arrays[f"w{k}"] + arrays[f"b{k}"]
-                x = eval(activation, {"np": np, "x": x})
+                activate, _ = ACTIVATIONS[hidden] if k < depth - 1 else OUTPUTS[last]
+                x = activate(x @ arrays[f"w{k}"] + arrays[f"b{k}"])
         error = np.max(np.abs(x[:, 0] - check_output) / np.maximum(1.0, np.abs(check_output)))
         if error < deviation:
             deviation, between, behind = float(error), hidden, last
@@ -265,8 +272,8 @@ def exported(path: Path) -> tuple[dict[str, NDArray[np.floating]], str, float, i
             f"{', '.join(ACTIVATIONS)}; float64 tells rounding from another network"
         )
     code = _template("network.py").partition("def activation")
-    code = code[1] + code[2].replace(ACTIVATIONS["relu"], ACTIVATIONS[between])
-    code = code.replace("return x @ w + b", f"x = x @ w + b\n        return {OUTPUTS[behind]}")
+    code = code[1] + code[2].replace(ACTIVATIONS["relu"][1], ACTIVATIONS[between][1])
+    code = code.replace("return x @ w + b", f"x = x @ w + b\n        return {OUTPUTS[behind][1]}")
     return (
         arrays,
         _GYMNASIUM.format(frames=inputs // _OBSERVED) + code,

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit
 
 from ventbench.base.arrays import Floats
 from ventbench.mechanics.labels import Estimate
@@ -79,19 +80,22 @@ def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]
     reach = t_quantile(breaths - 1) * sd
     ends = (1000.0 * (conductance - reach), 1000.0 * (conductance + reach))
     strength = Estimate(1000.0 * conductance, "mL/s per cmH2O", ends)
+    named = nats > LEAST_NATS
+    # Too little to be named is taken out by its probability, so that no other term makes up for it.
+    taken = conductance if named else conductance * float(expit(nats - LEAST_NATS))
     lost = np.concatenate([conductance * (s.dose - s.dose.mean()) for s in segments])
     effect = float(elastance * np.sqrt(np.mean(lost**2)))
     corrected = tuple(
         replace(
             segment,
-            flow=segment.flow - conductance * pressure,
-            slope=segment.slope - conductance * np.gradient(pressure, segment.time),
-            volume=segment.volume - conductance * (segment.dose - segment.dose[0]),
+            flow=segment.flow - taken * pressure,
+            slope=segment.slope - taken * np.gradient(pressure, segment.time),
+            volume=segment.volume - taken * (segment.dose - segment.dose[0]),
         )
         for segment, pressure in zip(segments, pressures, strict=True)
     )
     term = Term("leak", {"conductance": strength}, nats, effect, ("flow_sensor_zero",))
-    return corrected, term if nats > LEAST_NATS else None
+    return corrected, term if named else None
 
 
 def _first_coefficient(values: Floats, columns: Floats, deviations: Floats) -> tuple[float, float]:

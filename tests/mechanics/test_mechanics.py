@@ -267,7 +267,7 @@ def test_a_zero_within_its_scatter_is_no_leak_and_a_leak_is_as_large_as_it_says(
         lung = rng.choice([5.0, 20.0, 50.0]), rng.choice([10.0, 20.0, 50.0])
         plain, zero = recording(*lung, n=8, seed=seed), rng.normal(0.0, 5.0)
         false += leak(segments(leaking(plain, 0.0, zero)))[1] is not None
-        (term,) = [leak(segments(leaking(plain, 4.0, zero)))[1]]
+        term = leak(segments(leaking(plain, 4.0, zero)))[1]
         assert term is not None
         low, high = term.parameters["conductance"].ci95
         held += low <= 4.0 <= high
@@ -285,7 +285,7 @@ def test_a_cough_and_pieces_of_breaths_are_no_leak():
     valid[9, 60:] = False
     breaths = replace(plain, flow=flow, volume=None, valid=valid)
     assert leak(segments(breaths))[1] is None
-    (term,) = [leak(segments(leaking(breaths, 4.0)))[1]]
+    term = leak(segments(leaking(breaths, 4.0)))[1]
     assert term is not None
     near(term.parameters["conductance"], 4.0, 0.2)
     inspirations = plain.valid & (plain.time < 1.2)

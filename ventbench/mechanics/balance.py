@@ -66,17 +66,17 @@ def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]
         flow = segment.flow
         inside = pressure - (resistance + quadratic * np.abs(flow)) * flow
         stored = (inside[-1] - inside[0]) / elastance
-        lost = segment.volume[-1] - segment.volume[0] - stored
-        breathed = np.ptp(segment.volume)
-        rows.append((lost, segment.dose[-1] - segment.dose[0], stored, breathed))
+        missing = segment.volume[-1] - segment.volume[0] - stored
+        dose = segment.dose[-1] - segment.dose[0]
+        rows.append((missing, dose, stored, np.ptp(segment.volume)))
     times = np.array([segment.time[-1] - segment.time[0] for segment in segments])
-    imbalance, pressure, stored, breathed = np.array(rows).T / times
-    columns = np.stack([pressure, np.ones(len(rows)), stored, breathed], axis=1)
+    imbalance, mean_pressure, stored, breathed = np.array(rows).T / times
+    columns = np.stack([mean_pressure, np.ones(len(rows)), stored, breathed], axis=1)
     deviations = np.array([np.inf, ZERO, _STORED_ERROR, _CALIBRATION_ERROR])
     conductance, sd = _first_coefficient(imbalance, columns, deviations)
-    nats = 0.5 * (conductance / sd) ** 2
     if conductance <= 0.0:
         return tuple(segments), None
+    nats = 0.5 * (conductance / sd) ** 2
     reach = t_quantile(breaths - 1) * sd
     ends = (1000.0 * (conductance - reach), 1000.0 * (conductance + reach))
     strength = Estimate(1000.0 * conductance, "mL/s per cmH2O", ends)

@@ -266,9 +266,8 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     without_leak, leaks = leak(measured)
     at_lung, delayed_by = delay(without_leak)
     table = bounded(cross_products(at_lung))
-    lags = [] if delayed_by is None else [delayed_by.parameters.get("tau")]
-    timing = sum(0.5 * (lag.ci95[1] - lag.ci95[0]) for lag in lags if lag is not None)
-    selected = select_terms(table, timing)
+    lag = None if delayed_by is None else delayed_by.parameters.get("tau")
+    selected = select_terms(table, 0.0 if lag is None else 0.5 * float(np.ptp(lag.ci95)))
     full = _fit_lung(table, selected, at_lung, breaths)
     plain = _fit_lung(table, _quadratic_resistance(table), at_lung, breaths)
     label = Lung(float(breaths.R[0]), float(breaths.C[0]))

@@ -1,6 +1,7 @@
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.contract import check
-from ventbench.entries.review import check_sources, review
+from ventbench.entries.review import check_sources, inspect_folder, review
+from ventbench.sandbox import reader
 
 SOURCE = """\
 import gc, math
@@ -65,3 +66,18 @@ def test_code_that_another_encoding_hides_is_not_looked_for_there(demo):
     assert not [n for n in review(demo) if "uses gc" in n.what]
     (finding,) = (f for f in check_sources(demo) if f.file == "train.py")
     assert finding.what == "names the encoding unicode_escape, and is read as UTF-8"
+
+
+def test_sources_that_cannot_be_read_are_named_once(demo, monkeypatch):
+    asked = []
+
+    def unreadable(function, folder, checks):
+        asked.append(checks)
+        if len(checks) > 1 or checks[0] in ("sources", "review"):
+            raise reader.UnreadableError("takes more than 20 s of processor time to be read")
+        return []
+
+    monkeypatch.setattr("ventbench.entries.review.read_apart", unreadable)
+    (finding,) = inspect_folder(demo)
+    assert (finding.group, finding.file) == ("source", "the folder")
+    assert asked[1:] == [["manifest"], ["files"], ["sources"]]

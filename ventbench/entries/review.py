@@ -252,17 +252,22 @@ def inspect_folder(folder: Path) -> tuple[Finding, ...]:
     """Return what is wrong with the manifest, the files and the sources of a submission.
 
     One process makes all checks. Where a check ends the process, each check gets its own, so that
-    the answer says which files cannot be read and still has what the other checks find. Nothing
-    in the folder is run or imported.
+    the answer says which files cannot be read and still has what the other checks find. Sources
+    that one check cannot read are not read by another, which would take as long to say the same.
+    Nothing in the folder is run or imported.
     """
     function, findings = "ventbench.entries.review:findings_as_json", list[Finding]()
     with contextlib.suppress(UnreadableError):
         return tuple(Finding(**fields) for fields in read_apart(function, folder, [*_CHECKS]))
+    unread = set[str]()
     for check in _CHECKS:
+        group = check if check in ("manifest", "files") else "source"
+        if group in unread:
+            continue
         try:
             answer = read_apart(function, folder, [check])
         except UnreadableError as error:
-            group = check if check in ("manifest", "files") else "source"
+            unread.add(group)
             advice = "make its files smaller and plainer"
             findings.append(Finding(group, "the folder", str(error), advice))  # type: ignore[arg-type]
             continue

@@ -117,9 +117,9 @@ def run(
         seed=seed if how.seed is None else how.seed,
     )
     shows = [show_bars, *([RerunView(how.rerun).breath] if how.rerun else [])]
-    control, calibration = (None if x is None else Path(x) for x in (how.control, how.calibration))
+    calibration = None if how.calibration is None else Path(how.calibration)
 
-    with bench_on(port, yes=yes, control=control, kept=out) as (line, _, person):
+    with bench_on(port, yes=yes, kept=out) as (line, _, person):
         calibrated = calibration_of(line, calibration)
         masked = Blind(planned)
         if how.blind:
@@ -171,22 +171,8 @@ def emulate(
         str, typer.Option(help="Lung on it.", autocompletion=options.complete_lungs)
     ] = "R20C50",
     plant: options.PlantName = "frozen",
-    conceal: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WORDS",
-            help="A lung with physics that the simulator lacks; the words determine it.",
-        ),
-    ] = None,
-    seal: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Where the sealed answer of --conceal goes, as JSON."),
-    ] = None,
     link: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Symbolic link to make to the terminal.")
-    ] = None,
-    control: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Control socket to make.")
     ] = None,
     firmware: Annotated[
         Path | None,
@@ -206,28 +192,17 @@ def emulate(
     from hardware_eval.realtime import prefer, told_to_end
     from ventbench.plants.catalog import load_simulators
 
-    if seal is not None and conceal is None:
-        raise InputError("--seal: nothing is concealed; give --conceal too")
-    emulator.check_paths(link, control)
+    emulator.check_link(link)
     runs_image = None if firmware is None else command_of(firmware)
-    if conceal is None:
-        lung_plant, name = load_simulators(plant).plant(lung), f"emulated {lung}"
-        shown = name
-    else:
-        hidden = simulated.conceal(conceal, plant)
-        lung_plant, name = hidden.plant, f"emulated {hidden.lung}"
-        shown = f"{name}, with physics {hidden.seal['commitment'][:16]}..."
-        if seal is not None:
-            hidden.write(seal)
+    lung_plant = load_simulators(plant).plant(lung)
     print("compiling the lung; the terminal appears when it answers", file=sys.stderr, flush=True)
-    hal = simulated.SimulatedHal(lung_plant, name=name, sensor=simulated.PVP_SENSOR)
+    hal = simulated.SimulatedHal(lung_plant, name=f"emulated {lung}", sensor=simulated.PVP_SENSOR)
     begun = time.monotonic()
     image = None if runs_image is None else Firmware(runs_image, hal, begun)
     try:
         device = emulator.Emulator(
             image or DeviceService(hal, DeviceSettings(), 0.0),
             link=link,
-            control=control,
             begun=begun,
         )
         prefer()
@@ -235,7 +210,7 @@ def emulate(
         if image is not None:
             image.start(lambda: device.port.inbox.put(b""))
         print(device.terminal, flush=True)
-        print(f"ready: {shown}; Ctrl-C ends it", file=sys.stderr, flush=True)
+        print(f"ready: {hal.identity.name}; Ctrl-C ends it", file=sys.stderr, flush=True)
         device.run(lambda: ended() or (image is not None and image.lost))
         print(f"longest lateness of the device: {1e3 * device.lateness:.1f} ms", file=sys.stderr)
     finally:

@@ -53,7 +53,6 @@ def bench_on(
     port: str,
     *,
     yes: bool,
-    control: Path | None = None,
     confirmed: bool = True,
     kept: Path | None = None,
 ) -> Iterator[tuple[Line, Bench, ConsoleOperator]]:
@@ -77,7 +76,7 @@ def bench_on(
         return f"{reason}; {client.ending()}{left}"
 
     try:
-        person = ConsoleOperator(yes=yes, control=control, device=line.device)
+        person = ConsoleOperator(yes=yes, device=line.device)
         with _closing(client), person.keys():
             yield line, Bench(client, line.clock, DEFAULT, person), person
     except EmergencyStop:

@@ -18,7 +18,7 @@ import numpy as np
 
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
-from hardware_eval.emulation.emulator import LoopbackDevice, tell
+from hardware_eval.emulation.emulator import LoopbackDevice
 from ventbench.base.errors import InputError, require
 from ventbench.task import protocol
 
@@ -46,8 +46,7 @@ class ConsoleOperator(Operator):
 
     Args:
         yes: confirm everything; for an emulator and for tests.
-        control: control socket of an emulator, which then does perturbations by itself.
-        device: a device that is emulated in this process, to which the same applies.
+        device: a device that is emulated in this process, whose tube is disturbed by itself.
         reaction: time after a question was shown in which a key cannot be an answer yet, s.
 
     Attributes:
@@ -58,11 +57,10 @@ class ConsoleOperator(Operator):
         self,
         *,
         yes: bool = False,
-        control: Path | None = None,
         device: LoopbackDevice | None = None,
         reaction: float = REACTION,
     ) -> None:
-        self._yes, self._control, self._device = yes, control, device
+        self._yes, self._device = yes, device
         self._reaction = reaction
         self.hidden: Callable[[str], str] = str
         self._terminal: int | None = None
@@ -164,10 +162,6 @@ class ConsoleOperator(Operator):
         if self._device is not None:
             hal: Any = self._device.service.hal
             hal.disturb(perturbation if on else "")
-            return
-        if self._control is not None:
-            with contextlib.suppress(InputError):  # a session goes on though nobody disturbs it
-                tell(self._control, perturbation if on else "clear")
             return
         print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
 

@@ -135,7 +135,6 @@ class Procedure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rest: Annotated[float, msgspec.Meta(ge=0.5)] = 4.0  #: before each run, s.
     calibration: str | None = None  #: file of this device's calibration.
     rerun: str | None = None  #: also show breaths in rerun: a file, or ``live``.
-    control: str | None = None  #: control socket of an emulator, which disturbs the tube itself.
 
 
 def read_procedure(path: Path | None) -> Procedure:

@@ -50,19 +50,13 @@ class Port:
         self._woken, self._wake = os.pipe()
         os.set_blocking(self._wake, False)
         self._absent_until = 0.0
-        self._hang_up = self._ended = False
+        self._ended = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def send(self, data: bytes) -> None:
         """Leave bytes to be written; what the line does not take is lost, as on a wire."""
         self._outbox.append(data)
-        self._nudge()
-
-    def hang_up(self, seconds: float) -> None:
-        """Break the line, and open it again after a time, s."""
-        self._absent_until = time.monotonic() + seconds
-        self._hang_up = True
         self._nudge()
 
     def close(self) -> None:
@@ -86,12 +80,7 @@ class Port:
             ready, _, _ = select.select(sources, [], [], PERIOD if line is None else None)
             if self._woken in ready:
                 os.read(self._woken, _CHUNK)
-            if self._hang_up:
-                self._hang_up = False
-                if line is not None:
-                    self._close_line(line)
-                line = None
-            elif line is not None and line in ready and not self._read(line):
+            if line is not None and line in ready and not self._read(line):
                 self._close_line(line)  # the host hung up; the watchdog vents
                 line = None
             while self._outbox:

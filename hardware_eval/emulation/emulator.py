@@ -2,32 +2,24 @@
 
 In this process it lives on a virtual clock, without a wire (:class:`LoopbackDevice`). On a real
 pseudo-terminal, which is a serial port for any program, ``ventbench-hardware emulate`` runs it in
-real time. The tube can be disturbed while it runs: by lines of text on a socket (``--control``).
+real time.
 """
 
 from __future__ import annotations
 
-import contextlib
 import heapq
 import os
-import socket
-import sys
 import time
 import tty
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
 from hardware_eval.emulation.firmware import Firmware
 from hardware_eval.realtime import VirtualClock
 from ventbench.base.errors import InputError
-
-#: Bytes that are read at once.
-_CHUNK = 4096
-
 
 class LoopbackDevice:
     """A transport whose other end is a device; time passes only while somebody waits.
@@ -107,9 +99,6 @@ class LoopbackDevice:
 class Emulator(Guard):
     """A device on a pseudo-terminal, stepped in real time.
 
-    Lines of text on the control socket: ``leak`` or ``pinch`` to disturb the tube, ``clear`` to
-    mend it.
-
     Attributes:
         terminal: path that a host opens; of another name after the cable was pulled, unless there
             is a link.
@@ -120,7 +109,6 @@ class Emulator(Guard):
         service: DeviceService | Firmware,
         *,
         link: Path | None = None,
-        control: Path | None = None,
         begun: float | None = None,
     ) -> None:
         """Open the terminal.
@@ -128,53 +116,30 @@ class Emulator(Guard):
         Args:
             service: program of the device, with simulated hardware.
             link: symbolic link to make to the terminal, so that its name stays.
-            control: path of the control socket to make.
             begun: zero of the program's clock on ``time.monotonic``, s, if it is not now.
 
         Raises:
-            InputError: if the link or the socket cannot be made.
+            InputError: if the link cannot be made.
         """
         begun = time.monotonic() if begun is None else begun
-        self._link, self._control_path = link, control
+        self._link = link
         self._slave = -1
-        check_paths(link, control)
+        check_link(link)
         first = self._open()
-        self._control = self._open_control() if control else None
         unopened = [first]
         port = Port(lambda: unopened.pop() if unopened else self._open(), self._close_terminal)
-        self._device = service
         super().__init__(service, port, lambda: time.monotonic() - begun)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Serve until ``stop()``; then vent and remove link and socket."""
+        """Serve until ``stop()``; then vent and remove terminal and link."""
         try:
             super().run(stop)
         finally:
             self.close()
 
     def close(self) -> None:
-        """Remove terminal, link and socket."""
+        """Remove terminal and link."""
         self.port.close()
-        if self._control is not None and self._control_path is not None:
-            self._control.close()
-            self._control_path.unlink(missing_ok=True)
-            self._control = None
-
-    def turn(self, now: float, data: bytes) -> None:
-        """Step the program and answer, and do what the control says."""
-        super().turn(now, data)
-        if self._control is not None:
-            with contextlib.suppress(BlockingIOError):
-                self._obey(self._control.recv(_CHUNK).decode(errors="replace"))
-
-    def _obey(self, text: str) -> None:
-        """Do what lines of the control socket say; a wrong one is named on stderr."""
-        hal: Any = self._device.hal
-        for word in text.split():
-            try:
-                hal.disturb("" if word == "clear" else word)
-            except InputError as error:
-                print(f"control: {error}", file=sys.stderr, flush=True)
 
     def _open(self) -> int:
         master, self._slave = os.openpty()  # ours keeps it open between hosts
@@ -198,47 +163,16 @@ class Emulator(Guard):
         if self._link is not None and self._link.is_symlink():
             self._link.unlink()
 
-    def _open_control(self) -> socket.socket:
-        assert self._control_path is not None
-        self._control_path.unlink(missing_ok=True)
-        control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        try:
-            control.bind(str(self._control_path))
-        except OSError as error:
-            control.close()
-            raise InputError(
-                f"--control {self._control_path} cannot be made: {error}; a short path helps"
-            ) from error
-        control.setblocking(False)
-        return control
 
-
-def tell(control: Path, text: str) -> None:
-    """Send a line, see :class:`Emulator`, to the control socket of a running emulator.
-
-    Raises:
-        InputError: if no emulator listens there.
-    """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
-        try:
-            sender.sendto(text.encode(), str(control))
-        except OSError as error:
-            raise InputError(f"--control {control}: no emulator listens there: {error}") from error
-
-
-def check_paths(link: Path | None, control: Path | None) -> None:
-    """Check where an emulator shall make its link and its control socket.
+def check_link(link: Path | None) -> None:
+    """Check where an emulator shall make its link.
 
     Raises:
         InputError: if another file would be lost, or there is no such folder.
     """
-    for option, path, is_ours in (
-        ("--link", link, Path.is_symlink),
-        ("--control", control, Path.is_socket),
-    ):
-        if path is None:
-            continue
-        if not path.parent.is_dir():
-            raise InputError(f"{option} {path}: {path.parent} is no folder; make it first")
-        if path.exists() and not is_ours(path):
-            raise InputError(f"{option} {path}: there is a file of that name; remove it")
+    if link is None:
+        return
+    if not link.parent.is_dir():
+        raise InputError(f"--link {link}: {link.parent} is no folder; make it first")
+    if link.exists() and not link.is_symlink():
+        raise InputError(f"--link {link}: there is a file of that name; remove it")

@@ -287,10 +287,15 @@ def evaluate(
         calibration: of the device, for the record and the self-tests.
 
     Raises:
-        InputError: if the log is of another plan, a limit or a part of the self-test is none, or
-            the dry run finds the plan unsafe.
+        InputError: if the log is of another plan, a limit or a part of the self-test is none,
+            nobody can disturb the tube, or the dry run finds the plan unsafe.
         LinkError: if the device is lost and does not come back.
     """
+    if plan.perturbations and line.port in EMULATED_PORTS and line.device is None:
+        raise InputError(
+            "nobody can disturb the tube of an emulator in another process: leave `perturb` out of "
+            "the plan, or use a port such as virtual:R20C20, which disturbs it by itself"
+        )
     settings = SafetySettings(largest_u_in=how.largest_u_in, largest_rise=how.largest_rise)
     fallback, left_out = FALLBACK if how.fallback else None, chosen_parts(how.skip)
     runner = make_runner(sandbox)

@@ -277,11 +277,7 @@ def test_a_demo_without_words_leaves_nothing(tmp_path: Path) -> None:
     [
         ("--lung R7", "R7"),
         ("--plant nothing", "nothing"),
-        ("--conceal ''", "--conceal: give some words"),
-        ("--seal {new}", "give --conceal too"),
         ("--link {file}", "{file}: there is a file of that name"),
-        ("--control {file}", "{file}: there is a file of that name"),
-        ("--control {new}/socket", "is no folder; make it first"),
         ("--link {file}/lung", "is no folder; make it first"),
         ("--firmware {new}", "make it with `make`"),
     ],

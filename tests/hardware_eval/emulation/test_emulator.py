@@ -15,7 +15,6 @@ import pytest
 import serial
 
 from hardware_eval.device.program import DeviceService, DeviceSettings
-from hardware_eval.emulation.emulator import tell
 from hardware_eval.wire.client import (
     Client,
     DisconnectedError,
@@ -30,31 +29,30 @@ from hardware_eval.wire.client import (
 from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
 from tests.hardware_eval.electronics import LoggedEmulator
 from tests.hardware_eval.stand_in import Bench
-from ventbench.base.errors import InputError
 
 #: Patience with a busy machine, s; a healthy one needs a thousandth of it.
 PATIENCE = 600.0
 
 
-class Disturbed(Bench):
-    """A lung whose tube is only remembered."""
+class PulledEmulator(LoggedEmulator):
+    """An emulator whose cable can be pulled."""
 
-    tube = ""
+    def _open(self) -> int:
+        self.line = super()._open()
+        return self.line
 
-    def disturb(self, tube: str) -> None:
-        if tube == "fire":
-            raise InputError("no such tube")
-        self.tube = tube
+    def pull(self, seconds: float) -> None:
+        """Break the line, and let it be opened again after a time, s."""
+        self.port._absent_until = time.monotonic() + seconds
+        with open(os.devnull, "rb") as ended:
+            os.dup2(ended.fileno(), self.line)  # all that comes from it is its end
+        self.port.send(b"")
 
 
 @pytest.fixture
-def emulator(tmp_path: Path) -> Iterator[LoggedEmulator]:
-    running = LoggedEmulator(
-        DeviceService(Disturbed(), DeviceSettings(), 0.0),
-        tmp_path / "valves.csv",
-        link=tmp_path / "lung",
-        control=tmp_path / "control",
-    )
+def emulator(tmp_path: Path) -> Iterator[PulledEmulator]:
+    service = DeviceService(Bench(), DeviceSettings(), 0.0)
+    running = PulledEmulator(service, tmp_path / "valves.csv", link=tmp_path / "lung")
     stop = threading.Event()
     thread = threading.Thread(target=running.run, args=(stop.is_set,))
     thread.start()
@@ -70,7 +68,7 @@ def _wait_for(done: Callable[[], object]) -> None:
         time.sleep(0.002)
 
 
-def _vented(emulator: LoggedEmulator) -> bool:
+def _vented(emulator: PulledEmulator) -> bool:
     """Whether its program has vented; the log of its orders follows only after the answer."""
     service: Any = emulator.service
     return service.state.mode is Mode.VENTED
@@ -88,7 +86,7 @@ def _run(client: Client) -> None:
     pytest.fail("the device never ran")
 
 
-def test_a_session_on_a_pseudo_terminal(emulator: LoggedEmulator, tmp_path: Path) -> None:
+def test_a_session_on_a_pseudo_terminal(emulator: PulledEmulator, tmp_path: Path) -> None:
     client = Client(Link(emulator.terminal), timeout=PATIENCE)
     assert client.hello().name == "bench"
     _run(client)
@@ -104,11 +102,11 @@ def test_a_session_on_a_pseudo_terminal(emulator: LoggedEmulator, tmp_path: Path
     assert "COMMANDS_STOPPED" in causes.split("|")  # and that a busy machine was late
 
 
-def test_a_cable_is_pulled_and_comes_back(emulator: LoggedEmulator) -> None:
+def test_a_cable_is_pulled_and_comes_back(emulator: PulledEmulator) -> None:
     client = Client(Link(emulator.terminal), timeout=PATIENCE)
     client.hello()
     _run(client)
-    emulator.port.hang_up(0.3)
+    emulator.pull(0.3)
     with pytest.raises(DisconnectedError):
         _wait_for(lambda: client.heartbeat().mode is None)
     _wait_for(lambda: _vented(emulator))
@@ -118,21 +116,8 @@ def test_a_cable_is_pulled_and_comes_back(emulator: LoggedEmulator) -> None:
     client.close()
 
 
-def test_the_control_socket_disturbs_the_tube_and_names_nonsense(
-    emulator: LoggedEmulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    control, service = tmp_path / "control", emulator.service
-    assert isinstance(service, DeviceService)
-    for said, tube in (("leak", "leak"), ("fire pinch", "pinch"), ("clear", "")):
-        tell(control, said)
-        _wait_for(lambda tube=tube: service.hal.tube == tube)  # type: ignore[attr-defined]
-    assert "control: no such tube" in capfd.readouterr().err
-    with pytest.raises(InputError, match="no emulator listens"):
-        tell(tmp_path / "nobody", "clear")
-
-
 def test_a_line_that_cannot_be_opened_is_told_and_tried_again(
-    emulator: LoggedEmulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    emulator: PulledEmulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     told = ""
 
@@ -142,8 +127,8 @@ def test_a_line_that_cannot_be_opened_is_told_and_tried_again(
         return "cannot be opened" in told
 
     taken = tmp_path / "lung"
-    emulator._link = tmp_path / "control" / "lung"  # no folder can be made there
-    emulator.port.hang_up(0.0)
+    emulator._link = tmp_path / "valves.csv" / "lung"  # no folder can be made there
+    emulator.pull(0.0)
     _wait_for(failed)
     taken.unlink()
     emulator._link = taken
@@ -152,7 +137,7 @@ def test_a_line_that_cannot_be_opened_is_told_and_tried_again(
 
 
 def test_errors_of_ports(
-    emulator: LoggedEmulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    emulator: PulledEmulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(PortMissingError, match="is the cable in"):
         Link(str(tmp_path / "none"))
@@ -175,7 +160,7 @@ def test_errors_of_ports(
         Link(emulator.terminal)
 
 
-def test_patience_with_a_lost_port_ends(emulator: LoggedEmulator, tmp_path: Path) -> None:
+def test_patience_with_a_lost_port_ends(emulator: PulledEmulator, tmp_path: Path) -> None:
     link = Link(emulator.terminal, patience=0.05)
     (tmp_path / "lung").unlink()
     with pytest.raises(PortMissingError, match=r"tried for 0\.05 s"):

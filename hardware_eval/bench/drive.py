@@ -7,7 +7,6 @@ starts from a lung at rest, as those of a simulator do.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -17,19 +16,15 @@ from typing import Any
 import numpy as np
 
 from hardware_eval import realtime
-from hardware_eval.bench import safety
 from hardware_eval.bench.loop import (
     Bench,
-    BreathLog,
     EmergencyStop,
-    answer_by,
-    is_held_up,
+    Watched,
     no_collection,
-    sample_of,
 )
 from hardware_eval.bench.plan import PlannedRun
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
-from hardware_eval.wire.client import LinkError, NoAnswerError, RefusedError
+from hardware_eval.wire.messages import Reading
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, write
@@ -53,104 +48,6 @@ _OUTLET = 5.0
 _STOPPED = 3
 
 
-class Watched:
-    """Valves that are driven step by step, until a check trips and vents the lung.
-
-    Args:
-        bench: device, clock, safety, operator.
-        lung: label, for the checks.
-        pip: highest pressure that is meant, cmH2O, for the checks.
-
-    Attributes:
-        pip: see there; may be changed between two breaths.
-        log: what happened since :meth:`begin`.
-        answered: whether the device answered, of each reading in it.
-        last: command in force.
-        trips: why it ended: messages of the checks, or the device's refusal; empty as it goes on.
-        held_up: whether host or line, too slow for the loop, ended it, and nothing else.
-        missed: answers that did not come in time.
-    """
-
-    def __init__(self, bench: Bench, lung: str, pip: float) -> None:
-        self._bench, self._lung, self.pip = bench, parse_lung(lung), pip
-
-    def begin(self) -> None:
-        """Vent, rest, and arm the device."""
-        client, clock = self._bench.client, self._bench.clock
-        self.log, self.answered, self.last = BreathLog(), list[bool](), (0.0, 1)
-        self.trips: tuple[str, ...] = ()
-        self.held_up, self.missed = False, 0
-        self._safety = safety.init(self._lung)
-        client.vent()
-        clock.sleep_until(clock.now() + self._bench.rest)
-        self._start = self._deadline = clock.now() + protocol.DT
-        try:
-            client.arm()
-        except RefusedError as error:
-            self._end(f"the device cannot be armed: {error}")
-
-    def look(self) -> float:
-        """Pressure at the deadline of the next step, cmH2O; NaN if there is none.
-
-        Raises:
-            EmergencyStop: if the operator pressed the key; the lung is vented.
-            LinkError: if the device is lost.
-        """
-        bench, log = self._bench, self.log
-        bench.clock.sleep_until(self._deadline)
-        self._began = began = bench.clock.now()
-        if bench.operator.stop():
-            self.vent()
-            raise EmergencyStop
-        if self.trips:
-            return math.nan
-        reading = None
-        with contextlib.suppress(NoAnswerError):
-            reading = bench.client.heartbeat()
-        self.missed += reading is None
-        sample = sample_of(reading, began, self.last, self.pip, began - self._deadline)
-        log.time.append(began - self._start)
-        log.pressure.append(sample.pressure)
-        log.flow.append(sample.flow)
-        log.target.append(self.pip)
-        log.late.append(sample.late)
-        self.answered.append(sample.answered)
-        self._safety = safety.step(bench.settings, self._safety, sample)
-        if trips := self._safety.trips:
-            held_up = all(trip.check in safety.TIMING_CHECKS for trip in trips)
-            self._end(*(trip.message for trip in trips), held_up=held_up)
-        return sample.pressure
-
-    def send(self, wanted: float, u_out: int) -> None:
-        """Hold a command, % and 0/1, cut to what is safe, until the next step's deadline."""
-        bench, log, deadline = self._bench, self.log, self._deadline
-        self._deadline += protocol.DT
-        if self.trips:
-            return
-        u_in, _ = safety.limit_command(bench.settings, self.last[0], wanted)
-        try:
-            bench.client.command(u_in, u_out, answer_by(deadline, bench.clock.now()))
-        except RefusedError as error:
-            self._end(str(error), held_up=is_held_up(error.refusal.flags))
-            return
-        except NoAnswerError:
-            self.missed += 1
-        self.last = (u_in, u_out)
-        log.requested.append(wanted)
-        log.u_in.append(u_in)
-        log.u_out.append(u_out)
-        log.busy.append(bench.clock.now() - self._began)
-
-    def vent(self) -> None:
-        """Vent the lung."""
-        with contextlib.suppress(LinkError):  # then the watchdog does
-            self._bench.client.vent()
-
-    def _end(self, *trips: str, held_up: bool = False) -> None:
-        self.vent()
-        self.trips, self.held_up = trips, held_up
-
-
 @dataclass(frozen=True)
 class Driven:
     """What came of driving the valves; arrays of shape ``(T,)``.
@@ -158,7 +55,8 @@ class Driven:
     Attributes:
         time, pressure, flow, u_in, u_out, late, busy: s, cmH2O, mL/s, %, 0/1, s, s; flow is NaN
             where it is not measured.
-        trips, held_up, missed: see :class:`Watched`.
+        trips, missed: see :class:`~hardware_eval.bench.loop.Watched`.
+        held_up: see :class:`~hardware_eval.bench.loop.Ended`.
     """
 
     time: Floats
@@ -171,6 +69,11 @@ class Driven:
     trips: tuple[str, ...]
     held_up: bool
     missed: int
+
+
+def shown(reading: Reading | None) -> float:
+    """Pressure of a reading, cmH2O; NaN if there is none."""
+    return math.nan if reading is None else reading.pressure
 
 
 def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float) -> Driven:
@@ -194,12 +97,11 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
         with no_collection(), realtime.priority():
             watched.begin()
             for step in range(steps):
-                pressure = watched.look()
-                known = math.isfinite(pressure)
-                if not watched.trips:
-                    watched.send(*(commands(step, pressure) if known else watched.last))
-                if watched.trips:
+                if watched.ended:
                     break
+                pressure = shown(watched.look(pip))
+                known = math.isfinite(pressure)
+                watched.send_limited(*(commands(step, pressure) if known else watched.last))
     finally:
         watched.vent()
     log = watched.log
@@ -210,7 +112,8 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
     if heard.any():
         for name in ("pressure", "flow"):
             columns[name][~heard] = np.interp(time[~heard], time[heard], columns[name][heard])
-    return Driven(**columns, trips=watched.trips, held_up=watched.held_up, missed=watched.missed)
+    held_up = watched.ended is not None and watched.ended.held_up
+    return Driven(**columns, trips=watched.trips, held_up=held_up, missed=watched.missed)
 
 
 class BenchVentilator(Watched):
@@ -228,15 +131,15 @@ class BenchVentilator(Watched):
     def start(self, peep: float) -> Floats:
         """Vent until the lung is at rest, then begin a breath."""
         self.begin()
-        return np.full(1, self.look())
+        return np.full(1, shown(self.look(self.pip)))
 
     def step(self, u_in: Floats, u_out: Floats) -> Floats:
         """Hold a command until the next step's deadline."""
         above = float(time_above(worst(self._safety.breath), self.pip, protocol.DT)) / protocol.DT
         halved = 0.5 * max(self.log.u_in, default=0.0)
         largest = (protocol.U_MAX, halved, 0.0)[min(round(above), 2)]
-        self.send(min(float(u_in[0]), largest), int(u_out[0]))
-        return np.full(1, self.look())
+        self.send_limited(min(float(u_in[0]), largest), int(u_out[0]))
+        return np.full(1, shown(self.look(self.pip)))
 
 
 @dataclass(frozen=True)

@@ -207,6 +207,149 @@ class Bench:
     lateness: Lateness = field(default_factory=Lateness)  #: late answers, to tell whose they are.
 
 
+@dataclass(frozen=True)
+class Ended:
+    """Why valves are driven no longer; the lung is vented."""
+
+    reasons: tuple[str, ...]  #: messages of the checks, or what the device or the controller said.
+    status: str = "aborted"  #: see :class:`RunResult`.
+    held_up: bool = False  #: whether host or line, too slow for the loop, ended it alone.
+    vented_after: float = math.nan  #: see :class:`RunResult`.
+
+
+class Watched:
+    """Valves that are driven step by step, until a check trips and vents the lung.
+
+    Args:
+        bench: device, clock, safety, operator.
+        lung: label, for the checks.
+        pip: highest pressure that is meant, cmH2O, for the checks.
+
+    Attributes:
+        pip: see there; may be changed between two breaths.
+        log: what happened since :meth:`begin`.
+        answered: whether the device answered, of each reading.
+        last: command in force.
+        ended: why it ended; None as it goes on.
+        missed: answers that did not come in time.
+    """
+
+    def __init__(self, bench: Bench, lung: str, pip: float) -> None:
+        self._bench, self._lung, self.pip = bench, parse_lung(lung), pip
+
+    @property
+    def trips(self) -> tuple[str, ...]:
+        """Why it ended; empty as it goes on."""
+        return self.ended.reasons if self.ended else ()
+
+    def begin(self) -> None:
+        """Vent, rest, and arm the device."""
+        client, clock = self._bench.client, self._bench.clock
+        self.log, self.answered, self.last = BreathLog(), list[bool](), (0.0, 1)
+        self.ended: Ended | None = None
+        self.missed = 0
+        self._safety = safety.init(self._lung)
+        client.vent()
+        clock.sleep_until(clock.now() + self._bench.rest)
+        self._start = self._deadline = clock.now() + protocol.DT
+        try:
+            client.arm()
+        except RefusedError as error:
+            self._end(Ended((f"the device cannot be armed: {error}",)))
+
+    def look(self, target: float) -> Reading | None:
+        """The reading at the deadline of the next step, seen by the checks; None if there is none.
+
+        Args:
+            target: for the log, cmH2O.
+
+        Raises:
+            EmergencyStop: if the operator pressed the key; the lung is vented.
+            LinkError: if the device is lost.
+        """
+        bench, log = self._bench, self.log
+        bench.clock.sleep_until(self._deadline)
+        self._began = began = bench.clock.now()
+        if bench.operator.stop():
+            self.vent()
+            raise EmergencyStop
+        reading = None
+        try:
+            reading = None if self.ended else bench.client.heartbeat()
+        except NoAnswerError:
+            self.missed += 1
+        except RefusedError as error:
+            self._refused(error)
+        if self.ended:
+            return None
+        late = max(began - self._deadline, 0.0)
+        sample = sample_of(reading, began, self.last, self.pip, late)
+        log.time.append(began - self._start)
+        log.pressure.append(sample.pressure)
+        log.flow.append(sample.flow)
+        log.target.append(target)
+        log.late.append(late)
+        self.answered.append(sample.answered)
+        if reading is not None and reading.flags & _CAUSES:
+            self._vented_by_device(reading.flags)
+            return None
+        self._safety = safety.step(bench.settings, self._safety, sample)
+        if trips := self._safety.trips:
+            self.vent()
+            status = "aborted" if all(trip.bench for trip in trips) else "failed"
+            held_up = all(trip.check in safety.TIMING_CHECKS for trip in trips)
+            messages = tuple(trip.message for trip in trips)
+            self.ended = Ended(messages, status, held_up, bench.clock.now() - began)
+        return reading
+
+    def send(self, u_in: float, u_out: int, requested: float) -> None:
+        """Hold a command, % and 0/1, until the next step's deadline; note what was asked for, %."""
+        bench, log, deadline = self._bench, self.log, self._deadline
+        self._deadline += protocol.DT
+        if self.ended:
+            return
+        try:
+            bench.client.command(u_in, u_out, answer_by(deadline, bench.clock.now()))
+        except RefusedError as error:
+            self._refused(error)
+            return
+        except NoAnswerError:  # it may have arrived; the next reading and the watchdog tell
+            self.missed += 1
+        self.last = (u_in, u_out)
+        log.requested.append(requested)
+        log.u_in.append(u_in)
+        log.u_out.append(u_out)
+        log.busy.append(bench.clock.now() - self._began)
+
+    def send_limited(self, wanted: float, u_out: int) -> None:
+        """Hold a command, % and 0/1, cut to what is safe."""
+        u_in, _ = safety.limit_command(self._bench.settings, self.last[0], wanted)
+        self.send(u_in, u_out, wanted)
+
+    def vent(self) -> None:
+        """Vent the lung."""
+        with contextlib.suppress(LinkError):  # then the watchdog does
+            self._bench.client.vent()
+
+    def _end(self, ended: Ended) -> None:
+        self.vent()
+        self.ended = ended
+
+    def _refused(self, error: RefusedError) -> None:
+        if error.refusal.flags & _CAUSES:
+            self._vented_by_device(error.refusal.flags)
+            return
+        lost = error.refusal.reason is Reason.SESSION  # arming opens it again
+        self._end(Ended((str(error),), held_up=lost))
+
+    def _vented_by_device(self, flags: Flag) -> None:
+        # The device's pressure limit is the controller's to respect; all else is the bench's.
+        status = "failed" if flags & Flag.OVERPRESSURE else "aborted"
+        held_up = bool(flags & _HELD_UP) and not flags & _CAUSES & ~_HELD_UP
+        message = f"the device vented: {(flags & _CAUSES).name}"
+        self._end(Ended((message,), status, held_up, 0.0))
+
+
 def run_once(
     bench: Bench,
     run: PlannedRun,
@@ -235,7 +378,7 @@ def run_once(
             bench.client.vent()
 
 
-class _Loop:
+class _Loop(Watched):
     """The state of one run."""
 
     def __init__(
@@ -245,42 +388,49 @@ class _Loop:
         controller: LiveController,
         on_breath: Callable[[int, BreathLog], None],
     ) -> None:
-        self._bench, self._run, self._controller = bench, run, controller
-        self._on_breath = on_breath
-        self._safety = safety.init(parse_lung(run.lung))
-        self._fallback = fallback.init(parse_lung(run.lung))
+        super().__init__(bench, run.lung, run.pip)
+        self._run, self._controller, self._on_breath = run, controller, on_breath
+        self._fallback = fallback.init(self._lung)
         self._breaths: list[BreathLog] = []
-        self._asked = self._late_answers = self._limited = self._unanswered = 0
-        self._command = (0.0, 1)
+        self._asked = self._late_answers = self._limited = 0
         self._disturbed = False
 
     def run(self) -> RunResult:
         """All breaths."""
-        bench = self._bench
-        bench.client.vent()
-        bench.clock.sleep_until(bench.clock.now() + bench.rest)
         # Collected before the device waits for commands: that takes longer than the watchdog does.
         with no_collection(), realtime.priority():
-            start = bench.clock.now() + protocol.DT
-            try:
-                bench.client.arm()
-            except RefusedError as error:
-                return self._ended("aborted", f"the device cannot be armed: {error}")
-            for index in range(protocol.BREATHS * protocol.BREATH_STEPS):
-                breath, step = divmod(index, protocol.BREATH_STEPS)
-                deadline = start + index * protocol.DT
-                bench.clock.sleep_until(deadline)
-                if step == 0:
-                    self._breaths.append(BreathLog())
-                ended = self._step(start, deadline, breath, step)
-                if ended is not None:
-                    self._on_breath(breath, self._breaths[-1])
-                    return ended
-                if step == protocol.BREATH_STEPS - 1:
-                    self._on_breath(breath, self._breaths[-1])
-        return self._measured()
+            self.begin()
+            for breath in range(protocol.BREATHS):
+                if self.ended:
+                    break
+                self.log = BreathLog()
+                self._breaths.append(self.log)
+                for step in range(protocol.BREATH_STEPS):
+                    self._step(breath, step)
+                    if self.ended:
+                        break
+                self._on_breath(breath, self.log)
+        ended = self.ended or self._measured()
+        if self._disturbed:
+            self._bench.operator.disturb(self._run.perturbation, False)
+        return RunResult(
+            ended.status,
+            next(iter(ended.reasons), ""),
+            self._safety.trips,
+            tuple(self._breaths),
+            self._late_answers,
+            self._limited,
+            ended.vented_after,
+            ended.held_up,
+            self._asked,
+            self._controller.longest_answer,
+            self._fallback.outside,
+            self._fallback.taken,
+            self._fallback.longest,
+            self._controller.beside,
+        )
 
-    def _measured(self) -> RunResult:
+    def _measured(self) -> Ended:
         """The end of a run that went through.
 
         A score needs the pressures of its inspirations, and a controller that answered in time.
@@ -292,166 +442,78 @@ class _Loop:
             left = f", {outside} were outside the envelope" if outside else ""
             of_host &= outside <= most
             beside = f"; of an empty controller beside it {empty}" if empty.asked else ""
-            return self._ended(
-                "aborted" if of_host else "failed",
+            reason = (
                 f"{own} answers took longer than {1e3 * ANSWER_BY:.0f} ms, the longest "
                 f"{1e3 * self._controller.longest_answer:.0f} ms{beside}{left}; "
-                f"{100 * LATE_SHARE:g} % may",
-                held_up=of_host,
+                f"{100 * LATE_SHARE:g} % may"
             )
-        if self._run.kind not in MEASURED:
-            return self._ended("complete", "")
-        pressure = measured.scored([breath.pressure for breath in self._breaths])
-        reason = measured.too_few(pressure)
-        if not reason:
-            return self._ended("complete", "")
-        missing = int(np.isnan(pressure).sum())
-        return self._ended("aborted", reason, held_up=missing <= self._unanswered)
+            return Ended((reason,), "aborted" if of_host else "failed", of_host)
+        if self._run.kind in MEASURED:
+            pressure = measured.scored([breath.pressure for breath in self._breaths])
+            if reason := measured.too_few(pressure):
+                missing = int(np.isnan(pressure).sum())
+                return Ended((reason,), held_up=missing <= self.answered.count(False))
+        return Ended((), "complete")
 
-    def _step(self, start: float, deadline: float, breath: int, step: int) -> RunResult | None:
-        """One control step; a result ends the run."""
-        bench, run, log = self._bench, self._run, self._breaths[-1]
-        began = bench.clock.now()
-        if bench.operator.stop():
-            bench.client.vent()
-            raise EmergencyStop
-        self._disturb(breath, step)
+    def _step(self, breath: int, step: int) -> None:
+        """One control step."""
+        bench, run, log = self._bench, self._run, self.log
+        if run.perturbation and (breath, step) == (PERTURBED_BREATH, PERTURBED_STEP):
+            bench.clock.sleep_until(self._deadline)
+            bench.operator.disturb(run.perturbation, True)
+            self._disturbed = True
         last = bench.client.reading
-        try:
-            reading: Reading | None = bench.client.heartbeat()
-        except NoAnswerError:
-            reading = None
-            self._unanswered += 1
-        except RefusedError as error:
-            return self._refused(error)
-        target = float(waveform.target(step, run.pip))
-        log.time.append((bench.clock.now() if reading is None else began) - start)
+        reading = self.look(float(waveform.target(step, run.pip)))
         # A controller must see each breath begin; what the last command's answer told is at most a
         # step old, at the end of an expiration.
         lost = reading is None or not math.isfinite(reading.pressure)
-        seen = last if lost and step == 0 else reading
-        log.pressure.append(math.nan if seen is None else seen.pressure)
-        log.flow.append(math.nan if seen is None else seen.flow)
-        log.target.append(target)
-        log.late.append(max(began - deadline, 0.0))
-        result = self._look(reading, began, log.late[-1])
-        if result is None:
-            result = self._act(seen, deadline, step, target)
-        if result is not None:  # so that every list of the breath has as many values
+        if not self.ended:
+            if lost and step == 0 and last is not None:
+                reading = last
+                log.pressure[-1], log.flow[-1] = last.pressure, last.flow
+            self._act(reading, step)
+        if len(log.u_in) < len(log.time):  # so that every list of the breath has as many values
             log.requested.append(math.nan)
             log.u_in.append(0.0)
             log.u_out.append(1)
-        log.busy.append(bench.clock.now() - began)
-        return result
+            log.busy.append(bench.clock.now() - self._began)
 
-    def _look(self, reading: Reading | None, began: float, late: float) -> RunResult | None:
-        """Let the checks see a reading; vent if one trips."""
-        bench, run = self._bench, self._run
-        if reading is not None and reading.flags & _CAUSES:
-            return self._vented_by_device(reading.flags)
-        sample = sample_of(reading, began, self._command, run.pip, late)
-        self._safety = safety.step(bench.settings, self._safety, sample)
-        if not self._safety.trips:
-            return None
-        bench.client.vent()
-        first = self._safety.trips[0]
-        status = "aborted" if all(trip.bench for trip in self._safety.trips) else "failed"
-        held_up = all(trip.check in safety.TIMING_CHECKS for trip in self._safety.trips)
-        return self._ended(status, first.message, bench.clock.now() - began, held_up)
-
-    def _vented_by_device(self, flags: Flag) -> RunResult:
-        # The device's pressure limit is the controller's to respect; all else is the bench's.
-        status = "failed" if flags & Flag.OVERPRESSURE else "aborted"
-        return self._ended(
-            status, f"the device vented: {(flags & _CAUSES).name}", 0.0, is_held_up(flags)
-        )
-
-    def _act(
-        self, reading: Reading | None, deadline: float, step: int, target: float
-    ) -> RunResult | None:
+    def _act(self, reading: Reading | None, step: int) -> None:
         """Choose a command and send it."""
-        bench, run, log = self._bench, self._run, self._breaths[-1]
-        inspiring = step < protocol.INSPIRATION_STEPS
+        bench, run = self._bench, self._run
+        if step >= protocol.INSPIRATION_STEPS:
+            self.send(float(waveform.expiratory_command(step)), 1, math.nan)
+            return
         requested, budget, cut = math.nan, 0.0, False
-        if inspiring:
-            previous = _BIAS if step == 0 else self._command[0]
-            # A reading without a number would poison the averages of the entry that sees it.
-            if reading is not None and math.isfinite(reading.pressure):
-                row = _row(step, reading.pressure, target, run.pip, previous)
-                budget = deadline + ANSWER_BY - bench.clock.now()
-                self._asked += 1
-                try:
-                    answer = self._controller.act(row, budget)
-                except ControllerFailedError as error:
-                    bench.client.vent()
-                    return self._ended("failed", str(error))
-                requested = math.nan if answer is None else answer
-            self._late_answers += math.isnan(requested) and budget >= _FAIR
-            if not math.isnan(requested):
-                u_in, cut = safety.limit_command(bench.settings, previous, requested)
-            elif bench.fallback is None:
-                u_in = self._command[0] if self._command[1] == 0 else 0.0
-            else:
-                u_in = None
-            if bench.fallback is not None:
-                pressure = math.nan if reading is None else reading.pressure
-                self._fallback, u_in = fallback.step(
-                    bench.fallback, self._fallback, step, pressure, run.pip, u_in, previous
-                )
-                u_in, also = safety.limit_command(bench.settings, previous, u_in)
-                cut |= also
-            assert u_in is not None
-            self._limited += cut
-            command = (u_in, 0)
+        previous = _BIAS if step == 0 else self.last[0]
+        # A reading without a number would poison the averages of the entry that sees it.
+        if reading is not None and math.isfinite(reading.pressure):
+            row = _row(step, reading.pressure, self.log.target[-1], run.pip, previous)
+            budget = self._deadline + ANSWER_BY - bench.clock.now()
+            self._asked += 1
+            try:
+                answer = self._controller.act(row, budget)
+            except ControllerFailedError as error:
+                self._end(Ended((str(error),), "failed"))
+                return
+            requested = math.nan if answer is None else answer
+        self._late_answers += math.isnan(requested) and budget >= _FAIR
+        if not math.isnan(requested):
+            u_in, cut = safety.limit_command(bench.settings, previous, requested)
+        elif bench.fallback is None:
+            u_in = self.last[0] if self.last[1] == 0 else 0.0
         else:
-            command = (float(waveform.expiratory_command(step)), 1)
-        try:
-            bench.client.command(*command, answer_by(deadline, bench.clock.now()))
-        except RefusedError as error:
-            return self._refused(error)
-        except NoAnswerError:
-            pass  # it may have arrived; the next reading and the watchdog tell
-        self._command = command
-        log.requested.append(requested)
-        log.u_in.append(command[0])
-        log.u_out.append(command[1])
-        return None
-
-    def _refused(self, error: RefusedError) -> RunResult:
-        flags = getattr(error.refusal, "flags", Flag.NONE)
-        if flags & _CAUSES:
-            return self._vented_by_device(flags)
-        lost = error.refusal.reason is Reason.SESSION  # arming opens it again
-        return self._ended("aborted", str(error), held_up=lost)
-
-    def _disturb(self, breath: int, step: int) -> None:
-        """Announce and undo the perturbation of a perturbed run."""
-        tube = self._run.perturbation
-        if tube and not self._disturbed and (breath, step) == (PERTURBED_BREATH, PERTURBED_STEP):
-            self._bench.operator.disturb(tube, True)
-            self._disturbed = True
-
-    def _ended(
-        self, status: str, reason: str, vented_after: float = math.nan, held_up: bool = False
-    ) -> RunResult:
-        if self._disturbed:
-            self._bench.operator.disturb(self._run.perturbation, False)
-        return RunResult(
-            status,
-            reason,
-            self._safety.trips,
-            tuple(self._breaths),
-            self._late_answers,
-            self._limited,
-            vented_after,
-            held_up,
-            self._asked,
-            self._controller.longest_answer,
-            self._fallback.outside,
-            self._fallback.taken,
-            self._fallback.longest,
-            self._controller.beside,
-        )
+            u_in = None
+        if bench.fallback is not None:
+            pressure = math.nan if reading is None else reading.pressure
+            self._fallback, u_in = fallback.step(
+                bench.fallback, self._fallback, step, pressure, run.pip, u_in, previous
+            )
+            u_in, also = safety.limit_command(bench.settings, previous, u_in)
+            cut |= also
+        assert u_in is not None
+        self._limited += cut
+        self.send(u_in, 0, requested)
 
 
 _CAUSES = CAUSES & ~Flag.HOST_VENTED
@@ -467,11 +529,6 @@ def sample_of(
     if reading is None:
         return SafetySample(began, math.nan, math.nan, *command, pip, late, answered=False)
     return SafetySample(began, reading.pressure, reading.flow, *command, pip, late, reading.u_in)
-
-
-def is_held_up(flags: Flag) -> bool:
-    """Whether the device vented because commands did not come, and for no other reason."""
-    return bool(flags & _HELD_UP) and not flags & _CAUSES & ~_HELD_UP
 
 
 def answer_by(deadline: float, now: float) -> float:

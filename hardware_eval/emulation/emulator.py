@@ -21,6 +21,7 @@ from hardware_eval.emulation.firmware import Firmware
 from hardware_eval.realtime import VirtualClock
 from ventbench.base.errors import InputError
 
+
 class LoopbackDevice:
     """A transport whose other end is a device; time passes only while somebody waits.
 

@@ -292,9 +292,6 @@ def compare(
             "a recording in the public schema.",
         ),
     ],
-    log: Annotated[
-        Path | None, typer.Option(help="Raw recording of the record, if it lies elsewhere.")
-    ] = None,
     plant: options.PlantName = "frozen",
     out: Annotated[
         Path | None,
@@ -315,7 +312,7 @@ def compare(
     from hardware_eval.results.record import recorded_breaths, scored_plants
     from ventbench.simulation import error_summary, mean_errors
 
-    breaths = recorded_breaths(recorded, log)
+    breaths = recorded_breaths(recorded)
     tested = scored_plants(plant, list(breaths.by_lung_index))
     error = mean_errors(tested.pressures(breaths), breaths)
     lungs = {lung: error_summary("", error[index]) for lung, index in breaths.by_lung_index.items()}

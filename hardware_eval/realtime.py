@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 
@@ -96,21 +96,11 @@ def prefer(level: int = DEVICE_PRIORITY) -> str | None:
     Returns:
         None if it was granted, else the reason why not; the process then runs as before.
     """
-    if not hasattr(os, "sched_setscheduler"):
-        return "this system has none"
     try:
         threads = [int(entry.name) for entry in Path("/proc/self/task").iterdir()]
     except OSError:
         threads = [0]
-    _limit_runs()
-    try:
-        for thread in threads:
-            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(level))
-    except ProcessLookupError:  # a thread that has ended since
-        return None
-    except OSError as error:
-        return str(error)
-    return None
+    return _scheduled(level, threads, inherited=True)
 
 
 def take_priority() -> bool:
@@ -119,15 +109,23 @@ def take_priority() -> bool:
     Returns:
         Whether the system allowed it; it wants root, or a limit ``rtprio``.
     """
+    return _scheduled(PRIORITY, [0], inherited=False) is None
+
+
+def _scheduled(level: int, threads: Sequence[int], inherited: bool) -> str | None:
+    """Make threads real-time, by number; returns why not, or None."""
     if not hasattr(os, "sched_setscheduler"):
-        return False
+        return "this system has none"
+    policy = os.SCHED_FIFO | (0 if inherited else os.SCHED_RESET_ON_FORK)
     _limit_runs()
     try:
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
-    except OSError:
-        return False
-    return True
+        for thread in threads:
+            os.sched_setscheduler(thread, policy, os.sched_param(level))
+    except ProcessLookupError:  # a thread that has ended since
+        return None
+    except OSError as error:
+        return str(error)
+    return None
 
 
 def _limit_runs() -> None:

@@ -173,11 +173,6 @@ def look(bench: Bench, step: str) -> list[Finding]:
         bench.client.brought_up = None
 
 
-def pressures(bench: Bench, count: int) -> Floats:
-    """Pressures of a vented device, cmH2O, one each control step, ``(count,)``."""
-    return vented(bench, count)[0]
-
-
 def vented(bench: Bench, count: int) -> tuple[Floats, Floats]:
     """Pressures, cmH2O, and flows, mL/s, of a vented device, one each control step."""
     client, clock, taken = bench.client, bench.clock, []
@@ -200,7 +195,7 @@ def _room(bench: Bench) -> list[Finding]:
     question = "air supply off, no lung, the sensor's tube open to the room. Is it so?"
     if refused := _asked(bench, "room", question):
         return refused
-    read = pressures(bench, _READINGS)
+    read, _ = vented(bench, _READINGS)
     if not np.isfinite(read).all():
         return [unknown("room", "the sensor gives no pressure")]
     mean, noise = float(read.mean()), white_noise(read)
@@ -220,7 +215,7 @@ def _reference(bench: Bench) -> list[Finding]:
     if not low <= applied <= high:
         text = f"{applied:g} cmH2O tell no slope: apply {low:g} to {high:g}"
         return [unknown("reference", text)]
-    shown = float(pressures(bench, _READINGS).mean())
+    shown = float(vented(bench, _READINGS)[0].mean())
     text = f"{shown:.2f} cmH2O where the reference shows {applied:g}"
     found = judged("reference", shown / applied, text)
     if found.ok:

@@ -24,7 +24,7 @@ from subprocess import Popen
 from typing import Protocol
 
 from hardware_eval import realtime
-from hardware_eval.device.program import PERIOD, Identity, Sample
+from hardware_eval.device.program import PERIOD, Sample, Sensor
 
 #: Time without an order after which the valves are vented, s: ten periods of the program.
 DEADMAN = 0.050
@@ -126,19 +126,6 @@ def start(
     return process, near
 
 
-class Sensor(Protocol):
-    """What is read in a thread of its own."""
-
-    @property
-    def identity(self) -> Identity:
-        """What the device tells about itself."""
-        ...
-
-    def sample(self, now: float) -> Sample:
-        """Read the sensors at device time ``now``, s; may take its time."""
-        ...
-
-
 class SupervisedHal:
     """A sensor read in a thread, and valves behind a deadman; neither holds up the program.
 
@@ -150,7 +137,7 @@ class SupervisedHal:
     def __init__(
         self, sensor: Sensor, orders: socket.socket, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Begin to sample, by the program's clock, s."""
+        """Begin to sample, by the program's clock, s; the sensor may take its time."""
         self.identity = sensor.identity
         self.lost = False
         self._sensor, self._orders, self._clock = sensor, orders, clock

@@ -103,12 +103,8 @@ class Identity:
     noisy: bool = False
 
 
-class Hal(Protocol):
-    """One ventilator: a pressure sensor and two valves.
-
-    Both methods return within about 2 ms. When nobody calls them any more, the hardware itself
-    should vent: a normally open expiratory and a normally closed inspiratory valve.
-    """
+class Sensor(Protocol):
+    """What is read."""
 
     @property
     def identity(self) -> Identity:
@@ -118,6 +114,14 @@ class Hal(Protocol):
     def sample(self, now: float) -> Sample:
         """Read the sensors at device time ``now``, s. A sensor that fails gives NaN, no error."""
         ...
+
+
+class Hal(Sensor, Protocol):
+    """One ventilator: a pressure sensor and two valves.
+
+    Both methods return within about 2 ms. When nobody calls them any more, the hardware itself
+    should vent: a normally open expiratory and a normally closed inspiratory valve.
+    """
 
     def actuate(self, now: float, u_in: float, u_out: int) -> None:
         """Set the inspiratory valve, %, 0..100, and the expiratory valve, 0 closed, 1 open."""

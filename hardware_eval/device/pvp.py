@@ -339,7 +339,7 @@ class PvpValves:
 
 
 class PvpSensor:
-    """The ventilator's pressure sensor; see :class:`~hardware_eval.device.deadman.Sensor`.
+    """The ventilator's pressure sensor; see :class:`~hardware_eval.device.program.Sensor`.
 
     Attributes:
         identity: of the device.

@@ -346,10 +346,10 @@ def scored_plants(simulator: Any, lungs: list[str]) -> Simulators:
     return replace(plants, name=simulators.name)
 
 
-def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
+def recorded_breaths(path: Path) -> Breaths:
     """The breaths behind a hardware record, a log, a session's folder or a recording.
 
-    The raw log that a record names is looked for beside it if it is not given.
+    The raw log that a record names must lie beside it.
 
     Raises:
         InputError: if the log is not there, or not the one that the record names.
@@ -360,9 +360,9 @@ def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
         return recording(path, kinds=(*UNDISTURBED, "explore"))
     if not path.name.endswith(".json"):
         return load(path)
-    loaded, log = _loaded(path), log or path.parent / LOG
+    loaded, log = _loaded(path), path.parent / LOG
     if not log.is_file():
-        raise InputError(f"{log} is not there: give --log FILE, the raw recording of {path}")
+        raise InputError(f"{log} is not there: put the raw recording of {path} beside it")
     if files.sha256(log) != loaded.header.recording.sha256:
         raise InputError(f"{log} is not the raw recording that {path} names by its hash")
     return recording(log, kinds=UNDISTURBED)

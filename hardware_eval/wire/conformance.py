@@ -43,6 +43,7 @@ from hardware_eval.wire.probe import (
     ANSWER,
     BOUND,
     WATCHDOG,
+    WINDOW,
     DiffersError,
     LateError,
     Probe,
@@ -62,9 +63,6 @@ NOT_TRIED = (
     "the end of the sensor's range vents, and a limit beyond it bars arming (duty 2)",
     "a device that was held up vents before it listens (duty 3)",
 )
-
-#: Largest step of the sequence number.
-WINDOW = 65_536
 
 
 def _shows(
@@ -170,8 +168,8 @@ def _version(host: Probe) -> None:
     before = host.counters()
     other = host.random.getrandbits(32)
     for session in (host.session, other):
-        host.refused(Hello(2), Reason.VERSION, session=session, consumes=False)
-    host.refused(Hello(2), Reason.VERSION, step=0, consumes=False)
+        host.refused(Hello(2), Reason.VERSION, session=session)
+    host.refused(Hello(2), Reason.VERSION, step=0)
     after = host.counters()  # with the next number: the refused one was not consumed
     equal("messages of another number", after.sequence, before.sequence)
 
@@ -180,20 +178,20 @@ def _sessions(host: Probe) -> None:
     other = host.random.getrandbits(32)
     with host.counting(session=5):
         for message in (Arm(), Command(1.0, 0, 0), Heartbeat(), Statistics()):
-            host.refused(message, Reason.SESSION, session=other, consumes=False)
-        host.refused(Command(200.0, 0, 0), Reason.SESSION, session=other, consumes=False)
+            host.refused(message, Reason.SESSION, session=other)
+        host.refused(Command(200.0, 0, 0), Reason.SESSION, session=other)
     _shows(host.reading(), "after strangers", Mode.READY)
     old, since = host.session, host.inspire()
     host.hello()
     _shows(host.reading(), "after a second host", Mode.READY)
     host.in_time(since)
-    host.refused(Heartbeat(), Reason.SESSION, session=old, consumes=False)
+    host.refused(Heartbeat(), Reason.SESSION, session=old)
 
 
 def _again(host: Probe) -> None:
     host.reading()
     for step in (0, -1):
-        host.refused(Hello(), Reason.SEQUENCE, step=step, consumes=False)
+        host.refused(Hello(), Reason.SEQUENCE, step=step)
     host.ask(Hello(pressure_limit=20.0), Welcome)
     _shows(host.reading(), "after a hello of the same session", Mode.READY)
 
@@ -202,21 +200,21 @@ def _numbers(host: Probe) -> None:
     with host.counting(sequence=12):
         for step in (0, -1, WINDOW + 1):
             for message in (Heartbeat(), Arm(), Statistics(), Command(200.0, 0, 0)):
-                host.refused(message, Reason.SEQUENCE, step=step, consumes=False)
+                host.refused(message, Reason.SEQUENCE, step=step)
     host.ask(Heartbeat(), Reading, step=WINDOW)
     host.ask(Heartbeat(), Reading, step=2)
 
 
 def _consumed(host: Probe) -> None:
     host.refused(Command(1.0, 0, 0), Reason.NOT_ARMED)
-    host.refused(Heartbeat(), Reason.SEQUENCE, step=0, consumes=False)
+    host.refused(Heartbeat(), Reason.SEQUENCE, step=0)
     host.refused(Command(200.0, 0, 0), Reason.OUT_OF_RANGE)
-    host.refused(Heartbeat(), Reason.SEQUENCE, step=0, consumes=False)
+    host.refused(Heartbeat(), Reason.SEQUENCE, step=0)
     host.ask(Vent(), Reading)
-    host.refused(Heartbeat(), Reason.SEQUENCE, step=0, consumes=False)
-    host.ask(Vent(), Reading, step=-1, consumes=False)
-    host.ask(Vent(), Reading, step=WINDOW + 1, consumes=False)
-    host.ask(Vent(), Reading, step=5, session=host.session ^ 1, consumes=False)
+    host.refused(Heartbeat(), Reason.SEQUENCE, step=0)
+    host.ask(Vent(), Reading, step=-1)
+    host.ask(Vent(), Reading, step=WINDOW + 1)
+    host.ask(Vent(), Reading, step=5, session=host.session ^ 1)
     host.reading()
 
 
@@ -287,8 +285,7 @@ def _stale(host: Probe) -> None:
 def _vent(host: Probe) -> None:
     for session, step in ((None, 1), (host.session ^ 0x5A5A5A5A, 1), (None, 0)):
         since = host.inspire()
-        own = session is None and step == 1
-        reading = host.ask(Vent(), Reading, step=step, session=session, consumes=own)
+        reading = host.ask(Vent(), Reading, step=step, session=session)
         host.in_time(since)
         _vented(reading, "after a vent", Flag.HOST_VENTED)
         host.refused(host.command(30.0, 0), Reason.NOT_ARMED)
@@ -370,8 +367,8 @@ def _feeds(host: Probe) -> None:
 def _noise(host: Probe) -> object:
     """Messages that must not feed the watchdog."""
     host.refused(host.command(30.0, 0, age=500), Reason.STALE)
-    host.refused(Command(30.0, 0, 0), Reason.SEQUENCE, step=0, consumes=False)
-    host.refused(Arm(), Reason.SESSION, session=host.session ^ 1, consumes=False)
+    host.refused(Command(30.0, 0, 0), Reason.SEQUENCE, step=0)
+    host.refused(Arm(), Reason.SESSION, session=host.session ^ 1)
     return host.counters()
 
 

@@ -33,6 +33,9 @@ from hardware_eval.wire.messages import (
 #: From the last command to moved valves, s; the watchdog; and the time for an answer.
 BOUND, WATCHDOG, ANSWER = 0.100, 0.080, 0.005
 
+#: Largest step of the sequence number.
+WINDOW = 65_536
+
 #: Causes of venting that pass by themselves.
 _SENSOR = Flag.SENSOR_LOST | Flag.SENSOR_STUCK | Flag.SENSOR_NOISY
 
@@ -93,9 +96,12 @@ class Probe:
         answer: type[_AnswerT],
         step: int = 1,
         session: int | None = None,
-        consumes: bool = True,
     ) -> _AnswerT:
-        """Send a message, and return its answer, which must be of a type."""
+        """Send a message, and return its answer, which must be of a type.
+
+        The device consumes its number if ``step`` is one that a number may rise by, and no other
+        ``session`` is given.
+        """
         header = self.session if session is None else session, self.sequence + step
         got = self.raw(self.frame(message, step, session))
         if (got.session, got.sequence) != header:
@@ -103,7 +109,7 @@ class Probe:
                 f"{message.kind.name.lower()} {header[1]} of session {header[0]:#x} was answered "
                 f"with number {got.sequence} of session {got.session:#x}"
             )
-        self.sequence += step if consumes else 0
+        self.sequence += step if session is None and 0 < step <= WINDOW else 0
         if not isinstance(got.message, answer):
             raise DiffersError(
                 f"{message.kind.name.lower()} was answered with {told(got.message)}, not with "
@@ -112,15 +118,10 @@ class Probe:
         return got.message
 
     def refused(
-        self,
-        message: HostMessage,
-        reason: Reason,
-        step: int = 1,
-        session: int | None = None,
-        consumes: bool = True,
+        self, message: HostMessage, reason: Reason, step: int = 1, session: int | None = None
     ) -> Refusal:
         """Send what must be refused for a reason."""
-        got = self.ask(message, Refusal, step, session, consumes)
+        got = self.ask(message, Refusal, step, session)
         equal(f"{message.kind.name.lower()} refused for", got.reason.name, reason.name)
         return got
 

@@ -186,8 +186,6 @@ def test_faults_of_the_line(kind: LineFaultKind, strength: float, times_out: boo
         assert device.clock.now() - before >= strength
     device.clock.advance(1.0)
     assert client.vent().mode is Mode.VENTED  # the line is in order again
-    assert client.counts["unanswered"] == int(times_out)
-    assert client.counts["unexpected"] == int(kind is LineFaultKind.LATE and times_out)
 
 
 def test_a_pulled_cable_vents_and_the_client_comes_back() -> None:
@@ -204,7 +202,6 @@ def test_a_pulled_cable_vents_and_the_client_comes_back() -> None:
     assert bench.valves[-1][1:] == (0.0, 1)
     device.plug()
     assert client.reconnect().pressure_limit == 40.0
-    assert client.counts["disconnections"] == 1
     assert client.arm().mode is Mode.RUNNING
 
 

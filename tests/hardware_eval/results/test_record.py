@@ -186,7 +186,7 @@ def test_the_recording_is_compared_with_simulators(path: Path) -> None:
 def test_a_record_without_its_log_says_where_to_look(path: Path, tmp_path: Path) -> None:
     alone = tmp_path / path.name
     shutil.copy(path, alone)
-    with pytest.raises(InputError, match="--log"):
+    with pytest.raises(InputError, match="beside it"):
         recorded_breaths(alone)
     (tmp_path / "raw.jsonl").write_text('{"type":"log"}\n')
     with pytest.raises(InputError, match="by its hash"):

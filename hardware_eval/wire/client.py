@@ -639,5 +639,6 @@ class Client:
     def _expected(self, event: Event) -> Message | None:
         """The message of an answer; None of what was damaged, or answers nothing that waits."""
         waits = self._session, self._sequence
-        ours = isinstance(event, Packet) and (event.session, event.sequence) == waits
-        return event.message if ours else None
+        if isinstance(event, Packet) and (event.session, event.sequence) == waits:
+            return event.message
+        return None

@@ -188,6 +188,7 @@ def trial(device: FaultyDevice, lung: str, fault: Fault, moment: float) -> tuple
     try:
         result = run_once(bench, run, controller)
         done = "went on" if result.status == "complete" else result.reason.partition(":")[0]
+        done = "answers too late" if "answers took" in done else done
     except LinkError:
         done = "device's watchdog"
     except HostDiedError:

@@ -125,8 +125,8 @@ def _index(
             for row in track.hardware
         ],
         protocol=protocol,
-        round=None if page_round is None else _round(page_round),
-        rounds=[_round(x) for x in leaderboard.rounds],
+        round=page_round,
+        rounds=leaderboard.rounds,
         root=root,
     )
 
@@ -134,33 +134,12 @@ def _index(
 def _telling(lines: Sequence[Line]) -> list[Column]:
     """Columns of the page that do not say the same of every entry that is shown in its tables."""
     listed = [line for line in lines if line.status in ("ranked", "practice")]
-    cells = {column.names[0]: [column.cell(line) for line in listed] for column in PAGE_COLUMNS}
     return [
         column
         for column in PAGE_COLUMNS
         if len(listed) < 2
-        or any(cell != cells[column.names[0]][0] for cell in cells[column.names[0]])
+        or (cells := [column.cell(line) for line in listed]).count(cells[0]) < len(cells)
     ]
-
-
-def _round(round_: Round) -> dict[str, Any]:
-    """A round for the templates."""
-    frozen, result = round_.frozen, round_.result
-    return {
-        "name": round_.name,
-        "path": f"{canonical.ROUNDS}/{round_.name}.html",
-        "state": round_.state,
-        "rehearsal": round_.opened.rehearsal,
-        "closes": f"{round_.opened.closes:%Y-%m-%d %H:%M} UTC",
-        "frozen": f"{frozen.frozen:%Y-%m-%d %H:%M:%S} UTC" if frozen else "",
-        "frozen_sha256": round_.frozen_sha256,
-        "number": round_.number if frozen else None,
-        "randomness": round_.value.randomness if round_.value else "",
-        "entries": frozen.entries if frozen else [],
-        "left_out": sorted(frozen.left_out.items()) if frozen else [],
-        "failed": sorted(result.failed.items()) if result else [],
-        "notes": list(round_.notes().items()),
-    }
 
 
 def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:

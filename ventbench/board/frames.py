@@ -374,9 +374,7 @@ def csv_text(tracks: Sequence[Track]) -> str:
 
 def markdown(tracks: Sequence[Track]) -> str:
     """The newest ranked entries as a table of Markdown, a line for each, by the first track."""
-    performance = ["performance", "rank", "error"]
-    robustness = ["robustness", "rank", "stress", "runs survived"]
-    titles = ["entry", *performance, *robustness]
+    blank = {"performance": [""] * 3, "robustness": [""] * 4}
     listed = [line for line in lines(tracks) if line.status in ("ranked", "practice")]
     cells: dict[str, dict[str, list[str]]] = {}
     for line in (x for x in listed if x.track.draws == listed[0].track.draws):
@@ -394,15 +392,10 @@ def markdown(tracks: Sequence[Track]) -> str:
             secondary = ["", ""]
         text = f"**{score.value:.1f}** [{score.low:.1f}, {score.high:.1f}]" if score else ""
         cells.setdefault(row.record.name, {})[track.name] = [text, ranks, *secondary]
+    titles = ["entry", "performance", "rank", "error"]
+    titles += ["robustness", "rank", "stress", "runs survived"]
     table = [titles, ["---"] * len(titles)]
-    table += [
-        [
-            name,
-            *tracks.get("performance", [""] * len(performance)),
-            *tracks.get("robustness", [""] * len(robustness)),
-        ]
-        for name, tracks in cells.items()
-    ]
+    table += [sum((blank | tracks).values(), [name]) for name, tracks in cells.items()]
     return "\n".join(f"| {' | '.join(line)} |" for line in table)
 
 

@@ -211,9 +211,9 @@ def attested(folder: Path, records: Mapping[str, str | None]) -> tuple[frozenset
         problems.append(str(error))
     keys = {key.id: key for key in listed.keys}
     problems += [
-        f"{path}: key {key.id} should have the id {key_id(bytes.fromhex(key.public))}"
+        f"{path}: key {key.id} should have the id {own}"
         for key in listed.keys
-        if key.id != key_id(bytes.fromhex(key.public))
+        if key.id != (own := key_id(bytes.fromhex(key.public)))
     ]
     for entry in listed.second_runs:
         if entry.record not in records:

@@ -135,31 +135,21 @@ def hardware_of(rows: Sequence[HardwareRow], name: str) -> HardwareRow | None:
 
 
 def hardware_context(row: HardwareRow) -> dict[str, Any]:
-    """A hardware record for the templates."""
+    """A hardware record for the templates: the row's fields, and texts that are made of them."""
     record, header = row.record, row.record.header
-    kind = "emulator" if record.emulated else header.device.name
+    stopped = not math.isfinite(record.score)
     spread = "" if math.isnan(record.spread) else f" (SD {figure(record.spread)})"
     return {
-        "name": record.name,
-        "sha256": record.sha256,
+        **vars(row),
+        "header": header,
         "path": row.simulated and address(row.simulated.record),
-        "listed": row.simulated is not None,
-        "value": f"{record.score:.9f}" if math.isfinite(record.score) else "",
-        "score": figure(record.score) if math.isfinite(record.score) else "stopped",
+        "value": "" if stopped else f"{record.score:.9f}",
+        "score": "stopped" if stopped else figure(record.score),
         "spread": spread,
-        "rank": row.rank,
-        "count": row.count,
-        "simulated_rank": row.simulated.rank if row.simulated else None,
-        "nominal": figure(row.nominal),
+        "expected": figure(row.nominal),
         "gap": signed(row.gap),
         "same_code": row.same_code,
-        "device": kind,
-        "firmware": header.device.firmware,
-        "calibration": header.device.calibration[:12],
-        "emulated": record.emulated,
-        "operator": header.operator,
-        "notes": header.notes,
-        "created": header.created,
+        "device": "emulator" if record.emulated else header.device.name,
         "lungs": [
             {
                 "name": lung,
@@ -170,14 +160,6 @@ def hardware_context(row: HardwareRow) -> dict[str, Any]:
             for i, lung in enumerate(header.lungs)
         ],
         "pips": ", ".join(f"{pip:g}" for pip in header.pips),
-        "repeats": header.repeats,
-        "stops": [
-            f"{stop.lung}, PIP {stop.pip:g}, repetition {stop.repeat}: {stop.reason}"
-            for stop in header.stops
-        ],
-        "newest": row.newest,
-        "reasons": list(row.reasons),
-        "recording": header.recording.sha256,
     }
 
 
@@ -238,28 +220,24 @@ def stress_chart(rows: Sequence[StressRow]) -> list[dict[str, Any]]:
     if not rows:
         return []
     index = {condition: k for k, condition in enumerate(rows[0].tables.conditions)}
-    groups = []
-    for category in CATEGORIES:
-        names = dict.fromkeys(
-            c.stressors[0]
-            for c in index
-            if len(c.stressors) == 1 and stressor(c.stressors[0]).category == category
-        )
-        lines = [
-            _chart_line(
-                stressor(name).title, [(Condition((name,), s), s) for s in SEVERITIES], rows, index
-            )
-            for name in names
+    groups: dict[str, list[dict[str, Any]]] = {
+        title.capitalize(): [] for title in (*CATEGORIES.values(), _PAIRS)
+    }
+    for names in dict.fromkeys(c.stressors for c in index if c.stressors):
+        title = " + ".join(stressor(name).title for name in names)
+        group = CATEGORIES[stressor(names[0]).category] if len(names) == 1 else _PAIRS
+        columns = [(Condition(names, severity), f"{title}, {severity}") for severity in SEVERITIES]
+        fields = [
+            _field(entry, index[condition], said) if condition in index else None
+            for entry in rows
+            for condition, said in columns
         ]
-        groups.append({"title": CATEGORIES[category].capitalize(), "rows": lines})
-    pairs = [c for c in index if len(c.stressors) > 1]
-    titles = [" + ".join(stressor(name).title for name in c.stressors) for c in pairs]
-    lines = [
-        _chart_line(title, [(c, "mild"), (None, "")], rows, index)
-        for title, c in zip(titles, pairs, strict=True)
-    ]
-    groups.append({"title": "Two at once, both mild", "rows": lines})
-    return [group for group in groups if group["rows"]]
+        groups[group.capitalize()].append({"title": title, "fields": fields})
+    return [{"title": title, "rows": lines} for title, lines in groups.items() if lines]
+
+
+#: Title of the conditions of two stressors.
+_PAIRS = "two at once, both mild"
 
 
 def title_of(condition: str) -> str:
@@ -269,20 +247,6 @@ def title_of(condition: str) -> str:
             titles = " + ".join(stressor(name).title for name in candidate.stressors)
             return f"{titles}, {candidate.severity}" if titles else "without stressor"
     return condition
-
-
-def _chart_line(
-    title: str,
-    columns: Sequence[tuple[Condition | None, str]],
-    rows: Sequence[StressRow],
-    index: dict[Condition, int],
-) -> dict[str, Any]:
-    fields = []
-    for entry in rows:
-        for condition, severity in columns:
-            at = None if condition is None else index.get(condition)
-            fields.append(None if at is None else _field(entry, at, f"{title}, {severity}"))
-    return {"title": title, "fields": fields}
 
 
 def _field(entry: StressRow, at: int, title: str) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ventbench.base.arrays import Floats
-from ventbench.entries.cells import ControllerSession, Progress, Runner, counted
+from ventbench.entries.cells import ROUNDS, ControllerSession, Progress, Runner, counted
 from ventbench.entries.folder import (
     CONTROLLER,
     SEEDS,
@@ -198,10 +198,8 @@ def run_all(
 
 #: Calls of ``act`` in a run of all draws, in one under every condition, and the longest that those
 #: of a round may take, s: half of what an entry has, as the scorer's machine may be slower.
-ACTS = len(LUNGS) * len(protocol.PIPS) * (1 + draws.COUNT) * protocol.BREATHS
-ACTS *= protocol.INSPIRATION_STEPS
-STRESSED_ACTS = len(conditions()) * len(LUNGS) * DRAWS * protocol.BREATHS
-STRESSED_ACTS *= protocol.INSPIRATION_STEPS
+ACTS = len(LUNGS) * len(protocol.PIPS) * (1 + draws.COUNT) * ROUNDS
+STRESSED_ACTS = len(conditions()) * len(LUNGS) * DRAWS * ROUNDS
 LONGEST_S = 0.5 * protocol.ENTRY_S
 
 _PLACE = re.compile(r"([\w./-]+\.py) line (\d+) ")

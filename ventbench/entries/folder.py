@@ -198,13 +198,21 @@ class _Stateless:
         """Keep nothing of a task."""
 
 
-def _walk(folder: Path) -> list[Path]:
-    paths = []
+def _listed(folder: Path, ignored: set[str], *, hidden: bool = False) -> Iterator[Path]:
+    """Files and links below a folder, but for ignored folders; ``hidden`` ones as one each."""
     for parent, folders, names in walk(folder):
-        links = [name for name in folders if (parent / name).is_symlink()]
-        folders[:] = sorted(set(folders) - _IGNORED_FOLDERS - set(links))
-        paths += [parent / name for name in (*links, *names) if name not in _IGNORED_FILES]
-    return sorted(paths)
+        closed = [
+            name
+            for name in folders
+            if (parent / name).is_symlink() or (hidden and name.startswith("."))
+        ]
+        folders[:] = sorted(set(folders) - ignored - set(closed))
+        yield from (parent / name for name in sorted((*closed, *names)))
+
+
+def _walk(folder: Path) -> list[Path]:
+    paths = _listed(folder, _IGNORED_FOLDERS)
+    return sorted(path for path in paths if path.name not in _IGNORED_FILES)
 
 
 def file_hashes(folder: Path) -> dict[str, str]:
@@ -215,12 +223,9 @@ def file_hashes(folder: Path) -> dict[str, str]:
 
 def uncovered(folder: Path) -> list[str]:
     """What lies in a folder and is not in its hash: links, caches, compiled code, by path."""
-    covered, paths = file_hashes(folder), []
-    for parent, folders, names in walk(folder):
-        links = [name for name in folders if (parent / name).is_symlink()]
-        inside = ((parent / name).relative_to(folder).as_posix() for name in (*links, *names))
-        paths += [path for path in inside if path not in covered or ending(path) in _COMPILED]
-    return sorted(paths)
+    covered = file_hashes(folder)
+    paths = (path.relative_to(folder).as_posix() for path in _listed(folder, set()))
+    return sorted(path for path in paths if path not in covered or ending(path) in _COMPILED)
 
 
 def frozen_copy(folder: Path, sha256: str, place: Path) -> Submission:
@@ -281,7 +286,7 @@ _REQUIRED = {
 
 def check_files(folder: Path) -> list[Finding]:
     """Look at every file of a submission's folder."""
-    regular, findings = _inventory(folder, _members(folder))
+    regular, findings = _inventory(folder, _listed(folder, _IGNORED_FOLDERS, hidden=True))
     for name, status in regular.items():
         findings += _file(folder / name, name, status)
     for first, second in collisions(regular):
@@ -312,20 +317,8 @@ def _inventory(
     return regular, findings
 
 
-def _problem(file: str, message: str, advice: str) -> Finding:
-    return Finding("files", file, message, advice)
-
-
-def _note(file: str, message: str, advice: str) -> Finding:
-    return Finding("files", file, message, advice, problem=False)
-
-
-def _members(folder: Path) -> Iterator[Path]:
-    """Files, links, and hidden folders as one each; what Python caches is left out."""
-    for parent, folders, names in walk(folder):
-        closed = [n for n in folders if (parent / n).is_symlink() or n.startswith(".")]
-        folders[:] = sorted(set(folders) - {"__pycache__"} - set(closed))
-        yield from (parent / name for name in sorted((*closed, *names)))
+def _problem(file: str, message: str, advice: str, *, problem: bool = True) -> Finding:
+    return Finding("files", file, message, advice, problem=problem)
 
 
 def _irregular(name: str, mode: int) -> Finding:
@@ -341,7 +334,8 @@ def _irregular(name: str, mode: int) -> Finding:
 
 def _file(path: Path, name: str, status: os.stat_result) -> Iterator[Finding]:
     if path.name == ".DS_Store":
-        yield _note(name, "was written by macOS", "leave it out of the pull request")
+        advice = "leave it out of the pull request"
+        yield _problem(name, "was written by macOS", advice, problem=False)
         return
     wrong, advice = path_problem(name), kind_problem(name)
     if wrong:
@@ -353,7 +347,7 @@ def _file(path: Path, name: str, status: os.stat_result) -> Iterator[Finding]:
         yield from _content(path, name)
     if os.name != "nt" and status.st_mode & 0o111:
         refused = f"chmod -x {name}: a pull request with executables is refused"
-        yield _note(name, "is executable", refused)
+        yield _problem(name, "is executable", refused, problem=False)
 
 
 def _content(path: Path, name: str) -> Iterator[Finding]:

@@ -285,21 +285,25 @@ class Score:
         table = self.stressed.summary().iloc[1:].sort_values("error_cmH2O", ascending=False)
         return table[columns].head(_LISTED_CONDITIONS).reset_index()
 
-    def __str__(self) -> str:
-        rows = self.summary().reset_index()
-        lines = [rows.to_string(index=False, float_format="{:.3f}".format, na_rep="failed")]
+    def _tables(self, method: str) -> list[str]:
+        """Tables of lungs and of the worst conditions, written by a method of frames."""
+        frames = [(self.summary().reset_index(), "{:.3f}", "failed")]
         if (worst := self._worst()) is not None:
-            lines += [worst.to_string(index=False, float_format="{:.2f}".format)]
-        return "\n".join([self._headline(), lines[0], *self._sentences(), *lines[1:]])
+            frames.append((worst, "{:.2f}", "NaN"))
+        return [
+            getattr(frame, method)(index=False, float_format=form.format, na_rep=missing)
+            for frame, form, missing in frames
+        ]
+
+    def __str__(self) -> str:
+        first, *others = self._tables("to_string")
+        return "\n".join([self._headline(), first, *self._sentences(), *others])
 
     def _repr_html_(self) -> str:
-        rows = self.summary().reset_index()
-        tables = [rows.to_html(index=False, float_format="{:.3f}".format, na_rep="failed")]
-        if (worst := self._worst()) is not None:
-            tables += [worst.to_html(index=False, float_format="{:.2f}".format)]
-        paragraphs = "".join(f"<p>{html.escape(text)}</p>" for text in self._sentences())
-        headline = f"<p>{html.escape(self._headline())}</p>"
-        return f"<div>{headline}{tables[0]}{paragraphs}{''.join(tables[1:])}</div>"
+        first, *others = self._tables("to_html")
+        texts = map(html.escape, (self._headline(), *self._sentences()))
+        headline, *paragraphs = (f"<p>{text}</p>" for text in texts)
+        return f"<div>{headline}{first}{''.join([*paragraphs, *others])}</div>"
 
     def _stress(self) -> dict[str, Any] | None:
         """What missing physics does, as JSON values."""

@@ -31,7 +31,7 @@ JUDGES = (
 )
 
 #: Files of a round that are written with its records.
-_WITH_RECORDS = {*canonical.ROUND_FILES[-2:], "result.sig"}
+_WITH_RECORDS = {*canonical.ROUND_FILES[-2:], canonical.SEEDS, "result.sig"}
 
 
 def problems(paths: Iterable[str]) -> list[str]:

@@ -68,8 +68,9 @@ def swapped(board: Path) -> None:
 
 
 def invented_seeds(board: Path) -> None:
-    """Give an entry seeds that nobody ran."""
+    """Give an entry seeds that nobody ran, and sign that."""
     rewrite(board, lambda result: result["seeds"].update({"softer (performance)": [0.5] * 5}))
+    gate.sign(board, board / "rounds" / ROUND / "result.json", KEY)
 
 
 def withdrawn(board: Path) -> None:
@@ -81,7 +82,7 @@ ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
     "all but one record removed": (all_but_one, "is missing: the record of softer"),
     "an entry moved to the failed ones": (failed, "result.sig signs another file"),
     "hashes swapped": (swapped, "result.json, key records"),
-    "seeds invented": (invented_seeds, "result.sig signs another file"),
+    "seeds invented": (invented_seeds, "seeds.json, key softer (performance): its commands do not"),
     "no result": (
         lambda board: (board / "rounds" / ROUND / "result.json").unlink(),
         "result.json is missing",

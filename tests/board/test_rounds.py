@@ -270,7 +270,7 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
             )
 
     with monkeypatch.context() as broken:
-        broken.setattr(store, "add", lambda *_: 1 / 0)  # as if the machine had gone off
+        broken.setattr(store, "add", lambda *_, **__: 1 / 0)  # as if the machine had gone off
         with pytest.raises(ZeroDivisionError):
             score()
     first, done = list(ran), score()
@@ -289,6 +289,7 @@ def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -
         same, other = done.result.seeds[key]
         assert same == pytest.approx(record.figures.ranked_values.mean(), abs=1e-9)
         assert abs(other - same) > 1
+        assert len(done.seeds[key]) == 2, "their commands are there"
         assert done.result.failed[f"{key}, seed 2"] == "a cell failed"
     _proposed(fresh.parent / "work", done, checkout, simulators)
 

@@ -39,8 +39,8 @@ ROUND_FILES = (
     "result.json",
 )
 
-#: Of a round too: what the maintainers say of entries.
-NOTES = "notes.toml"
+#: Of a round too: what the maintainers say of entries, and commands of seeds.
+NOTES, SEEDS = "notes.toml", "seeds.json"
 
 #: Files that nothing else binds and a key signs, besides withdrawals: in the leaderboard's folder.
 SIGNED = (ATTESTATIONS, f"{ROUNDS}/*/{ROUND_FILES[-1]}", f"{ROUNDS}/*/{NOTES}")
@@ -55,7 +55,7 @@ BUILT = re.compile(
 _PART = re.compile(
     rf"attestations\.(toml|sig)|{RECORDS}/[0-9a-f]{{64}}\.(json|actions|sig)|"
     rf"{ROUNDS}/{ROUND_NAME}/"
-    rf"((result|notes)\.sig|{'|'.join(map(re.escape, (*ROUND_FILES, NOTES)))})"
+    rf"((result|notes)\.sig|{'|'.join(map(re.escape, (*ROUND_FILES, NOTES, SEEDS)))})"
 )
 
 

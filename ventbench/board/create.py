@@ -17,6 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ventbench.base import files
@@ -92,10 +93,7 @@ def create(
     of_runs = [score.requested] + ([] if stressed is None else [stressed.requested])
     requested = [np.asarray(x) for x in of_runs]
     commands = tuple(map(store.encode, requested))
-    described = [
-        {"sha256": canonical.digest(encoded), "bytes": len(encoded), "shape": list(x.shape)}
-        for encoded, x in zip(commands, requested, strict=True)
-    ]
+    described = [store.described(x, y.shape) for x, y in zip(commands, requested, strict=True)]
     stress = None
     if stressed is not None:
         stress = {
@@ -126,7 +124,7 @@ def create(
         "machine": machine(),
         "timing": dict(score.timing),
     }
-    draft = Draft(canonical.canonical(content), commands)
+    draft = Draft(canonical.canonical(msgspec.to_builtins(content)), commands)
     parsed = record.from_bytes(draft.content, f"the record of {label}")
     assert isinstance(parsed, record.Record)
     _require_replay(parsed, draft, score, simulators)
@@ -202,16 +200,11 @@ def _cpuinfo() -> dict[str, str]:
 
 def _failures(score: Score, failures: Sequence[CellFailure]) -> list[dict[str, Any]]:
     """Failures for a record; the first ones with their whole text."""
-    return [_failure(score, failure, n < _IN_FULL) for n, failure in enumerate(failures)]
-
-
-def _failure(score: Score, failure: CellFailure, in_full: bool) -> dict[str, Any]:
-    names = ("condition", "lung", "pip", "draw")
-    cell = {name: getattr(failure, name) for name in names}
-    # By its name, wherever its folder was.
-    description = failure.message.removeprefix(score.submission.label)
-    message = f"{score.submission.manifest.name}{description}"
-    texts = {**failure.failure.to_json(), "message": message}
-    length = schema.MAX_TEXT if in_full else _SHORT
-    cut = {k: v[:length] if isinstance(v, str) else v for k, v in texts.items()}
-    return {**cell, **cut}
+    recorded = []
+    for n, failure in enumerate(failures):
+        length = schema.MAX_TEXT if n < _IN_FULL else _SHORT
+        # By its name, wherever its folder was.
+        description = failure.message.removeprefix(score.submission.label)
+        texts = failure.to_json() | {"message": f"{score.submission.manifest.name}{description}"}
+        recorded.append({k: v[:length] if isinstance(v, str) else v for k, v in texts.items()})
+    return recorded

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -30,13 +29,15 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.board import canonical, create, gate, record, rounds, schema, store
-from ventbench.board.canonical import RECORDS
+from ventbench.board.canonical import RECORDS, SEEDS
 from ventbench.board.record import Record
-from ventbench.board.replay import Load, ReplayPlants, protocol_of, require_replay
+from ventbench.board.replay import Load, ReplayPlants, protocol_of, require_replay, seed_scores
 from ventbench.board.rounds import BOUNDS, RESULT, Entered, Result, Round
 from ventbench.entries import reference as references
 from ventbench.entries.cells import Runner
 from ventbench.entries.folder import (
+    CONTROLLER,
+    MAX_SEEDS,
     combined_hash,
     file_hashes,
     frozen_copy,
@@ -44,7 +45,6 @@ from ventbench.entries.folder import (
     with_seed,
 )
 from ventbench.entries.reference import Reference
-from ventbench.entries.result import Score
 from ventbench.entries.runs import DRAWS
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
@@ -134,20 +134,24 @@ def rerun(
         if progress is not None:
             progress(outcome)
 
-    available = list(folders([folder.parent / "submissions", *sources]))
+    available = code_in([folder.parent / "submissions", *sources])
     for score in scores:
-        code, why = _code_of(score, available, identity)
-        if code is None:
+        code, why = available.get(score.header.submission.sha256), ""
+        if score.header.simulators != identity:
+            why = "it was scored on other simulators than those of this ventbench"
+        elif code is None:
+            why = "no folder at hand has the files that it names; give --source DIR"
+        if why:
             note(Outcome(score.sha256, score.name, score.track, NOT_RERUN, why))
         else:
-            todo[score.sha256] = score.sha256, code.resolve(), folder.resolve(), load, runner
+            todo[score.sha256] = score.sha256, code, folder.resolve(), load, runner
     with executor(jobs if jobs > 1 and scheduler is None else 0, scheduler) as pool:
         for _, outcome in results(pool, _run, todo):
             note(outcome)
     return [outcomes[score.sha256] for score in scores]
 
 
-def folders(places: Sequence[Path]) -> Iterator[Path]:
+def folders(places: Iterable[Path]) -> Iterator[Path]:
     """Folders that may hold a submission: the places themselves and those in them."""
     for place in (*places, files.submissions_folder()):
         if not place.is_dir():
@@ -157,18 +161,13 @@ def folders(places: Sequence[Path]) -> Iterator[Path]:
         yield from (path for path in inside if path.is_dir())
 
 
-def _code_of(
-    score: Record, available: Sequence[Path], simulators: Mapping[str, Any]
-) -> tuple[Path | None, str]:
-    """Find the code that a record names by its hashes; else why it cannot be run again."""
-    if score.header.simulators != simulators:
-        return None, "it was scored on other simulators than those of this ventbench"
-    hashes = score.header.submission.files
-    for folder in available:
-        # By its files first: hashing every folder for every record would take long.
-        if all((folder / name).is_file() for name in hashes) and file_hashes(folder) == hashes:
-            return folder, ""
-    return None, "no folder at hand has the files that it names; give --source DIR"
+def code_in(places: Iterable[Path]) -> dict[str, Path]:
+    """Folders that hold a submission, the first of each, by the hash of its files."""
+    found: dict[str, Path] = {}
+    for folder in folders(places):
+        if (folder / CONTROLLER).is_file():
+            found.setdefault(combined_hash(file_hashes(folder)), folder.resolve())
+    return found
 
 
 def _run(
@@ -203,7 +202,8 @@ def _run(
             recorded = store.load_commands(commands, folder / RECORDS)
             again = environment.resolved(requested)
             detail = detail or difference(recorded, again)
-            closest.append(_closeness(recorded, again))
+            off = 0.0 if detail else np.abs(recorded - again).max()
+            closest.append(f"commands within {off:.1e} %" if off else "to the bit")
             failed, before = (
                 {(x.condition, x.lung, x.pip, x.draw) for x in y} for y in (failures, named)
             )
@@ -214,15 +214,6 @@ def _run(
         detail, closeness = f"its code cannot be run: {error}", ""
     state = DIFFERENT if detail else REPRODUCED
     return Outcome(score.sha256, score.name, score.track, state, detail or closeness)
-
-
-def _closeness(recorded: Floats, again: Floats) -> str:
-    """Say how close commands of equal shape are."""
-    if recorded.shape != again.shape:
-        return ""
-    if recorded.tobytes() == again.tobytes():
-        return "to the bit"
-    return f"commands within {np.abs(recorded - again).max():.1e} %"
 
 
 def difference(recorded: Floats, again: Floats) -> str:
@@ -271,13 +262,9 @@ def code_of(round_: Round, places: Iterable[Path]) -> dict[str, Path]:
         InputError: naming the entries whose code is not at hand.
     """
     assert round_.frozen is not None
-    hashes = {entry.name: entry.sha256 for entry in round_.frozen.entries}
-    code: dict[str, Path] = {}
-    for folder in folders(list(places)):
-        sha256 = hashes.get(folder.name)
-        if sha256 is not None and combined_hash(file_hashes(folder)) == sha256:
-            code.setdefault(folder.name, folder.resolve())
-    if missing := sorted(set(hashes) - set(code)):
+    found = code_in(places)
+    code = {x.name: found[x.sha256] for x in round_.frozen.entries if x.sha256 in found}
+    if missing := sorted({x.name for x in round_.frozen.entries} - set(code)):
         raise InputError(
             f"the code of {', '.join(missing)}, as it was frozen, is not at hand; give --source DIR"
         )
@@ -384,25 +371,26 @@ def score(
         OSError: if a file cannot be read or written.
     """
     tell = progress or (lambda stage, completed, count: None)
-    code = code_of(_load_scorable(leaderboard, name), list(places))
+    code = code_of(_load_scorable(leaderboard, name), places)
     bounds_progress = functools.partial(tell, "bounds of the draws")
     round_ = bound(
         leaderboard, name, pool, work, load=load, starts=starts, progress=bounds_progress
     )
     bounds = files.sha256(round_.folder / BOUNDS)
-    chosen = sorted(set(code) & set(only or code))
+    assert round_.frozen is not None
+    chosen = [x for x in round_.frozen.entries if x.name in (only or code)]
     jobs = {
-        entry: (leaderboard.resolve(), name, code[entry], work.resolve(), load, runner)
-        for entry in chosen
-        if not (path := _job(work, entry) / RESULT).exists() or not _job_result(path, bounds)
+        x.name: (leaderboard.resolve(), name, x, code[x.name], work.resolve(), load, runner)
+        for x in chosen
+        if not (path := _job(work, x.name) / RESULT).exists() or not _job_result(path, bounds)
     }
     count = len(chosen) - len(jobs)
     tell("entries and their seeds", count, len(chosen))
     for completed, _ in enumerate(results(pool, _score_entry, jobs), count + 1):
         tell("entries and their seeds", completed, len(chosen))
-    return (
-        round_ if only else close(leaderboard, name, work, load=load, secret=secret, progress=tell)
-    )
+    if only:
+        return round_
+    return close(leaderboard, name, work, load=load, secret=secret, progress=tell)
 
 
 def _load_scorable(leaderboard: Path, name: str) -> Round:
@@ -429,6 +417,7 @@ def _job_result(path: Path, bounds: str) -> Result:
 def _score_entry(
     leaderboard: Path,
     name: str,
+    entry: Entered,
     code: Path,
     work: Path,
     load: Load,
@@ -436,14 +425,13 @@ def _score_entry(
 ) -> None:
     """Score an entry on its tracks, and with the weights of each of its seeds, all by one runner.
 
-    Leaves its records, and its part of the result, in a folder of its own.
+    Leaves its records, commands of its seeds, and its part of the result, in a folder of its own.
     """
     round_, simulators = rounds.load(leaderboard, name), load()
     rigs = rigs_of(simulators)
-    entry = next(x for x in round_.frozen.entries if x.name == code.name) if round_.frozen else None
-    assert entry is not None
     draws, bounds, apart = round_.draws(rigs), round_.bounds(), runner()
     job_result, folder = Result(files.sha256(round_.folder / BOUNDS), {}), _job(work, entry.name)
+    of_seeds: dict[str, list[schema.Commands]] = {}
     with TemporaryDirectory() as place:
         for track, seed in itertools.product(entry.tracks, ["", *(x.name for x in seeds(code))]):
             key = f"{entry.name} ({track})"
@@ -462,7 +450,10 @@ def _score_entry(
                     runner=apart,
                 )
                 if seed:
-                    job_result.seeds.setdefault(key, []).append(_of_seed(result))
+                    if result.failures:
+                        raise InputError("a cell failed")
+                    commands = store.save_commands(np.asarray(result.requested), folder)
+                    of_seeds.setdefault(key, []).append(commands)
                     continue
                 provenance: Mapping[str, Any] = {"round": name, "frozen": round_.frozen_sha256}
                 draft = create.create(result, simulators, source=provenance)
@@ -470,16 +461,15 @@ def _score_entry(
             except (InputError, FloatingPointError, OSError) as error:
                 why = str(error)[: schema.MAX_TEXT]
                 job_result.failed[f"{key}, seed {seed}" if seed else key] = why
-    files.write_bytes(folder / RESULT, canonical.canonical(msgspec.to_builtins(job_result)))
+    _write(folder, of_seeds, job_result)
 
 
-def _of_seed(result: Score) -> float:
-    """Ranked score of a seed."""
-    assert result.normalised is not None
-    value = float(result.normalised[:, 1:][:, result.ranked].mean())
-    if math.isnan(value):
-        raise InputError("a cell failed")
-    return value
+def _write(folder: Path, of_seeds: Mapping[str, list[schema.Commands]], result: Result) -> None:
+    """Write a result, and before it the commands of seeds, if there are any."""
+    for name, content in ((SEEDS, of_seeds), (RESULT, result)):
+        if content:
+            written = canonical.canonical(msgspec.to_builtins(content))
+            files.write_bytes(folder / name, written)
 
 
 def close(
@@ -510,6 +500,7 @@ def close(
     round_, simulators = _load_scorable(leaderboard, name), load()
     assert round_.frozen is not None
     result = Result(files.sha256(round_.folder / BOUNDS), {})
+    of_seeds: dict[str, list[schema.Commands]] = {}
     for index, entry in enumerate(round_.frozen.entries):
         for track in entry.tracks:
             key, folder = f"{entry.name} ({track})", _job(work, entry.name)
@@ -517,19 +508,22 @@ def close(
                 job_result = _job_result(folder / RESULT, result.bounds)
                 if (sha256 := job_result.records.get(key)) is None:
                     raise InputError(job_result.failed.get(key, "its job left no record"))
-                path = _take(leaderboard, folder, sha256, round_, entry, track, simulators)
+                path, commands, scores = _take(
+                    leaderboard, folder, sha256, round_, entry, track, simulators
+                )
             except (InputError, OSError) as error:
                 result.failed[key] = str(error)[: schema.MAX_TEXT]
                 continue
             if secret:
                 gate.sign(leaderboard, path, secret)
             result.records[key] = sha256
-            result.seeds.update({x: y for x, y in job_result.seeds.items() if x == key})
+            if scores:
+                of_seeds[key], result.seeds[key] = commands, scores
             seeds_failed = (x for x in job_result.failed if x.startswith(f"{key}, seed "))
             result.failed.update({x: job_result.failed[x][: schema.MAX_TEXT] for x in seeds_failed})
         if progress is not None:
             progress("records", index + 1, len(round_.frozen.entries))
-    files.write_bytes(round_.folder / RESULT, canonical.canonical(msgspec.to_builtins(result)))
+    _write(round_.folder, of_seeds, result)
     if secret:
         gate.sign(leaderboard, round_.folder / RESULT, secret)
     return rounds.load(leaderboard, name)
@@ -543,8 +537,12 @@ def _take(
     entry: Entered,
     track: str,
     simulators: ReplayPlants,
-) -> Path:
-    """Add the record that a job left, unless it is there; InputError if it is of anything else."""
+) -> tuple[Path, list[schema.Commands], list[float]]:
+    """Add the record that a job left, unless it is there; InputError if it is of anything else.
+
+    Returns:
+        Its path, and commands of seeds of the entry with the scores that they give.
+    """
     path = store.path_of(leaderboard, sha256)
     source = path if path.exists() else folder / path.name
     candidate = record.load(source)
@@ -556,6 +554,9 @@ def _take(
         candidate.header.draws.sha256,
     ) != (sha256, entry.name, track, entry.sha256, round_.commitment):
         raise InputError(f"{source.name} is not the record of {entry.name} ({track}) in this round")
+    commands = rounds.seed_commands(folder).get(f"{entry.name} ({track})", [])[:MAX_SEEDS]
+    scores = seed_scores(candidate, commands, folder, simulators, round_, {})
     if source != path:
-        store.add(leaderboard, source, functools.partial(require_replay, simulators))
-    return path
+        replayed = functools.partial(require_replay, simulators)
+        store.add(leaderboard, source, replayed, seeds=commands)
+    return path, commands, scores

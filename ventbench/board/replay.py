@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jax import Array
 
@@ -29,7 +30,7 @@ from ventbench.board.canonical import RECORDS
 from ventbench.board.figures import Figures
 from ventbench.board.record import Record
 from ventbench.board.rounds import Round
-from ventbench.board.schema import RecordedFailure, ScoreContent
+from ventbench.board.schema import Commands, RecordedFailure, ScoreContent
 from ventbench.board.store import Store
 from ventbench.entries import cells as scored
 from ventbench.entries.cells import Cells, ProtocolRun, as_float64
@@ -415,6 +416,32 @@ def require_replay(
     if added.track == "robustness" and figures.leak:
         name = store.path_of(folder, added.sha256).name
         raise InputError(f"{name}, key commands: {figures.leak}")
+
+
+def seed_scores(
+    record: Record,
+    commands: Sequence[Commands],
+    folder: Path,
+    simulators: ReplayPlants,
+    round_: Round,
+    memo: Memo,
+) -> list[float]:
+    """Ranked scores that commands of seeds give; ``record`` is of their entry on the same track.
+
+    Raises:
+        InputError: if some are missing, cannot be honest, or are of another number of runs.
+    """
+    scores = []
+    for own in commands:
+        path = store.commands_path(own, folder)
+        if own.shape != record.header.commands.shape:
+            raise InputError(f"{path} does not have the shape of the commands of {record.name}")
+        header = msgspec.structs.replace(record.header, commands=own, failures=[], stress=None)
+        figures = derived_of(Record(own.sha256, header), folder, simulators, round_, memo)
+        if record.track == "robustness" and figures.leak:
+            raise InputError(f"{path}: {figures.leak}")
+        scores.append(float(figures.ranked_values.mean()))
+    return scores
 
 
 def once(memo: Memo, key: Any, make: Callable[..., Any], *of: Any) -> Any:

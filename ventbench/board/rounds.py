@@ -8,6 +8,7 @@ A round is a folder ``rounds/NAME/`` of the leaderboard; each file is bound by t
 - ``beacon.json``: the beacon's first value after freeze and delay;
 - ``bounds.npz``: best attainable and best PID of the draws, once the entries were scored;
 - ``result.json``: its hash, and what became of each entry;
+- ``seeds.json``: files of commands that give the scores of seeds in the result;
 - ``notes.toml``, if the maintainers have written it: why an entry is where it is, a sentence each.
 
 The seed of the draws is HMAC-SHA256 of the hash of ``frozen.toml`` with the beacon's randomness as
@@ -18,7 +19,7 @@ fixed by the time of the freeze. A round whose chain is not the pinned public on
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -105,8 +106,8 @@ class Frozen(schema.Table, frozen=True):
 class Result(schema.Table, frozen=True):
     """Content of ``result.json``: by entry and track a record, or why there is none.
 
-    The job of each entry leaves its part. ``seeds`` are the ranked scores of an entry with the
-    files of each of its seeds.
+    The job of each entry leaves its part, but for ``seeds``: the ranked scores of an entry with the
+    files of each of its seeds, which follow from the commands that ``seeds.json`` names.
     """
 
     bounds: schema.Sha256
@@ -117,6 +118,9 @@ class Result(schema.Table, frozen=True):
 
 #: Of results: of a round, and of the job of an entry.
 RESULT_DECODER = msgspec.json.Decoder(Result)
+
+#: Of files of commands of seeds, by entry and track.
+SEEDS_DECODER = msgspec.json.Decoder(dict[str, list[schema.Commands]])
 
 
 class Notes(schema.Table, frozen=True):
@@ -135,6 +139,8 @@ class Round:
     value: Value | None = None  #: of the beacon, checked; None before.
     result: Result | None = None  #: None before it is scored.
     frozen_sha256: str = ""  #: of ``frozen.toml``; empty before.
+    #: files of commands of seeds, by entry and track.
+    seeds: Mapping[str, Sequence[schema.Commands]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -225,7 +231,13 @@ def load(leaderboard: Path, name: str) -> Round:
     value = schema.read_canonical(beacon.DECODER, folder / BEACON)
     beacon.check(value, opened.chain, round_.number, str(folder / BEACON))
     result = schema.read_canonical(RESULT_DECODER, folder / RESULT) if RESULT in there else None
-    return Round(folder, opened, frozen, value, result, round_.frozen_sha256)
+    return Round(folder, opened, frozen, value, result, round_.frozen_sha256, seed_commands(folder))
+
+
+def seed_commands(folder: Path) -> dict[str, list[schema.Commands]]:
+    """Files of commands of seeds, of a round or of the job of an entry; none without the file."""
+    path = folder / canonical.SEEDS
+    return schema.read_canonical(SEEDS_DECODER, path) if path.exists() else {}
 
 
 def names(leaderboard: Path) -> list[str]:

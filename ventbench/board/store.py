@@ -168,7 +168,11 @@ def find_signed(folder: Path, named: str) -> Path:
 
 
 def add(
-    folder: Path, path: Path, require: Callable[[Record, Path, Store], object] | None = None
+    folder: Path,
+    path: Path,
+    require: Callable[[Record, Path, Store], object] | None = None,
+    *,
+    seeds: Sequence[Commands] = (),
 ) -> Record | HardwareRecord:
     """Add a record, beside which its commands lie, to a leaderboard, which is made if missing.
 
@@ -178,6 +182,7 @@ def add(
         require: called with a record of scores, the folder of its commands and the leaderboard
             before anything is written, such as :func:`ventbench.board.replay.require_replay` on
             the simulators; raises to refuse.
+        seeds: more commands beside it, of seeds of its entry.
 
     Raises:
         InputError: if it is not a record, does not replay, or does not fit those that are there.
@@ -198,7 +203,7 @@ def add(
             load_commands(commands, path.parent)
         if require is not None:
             require(added, path.parent, store)
-        for commands in added.commands:
+        for commands in (*added.commands, *seeds):
             content = commands_path(commands, path.parent).read_bytes()
             files.write_bytes(commands_path(commands, folder / RECORDS), content)
     _write(folder, added, path.read_bytes())
@@ -289,6 +294,19 @@ def _conflicts(entry: Record, first: Record | None, incumbent: Record | None) ->
 def commands_path(commands: Commands, folder: Path) -> Path:
     """Where a file of commands lies."""
     return folder / f"{commands.sha256}{canonical.ACTIONS_SUFFIX}"
+
+
+def described(content: bytes, shape: Sequence[int]) -> Commands:
+    """What a record says of a file of commands."""
+    return Commands(canonical.digest(content), len(content), list(shape))
+
+
+def save_commands(requested: Floats, folder: Path) -> Commands:
+    """Write a file of commands, %, of any shape."""
+    content = encode(requested)
+    commands = described(content, requested.shape)
+    files.write_bytes(commands_path(commands, folder), content)
+    return commands
 
 
 def load_commands(commands: Commands, folder: Path) -> Floats:

@@ -13,7 +13,7 @@ that errors follow from commands; who computed them is for :mod:`ventbench.board
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,20 @@ from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, gate, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
-from ventbench.board.official_runs import folders
-from ventbench.board.record import AnyRecord, Record, Withdrawal
-from ventbench.board.replay import Load, Memo, ReplayPlants, loaded, once, with_figures
+from ventbench.board.official_runs import code_in, folders
+from ventbench.board.record import AnyRecord, Withdrawal
+from ventbench.board.replay import (
+    Load,
+    Memo,
+    ReplayPlants,
+    loaded,
+    once,
+    seed_scores,
+    with_figures,
+)
 from ventbench.board.rounds import Round
 from ventbench.board.store import Store
 from ventbench.entries import reference as references
-from ventbench.entries.folder import combined_hash, file_hashes
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import protocol
 from ventbench.task.draws import uniforms
@@ -40,6 +47,10 @@ from ventbench.task.metrics.score import LEAST_HEADROOM
 #: Most that errors of bounds may differ from what their commands give, cmH2O, and that an entry or
 #: a second optimiser may lie below them: what no cell tells apart.
 BOUNDS_TOLERANCE, BOUNDS_LEAD = 1e-9, LEAST_HEADROOM
+
+#: Most that the score of a seed may differ from that of its commands, points: an error may by
+#: :data:`~ventbench.board.replay.TOLERANCE`, against the least headroom.
+SEED_TOLERANCE = 1e-6
 
 #: Cells of a round whose bound the second optimiser computes anew: about two minutes of one core.
 RECOMPUTED = 24
@@ -108,11 +119,11 @@ def verify(
         site = folder
     inputs = {x for x in plain if site != folder or not canonical.BUILT.fullmatch(x)}
     report.problems += [f"{folder / x} is no plain file or folder; remove it" for x in odd]
-    report.problems += _strange_files(folder, inputs, entries, complete=len(entries) == len(paths))
     report.problems += store.conflicts(entries)
     vouched, problems = gate.attested(folder, store.measured(entries))
     report.problems += problems if len(entries) == len(paths) else []
     leaderboard = Store(folder, entries, vouched, tuple(_rounds(folder, load, report, memo)))
+    report.problems += _strange_files(leaderboard, inputs, complete=len(entries) == len(paths))
     report.problems += [] if problems else _unsigned(leaderboard)
     for round_ in leaderboard.rounds:
         report.problems += _unaccounted(round_, leaderboard)
@@ -126,6 +137,8 @@ def verify(
     )
     report.replayed = sum(score.derived is not None for score in leaderboard.scores)
     report.problems += _below_bounds(leaderboard)
+    for round_ in leaderboard.rounds:
+        report.problems += _wrong_seeds(round_, leaderboard, load, memo)
     if not report.problems:  # else whatever is wrong has been said, and moves ranks and pages
         report.problems += _check_published(leaderboard, site, folder.parent / "README.md", memo)
         for round_ in leaderboard.rounds:
@@ -134,16 +147,17 @@ def verify(
     return report
 
 
-def _strange_files(
-    folder: Path, plain: set[str], entries: Sequence[AnyRecord], *, complete: bool
-) -> list[str]:
+def _strange_files(leaderboard: Store, plain: set[str], *, complete: bool) -> list[str]:
     """Files that belong to no record of the leaderboard: none of them may be published.
 
     If the entries are not complete, nobody knows which commands the missing ones name.
     """
-    problems = []
+    problems, folder, entries = [], leaderboard.folder, leaderboard.records
+    complete &= len(leaderboard.rounds) == len(rounds.names(folder))
     named = {entry.sha256 for entry in entries}
-    commands = {x.sha256 for entry in entries if isinstance(entry, Record) for x in entry.commands}
+    of_seeds = [x for round_ in leaderboard.rounds for x in round_.seeds.values()]
+    used = [*(x.commands for x in leaderboard.scores), *of_seeds]
+    commands = {x.sha256 for own in used for x in own}
     for name in sorted(plain - {ATTESTATIONS}):
         path = Path(name)
         if not canonical.named(name):
@@ -227,7 +241,8 @@ def _unaccounted(round_: Round, leaderboard: Store) -> list[str]:
         if key.partition(", seed ")[0] not in runs
     ]
     return problems + [
-        f"{path}, key seeds: {key} has no record" for key in set(result.seeds) - set(result.records)
+        f"{path}, key seeds: {key} has no record"
+        for key in {*result.seeds, *round_.seeds} - set(result.records)
     ]
 
 
@@ -284,12 +299,13 @@ def _rounds(folder: Path, load: Load, report: Report, memo: Memo) -> Iterator[Ro
             return
         for key in rounds.protocol_differences(round_, simulators.about()):
             report.problems.append(f"{round_.folder}: this ventbench has another protocol: {key}")
-        available = list(folders([folder.parent / "submissions"]))
+        places = [folder.parent / "submissions"]
+        available, named = code_in(places), {x.name: x for x in folders(places)}
         for entry in round_.frozen.entries if at == 0 else ():
-            named = [x for x in available if x.name == entry.name]
-            if named and all(combined_hash(file_hashes(x)) != entry.sha256 for x in named):
+            if entry.name in named and entry.sha256 not in available:
                 report.problems.append(
-                    f"{named[0]} is not what was frozen in round {round_.name}, {entry.sha256[:12]}"
+                    f"{named[entry.name]} is not what was frozen in round {round_.name}, "
+                    f"{entry.sha256[:12]}"
                 )
         if round_.result is not None:
             state = (
@@ -299,6 +315,27 @@ def _rounds(folder: Path, load: Load, report: Report, memo: Memo) -> Iterator[Ro
             )
             identity = canonical.canonical(simulators.about())
             report.problems += once(memo, (state, identity), _wrong_bounds, round_, simulators)
+
+
+def _wrong_seeds(round_: Round, leaderboard: Store, load: Load, memo: Memo) -> list[str]:
+    """Scores of seeds that their commands do not give."""
+    problems, path, result = [], round_.folder / canonical.SEEDS, round_.result
+    if result is None:
+        return []
+    replayed = {x.sha256: x for x in leaderboard.scores if x.derived}
+    for key, sha256 in result.records.items():
+        if sha256 not in replayed:
+            continue  # that has been named
+        stated, where = result.seeds.get(key, []), leaderboard.folder / RECORDS
+        commands = round_.seeds.get(key, [])
+        try:
+            given = seed_scores(replayed[sha256], commands, where, load(), round_, memo)
+            same = len(given) == len(stated) and np.allclose(given, stated, 0.0, SEED_TOLERANCE)
+            if not same:
+                raise InputError("its commands do not give the scores of the result")
+        except (InputError, OSError) as error:
+            problems.append(f"{path}, key {key}: {error}")
+    return problems
 
 
 def _below_bounds(leaderboard: Store) -> list[str]:
@@ -331,11 +368,9 @@ def _wrong_bounds(round_: Round, simulators: ReplayPlants) -> list[str]:
         draws, bounds = round_.draws(rigs), round_.bounds()
         references.reference_of(rigs.about, draws.about(), bounds)
     except (InputError, OSError) as error:
-        return [str(error)]
-    plants, cells = rigs.cells(draws, protocol.PIPS)
-    attained = references.witness_errors(bounds, plants, cells) - bounds.attainable
-    pid = references.pid_errors(plants, cells, bounds.gains) - bounds.pid
-    if max(np.abs(attained).max(), np.abs(pid).max()) > BOUNDS_TOLERANCE:
+        files_ = f"{rounds.BOUNDS}, {rounds.FROZEN} and {rounds.BEACON}"
+        return [f"{round_.folder}: {files_} do not belong together: {error}"]
+    if max(references.deviations(bounds, *rigs.cells(draws, protocol.PIPS))) > BOUNDS_TOLERANCE:
         return [f"{round_.folder / rounds.BOUNDS}: its commands or PIDs do not attain its errors"]
     return []
 

@@ -101,6 +101,13 @@ def test_text_of_records_is_escaped_everywhere(site: Path) -> None:
     assert "\u202e" in HOSTILE
 
 
+def test_a_rehearsal_says_who_could_choose(site: Path) -> None:
+    page = (site / "index.html").read_text("utf-8")
+    assert "Rehearsal, never official." in page
+    assert "nobody could know or choose" not in page
+    assert "mean over 20 draws" not in page
+
+
 def test_pages_stand_alone(site: Path) -> None:
     for path in site.rglob("*.html"):
         page = path.read_text()

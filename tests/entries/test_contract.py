@@ -91,6 +91,27 @@ def test_assert_ready_says_all(make):
     assert "2 problems; not ready to submit" in text
 
 
+def test_every_seed_is_run(make):
+    folder = make(
+        """
+        from pathlib import Path
+        import numpy as np
+        class Controller:
+            def reset(self, task):
+                self.gain = float(np.load(Path(__file__).parent / "gain.npy"))
+            def act(self, observation):
+                return self.gain
+        """
+    )
+    (folder / "README.md").write_text("A test.")
+    np.save(folder / "gain.npy", 5.0)
+    for seed, gain in (("0", 4.0), ("1", [1.0, 2.0])):
+        (folder / "seeds" / seed).mkdir(parents=True)
+        np.save(folder / "seeds" / seed / "gain.npy", gain)
+    finding = only(contract.check(str(folder), InProcessRunner()), "run")
+    assert "with the weights of seeds/1 raised TypeError in reset" in finding.what
+
+
 def test_no_such_folder(tmp_path):
     with pytest.raises(SubmissionError, match="no such folder"):
         contract.check(str(tmp_path / "none"))

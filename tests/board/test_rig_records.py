@@ -138,6 +138,7 @@ def test_without_stressed_commands_there_is_no_stress_rank(board, drafts, simula
     assert report.problems == []
     (note,) = report.notes
     assert record.sha256 in note
+    assert record.header.stress.commands.sha256 in note
     assert "are not at hand" in note
     (track, _) = frames.load_tracks(folder, track="robustness")
     assert "soft" in [row.record.name for row in track.ranked]

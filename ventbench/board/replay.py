@@ -312,7 +312,10 @@ def with_figures(
         if record.track == "robustness" and derived.leak:
             problem(f"{path}, key commands: {derived.leak}")
         if record.header.stress is not None and derived.stressed is None:
-            note(f"{path}: its stressed commands are not at hand; it has no stress rank")
+            note(
+                f"{store.commands_path(record.header.stress.commands, folder)}, stressed commands, "
+                f"are not at hand: {path} has no stress rank"
+            )
         replayed[record.sha256] = dataclasses.replace(record, derived=derived)
         if progress is not None:
             progress(at + 1, len(leaderboard.scores))

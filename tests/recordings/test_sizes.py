@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import runpy
+import sys
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -116,3 +118,14 @@ def test_a_header_must_not_claim_what_is_not_there(tmp_path: Path) -> None:
 
 def test_the_limit_leaves_room_for_the_public_set() -> None:
     assert sizes.LARGEST > 8 * 8 * 6_036_000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak is read from /proc")
+def test_an_import_of_900_000_rows_fits_in_300_mb(tmp_path: Path) -> None:
+    root = Path(__file__).resolve().parents[2]
+    benchmark = runpy.run_path(str(root / "benchmarks" / "load_recordings.py"))
+    benchmark["write_foreign"](tmp_path / "foreign.csv", 900_000)
+    breaths, _, peak = benchmark["measure"](benchmark["IMPORT"], tmp_path / "foreign.csv")
+    assert breaths == 2998
+    assert peak < benchmark["BARS"]["import"][1]

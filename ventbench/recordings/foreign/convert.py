@@ -213,6 +213,7 @@ def import_recording(
         role: changes[role].apply(raw[role] + added[role] if role in added else raw[role])
         for role in changes.keys() & raw.keys()
     }
+    del raw, measured  # a copy of every column that is no longer needed
     _net_flow(values)
     for role in ("flow", "volume"):
         if role in values and not np.isfinite(values[role]).any():

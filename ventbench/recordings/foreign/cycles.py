@@ -159,14 +159,9 @@ def _onsets(file: str, time: Floats, values: Mapping[str, Floats]) -> tuple[Ints
 
 def _crossings(signal: Floats, high: float, low: float) -> Ints:
     """Rows before which a signal was low for the last time before it becomes high."""
-    onsets, last, armed = [], 0, False
-    for k, value in enumerate(signal.tolist()):
-        if value <= low:
-            last, armed = k, True
-        elif value >= high and armed:
-            onsets.append(last)
-            armed = False
-    return np.array(onsets, np.int64)
+    at = np.flatnonzero((signal <= low) | (signal >= high))
+    is_low = signal[at] <= low
+    return at[:-1][is_low[:-1] & ~is_low[1:]]
 
 
 def _after_pause(on: Bools, time: Floats) -> Ints:
@@ -190,4 +185,6 @@ def _is_high(signal: Floats) -> Bools:
 def _bridged(values: Floats) -> Floats:
     """Values with their blanks interpolated, shape ``(N,)``."""
     finite = np.isfinite(values)
+    if finite.all():
+        return values
     return np.interp(np.arange(len(values)), np.flatnonzero(finite), values[finite])

@@ -74,11 +74,11 @@ def _clock(table: Table, mapped: Mapping[str, str]) -> str | None:
 
 def _pivoted(table: Table, mapped: Mapping[str, str]) -> Table:
     """A column each of what a long table measures; a row each time, in the order of time."""
-    import pandas as pd
-
     numeric = list(filter(table.is_numeric, table.columns))
     if any(_role(table, name, mapped) == "pressure" for name in numeric):
         return table
+    import pandas as pd  # which takes time and memory that most files do not need
+
     values = next((n for n in numeric if n.strip("_ ").casefold() in _VALUES), None)
     words = {
         name: [str(x) for x in pd.unique(x) if x]

@@ -295,7 +295,7 @@ def _arrow(
 
     Comments and repeats of the header are none.
     """
-    from pyarrow import ArrowInvalid, BufferReader, py_buffer, string, types
+    from pyarrow import ArrowInvalid, BufferReader, py_buffer, string, system_memory_pool, types
     from pyarrow import csv as arrow
 
     if separator == " ":
@@ -326,6 +326,7 @@ def _arrow(
                 ),
                 strings_can_be_null=False,
             ),
+            system_memory_pool(),  # which gives back what is freed
         )
         return table, odd
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import json
 import subprocess
 import sys
 from datetime import UTC, datetime
@@ -27,6 +29,38 @@ KNOWN = Value(
 
 def test_a_published_value_is_genuine() -> None:
     beacon.check(KNOWN, QUICKNET, 657413, "the value")
+
+
+@pytest.mark.parametrize("keys", [("round", "randomness", "signature"), ("round", "signature")])
+def test_both_versions_of_the_relays_json_are_read(keys: tuple[str, ...]) -> None:
+    published = {key: getattr(KNOWN, key) for key in keys}
+    assert beacon.read(json.dumps(published).encode(), "the value") == KNOWN
+
+
+@pytest.mark.parametrize("content", [b"[]", b"{", b'{"round": 1}', b'{"round": 1, "signature": 2}'])
+def test_what_is_no_value_is_refused(content: bytes) -> None:
+    with pytest.raises(InputError, match="the value"):
+        beacon.read(content, "the value")
+
+
+def test_the_next_relay_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def answer(address: str, timeout: float) -> io.BytesIO:
+        asked.append(address)
+        if len(asked) < 3:
+            raise OSError("down")
+        return io.BytesIO(b"{}")
+
+    monkeypatch.setattr(beacon.urllib.request, "urlopen", answer)
+    assert beacon.fetch(QUICKNET, 9) == b"{}"
+    assert [address.rpartition(f"/{QUICKNET.hash}/public/9")[0] for address in asked] == list(
+        beacon.RELAYS[:3]
+    )
+    monkeypatch.setattr(beacon, "RELAYS", beacon.RELAYS[:1])
+    asked.clear()
+    with pytest.raises(InputError, match=r"down.*--beacon FILE"):
+        beacon.fetch(QUICKNET, 9)
 
 
 def test_checking_leaves_python_able_to_refuse_deep_json() -> None:

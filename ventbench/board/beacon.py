@@ -32,7 +32,12 @@ from ventbench.board import schema
 DOMAIN = b"BLS_SIG_BLS12381G1_XMD:SHA-256_SSWU_RO_NUL_"
 
 #: Where values of quicknet are published; its signature says whether the answer is genuine.
-RELAY = "https://api.drand.sh"
+RELAYS = (
+    "https://api.drand.sh",
+    "https://api2.drand.sh",
+    "https://api3.drand.sh",
+    "https://drand.cloudflare.com",
+)
 
 _MAX_BYTES, _TIMEOUT_S = 10_000, 20.0
 
@@ -79,26 +84,42 @@ class Value(schema.Table, frozen=True):
         return hmac.digest(key, _PURPOSE + bytes.fromhex(frozen), "sha256")
 
 
-#: Of values as relays publish them.
+#: Of values as they are stored.
 DECODER = msgspec.json.Decoder(Value)
 
 
 def read(content: bytes, label: str) -> Value:
-    """Read a value as relays publish it; InputError if it is none."""
+    """Read a value as relays publish it; InputError if it is none.
+
+    Version 2 of their interface leaves the randomness out, as it follows from the signature.
+    """
+    try:
+        published = json.loads(content)
+        published.setdefault("randomness", _randomness(published["signature"]))
+        content = json.dumps(published).encode()
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        pass  # the decoder says what is wrong
     return schema.decoded(DECODER, content, label)
 
 
+def _randomness(signature: str) -> str:
+    return hashlib.sha256(bytes.fromhex(signature)).hexdigest()
+
+
 def fetch(chain: Chain, number: int) -> bytes:
-    """Get a value from a public relay; InputError if it does not answer with one."""
-    address = f"{RELAY}/{chain.hash}/public/{number}"
-    try:
-        with urllib.request.urlopen(address, timeout=_TIMEOUT_S) as answer:
-            return answer.read(_MAX_BYTES)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{address} does not answer: {error}; get the value of round {number} from any other "
-            "relay and give it with --beacon FILE"
-        ) from None
+    """Get a value from the first public relay that answers; InputError if none does."""
+    silent = []
+    for relay in RELAYS:
+        try:
+            address = f"{relay}/{chain.hash}/public/{number}"
+            with urllib.request.urlopen(address, timeout=_TIMEOUT_S) as answer:
+                return answer.read(_MAX_BYTES)
+        except (OSError, ValueError) as error:
+            silent.append(f"{relay} ({error})")
+    raise InputError(
+        f"no relay answers: {', '.join(silent)}; get the value of round {number} from any other "
+        "and give it with --beacon FILE"
+    )
 
 
 def check(value: Value, chain: Chain, number: int, label: str) -> None:
@@ -112,7 +133,7 @@ def check(value: Value, chain: Chain, number: int, label: str) -> None:
             f"{label}, key round: is {value.round}, and must be {number}, the first after the "
             "freeze and the delay"
         )
-    if hashlib.sha256(bytes.fromhex(value.signature)).hexdigest() != value.randomness:
+    if _randomness(value.signature) != value.randomness:
         raise InputError(f"{label}, key randomness: is not the SHA-256 of the signature")
     if not _genuine(value.signature, chain.public_key, value.round):
         raise InputError(f"{label}, key signature: is not by key {chain.public_key[:16]}")

@@ -25,7 +25,7 @@ def test_every_mechanism_of_the_library_has_a_line_or_a_reason() -> None:
     covered = {line.strength.rpartition(".")[0] for line in STRESSORS}
     missing = set(library()) - covered - set(NOT_STRESSED)
     assert not missing, (
-        f"{sorted(missing)}: add a line to STRESSORS in ventbench/task/stressors.py (and raise "
+        f"{sorted(missing)}: add a table to ventbench/task/stressors.toml (and raise "
         "VERSION), or a reason to NOT_STRESSED"
     )
     assert covered <= {"", *library(), *events()}

@@ -190,8 +190,17 @@ def leaderboard_folder() -> Path:
 
 
 def data_beside(module: str, name: str) -> dict[str, Any]:
-    """Content of a TOML file that lies beside a module, of which this is the file's path."""
-    return tomllib.loads(Path(module).with_name(name).read_text("utf-8"))
+    """Content of a TOML file that lies beside a module, of which this is the file's path.
+
+    Its lists are tuples.
+    """
+    return _frozen(tomllib.loads(Path(module).with_name(name).read_text("utf-8")))
+
+
+def _frozen(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _frozen(each) for key, each in value.items()}
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
 def example(name: str) -> Path:

@@ -152,7 +152,7 @@ def test_arrays_of_numpy(tmp_path):
         same(imported(tmp_path / name))
     for array in (matrix, matrix.T):
         np.save(tmp_path / "plain.npy", array)
-        with pytest.raises(InputError, match="--map 1=pressure"):
+        with pytest.raises(InputError, match="--map 2=pressure"):
             imported(tmp_path / "plain.npy")
         roles = {"1": "time", "2": "pressure", "3": "flow"}
         same(imported(tmp_path / "plain.npy", columns=roles))

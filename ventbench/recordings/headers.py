@@ -127,6 +127,11 @@ def _key(text: str) -> str:
     return plain if plain == "%" else re.sub(r"[^\w%]|_", "", plain)
 
 
+def is_foreign(text: str) -> bool:
+    """Whether a text has a word of a header in letters that are not Latin."""
+    return any(word in text.lower() for word in _KINDS if word > "\u0250")
+
+
 def is_unit(text: str) -> bool:
     """Whether a text spells a unit of some quantity."""
     return _key(text) != "1" and any(_key(text) in _spelled(quantity) for quantity in UNITS)
@@ -244,8 +249,8 @@ def _meaning(text: str, unit: str | None) -> tuple[str | None, str, bool]:
 
 def _words(text: str) -> list[str]:
     """Words of a name: parted by marks and by capitals, or made of words that are known."""
-    words = []
-    for part in re.findall(r"[^\W_]+", text):
+    words, plain = [], re.sub("[\u0300-\u036f]", "", unicodedata.normalize("NFD", text))
+    for part in re.findall(r"[^\W_]+", plain):
         if part.lower() in _KINDS or part.lower() in _LETTERS:
             words.append(part.lower())
             continue

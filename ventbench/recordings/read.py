@@ -433,7 +433,10 @@ def session_files(path: FilePath) -> tuple[Path, ...]:
         return (folder / SESSION,)
     files = (file for file in folder.iterdir() if file.name.endswith(_SUFFIXES))
     if not (recordings_found := tuple(sorted(files))):
-        raise InputError(f"{folder} has no recording; name a file, or a folder with some")
+        raise InputError(
+            f"{folder} has no recording; name a file, or a folder with some (`ventbench data "
+            "import` reads a bag of ROS)"
+        )
     return recordings_found
 
 

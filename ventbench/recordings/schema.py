@@ -180,5 +180,5 @@ def _advice(names: Sequence[str], missing: Sequence[str]) -> str:
             for match in get_close_matches(name.lower(), plain, n=1, cutoff=0.75)
         )
     if hints:
-        return f"Perhaps {', '.join(hints)}."
+        return f"Perhaps {', '.join(hints)}; `ventbench data import` reads other tables."
     return f"The header is {HEADER}; `ventbench data import` reads other tables."

@@ -152,7 +152,8 @@ def _header(file: str, kind: Kind) -> tuple[str, ...]:
         text = first.decode("utf-8-sig").rstrip("\r\n")
     except UnicodeDecodeError as error:
         message = f"byte 0x{first[error.start]:02x} is not UTF-8"
-        raise fail(file, message, "Save the file as UTF-8 text.", 1) from None
+        advice = "Save the file as UTF-8 text; `ventbench data import` reads others."
+        raise fail(file, message, advice, 1) from None
     if "\r" in text:
         raise fail(file, "lines end in CR alone", "Save the file with LF or CRLF line ends.", 1)
     if not text.strip():
@@ -387,5 +388,6 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
     if first.startswith(b"PK\x03\x04"):
         raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
     if first.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise fail(name, "this is UTF-16 text", "Save the file as UTF-8.")
+        advice = "Save the file as UTF-8; `ventbench data import` reads it as it is."
+        raise fail(name, "this is UTF-16 text", advice)
     return "csv"

@@ -324,8 +324,7 @@ def _selected(table: Table, select: dict[str, str]) -> Table:
     for name, value in select.items():
         if name not in table.columns:
             raise InputError(
-                f"--select {name}={value}: {table.file} has no column {name}; it has "
-                f"{', '.join(table.columns)}"
+                f"--select {name}={value}: {table.file} has no column {name}; it has {table.names}"
             )
         keep &= np.array([_same(cell, value) for cell in table.columns[name].tolist()])
     if not keep.any():
@@ -406,7 +405,7 @@ def _mapped(table: Table, mapped: dict[str, str]) -> dict[str, str]:
             hint = f" Perhaps {close[0]!r}." if close else ""
             raise InputError(
                 f"--map {header}={role}: {table.file} has no column {header!r}; it has "
-                f"{', '.join(table.columns)}.{hint}"
+                f"{table.names}.{hint}"
             )
         roles[name] = role
     return roles
@@ -424,6 +423,11 @@ def _check_needed(
     table: Table, roles: Mapping[str, str], layout: Layout, rate: float | None
 ) -> None:
     """Ask for a column that is needed and not understood, with the option that says it."""
+    if set(table.columns) == {"id", "pressure"}:  # as the competition's submissions
+        raise InputError(
+            f"{table.file} holds pressures by row alone, as a submission does; diagnose the "
+            f"recording with --plant {table.file}"
+        )
     has = set(roles.values())
     timed = rate or table.rate or any(table.header(name).interval for name in table.columns)
     for quantity, accepted in _NEEDED.items():
@@ -435,9 +439,9 @@ def _check_needed(
         open_ = likely or [name for name, x in headers.items() if not (x.role or x.excluded)]
         if len(accepted) > 1 and (not open_ or layout.columns):
             continue
-        columns = (
-            f"{table.file}: no column is {quantity}; the columns are {', '.join(table.columns)}"
-        )
+        onwards = {n: (np.diff(table.columns[n]) >= 0).mean() > 0.9 for n in open_}
+        open_.sort(key=lambda name: onwards[name] != (accepted == ("time",)))
+        columns = f"{table.file}: no column is {quantity}; the columns are {table.names}"
         role = next((headers[n].role for n in likely), None) or accepted[0]
         option = f"--map {quote((open_ or ['NAME'])[0])}={role}"
         if accepted == ("time",):

@@ -13,6 +13,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from ventbench.recordings.foreign.tables import (
     read_spreadsheet,
     read_text,
 )
-from ventbench.recordings.headers import read_header
+from ventbench.recordings.headers import is_unit, read_header
 
 
 def read_table(
@@ -67,7 +68,10 @@ def read_table(
         )
     if path.suffix == ".hea":
         return _wfdb(file)
-    if first.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"["):
+    begins = first.lstrip(b"\xef\xbb\xbf \r\n\t")[:1]
+    if begins == b"<":
+        raise InputError(f"{file} is XML or HTML; save the table in it as CSV")
+    if begins in (b"{", b"["):
         content = _json(file)
         if content is not None:
             return content
@@ -172,9 +176,14 @@ def _variables(file: str, content: dict[str, Any], kind: str) -> Table:
     notes = [f"{kind} with {len(columns)} columns of {length} rows."]
     if mismatched:
         notes.append(f"Columns of other lengths were left out ({', '.join(mismatched[:5])}).")
-    named = {re.sub(r"[^a-z]", "", n.rpartition(".")[2].lower()): v for n, v in scalars.items()}
-    rate = next((named[name] for name in RATES if named.get(name, 0.0) > 0.0), None)
-    return Table(file, columns, rate=rate, notes=tuple(notes))
+    return Table(file, columns, rate=_stated_rate(scalars), notes=tuple(notes))
+
+
+def _stated_rate(beside: Mapping[str, Any]) -> float | None:
+    """Sampling rate, Hz, among the numbers that stand beside columns."""
+    named = {re.sub(r"[^a-z]|hz$", "", n.rpartition(".")[2].lower()): v for n, v in beside.items()}
+    rates = (named[name] for name in RATES if isinstance(named.get(name), int | float))
+    return next((float(rate) for rate in rates if rate > 0.0), None)
 
 
 def _flatten(
@@ -293,7 +302,13 @@ def _json(file: str) -> Table | None:
             f"{file} is JSON without a table: a list of records, lists of equal length by name, or "
             "rows beside a list of their names are wanted"
         )
-    return _of_values(file, columns, "JSON")
+    table, beside = _of_values(file, columns, "JSON"), dict[str, Any]()
+    for name, value in _flat(content).items() if isinstance(content, dict) else ():
+        if not isinstance(value, list):
+            beside[name.rpartition(".")[2]] = value
+    stated = ((n, str(beside.get(key))) for n in table.columns for key in (n, f"{n}_unit"))
+    units = {name: unit for name, unit in stated if is_unit(unit)}
+    return replace(table, rate=_stated_rate(beside), units=table.units | units)
 
 
 def _rows_within(content: Any) -> dict[str, Sequence[Any]] | None:

@@ -18,7 +18,7 @@ from ventbench.recordings.foreign.tables import FREQUENCIES, INTERVALS, Table, n
 from ventbench.recordings.headers import Conversion, conversion, is_unit
 
 #: Names of the values of a long table, and most things that it measures.
-_VALUES, _MOST = ("value", "values", "reading", "measurement", "val", "amplitude"), 100
+_VALUES, _MOST = ("value", "values", "reading", "measurement", "val", "amplitude", "payload"), 100
 
 #: Seconds since 1970 that a recording may be of: 2001 to 2100.
 _RECORDED = (1e9, 4.1e9)
@@ -41,7 +41,7 @@ def one_row_a_sample(
     Raises:
         InputError: if lists of one row differ in length, or nothing tells the time within them.
     """
-    return _unpacked(_pivoted(table, mapped), mapped, time_unit, rate)
+    return _unpacked(_pivoted(_with_units(table), mapped), mapped, time_unit, rate)
 
 
 def epoch_unit(values: Floats) -> str | None:
@@ -58,6 +58,16 @@ def time_change(table: Table, name: str, unit: str | None) -> Conversion:
     """Change of units of a clock: as given, by its header, beside it, or since 1970."""
     unit = unit or table.header(name).unit or table.units.get(name)
     return conversion("time", unit or epoch_unit(table.columns[name]))
+
+
+def _with_units(table: Table) -> Table:
+    """The table with units that stand in a column beside: ``flow`` and ``flow_unit``."""
+    units = {}
+    for name, words in table.columns.items():
+        what = re.sub(r"[\s_.]*units?$", "", name, flags=re.IGNORECASE)
+        if what != name and words.dtype.kind == "U" and _units(np.unique(words).tolist()):
+            units |= {n: str(words[0]) for n in table.columns if n in (what, f"{what}.value")}
+    return replace(table, units=units | table.units)
 
 
 def _role(table: Table, name: str, mapped: Mapping[str, str]) -> str | None:

@@ -3,7 +3,8 @@
 The first lines tell the separator and the decimal mark that make most cells numbers; the first
 three lines of numbers in a row begin the data, and names and units stand above them. pyarrow reads
 the rest. Only lines of another length, and columns in which a cell is no number, are looked at one
-by one. What stands between rows and is none, such as an alarm, is left out and named.
+by one. What stands between rows and is none, such as an alarm, is left out and named. What devices
+write around their tables is data: ``texts.toml``.
 """
 
 from __future__ import annotations
@@ -21,18 +22,24 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError, require
+from ventbench.base.files import data_beside
 from ventbench.recordings.foreign import sizes
-from ventbench.recordings.headers import UNITS, Header, is_unit, read_header
+from ventbench.recordings.headers import UNITS, Header, is_foreign, is_unit, read_header
 from ventbench.recordings.sources import to_numpy
+
+_TEXTS = data_beside(__file__, "texts.toml")
 
 #: Lines that decide on separator, decimal mark and header.
 _LOOKED_AT = 400
+
+#: Lines of a file below which longer ones are the rows of a table whose columns they should be.
+_ROWS = 30
 
 #: Separators, the likelier first.
 _SEPARATORS = ("\t", ";", ",", "|", " ")
 
 #: Cells that stand for nothing.
-_BLANKS = ("", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a", "inf", "-inf")
+_BLANKS = _TEXTS["cells"]["blank"]
 
 #: Numbers by decimal mark, also with thousands apart: "1,061.3" or "1.061,3".
 _NUMBER = {
@@ -60,21 +67,17 @@ _CLOCK = re.compile(
 )
 
 #: Names of a sampling rate, Hz, and of an interval, s, above a table or beside it.
-FREQUENCIES = ("fs", "samplingrate", "samplerate", "samplingfrequency")
-RATES = (*FREQUENCIES, "rate", "freq", "frequency")
-INTERVALS = ("interval", "samplinginterval", "sampleinterval", "dt", "deltax")
+FREQUENCIES, _OTHERS, INTERVALS = _TEXTS["rates"].values()
+RATES = (*FREQUENCIES, *_OTHERS)
 
 #: First cells of lines that hold names, and units, of the columns right of them.
-_TITLES, _UNIT_TITLES = (
-    ("channeltitle", "channels", "titles", "names"),
-    ("unitname", "units", "unit"),
-)
+_TITLES, _UNIT_TITLES = _TEXTS["titles"].values()
+
+#: A reading behind its name, as a serial port prints it: ``P:12.3``.
+_LABELLED = re.compile(r"(?<![^\s,;|])([^\W\d]\w*) ?[:=] ?(?=[-+.\d])")
 
 #: Share of the lines that may be no rows before a file is refused, and number of lines anyway.
 _STRAY, _STRAY_LINES = 0.01, 20
-
-#: First lines of what a Servo ventilator exports beside recordings.
-_NO_WAVEFORMS = {"[TRE]": "trends", "[RECRUITMENT]": "a manoeuvre", "[LOG]": "events"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +108,12 @@ class Table:
         return replace(
             self, columns=columns, lines=None if self.lines is None else self.lines[which]
         )
+
+    @property
+    def names(self) -> str:
+        """Its first columns, in words."""
+        more = f" and {len(self.columns) - 20} more" if len(self.columns) > 20 else ""
+        return ", ".join(list(self.columns)[:20]) + more
 
     def is_numeric(self, name: str) -> bool:
         """Whether a column holds numbers."""
@@ -142,17 +151,29 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
         raise InputError(f"{file} holds no text")
     looked_at = data[: 1 << 20].decode(errors="replace")
     above = looked_at.split("\n", _LOOKED_AT)[:_LOOKED_AT]
-    if re.match(r"\s*BS\b", next((x for x in above if re.match(r"\s*B[SE]\b", x)), "")):
-        return _delimited_breaths(file, data.decode().split("\n"), encoding)
+    for form in _TEXTS["between"].values():
+        marks = (re.match(rf"\s*({form['begin']}|{form['end']})\b", line) for line in above)
+        if form["begin"] in (next(filter(None, marks), None) or " ")[0]:
+            return _delimited_breaths(file, data.decode().split("\n"), encoding, form)
+    data, above = _plain_lines(data, above)
     stated = re.fullmatch(r"\"?sep=(.)\"?", above[0])
     if stated is not None:  # a spreadsheet's own line
         separator, above[0] = separator or stated[1], ""
-    if of_servo := _above_servo_data(file, above):
-        separator, above[:of_servo] = separator or "\t", [""] * of_servo
+    form, begins = _below(file, above)
+    stated_units = [x.split("\t") for x in above[:begins] if x.startswith(form.get("units", "\t"))]
+    above[:begins] = [""] * begins
     above = _titled(above)
     separator, decimal = _dialect(file, [x for x in above if x.strip()], separator, decimal)
-    table = _table(file, data, above, separator, decimal, f"Text ({encoding}), cells ")
-    return _by_units(table) if of_servo else table
+    note = f"Text ({encoding}), cells "
+    if len(above) < _ROWS:  # rows in the place of columns
+        cells = [x for line in above if len(x := _cells(line, separator)) > _ROWS]
+        if len(cells) > 1:
+            above = ["\t".join(x) for x in zip(*cells, strict=False)]
+            data, note, separator = "\n".join(above).encode(), f"{note}of rows, ", "\t"
+    table = _table(file, data, above[:_LOOKED_AT], separator, decimal, note)
+    for units in stated_units:
+        table = replace(table, units=dict(zip(list(table.columns)[1:], units[1:], strict=False)))
+    return _by_units(table) if form.get("by_units") else table
 
 
 def decoded(file: str) -> tuple[bytes, str]:
@@ -175,7 +196,12 @@ def decoded(file: str) -> tuple[bytes, str]:
         try:
             data = data.decode("utf-8-sig").replace("\N{MINUS SIGN}", "-").encode()
         except UnicodeDecodeError:
-            data, encoding = data.decode("latin-1").encode(), "Latin-1"
+            head = data[: 1 << 16]
+            likely = (
+                x for x in _TEXTS["encodings"]["tried"] if is_foreign(head.decode(x, "ignore"))
+            )
+            encoding = next(likely, "Latin-1")
+            data = data.decode(encoding, "replace").encode()
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return data.rstrip(b" \n\0"), encoding
@@ -241,7 +267,10 @@ def _table(
     widths = Counter(_width(cells) for _, cells in rows[begins:])
     width = max(w for w, count in widths.items() if count >= 0.05 * sum(widths.values()))
     texts = [cells for _, cells in rows[:begins]]
-    headers, units, notes = _header(file, texts, width, separator == " ")
+    if separator == " ":  # names of several words are further apart
+        wide = [re.split(r"\s{2,}|\t", above[k].strip(" #%\t")) for k, _ in rows[:begins]]
+        texts = [x if len(x) == width else y for x, y in zip(wide, texts, strict=True)]
+    headers, units, notes = _header(texts, width, separator == " ")
     names = named(headers)
     first = rows[begins][0]
     offset = sum(len(line) + 1 for line in data.split(b"\n", first)[:first])
@@ -377,7 +406,7 @@ def _width(cells: list[str]) -> int:
 
 
 def _header(
-    file: str, above: list[list[str]], width: int, packed: bool
+    above: list[list[str]], width: int, packed: bool
 ) -> tuple[list[str], list[str], list[str]]:
     """Headers, units that stand below them, and notes, from the lines above the numbers."""
     texts = [
@@ -407,10 +436,8 @@ def _header(
     # The names are the last line of as many cells as columns; an alarm may stand below them.
     cells = next((text for text in reversed(texts) if sum(map(bool, text)) == width), texts[-1])
     if packed and len(cells) != width:
-        raise InputError(
-            f"{file}: {len(cells)} names stand above {width} columns that blanks separate; put "
-            "names of one word there, or map numbers after removing the line"
-        )
+        note = f"{len(cells)} words stand above {width} columns; the columns are 1, 2, ..."
+        return [str(k + 1) for k in range(width)], [], [note]
     if width == len(cells) + 1 and not units_row:  # names of R's write.table have no row's own
         cells = ["row", *cells]
     cells = cells + [""] * (width - len(cells))
@@ -555,56 +582,75 @@ def clock_seconds(cells: Any) -> Floats | None:
     return np.round(out, 9)
 
 
-def _delimited_breaths(file: str, lines: list[str], encoding: str) -> Table:
-    """Breaths between lines BS and BE, flow and pressure a line, 50 times a second."""
-    rows: list[tuple[int, float, float, float]] = []
+def _delimited_breaths(file: str, lines: list[str], encoding: str, form: dict[str, Any]) -> Table:
+    """Breaths between lines that begin and end them, a sample a line."""
+    rows: list[tuple[float, ...]] = []
+    begin, end, units = form["begin"], form["end"], form["units"]
     breath, first_row, cut = 0, 0, 0
     inside = False
-    for number, line in enumerate(lines, 1):
-        if re.match(r"\s*BS\b", line):
+    for number, line in enumerate([*lines, begin], 1):
+        if re.match(rf"\s*{begin}\b", line):
             if inside:  # the breath before has no end
                 cut += 1
                 del rows[first_row:]
             breath, first_row, inside = breath + 1, len(rows), True
-        elif re.match(r"\s*BE\b", line):
+        elif re.match(rf"\s*{end}\b", line):
             inside = False
         elif inside:
             try:
-                flow, pressure = (float(cell) for cell in line.strip(" ,").split(",")[:2])
+                cells = map(float, line.strip(" ,").split(",")[: len(units)])
+                rows.append((number, breath, *cells))
             except ValueError:
                 raise InputError(
-                    f"{file}, line {number}: flow and pressure are wanted between BS and BE, not "
-                    f"{line.strip()[:40]!r}"
+                    f"{file}, line {number}: {' and '.join(units)} are wanted between {begin} and "
+                    f"{end}, not {line.strip()[:40]!r}"
                 ) from None
-            rows.append((number, flow, pressure, breath))
-    if inside:
-        cut += 1
-        del rows[first_row:]
     if not rows:
-        raise InputError(f"{file}: no breath stands between a line BS and a line BE")
-    numbers, flows, pressures, breaths = np.array(rows).T
+        raise InputError(f"{file}: no breath stands between a line {begin} and a line {end}")
+    numbers, breaths, *values = np.array(rows).T
+    each = ", ".join(f"{name} in {unit}" for name, unit in units.items())
     notes = [
-        f"Text ({encoding}) with breaths between BS and BE (Puritan Bennett 840 and 980): flow in "
-        "L/min, pressure in cmH2O, 50 Hz."
+        f"Text ({encoding}) with breaths between {begin} and {end} ({form['about']}): {each}, "
+        f"{form['rate']:g} Hz."
     ]
     if cut:
         notes.append(f"{cut} breaths without an end were left out.")
-    columns = {"flow": flows, "pressure": pressures, "breath": breaths}
-    units = {"flow": "L/min", "pressure": "cmH2O"}
-    return Table(file, columns, units, numbers.astype(np.int64), 50.0, tuple(notes))
+    columns = dict(zip(units, values, strict=True)) | {"breath": breaths}
+    return Table(file, columns, units, numbers.astype(np.int64), form["rate"], tuple(notes))
 
 
-def _above_servo_data(file: str, lines: list[str]) -> int:
-    """Number of lines up to ``[DATA]`` in a recording of a Servo ventilator; 0 for other text."""
+def _below(file: str, lines: list[str]) -> tuple[dict[str, Any], int]:
+    """The form of a text whose table stands below a line, and that line's number; 0 of others."""
     stripped = [line.strip() for line in lines]
-    if stripped[0] not in ("[REC]", *_NO_WAVEFORMS):
-        return 0
-    if "[DATA]" not in stripped or stripped[0] != "[REC]":
-        content = _NO_WAVEFORMS.get(stripped[0], "no line [DATA]")
-        raise InputError(
-            f"{file} of a Servo ventilator holds {content}; export a recording ([REC])"
-        )
-    return stripped.index("[DATA]") + 1
+    for form in _TEXTS["below"].values():
+        others = form.get("others", {})
+        if stripped[0] != form["first"] and stripped[0] not in others:
+            continue
+        if stripped[0] in others or form["line"] not in stripped:
+            content = others.get(stripped[0], f"no line {form['line']}")
+            raise InputError(
+                f"{file} of {form['about']} holds {content}; export a recording ({form['first']})"
+            )
+        return form, len(lines) - stripped[::-1].index(form["line"])
+    return {}, 0
+
+
+def _plain_lines(data: bytes, above: list[str]) -> tuple[bytes, list[str]]:
+    """Text without the names before its readings, which become its first line, or arrows."""
+    names = [tuple(_LABELLED.findall(line)) for line in above]
+    usual, count = Counter(names).most_common(1)[0]
+    text = data.decode()
+    if len(usual) > 1 and 2 * count > len(above):
+        first = above[names.index(usual)]
+        between = _LABELLED.split(first)[2].lstrip("+-.0123456789")[:1]
+        text = _LABELLED.sub("", text[text.index(first) + len(first) :])
+        text = between.join(usual) + text
+    elif sum(" -> " in line for line in above) > len(above) / 2:
+        between = next((x for x in _SEPARATORS if x in above[-1].split(" -> ")[1].strip()), ",")
+        text = text.replace(" -> ", between)
+    else:
+        return data, above
+    return text.encode(), text.split("\n", _LOOKED_AT)[:_LOOKED_AT]
 
 
 def _titled(lines: list[str]) -> list[str]:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-BLOCK = 4 << 20
+BLOCK = 2 << 20
 """Bytes of text read at a time (the parser holds a few of them)."""
 
 BATCH = 1 << 17

@@ -18,9 +18,9 @@ _EVENTS = data_beside(__file__, "events.toml")
 
 def _described(name: str) -> Description:
     """What ``events.toml`` says of an event."""
-    event = {"equation": "", **_EVENTS[name]}
-    parameters = tuple(Parameter(**row) for row in event.pop("parameters"))
-    return Description(name, parameters=parameters, **event)
+    event = _EVENTS[name]
+    parameters = tuple(Parameter(**row) for row in event["parameters"])
+    return Description(**{**event, "name": name, "parameters": parameters})
 
 
 class LostCommands(Mechanism):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ventbench.base.files import data_beside
 from ventbench.physics.mechanism import Description, Mechanism, Parameter, Site, Values
 
 #: Added to the fading, so that a steady drift is no division by zero.
@@ -162,63 +163,7 @@ def _pair(
 
 
 MECHANISMS = (
-    *_pair(
-        "gain",
-        "gain",
-        "valve's gain",
-        "inspiratory valve",
-        (-0.6, 1.5),
-        (0.15, 0.3),
-        0.03,
-        "regulators hold their pressure to a few percent",
-        "A regulator that is set anew, a bottle that is changed, a filter that clogs, or a driver "
-        "that is calibrated between two breaths.",
-        "Blowers and coils warm up within minutes and lose 5 to 20 % of their flow; a bottle "
-        "empties steadily.",
-        "all that the valve delivers is larger by one factor",
-        (
-            ("gain_drift", "compliance_step", "resistance_step"),
-            ("gain_step", "compliance_drift", "resistance_drift"),
-        ),
-    ),
-    *_pair(
-        "R",
-        "resistance",
-        "resistance",
-        "airway",
-        (-0.8, 3.0),
-        (0.3, 0.6),
-        0.05,
-        "resistors repeat to a few percent",
-        "A hose that kinks, a plug of secretions or its suction, or a resistor that is exchanged "
-        "between two breaths.",
-        "Secretions, wet filters and bronchodilators change resistance by tens of percent (Bates, "
-        "Lung Mechanics, Cambridge 2009).",
-        "an error that grows with flow",
-        (
-            ("resistance_drift", "gain_step", "compliance_step"),
-            ("resistance_step", "compliance_drift", "sensor_drift"),
-        ),
-    ),
-    *_pair(
-        "C",
-        "compliance",
-        "compliance",
-        "alveolus",
-        (-0.7, 2.0),
-        (0.2, 0.4),
-        0.03,
-        "test lungs repeat their compliance to a few percent",
-        "Turning, a lobe that opens or collapses, or a spring that is exchanged changes 20 to 50 % "
-        "of the compliance between two breaths.",
-        "Recruitment moves compliance by tens of percent within minutes (Hickling, Am. J. Respir. "
-        "Crit. Care Med. 158, 1998, 194); springs and bellows settle as they warm.",
-        "an error that grows with volume",
-        (
-            ("compliance_drift", "gain_step", "resistance_step"),
-            ("compliance_step", "sensor_drift", "resistance_drift"),
-        ),
-    ),
+    *(x for path, row in data_beside(__file__, "session.toml").items() for x in _pair(path, **row)),
     SensorChange(
         Description(
             name="zero_step",

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
@@ -124,6 +126,7 @@ def waves() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def lines(form: str) -> str:
+    """Rows of the examples, each in a form."""
     return "\n".join(form.format(*row) for row in zip(*waves(), strict=True))
 
 
@@ -134,6 +137,9 @@ def lines(form: str) -> str:
         ("Time (sec)  Airway Pressure (cmH2O)  Air Flow (L/min)\n", "{}  {}  {}"),
         ("Temps;Pression voies aériennes;Débit\n(s);(cmH2O);(L/min)\n", "{};{};{}"),
         ("Tiempo (s);Presión vía aérea (cmH2O);Flujo (L/min)\n", "{};{};{}"),
+        ("Tempo (s);Pressão nas vias aéreas (cmH2O);Fluxo (L/min)\n", "{};{};{}"),
+        ("Tijd (s);Luchtwegdruk (cmH2O);Flow (L/min)\n", "{};{};{}"),
+        ("시간(s),압력(cmH2O),유량(L/min)\n", "{},{},{}"),
         ("t,paw,paw_unit,flow,flow_unit\n", "{},{},cmH2O,{},L/min"),
         ("", "time_s={} paw={} flow_lpm={}"),
     ],
@@ -192,6 +198,28 @@ def test_stamps_of_a_serial_monitor(tmp_path: Path) -> None:
     path, units = text(tmp_path, content), {"flow": "L/min"}
     imported = import_recording(path, lung="R20C50", columns=columns, units=units)
     np.testing.assert_allclose(lung(imported), [20.0, 50.0, 6.0], rtol=0.05)
+
+
+@pytest.mark.parametrize("orient", ["columns", "index", "records", "split"])
+def test_json_as_pandas_writes_it(tmp_path: Path, orient: Any) -> None:
+    names = ("t", "paw", "flow_lpm")
+    path = tmp_path / "lab.json"
+    pd.DataFrame(dict(zip(names, waves(), strict=True))).to_json(path, orient=orient)
+    imported = import_recording(path, lung="R20C50")
+    np.testing.assert_allclose(lung(imported), [20.0, 50.0, 6.0], rtol=0.05)
+
+
+def test_text_of_korea_that_is_not_utf_8(tmp_path: Path) -> None:
+    content = "시간(s),압력(cmH2O),유량(L/min)\n" + lines("{},{},{}")
+    imported = import_recording(text(tmp_path, content, "cp949"), lung="R20C50")
+    assert "Text (cp949)" in imported.understood[0]
+    np.testing.assert_allclose(lung(imported), [20.0, 50.0, 6.0], rtol=0.05)
+
+
+def test_decimal_commas_between_commas_are_refused(tmp_path: Path) -> None:
+    content = "Time,Paw,Flow\n" + lines("{},{},{}").replace(",", ";").replace(".", ",")
+    with pytest.raises(InputError, match=r"6 cells stand below 3 names.*semicolons"):
+        import_recording(text(tmp_path, content.replace(";", ",")), lung="R20C50")
 
 
 def test_markup_is_no_table(tmp_path: Path) -> None:

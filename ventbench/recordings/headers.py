@@ -250,6 +250,7 @@ def _meaning(text: str, unit: str | None) -> tuple[str | None, str, bool]:
 def _words(text: str) -> list[str]:
     """Words of a name: parted by marks and by capitals, or made of words that are known."""
     words, plain = [], re.sub("[\u0300-\u036f]", "", unicodedata.normalize("NFD", text))
+    plain = unicodedata.normalize("NFC", plain)
     for part in re.findall(r"[^\W_]+", plain):
         if part.lower() in _KINDS or part.lower() in _LETTERS:
             words.append(part.lower())

@@ -226,12 +226,9 @@ def import_recording(
         )
     _invert(values, invert)
     _check_signs(table, by_role, values, changes)
-    keys = [
-        _labels(table.columns[name])
-        for name, role in roles.items()
-        if role == "group" or (role == "breath" and not split_breaths)
-    ]
-    groups = [_labels(table.columns[n]) for n, role in roles.items() if role == "group"]
+    keys = groups = [_labels(table.columns[n]) for n, role in roles.items() if role == "group"]
+    if "breath" in by_role and not split_breaths:
+        keys = [*groups, _labels(table.columns[by_role["breath"]])]
     time, how = _time(table, by_role, values.get("time"), rate, keys)
     notes.append(how)
     notes += _bridge(values, time, by_role)
@@ -431,7 +428,8 @@ def _check_needed(
     has = set(roles.values())
     timed = rate or table.rate or any(table.header(name).interval for name in table.columns)
     for quantity, accepted in _NEEDED.items():
-        if has & set(accepted) or (accepted == ("time",) and timed):
+        is_time = accepted[0] == "time"
+        if has & set(accepted) or (is_time and timed):
             continue
         headers = {name: table.header(name) for name in table.columns if name not in roles}
         headers = {n: x for n, x in headers.items() if table.is_numeric(n)}
@@ -440,11 +438,11 @@ def _check_needed(
         if len(accepted) > 1 and (not open_ or layout.columns):
             continue
         onwards = {n: (np.diff(table.columns[n]) >= 0).mean() > 0.9 for n in open_}
-        open_.sort(key=lambda name: onwards[name] != (accepted == ("time",)))
+        open_.sort(key=lambda name: onwards[name] != is_time)
         columns = f"{table.file}: no column is {quantity}; the columns are {table.names}"
         role = next((headers[n].role for n in likely), None) or accepted[0]
         option = f"--map {quote((open_ or ['NAME'])[0])}={role}"
-        if accepted == ("time",):
+        if is_time:
             raise InputError(
                 f"{columns}. Say which with {option}, or give the sampling rate with --rate 50"
             )

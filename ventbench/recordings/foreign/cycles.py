@@ -166,15 +166,9 @@ def _crossings(signal: Floats, high: float, low: float) -> Ints:
 
 def _after_pause(on: Bools, time: Floats) -> Ints:
     """Rows at which a valve opens after it was shut for a while."""
-    onsets, shut_since = [], None
-    for k in range(len(on)):
-        if not on[k]:
-            shut_since = k if shut_since is None else shut_since
-        elif shut_since is not None:
-            if time[k] - time[shut_since] >= 0.2:
-                onsets.append(k)
-            shut_since = None
-    return np.array(onsets, np.int64)
+    shuts = np.flatnonzero(~on & np.append(True, on[:-1]))
+    opens = np.flatnonzero(on[1:] & ~on[:-1]) + 1
+    return opens[time[opens] - time[shuts[: len(opens)]] >= 0.2]
 
 
 def _is_high(signal: Floats) -> Bools:

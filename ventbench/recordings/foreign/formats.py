@@ -314,6 +314,12 @@ def _json(file: str) -> Table | None:
 def _rows_within(content: Any) -> dict[str, Sequence[Any]] | None:
     """The longest table in a document: records, named lists, or rows beside their names."""
     tables: list[dict[str, Sequence[Any]]] = []
+    if isinstance(content, dict) and len(content) > 1:
+        inner = [tuple(x) if isinstance(x, dict) else () for x in content.values()]
+        if len(inner[0]) > 1 and len(set(inner)) == 1:  # as pandas writes them, by name or by row
+            if len(inner[0]) < len(content):
+                return _rows_within(list(content.values()))
+            content = {name: list(x.values()) for name, x in content.items()}
     if isinstance(content, list) and len(content) > 1 and all(isinstance(x, dict) for x in content):
         records = [_flat(record) for record in content]
         names = dict.fromkeys(name for record in records[:1000] for name in record)

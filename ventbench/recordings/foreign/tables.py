@@ -271,6 +271,11 @@ def _table(
         wide = [re.split(r"\s{2,}|\t", above[k].strip(" #%\t")) for k, _ in rows[:begins]]
         texts = [x if len(x) == width else y for x, y in zip(wide, texts, strict=True)]
     headers, units, notes = _header(texts, width, separator == " ")
+    if separator == "," and all(headers[: width // 2]) and not any(headers[width // 2 :]):
+        raise InputError(
+            f"{file}: {width} cells stand below {width // 2} names, as if commas were decimal "
+            "marks too; export it with semicolons between the cells"
+        )
     names = named(headers)
     first = rows[begins][0]
     offset = sum(len(line) + 1 for line in data.split(b"\n", first)[:first])
@@ -424,11 +429,12 @@ def _header(
         return [*first, *titles], [""] * len(first) + units, ["Names stand in a line of titles."]
     while texts and (sum(map(bool, texts[-1])) < min(2, width) or _mostly_numbers(texts[-1])):
         texts.pop()
+    numbered = [str(k + 1) for k in range(width)]
     comments = [bool(cells) and cells[0].startswith("#") for cells in above[: len(texts)]]
     if texts and not comments[-1]:
         texts = [x for x, is_comment in zip(texts, comments, strict=True) if not is_comment]
     if not texts:
-        return [str(k + 1) for k in range(width)], [], ["There is no header; columns are 1, 2, ..."]
+        return numbered, [], ["There is no header; columns are 1, 2, ..."]
     units_row: list[str] = []
     unit_cells = sum(map(is_unit, texts[-1]))
     if len(texts) > 1 and unit_cells and 2 * unit_cells >= sum(map(bool, texts[-1])):
@@ -437,7 +443,7 @@ def _header(
     cells = next((text for text in reversed(texts) if sum(map(bool, text)) == width), texts[-1])
     if packed and len(cells) != width:
         note = f"{len(cells)} words stand above {width} columns; the columns are 1, 2, ..."
-        return [str(k + 1) for k in range(width)], [], [note]
+        return numbered, [], [note]
     if width == len(cells) + 1 and not units_row:  # names of R's write.table have no row's own
         cells = ["row", *cells]
     cells = cells + [""] * (width - len(cells))

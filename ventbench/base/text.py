@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,12 @@ def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
         return "failed"
     # + 0.0 turns -0.0, which rounding may leave, into 0.0.
     return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "−")
+
+
+def few(items: Sequence[str], most: int = 3) -> str:
+    """The first of several items, and how many more there are."""
+    more = f" and {len(items) - most} more" if len(items) > most else ""
+    return ", ".join(items[:most]) + more
 
 
 def suggestion(word: str, choices: Iterable[str], cutoff: float = 0.6) -> str:

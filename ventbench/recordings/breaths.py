@@ -200,11 +200,11 @@ def stack(values: np.ndarray, lengths: Ints, fill: float, width: int | None = No
 
     A value fills short breaths. T is the width, or the longest length; a view if all lengths are T.
     """
-    width = int(lengths.max(initial=0)) if width is None else width
-    if (lengths == width).all():
-        return values.reshape(len(lengths), width)
-    out = np.full((len(lengths), width), fill, dtype=values.dtype)
-    out[valid_mask(lengths, width)] = values
+    valid = valid_mask(lengths, width)
+    if valid.all():
+        return values.reshape(valid.shape)
+    out = np.full(valid.shape, fill, dtype=values.dtype)
+    out[valid] = values
     return out
 
 

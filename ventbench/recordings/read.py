@@ -12,6 +12,7 @@ import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.base.text import few
 from ventbench.recordings.bad_samples import UNUSABLE, clean, left_out
 from ventbench.recordings.breaths import Breaths, arranged, join
 from ventbench.recordings.roles import few_breaths, findings
@@ -215,10 +216,9 @@ class RecordingReport:
         notes = [str(problem) for problem in self.suspicious]
         if self.time_inferred:
             listed = [f"breath {i}: {1e3 * dt:.1f} ms" for i, dt in self.time_inferred.items()]
-            more = f" and {len(listed) - 10} more" if len(listed) > 10 else ""
             notes.append(
                 f"{len(listed)} breaths have no times; their sampling interval was inferred "
-                f"({', '.join(listed[:10])}{more})."
+                f"({few(listed, 10)})."
             )
         if self.time_interpolated:
             notes.append(f"{self.time_interpolated} single blank times were interpolated.")
@@ -231,8 +231,7 @@ class RecordingReport:
         notes += [str(warning) for warning in self.warnings]
         if self.warning_count > len(self.warnings):
             notes.append(f"... and {self.warning_count - len(self.warnings)} more warnings.")
-        few = few_breaths(self.breaths)
-        return (*notes, few) if few is not None else tuple(notes)
+        return (*notes, *few_breaths(self.breaths))
 
     def lines(self) -> list[str]:
         """The report as lines of text."""
@@ -300,12 +299,9 @@ def role_problems(source: Source, scanned: Scanned) -> dict[str, tuple[Recording
     }
     unusable = {column for column, share in left_out(scanned.bad).items() if share > UNUSABLE}
     for samples in scanned.bad:
-        level = "refused" if samples.column in unusable else "suspicious"
-        advice = (
-            "That is too much: the recording is unusable."
-            if samples.column in unusable
-            else _ADVICE
-        )
+        level, advice = "suspicious", _ADVICE
+        if samples.column in unusable:
+            level, advice = "refused", "That is too much: the recording is unusable."
         places = sorted(x for x, _ in source.locate(samples.rows[:6].tolist()).values())
         message = samples.what(f"{source.place}s", places)
         problem = RecordingProblem(file, message, advice, column=samples.column)

@@ -344,17 +344,17 @@ def findings(
     return tuple(sorted(collected, key=lambda f: f.level))  # what is refused comes first
 
 
-def few_breaths(count: int) -> str | None:
-    """What fewer breaths than everything needs can still be used for; None if they are enough."""
+def few_breaths(count: int) -> tuple[str, ...]:
+    """What fewer breaths than everything needs can still be used for; none if they are enough."""
     if not 0 < count < _TRAINING:
-        return None
+        return ()
     use = "`ventbench data open-loop` and, with flow, `ventbench mechanics`"
     need = f"`train simulator` needs {_TRAINING}"
     if count >= _DIAGNOSIS:
         use = f"`ventbench diagnose`, {use}"
     else:
         need += f", `diagnose` {_DIAGNOSIS} of a lung"
-    return f"{count} breath{'s' if count > 1 else ''}: enough for {use} only; {need}."
+    return (f"{count} breath{'s' if count > 1 else ''}: enough for {use} only; {need}.",)
 
 
 def _agree(values: Floats, limit: float) -> bool:
@@ -392,13 +392,12 @@ def _volumes(figures: Mapping[str, Floats]) -> Iterator[Finding]:
         for unit, size in UNITS[role].items()
         if size != 1 and abs(np.log(factor * float(size) ** -sense)) < np.log(1.1)
     ]
-    share = {2: "half", 3: "a third", 4: "a quarter"}.get(round(apart), f"1/{apart:.3g}")
-    times = {2: "twice", 3: "three times"}.get(round(apart), f"{apart:.3g} times")
-    if abs(apart / round(apart) - 1.0) > 0.05:
-        share, times = f"1/{apart:.3g}", f"{apart:.3g} times"
+    whole = round(apart) if abs(apart / round(apart) - 1.0) <= 0.05 else 0
+    share = {2: "half of", 3: "a third of", 4: "a quarter of"}.get(whole, f"1/{apart:.3g} of")
+    times = {2: "twice", 3: "three times"}.get(whole, f"{apart:.3g} times")
     message = (
         f"flow and volume contradict each other: they differ by a factor of {apart:.1f} (volume is "
-        f"{share if factor < 1.0 else times}{' of' if factor < 1.0 else ''} the integrated flow)"
+        f"{share if factor < 1.0 else times} the integrated flow)"
     )
     advice = "Say which is wrong: --map NAME=unused leaves it out, "
     advice += f"{' or '.join(units) or 'a unit such as --flow-unit L/min'} corrects it."

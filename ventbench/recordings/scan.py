@@ -308,6 +308,7 @@ def check_row_ids(rows: Rows, log: ProblemLog, last: int) -> int:
     return int(ids[-1])
 
 
+_REPEAT = ("the row repeats {other}", "Remove one of the two.")
 _SORT = "Sort the rows of the breath by time_step, and remove rows that are there twice."
 
 
@@ -326,7 +327,7 @@ def check_times(rows: Rows, log: ProblemLog) -> None:
     blank = np.isnan(time)
     at = np.flatnonzero(blank[1:] & blank[:-1] & (breath[1:] == breath[:-1])) + 1
     at = at[_same(rows, at - 1, at, rows.columns)] if len(at) else at
-    _add_repeat(rows, log, at - 1, at, "id", rows.columns["id"])
+    log.add(at, "id", *_REPEAT, rows.columns["id"][at], references=at - 1)
 
 
 def _add_order(rows: Rows, log: ProblemLog, previous: Ints, current: Ints) -> None:
@@ -334,25 +335,14 @@ def _add_order(rows: Rows, log: ProblemLog, previous: Ints, current: Ints) -> No
     equal = time[previous] == time[current]
     names = [name for name in rows.columns if name != "id"]
     repeat = equal & _same(rows, previous, current, names)
-    _add_repeat(rows, log, previous[repeat], current[repeat], "time_step", time)
-    for chosen, message in (
-        (equal & ~repeat, "two rows of the breath have the time {value} s, the other is {other}"),
-        (~equal, "time goes back to {value} s from {other}"),
+    two = "two rows of the breath have the time {value} s, the other is {other}"
+    for chosen, message, advice in (
+        (repeat, *_REPEAT),
+        (equal & ~repeat, two, _SORT),
+        (~equal, "time goes back to {value} s from {other}", _SORT),
     ):
         at, before = current[chosen], previous[chosen]
-        log.add(at, "time_step", message, _SORT, time[at], references=before)
-
-
-def _add_repeat(
-    rows: Rows,
-    log: ProblemLog,
-    previous: Ints,
-    current: Ints,
-    column: str,
-    values: NDArray[Any],
-) -> None:
-    message, advice = "the row repeats {other}", "Remove one of the two."
-    log.add(current, column, message, advice, values[current], references=previous)
+        log.add(at, "time_step", message, advice, time[at], references=before)
 
 
 def _same(rows: Rows, first: Ints, second: Ints, names: Iterable[str]) -> Bools:

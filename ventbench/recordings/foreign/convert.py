@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats, Ints, Pieces
 from ventbench.base.errors import InputError
+from ventbench.base.text import few
 from ventbench.recordings.bad_samples import (
     MEASURED,
     BadSamples,
@@ -273,13 +274,12 @@ def import_recording(
         left_out=left_out(bad),
     )
     notable(breaths)
-    few = few_breaths(len(breaths))
     issues = check_roles(breaths)
     if issues and issues[0].level == "refused":
         column = by_role.get(issues[0].column, issues[0].column)
         raise InputError(f"{table.file}, column {column}: {issues[0]}")
     warnings += [str(finding) for finding in issues]
-    notes += [few] if few is not None else []
+    notes += few_breaths(len(breaths))
     used = {name: role for name, role in roles.items() if role != "unused"}
     return Imported(breaths, changes, used, tuple(notes), tuple(warnings), bad)
 
@@ -601,15 +601,10 @@ def _continued(table: Table, time: Floats) -> tuple[Floats, list[str]]:
             time[at[k + 1] :] += size
     sentences = []
     if wraps:
-        sentences.append(f"The clock wraps in {_few(wraps)}; it was continued.")
+        sentences.append(f"The clock wraps in {few(wraps)}; it was continued.")
     if resets and len(resets) <= max(3, len(time) // 1000):
-        sentences.append(f"The clock begins anew in {_few(resets)}; no breath goes on over that.")
+        sentences.append(f"The clock begins anew in {few(resets)}; no breath goes on over that.")
     return time, sentences
-
-
-def _few(items: Sequence[str]) -> str:
-    more = f" and {len(items) - 3} more places" if len(items) > 3 else ""
-    return ", ".join(items[:3]) + more
 
 
 def _bridge(values: dict[str, Floats], time: Floats, by_role: Mapping[str, str]) -> list[str]:
@@ -792,8 +787,7 @@ def _sound(
         raise InputError("\n".join([*problems[:5], *problems[5:][-1:]]))
     intact = [piece for k, piece in enumerate(pieces) if k not in bad]
     reasons = [f"{table.place(int(pieces[k][0]))} ({why})" for k, why in sorted(bad.items())]
-    more = f" and {len(reasons) - 10} more" if len(reasons) > 10 else ""
-    sentence = f"{len(reasons)} bad breaths were left out: {', '.join(reasons[:10])}{more}."
+    sentence = f"{len(reasons)} bad breaths were left out: {few(reasons, 10)}."
     return intact, [sentence] if reasons else []
 
 

@@ -114,19 +114,17 @@ def expiratory_valve(
         flow = _bridged(values["flow"])
         limit = -0.02 * float(np.quantile(np.abs(flow), 0.99))
         for piece in pieces:
-            out = np.flatnonzero(flow[piece] < limit)
-            inward = np.flatnonzero(flow[piece] > -limit)
-            first = out[out > (inward[0] if len(inward) else -1)]
-            if len(first):
-                u_out[piece[first[0]] : piece[-1] + 1] = 1
+            inward = flow[piece] > -limit
+            after = np.maximum.accumulate(inward) | ~inward.any()
+            u_out[piece] = np.maximum.accumulate(after & (flow[piece] < limit))
         return u_out, "u_out is 1 from where flow turns outwards."
+    pressure = _bridged(values["pressure"])
     for piece in pieces:
-        p = _bridged(values["pressure"])[piece]
+        p = pressure[piece]
         peak = int(np.argmax(p))
-        half = 0.5 * (p[peak] + p[-1])
-        below = np.flatnonzero(p[peak:] < half)
-        if len(below):
-            u_out[piece[peak + below[0]] : piece[-1] + 1] = 1
+        fallen = p < 0.5 * (p[peak] + p[-1])
+        fallen[:peak] = False
+        u_out[piece] = np.maximum.accumulate(fallen)
     return u_out, "u_out is 1 from where pressure has fallen half-way from its peak (a guess)."
 
 
@@ -134,10 +132,9 @@ def _onsets(file: str, time: Floats, values: Mapping[str, Floats]) -> tuple[Ints
     """Rows at which inspirations begin, and what shows them."""
     if "u_out" in values:
         shut = values["u_out"] < 0.5
-        return np.flatnonzero(shut[1:] & ~shut[:-1]) + 1, "where the expiratory valve closes"
+        return _rises(shut), "where the expiratory valve closes"
     if "target" in values:
-        high = _is_high(values["target"])
-        return np.flatnonzero(high[1:] & ~high[:-1]) + 1, "where the target rises"
+        return _rises(_is_high(values["target"])), "where the target rises"
     if "u_in" in values and np.nanmax(values["u_in"]) > 0:
         on = np.nan_to_num(values["u_in"]) > 0
         openings = _after_pause(on, time)
@@ -164,10 +161,15 @@ def _crossings(signal: Floats, high: float, low: float) -> Ints:
     return at[:-1][is_low[:-1] & ~is_low[1:]]
 
 
+def _rises(on: Bools) -> Ints:
+    """Rows at which something is on that was not in the row before."""
+    return np.flatnonzero(on[1:] & ~on[:-1]) + 1
+
+
 def _after_pause(on: Bools, time: Floats) -> Ints:
     """Rows at which a valve opens after it was shut for a while."""
     shuts = np.flatnonzero(~on & np.append(True, on[:-1]))
-    opens = np.flatnonzero(on[1:] & ~on[:-1]) + 1
+    opens = _rises(on)
     return opens[time[opens] - time[shuts[: len(opens)]] >= 0.2]
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import struct
+import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -54,8 +55,6 @@ def check_parquet(file: str) -> None:
 
 def check_archive(file: str) -> None:
     """Check what the members of a zip archive, such as a spreadsheet, unpack to."""
-    import zipfile
-
     with zipfile.ZipFile(file) as archive:
         refuse(file, sum(member.file_size for member in archive.infolist()), "its unpacked parts")
 
@@ -72,8 +71,6 @@ def check_text(file: str, cells: Any) -> None:
 
 def check_numpy(file: str) -> None:
     """Check the shapes of the arrays of a ``.npy`` or ``.npz`` file, by their headers."""
-    import zipfile
-
     import numpy as np
 
     def size(stream: Any) -> int:

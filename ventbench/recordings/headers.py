@@ -127,11 +127,13 @@ def _key(text: str) -> str:
     return plain if plain == "%" else re.sub(r"[^\w%]|_", "", plain)
 
 
-def is_foreign(text: str) -> bool:
-    """Whether a text has a word of a header in letters that are not Latin."""
-    return any(word in text.lower() for word in _KINDS if word > "\u0250")
+def known_words(text: str) -> int:
+    """How many words of headers stand somewhere in a text."""
+    plain = _plain(text).casefold()
+    return sum(word in plain for word in _KINDS)
 
 
+@cache
 def is_unit(text: str) -> bool:
     """Whether a text spells a unit of some quantity."""
     return _key(text) != "1" and any(_key(text) in _spelled(quantity) for quantity in UNITS)
@@ -249,15 +251,20 @@ def _meaning(text: str, unit: str | None) -> tuple[str | None, str, bool]:
 
 def _words(text: str) -> list[str]:
     """Words of a name: parted by marks and by capitals, or made of words that are known."""
-    words, plain = [], re.sub("[\u0300-\u036f]", "", unicodedata.normalize("NFD", text))
-    plain = unicodedata.normalize("NFC", plain)
-    for part in re.findall(r"[^\W_]+", plain):
+    words = []
+    for part in re.findall(r"[^\W_]+", _plain(text)):
         if part.lower() in _KINDS or part.lower() in _LETTERS:
             words.append(part.lower())
             continue
         for piece in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[^\WA-Z\d_]+|\d+", part):
-            words += _parted(piece.lower())
+            words += _parted(piece.casefold())
     return words
+
+
+def _plain(text: str) -> str:
+    """A text without accents, and without the letters of Turkish and Polish that have a stroke."""
+    letters = unicodedata.normalize("NFD", text.translate(str.maketrans("ıłŁ", "ilL")))
+    return unicodedata.normalize("NFC", re.sub("[\u0300-\u036f]", "", letters))
 
 
 @cache

@@ -24,7 +24,7 @@ from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError, require
 from ventbench.base.files import data_beside
 from ventbench.recordings.foreign import sizes
-from ventbench.recordings.headers import UNITS, Header, is_foreign, is_unit, read_header
+from ventbench.recordings.headers import UNITS, Header, is_unit, known_words, read_header
 from ventbench.recordings.sources import to_numpy
 
 _TEXTS = data_beside(__file__, "texts.toml")
@@ -196,11 +196,10 @@ def decoded(file: str) -> tuple[bytes, str]:
         try:
             data = data.decode("utf-8-sig").replace("\N{MINUS SIGN}", "-").encode()
         except UnicodeDecodeError:
-            head = data[: 1 << 16]
-            likely = (
-                x for x in _TEXTS["encodings"]["tried"] if is_foreign(head.decode(x, "ignore"))
+            encoding = max(
+                _TEXTS["encodings"]["tried"],
+                key=lambda x: known_words(data[: 1 << 16].decode(x, "ignore")),
             )
-            encoding = next(likely, "Latin-1")
             data = data.decode(encoding, "replace").encode()
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")

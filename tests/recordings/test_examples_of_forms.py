@@ -23,6 +23,7 @@ from ventbench.recordings.foreign.formats import read_table
 from ventbench.recordings.foreign.layouts import LAYOUTS
 from ventbench.recordings.foreign.tables import _TEXTS as TEXTS
 from ventbench.recordings.read import read_simulated, simulated_pressures
+from ventbench.recordings.sources import _REFUSED as REFUSED
 
 FORMS = Path(__file__).parent / "forms"
 
@@ -30,12 +31,15 @@ FORMS = Path(__file__).parent / "forms"
 SAID = {
     "biopac.txt.gz": "cells separated by ','",
     "cp1251.csv.gz": "Text (cp1251)",
+    "cp1254.csv.gz": "Text (cp1254)",
     "gb18030.csv.gz": "Text (gb18030)",
     "influx.csv.gz": "A row a measurement",
     "kaggle.csv.gz": "Layout kaggle",
     "labchart.txt.gz": "Names stand in a line of titles",
     "labview.lvm.gz": "first row in line 16",
     "lung_simulator.txt.gz": "by the column that numbers them",
+    "log.txt.gz": "readings behind names (3 other lines)",
+    "markdown.md.gz": "cells separated by '|'",
     "mvm.json.gz": "Layout mvm",
     "names_and_units_in_rows.csv.gz": "Text (Latin-1)",
     "nested_records.json.gz": "ts counts ms since 1970",
@@ -49,6 +53,7 @@ SAID = {
     "servo.txt.gz": "Layout servo",
     "session.mcap": "Layout session",
     "signals_and_rate.json.gz": "Sampling rate 50 Hz, of the file",
+    "units_in_cells.csv.gz": "cells separated by ';', decimal ','",
     "valve_words.csv.gz": "open is 1 (open) and closed is 0",
 }
 NO_FLOW = ("kaggle.csv.gz", "pvp.csv.gz")
@@ -142,6 +147,14 @@ def lines(form: str) -> str:
         ("시간(s),압력(cmH2O),유량(L/min)\n", "{},{},{}"),
         ("t,paw,paw_unit,flow,flow_unit\n", "{},{},cmH2O,{},L/min"),
         ("", "time_s={} paw={} flow_lpm={}"),
+        ("", "INFO:vent: t={} paw={} flow_lpm={} ok"),
+        ("", "t: {} s, paw: {} cmH2O, flow: {} L/min (ok)"),
+        ("", "[vent] t[s]={}; paw[cmH2O]={}; flow[L/min]={}"),
+        ("t paw flow\n", "{}s {}cmH2O {}L/min"),
+        ("t,paw,flow\n", '"{} s","{} cmH2O","{} L/min"'),
+        (" t | paw | flow_lpm \n---+-----+----------\n", " {} | {} | {}"),
+        ("+--+--+--+\n| t | paw | flow_lpm |\n+==+==+==+\n", "| {} | {} | {} |\n+--+--+--+"),
+        ("ZAMAN (sn);BASINÇ (cmH2O);AKIŞ (L/dk)\n", "{};{};{}"),
     ],
 )
 def test_headers_of_further_kinds(tmp_path: Path, above: str, form: str) -> None:
@@ -222,8 +235,34 @@ def test_decimal_commas_between_commas_are_refused(tmp_path: Path) -> None:
         import_recording(text(tmp_path, content.replace(";", ",")), lung="R20C50")
 
 
+@pytest.mark.parametrize("form", ["{:.2f} paw={} flow_lpm={}", "vent {} paw={} flow_lpm={}"])
+def test_a_log_without_a_clock_asks_for_it(tmp_path: Path, form: str) -> None:
+    path = text(tmp_path, lines(form))
+    with pytest.raises(InputError, match=r"--map (row|NAME)=time, or .* --rate 50"):
+        import_recording(path, lung="R20C50")
+    imported = import_recording(path, lung="R20C50", rate=50.0)
+    np.testing.assert_allclose(lung(imported), [20.0, 50.0, 6.0], rtol=0.05)
+
+
+@pytest.mark.parametrize("header", ["t,paw (cmH2O),flow (L/min)", "t,paw,flow"])
+def test_units_that_contradict_each_other_are_refused(tmp_path: Path, header: str) -> None:
+    content = f"{header}\n" + lines("{} s,{} mbar,{} L/min").replace("mbar", "kPa", 3)
+    with pytest.raises(InputError, match=r"paw is in .*kPa, mbar; save it in one unit"):
+        import_recording(text(tmp_path, content), lung="R20C50")
+
+
+@pytest.mark.parametrize("begins", REFUSED)
+def test_what_holds_no_table_is_refused_in_one_line(tmp_path: Path, begins: str) -> None:
+    path = tmp_path / "lab.dat"
+    path.write_bytes(begins.encode("latin-1") + bytes(range(256)))
+    for read in (import_recording, load):
+        with pytest.raises(InputError, match=r"this is .*\. (Save|Export|Unpack) ") as refused:
+            read(path)
+        assert len(str(refused.value).splitlines()) == 1
+
+
 def test_markup_is_no_table(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="XML or HTML; save the table in it as CSV"):
+    with pytest.raises(InputError, match=r"XML or HTML\. Save the table in it as CSV"):
         import_recording(text(tmp_path, "<?xml version='1.0'?><s t='0' p='1'/>"), lung="R20C50")
 
 

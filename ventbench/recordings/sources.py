@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputTypeError
-from ventbench.base.files import sha256
+from ventbench.base.files import data_beside, sha256
 from ventbench.recordings.schema import (
     COLUMNS,
     SHOWN,
@@ -41,6 +41,9 @@ BATCH = 1 << 17
 """Rows of Parquet read at a time."""
 
 BLANKS = ["", "NaN", "nan", "NA", "N/A", "null"]
+
+#: What files are that hold no table, and the way out, by their first bytes.
+_REFUSED = data_beside(__file__, "kinds.toml")["refused"]
 
 #: What messages call a table in memory.
 _TABLE = "the table"
@@ -352,18 +355,18 @@ def _table_source(frame: object) -> ParquetSource:
     return ParquetSource(_TABLE, "table", table)
 
 
-def kind_of(path: str | os.PathLike[str]) -> Kind:
-    """Return the format of a file by its first bytes; its name only improves the error message.
+def first_bytes(path: str | os.PathLike[str]) -> bytes:
+    """The beginning of a file that may hold a table.
 
     Raises:
-        RecordingError: no such file, a folder, no permission, empty, or another format.
+        RecordingError: no such file, a folder, no permission, empty, or one of ``kinds.toml``.
     """
     name = str(path)
     try:
         if Path(path).is_dir():
             raise fail(name, "this is a folder", "Name one file in it.")
         with open(path, "rb") as stream:
-            first = stream.read(4)
+            first = stream.read(128)
     except FileNotFoundError:
         raise fail(name, "there is no such file", "Check the path.") from None
     except OSError as error:
@@ -371,22 +374,34 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
         raise fail(name, f"the file cannot be read ({error.strerror})", advice) from None
     if not first:
         raise fail(name, "the file is empty", "Write a header and at least one breath.")
-    if first == b"PAR1":
+    for begins, (what, advice) in _REFUSED.items():
+        if first.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(begins.encode("latin-1")):
+            raise fail(name, f"this is {what}", f"{advice}.")
+    return first
+
+
+def kind_of(path: str | os.PathLike[str]) -> Kind:
+    """Return the format of a file by its first bytes; its name only improves the error message.
+
+    Raises:
+        RecordingError: as :func:`first_bytes` does, or it is of another format.
+    """
+    name, first = str(path), first_bytes(path)
+    if first.startswith(b"PAR1"):
         return "parquet"
     if name.endswith((".parquet", ".pq")):
         advice = "Write it again, or name it .csv if it is text."
         raise fail(name, "this is not a Parquet file", advice)
     if first.startswith(b"\x1f\x8b"):
         return "csv.gz"
-    marks = {b"MATL": "MATLAB", b"\x89HDF": "HDF5 (MATLAB 7.3)", b"\x93NUM": "NumPy"}
-    format_name = marks.get(first)
-    if first == b"PK\x03\x04":
+    format_name = {b"MATL": "MATLAB", b"\x93NUM": "NumPy"}.get(first[:4])
+    if first.startswith(b"PK\x03\x04"):
         format_name = {".xlsx": "spreadsheet", ".npz": "NumPy"}.get(Path(name).suffix)
+        if format_name is None:
+            raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
     if format_name:
         advice = "Bring it into the schema with `ventbench data import`."
         raise fail(name, f"this is a {format_name} file", advice)
-    if first.startswith(b"PK\x03\x04"):
-        raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
     if first.startswith((b"\xff\xfe", b"\xfe\xff")):
         advice = "Save the file as UTF-8; `ventbench data import` reads it as it is."
         raise fail(name, "this is UTF-16 text", advice)

@@ -9,8 +9,6 @@ from __future__ import annotations
 import json
 import re
 import warnings
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError, require
+from ventbench.base.text import few
 from ventbench.recordings.foreign import sizes
 from ventbench.recordings.foreign.tables import (
     RATES,
@@ -31,8 +30,10 @@ from ventbench.recordings.foreign.tables import (
     named,
     read_spreadsheet,
     read_text,
+    readable,
 )
 from ventbench.recordings.headers import is_unit, read_header
+from ventbench.recordings.sources import first_bytes
 
 
 def read_table(
@@ -47,30 +48,17 @@ def read_table(
         InputError: if the file cannot be read, or holds no table of numbers.
     """
     file, path = str(path), Path(path)
-    if not path.is_file():
-        if (path / "metadata.yaml").is_file():
-            return _rosbag(file)
-        reason = "is a folder" if path.is_dir() else "does not exist"
-        raise InputError(f"{file} {reason}; name a CSV, Parquet or .mat file")
-    with open(path, "rb") as stream:
-        first = stream.read(128)
-    if not first:
-        raise InputError(f"{file} is empty")
+    if (path / "metadata.yaml").is_file():
+        return _rosbag(file)
+    first = first_bytes(path)
     if first.startswith(b"\x1f\x8b"):
         first = decoded(file)[0][:128]
     for beginnings, read in _readers().items():
         if first.startswith(beginnings):
             return read(file)
-    if first.startswith((b"MATLAB 7.3", b"\x89HDF")):
-        raise InputError(
-            f"{file} is HDF5 (MATLAB 7.3, a log of PyTables?); save it with `save(..., '-v7')` in "
-            "MATLAB, or export the table as CSV"
-        )
     if path.suffix == ".hea":
         return _wfdb(file)
     begins = first.lstrip(b"\xef\xbb\xbf \r\n\t")[:1]
-    if begins == b"<":
-        raise InputError(f"{file} is XML or HTML; save the table in it as CSV")
     if begins in (b"{", b"["):
         content = _json(file)
         if content is not None:
@@ -95,14 +83,11 @@ def _readers() -> dict[tuple[bytes, ...], Callable[[str], Table]]:
 
 
 def _parquet(file: str) -> Table:
-    import pyarrow as pa
     from pyarrow import parquet
 
-    try:
+    with readable(file, "Parquet"):
         sizes.check_parquet(file)
         frame = parquet.read_table(file).to_pandas()
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{file} cannot be read ({str(error).splitlines()[0]})") from None
     if frame.empty:
         raise InputError(f"{file} holds no rows")
     return _of_values(file, {str(header): frame[header] for header in frame}, "Parquet")
@@ -111,29 +96,18 @@ def _parquet(file: str) -> Table:
 def _matlab(file: str) -> Table:
     from scipy.io import loadmat
 
-    try:
+    with readable(file, "a MATLAB file"):
         sizes.check_matlab(file)
         content = loadmat(file, simplify_cells=True)
-    except InputError:
-        raise
-    except (ValueError, NotImplementedError, OSError, TypeError, zlib.error) as error:
-        raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
     return _variables(file, content, "MATLAB file")
 
 
 def _numpy(file: str) -> Table:
     """The arrays of a ``.npz`` by name, the fields of a structured one, or columns by number."""
-    try:
+    with readable(file, "NumPy", "; save arrays of numbers by np.save or np.savez"):
         sizes.check_numpy(file)
         loaded = np.load(file, allow_pickle=False)
         arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
-    except InputError:
-        raise
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"{file} cannot be read ({reason}); save arrays of numbers by np.save or np.savez"
-        ) from None
 
     def content(array: NDArray[Any]) -> Any:
         if array.dtype.names:
@@ -161,10 +135,9 @@ def _variables(file: str, content: dict[str, Any], kind: str) -> Table:
             f"{', '.join(n for n in content if not n.startswith('__')) or 'none'}); a MATLAB table "
             "object must be saved as a struct or as columns"
         )
-    length = Counter(len(v) for v in flat.values()).most_common(1)[0][0]
-    longest = max(len(v) for v in flat.values())
-    same = [name for name, v in flat.items() if len(v) == longest]
-    length = longest if len(same) > 1 else length
+    counts = Counter(map(len, flat.values()))
+    longest = max(counts)
+    length = longest if counts[longest] > 1 else counts.most_common(1)[0][0]
     columns = {name: v for name, v in flat.items() if len(v) == length}
     # Short names, where they are unique: `data.Paw` is `Paw`.
     last = Counter(name.rpartition(".")[2] for name in columns)
@@ -175,7 +148,7 @@ def _variables(file: str, content: dict[str, Any], kind: str) -> Table:
     mismatched = [name for name, v in flat.items() if len(v) != length]
     notes = [f"{kind} with {len(columns)} columns of {length} rows."]
     if mismatched:
-        notes.append(f"Columns of other lengths were left out ({', '.join(mismatched[:5])}).")
+        notes.append(f"Columns of other lengths were left out ({few(mismatched, 5)}).")
     return Table(file, columns, rate=_stated_rate(scalars), notes=tuple(notes))
 
 
@@ -252,13 +225,9 @@ def _edf(file: str) -> Table:
     )
     from pyedflib import highlevel
 
-    sizes.check_edf(file)
-    try:
+    with readable(file, "EDF", "; it must be continuous (EDF, EDF+C or BDF)"):
+        sizes.check_edf(file)
         signals, headers, _ = highlevel.read_edf(file)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{file} cannot be read as EDF ({error}); it must be continuous (EDF, EDF+C or BDF)"
-        ) from None
     names, units, rates = (
         [header[key] for header in headers] for key in ("label", "dimension", "sample_frequency")
     )
@@ -271,14 +240,9 @@ def _wfdb(file: str) -> Table:
         require("wfdb", extra="formats", what="WFDB records")
         import wfdb
 
-        try:
+        with readable(file, "a WFDB record", "; its signal files must lie beside it"):
             sizes.check_wfdb(file)
             record = wfdb.rdrecord(file.removesuffix(".hea"), smooth_frames=False)
-        except (OSError, ValueError, IndexError) as error:
-            raise InputError(
-                f"{file} cannot be read as a WFDB record ({error}); its signal files "
-                "must lie beside it"
-            ) from None
     if not isinstance(record, wfdb.Record):
         raise InputError(f"{file} is a record of segments; name the header of one of them")
     rates = [record.fs * samples for samples in record.samps_per_frame or ()]
@@ -380,15 +344,12 @@ def _mcap(file: str) -> Table:
     from mcap.reader import make_reader
 
     topics: dict[str, list[dict[str, Any]]] = {}
-    try:
-        with open(file, "rb") as stream:
-            for _, channel, message in make_reader(stream).iter_messages():
-                if channel.message_encoding != "json":
-                    return _rosbag(file)
-                record = {"time": 1e-9 * message.log_time} | _flat(json.loads(message.data))
-                topics.setdefault(channel.topic, []).append(record)
-    except (McapError, OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read as MCAP ({error})") from None
+    with readable(file, "MCAP", also=McapError), open(file, "rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            if channel.message_encoding != "json":
+                return _rosbag(file)
+            record = {"time": 1e-9 * message.log_time} | _flat(json.loads(message.data))
+            topics.setdefault(channel.topic, []).append(record)
     return _of_topics(file, topics, "MCAP")
 
 
@@ -401,17 +362,15 @@ def _rosbag(file: str) -> Table:
     topics: dict[str, list[dict[str, Any]]] = {}
     path = Path(file)
     store = get_typestore(Stores.LATEST)
-    try:
-        with AnyReader(
-            [path if path.is_dir() or path.suffix == ".bag" else path.parent],
-            default_typestore=store,
-        ) as bag:
-            for connection, at, data in bag.messages():
-                message = bag.deserialize(data, connection.msgtype)
-                record = {"time": 1e-9 * at} | _flat(_fields(message))
-                topics.setdefault(connection.topic, []).append(record)
-    except (AnyReaderError, OSError) as error:
-        raise InputError(f"{file} cannot be read as a bag of ROS ({error})") from None
+    folder = path if path.is_dir() or path.suffix == ".bag" else path.parent
+    with (
+        readable(file, "a bag of ROS", also=AnyReaderError),
+        AnyReader([folder], default_typestore=store) as bag,
+    ):
+        for connection, at, data in bag.messages():
+            message = bag.deserialize(data, connection.msgtype)
+            record = {"time": 1e-9 * at} | _flat(_fields(message))
+            topics.setdefault(connection.topic, []).append(record)
     return _of_topics(file, topics, "ROS bag")
 
 

@@ -11,8 +11,11 @@ from __future__ import annotations
 
 import csv
 import re
+import zipfile
+import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,7 @@ from numpy.typing import NDArray
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError, require
 from ventbench.base.files import data_beside
+from ventbench.base.text import few
 from ventbench.recordings.foreign import sizes
 from ventbench.recordings.headers import UNITS, Header, is_unit, known_words, read_header
 from ventbench.recordings.sources import to_numpy
@@ -51,6 +55,9 @@ _NUMBER = {
     for mark, m, other in ((".", r"\.", ","), (",", ",", r"\."))
 }
 
+#: A reading with its unit behind it.
+_READING = re.compile(r"([-+.,\d]*\d(?:[eE][-+]?\d+)?)\s*((?:[^\W\d]|%).*)")
+
 #: A list of samples in one cell, also as JSON writes it, and least number of them.
 _LIST = {
     mark: re.compile(rf"[\[({{]?\s*{number}(?:{separators}{number}){{7,}}\s*[\])}}]?")
@@ -73,8 +80,33 @@ RATES = (*FREQUENCIES, *_OTHERS)
 #: First cells of lines that hold names, and units, of the columns right of them.
 _TITLES, _UNIT_TITLES = _TEXTS["titles"].values()
 
-#: A reading behind its name, as a serial port prints it: ``P:12.3``.
-_LABELLED = re.compile(r"(?<![^\s,;|])([^\W\d]\w*) ?[:=] ?(?=[-+.\d])")
+#: A reading behind its name, as serial ports and logs print it: ``P:12.3``, ``flow = 24 L/min``.
+_LABELLED = re.compile(
+    r"(?<![^\s,;|])([^\W\d]\w*(?:[\[(][^\s\])]+[\])])?) ?[:=] ?"
+    r"((?:[-+.\d]|nan|null)(?:[^\s,;|)\]}\"']|,(?=\d))*"
+    rf"(?: (?:{'|'.join(u for sizes in UNITS.values() for u in sizes if u != '1')})"
+    r"(?![^\s,;|)]))?)",
+    re.IGNORECASE,
+)
+
+#: A time before such readings: a time of day, or a number at the very beginning of the line.
+_STAMP = re.compile(
+    rf"(?:.*?(?P<clock>{re.sub(r'[(](?![?])', '(?:', _CLOCK.pattern)})|\W*(?P<row>\d+\.?\d*)\b)?"
+)
+
+#: Names and units of channels, a line each, above the header of BIOPAC AcqKnowledge.
+_CHANNELS = re.compile(
+    r"(?im)^\W*\d+ channels?\W*\n((?:.*\n)*?)"
+    r"(?:(?!CH\d)(\w+)\W)?CH\d+(\W)?.*\n(?:[\d,;\t ]+\n)?"
+)
+
+#: Lines of marks in a table that is drawn, as in Markdown, and rows between marks.
+_RULE = re.compile(r"[ \t|+:=-]*(?:--|==)[ \t|+:=-]*")
+_DRAWN = re.compile(rf"(?m)^{_RULE.pattern}$|^ *\|(.*)\| *$")
+
+#: What readers raise at files that are damaged.
+_FAILURES = (ValueError, TypeError, LookupError, OSError, EOFError, NotImplementedError)
+_FAILURES += (zipfile.BadZipFile, zlib.error)
 
 #: Share of the lines that may be no rows before a file is refused, and number of lines anyway.
 _STRAY, _STRAY_LINES = 0.01, 20
@@ -112,8 +144,7 @@ class Table:
     @property
     def names(self) -> str:
         """Its first columns, in words."""
-        more = f" and {len(self.columns) - 20} more" if len(self.columns) > 20 else ""
-        return ", ".join(list(self.columns)[:20]) + more
+        return few(list(self.columns), 20)
 
     def is_numeric(self, name: str) -> bool:
         """Whether a column holds numbers."""
@@ -149,13 +180,13 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     data, encoding = decoded(file)
     if not data:
         raise InputError(f"{file} holds no text")
-    looked_at = data[: 1 << 20].decode(errors="replace")
-    above = looked_at.split("\n", _LOOKED_AT)[:_LOOKED_AT]
+    above = _beginning(data)
     for form in _TEXTS["between"].values():
         marks = (re.match(rf"\s*({form['begin']}|{form['end']})\b", line) for line in above)
         if form["begin"] in (next(filter(None, marks), None) or " ")[0]:
             return _delimited_breaths(file, data.decode().split("\n"), encoding, form)
-    data, above = _plain_lines(data, above)
+    data, kind = _plain_lines(data, above)
+    above = _beginning(data)
     stated = re.fullmatch(r"\"?sep=(.)\"?", above[0])
     if stated is not None:  # a spreadsheet's own line
         separator, above[0] = separator or stated[1], ""
@@ -164,7 +195,7 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     above[:begins] = [""] * begins
     above = _titled(above)
     separator, decimal = _dialect(file, [x for x in above if x.strip()], separator, decimal)
-    note = f"Text ({encoding}), cells "
+    note = f"Text ({encoding}), {kind}cells "
     if len(above) < _ROWS:  # rows in the place of columns
         cells = [x for line in above if len(x := _cells(line, separator)) > _ROWS]
         if len(cells) > 1:
@@ -182,8 +213,8 @@ def decoded(file: str) -> tuple[bytes, str]:
     if data.startswith(b"\x1f\x8b"):
         data = sizes.gunzipped(file)
     zeros, encoding = data[:4096].count(0), "UTF-8"
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")) or zeros > 0.3 * len(data[:4096]):
-        wide = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le"
+    wide = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le"
+    if wide == "utf-16" or zeros > 0.3 * len(data[:4096]):
         try:
             data, encoding = data.decode(wide).encode(), "UTF-16"
         except UnicodeError:
@@ -204,6 +235,25 @@ def decoded(file: str) -> tuple[bytes, str]:
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return data.rstrip(b" \n\0"), encoding
+
+
+@contextmanager
+def readable(
+    file: str, kind: str, advice: str = "", also: type[Exception] = OSError
+) -> Iterator[None]:
+    """Say that a file cannot be read as what it seems to be, where that fails."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (*_FAILURES, also) as error:
+        reason = str(error).partition("\n")[0]
+        raise InputError(f"{file} cannot be read as {kind} ({reason}){advice}") from None
+
+
+def _beginning(data: bytes) -> list[str]:
+    """The first lines of a text."""
+    return data[: 1 << 20].decode(errors="replace").split("\n", _LOOKED_AT)[:_LOOKED_AT]
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -252,6 +302,7 @@ def _is_value(cell: str, mark: str) -> bool:
         _NUMBER[mark].fullmatch(cell)
         or (":" in cell and _CLOCK.fullmatch(cell))
         or _LIST[mark].fullmatch(cell)
+        or ((reading := _READING.fullmatch(cell)) and is_unit(reading[2]))
     )
 
 
@@ -289,7 +340,7 @@ def _table(
             f"lines are no rows of at most {len(names)} numbers, such as {odd[0][1][:60]!r}; "
             "remove them, or give --separator"
         )
-    columns, units, odd_cells, message = _columns(file, list(names), units, cells, mark, notes)
+    columns, units, odd_cells, message = _columns(file, names, units, cells, mark, notes)
     if message.any():
         lines = data[offset:].split(b"\n")
         stray += [(k, lines[k].decode()) for k in numbers[message].tolist()]
@@ -475,7 +526,7 @@ def _rate(above: list[list[str]], mark: str) -> float | None:
 
 
 def _columns(
-    file: str, names: list[str], units_row: list[str], cells: Any, mark: str, notes: list[str]
+    file: str, names: dict[str, str], units_row: list[str], cells: Any, mark: str, notes: list[str]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, str], list[str], Bools]:
     """Values and units by name; odd cells in words; rows of a word with hardly a number."""
     import pyarrow as pa
@@ -493,8 +544,17 @@ def _columns(
             columns[name], filled = values, filled + np.isfinite(values)
             continue
         texts = column.to_pandas().str.strip()
+        filled_in = ~texts.str.lower().isin(_BLANKS).to_numpy()
+        readings = texts.str.extract(f"^{_READING.pattern}$")
+        stated = readings[1].dropna().unique()
+        if readings[1].count() > 0.9 * filled_in.sum() and all(map(is_unit, stated)):
+            headers = (names[name], *map("[{}]".format, stated))
+            said = {read_header(header).unit or "" for header in headers} - {""}
+            if len(said) > 1:
+                raise InputError(f"{file}: {name} is in {few(sorted(said))}; save it in one unit")
+            texts, units[name] = readings[0].fillna(texts), stated[0]
         values, grouped = _values(texts, mark)
-        odd = np.isnan(values) & ~texts.str.lower().isin(_BLANKS).to_numpy()
+        odd = np.isnan(values) & filled_in
         if odd.any() and not np.isfinite(values).any():
             lists = listed(texts, mark)
             if lists is not None:
@@ -529,16 +589,12 @@ def _values(cells: Any, mark: str) -> tuple[Floats, int]:
     """Numbers of a column, NaN for other cells; and how many have thousands apart."""
     import pandas as pd
 
-    other = "," if mark == "." else "."
-    apart = cells.str.contains(rf"[{re.escape(other)} '’\u00a0\u202f]") & cells.str.fullmatch(
-        _NUMBER[mark].pattern
-    )
+    between = rf"[{',' if mark == '.' else '.'} '’\u00a0\u202f]"
+    apart = cells.str.contains(between) & cells.str.fullmatch(_NUMBER[mark].pattern)
     if mark == "," and not cells.str.contains(",", regex=False).any():
         apart &= False  # a column of a file with decimal commas that has points itself
     if apart.any():
-        cells = cells.mask(
-            apart, cells.str.replace(rf"[{re.escape(other)} '’\u00a0\u202f]", "", regex=True)
-        )
+        cells = cells.mask(apart, cells.str.replace(between, "", regex=True))
     plain = cells.str.replace(",", ".", regex=False) if mark == "," else cells
     values = np.array(pd.to_numeric(plain, errors="coerce"), float)
     values[~np.isfinite(values)] = np.nan
@@ -640,22 +696,33 @@ def _below(file: str, lines: list[str]) -> tuple[dict[str, Any], int]:
     return {}, 0
 
 
-def _plain_lines(data: bytes, above: list[str]) -> tuple[bytes, list[str]]:
-    """Text without the names before its readings, which become its first line, or arrows."""
-    names = [tuple(_LABELLED.findall(line)) for line in above]
-    usual, count = Counter(names).most_common(1)[0]
-    text = data.decode()
-    if len(usual) > 1 and 2 * count > len(above):
-        first = above[names.index(usual)]
-        between = _LABELLED.split(first)[2].lstrip("+-.0123456789")[:1]
-        text = _LABELLED.sub("", text[text.index(first) + len(first) :])
-        text = between.join(usual) + text
+def _plain_lines(data: bytes, above: list[str]) -> tuple[bytes, str]:
+    """Text as lines of cells: of names before readings, arrows, drawn tables; and the kind."""
+    names = [tuple(dict(_LABELLED.findall(line))) for line in above]
+    usual, count = max(Counter(names).items(), key=lambda x: x[1] * (len(x[0]) > 1))
+    text, kind = data.decode(), ""
+    if len(usual) > 1 and count > max(2, len(above) // 4):
+        first = names.index(usual)
+        titles = [title for title, cell in _readings(above[first]).items() if cell]
+        rows = [
+            "\t".join(map(cells.__getitem__, titles)) if {*usual} <= {*cells} else ""
+            for cells in map(_readings, text.split("\n"))
+        ]
+        rows[first] = "\t".join(titles)
+        text, kind = "\n".join(rows), f"readings behind names ({rows.count('')} other lines), "
     elif sum(" -> " in line for line in above) > len(above) / 2:
         between = next((x for x in _SEPARATORS if x in above[-1].split(" -> ")[1].strip()), ",")
         text = text.replace(" -> ", between)
+    elif any(map(_RULE.fullmatch, above)):
+        text = _DRAWN.sub(r"\1", text)
     else:
-        return data, above
-    return text.encode(), text.split("\n", _LOOKED_AT)[:_LOOKED_AT]
+        return data, kind
+    return text.encode(), kind
+
+
+def _readings(line: str) -> dict[str, str]:
+    """Cells of a line by the names before them, and the time before all."""
+    return dict(_LABELLED.findall(line)) | next(_STAMP.finditer(line)).groupdict("")
 
 
 def _titled(lines: list[str]) -> list[str]:
@@ -664,22 +731,16 @@ def _titled(lines: list[str]) -> list[str]:
     Below ``2 channels`` stand the name and the unit of each, a line each, then ``min,CH1,CH2`` and
     the number of samples of each.
     """
-    for k, line in enumerate(lines[:20]):
-        if (stated := re.fullmatch(r"\W*(\d+) channels?\W*", line, re.IGNORECASE)) is None:
-            continue
-        end = k + 1 + 2 * int(stated[1])
-        head = re.fullmatch(r"(?:(?!CH\d)(\w+)\W)?CH\d+(\W)?.*", "".join(lines[end : end + 1]))
-        if head is None:
-            continue
-        separator = head[2] or "\t"
-        texts = [re.sub(rf"[{separator}\"]+", " ", x).strip() for x in lines[k + 1 : end]]
-        titles = [f"{x} [{unit}]" for x, unit in zip(texts[::2], texts[1::2], strict=True)]
-        titles = [f"time [{head[1]}]", *titles] if head[1] else titles
-        counted = re.fullmatch(rf"[\d\s{separator}]+", "".join(lines[end + 1 : end + 2]))
-        below = end + 1 + (counted is not None)
-        blank = [""] * (below - k - 1)
-        return [*lines[:k], *blank, separator.join(titles), *lines[below:]]
-    return lines
+    text = "\n".join(lines)
+    if (found := _CHANNELS.search(text)) is None:
+        return lines
+    titles, unit, separator = found.groups()
+    texts = [re.sub(r"[,;\t\"]+", " ", x).strip() for x in titles.splitlines()]
+    names = [f"time [{unit}]"] if unit else []
+    names += [f"{x} [{of}]" for x, of in zip(texts[::2], texts[1::2], strict=False)]
+    above = text[: found.start()] + "\n" * (found[0].count("\n") - 1)
+    below = "\n" + text[found.end() :]
+    return (above + (separator or "\t").join(names) + below).split("\n")
 
 
 def _by_units(table: Table) -> Table:
@@ -707,19 +768,15 @@ def _by_units(table: Table) -> Table:
 
 def read_spreadsheet(file: str) -> Table:
     """Read the first sheet of a spreadsheet."""
-    import zipfile
-
     require("openpyxl", extra="excel", what="spreadsheets")
     from openpyxl import load_workbook
 
-    try:
+    with readable(file, "a spreadsheet", "; copy it again"):
         with zipfile.ZipFile(file) as archive:
             if "xl/workbook.xml" not in archive.namelist():
                 raise InputError(f"{file} is a zip archive; unpack it and name the file in it")
         sizes.check_archive(file)
         sheet = load_workbook(file, read_only=True, data_only=True).worksheets[0]
-    except zipfile.BadZipFile as error:
-        raise InputError(f"{file} cannot be unpacked ({error}); copy it again") from None
     rows, cells = [], 0
     for row in sheet.iter_rows(values_only=True):  # padded to the last row and column
         sizes.check_cells(file, cells := cells + len(row))

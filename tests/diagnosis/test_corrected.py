@@ -79,7 +79,7 @@ def test_whatever_the_candidates_no_lung_gets_worse(refit, after, seed):
     judge = Judge(both, split(both).judging)
     stages = choose(both, judge, pressures)
     final = {"before": pressures["before"]} | {
-        stage: module._by_lung(both, pressures, chosen)
+        stage: module.by_lung(both, pressures, chosen)
         for stage, chosen in zip(("refit", "after"), stages, strict=True)
     }
     line = compare_open_loop(both, judge, final, 0.2)

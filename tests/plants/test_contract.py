@@ -32,6 +32,7 @@ from ventbench.plants.catalog import load_simulators
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import FAMILIES, PlantFamily, save_plants
 from ventbench.plants.rigs import Rigs
+from ventbench.plants.sensed import Sensed, sensor
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.task import protocol, waveform
 from ventbench.task.interfaces import Plant, Signals
@@ -59,10 +60,16 @@ def corrected(lung_id: str) -> Plant:
     return Corrected(single_compartment(label), bent(lung_id), physics(label))
 
 
+def sensed(lung_id: str) -> Plant:
+    """Make a textbook lung that is read through a bent sensor, as its pressure may jump."""
+    return Sensed(single_compartment(lung(lung_id)), sensor({"sensor_curve.bend": 0.05}))
+
+
 #: Plants of the families that need more than a label.
 EXAMPLES = {
     "physics": {"R5C10": partial(bent, "R5C10")},
     "corrected": {"R20C50": partial(corrected, "R20C50")},
+    "sensed": {"R20C50": partial(sensed, "R20C50")},
     "hybrid": {name: partial(official, name) for name in STIFF_AND_SOFT},
 }
 

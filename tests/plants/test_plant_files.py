@@ -25,6 +25,7 @@ from ventbench.plants.plant_files import (
     save_plant,
     save_plants,
 )
+from ventbench.plants.sensed import Sensed, sensor
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, stack_heterogeneous, take
 from ventbench.plants.two_balloon import two_balloon
@@ -39,6 +40,7 @@ PLANTS = {
         physics(LUNGS[0], {"valve_lag": {"tau": 0.04}}),
         physics(LUNGS[0]),
     ),
+    "Sensed": lambda: Sensed(single_compartment(LUNGS[0]), sensor({"sensor_lag.tau": 0.05})),
     "Physics": lambda: physics(LUNGS[0], {"leak": {"conductance": 8.0}}),
 }
 

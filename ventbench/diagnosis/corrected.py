@@ -28,6 +28,7 @@ from ventbench.diagnosis.settings import CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import parse_rig_id, rig_id
+from ventbench.plants.sensed import Sensed, Sensor
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.clocks import rigs_by_clock, sampling_intervals
 from ventbench.recordings.decimation import is_fast
@@ -107,8 +108,8 @@ def correct(
         refitted = chosen = unchanged_stages
     final = {
         "before": before,
-        "refit": _by_lung(breaths, pressures, refitted),
-        "after": _by_lung(breaths, pressures, chosen),
+        "refit": by_lung(breaths, pressures, refitted),
+        "after": by_lung(breaths, pressures, chosen),
     }
     if not simulators.has_plants:
         note = (
@@ -182,6 +183,28 @@ def choose(
     return refitted, corrected
 
 
+def behind_sensor(
+    plant: Plant, sensor: Sensor, stage: Stage, lung: str, lungs: tuple[Plants, Plants]
+) -> Plant:
+    """A corrected plant whose simulator is read through a sensor.
+
+    Args:
+        plant: what was corrected beside the sensor, or was not.
+        sensor: the sensor.
+        stage: what is chosen: the simulator as given, refitted, or with the sensor.
+        lung: label of the plant.
+        lungs: base models of the simulator's response and of the recording, by label.
+    """
+    given = plant.simulator if isinstance(plant, Corrected) else plant
+    if stage == "before":
+        return given
+    if stage == "refit":
+        return Corrected(given, lungs[1][lung], lungs[0][lung])
+    if isinstance(plant, Corrected):
+        return Corrected(Sensed(given, sensor), plant.with_mechanisms, plant.without_mechanisms)
+    return Sensed(given, sensor)
+
+
 def _compared(breaths: Breaths, mask: Bools) -> Bools:
     """Readings of some breaths but for the first, where every simulation starts, ``(n, T)``."""
     return breaths.valid & (breaths.time > 0) & mask[:, None]
@@ -195,7 +218,7 @@ def _is_no_worse(judge: Judge, trial: Floats, current: Floats, mask: Bools) -> b
     return bool(new.rmse <= old.rmse and new.mae <= old.mae)
 
 
-def _by_lung(breaths: Breaths, pressures: dict[str, Floats], stages: dict[str, Stage]) -> Floats:
+def by_lung(breaths: Breaths, pressures: dict[str, Floats], stages: dict[str, Stage]) -> Floats:
     """Pressures of the stage that is chosen for each lung, cmH2O, ``(n, T)``."""
     result = pressures["before"].copy()
     for name, index in breaths.by_lung_index.items():

@@ -12,12 +12,15 @@ import numpy as np
 
 from ventbench import mechanics
 from ventbench.base import compilation
-from ventbench.base.arrays import Bools
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.conclusion import Alternatives, Conclusion
 from ventbench.diagnosis.corrected import (
     Correction,
+    behind_sensor,
+    by_lung,
+    choose,
     compare_open_loop,
     correct,
 )
@@ -36,6 +39,7 @@ from ventbench.diagnosis.identification import IdentifiedModel, identify, place_
 from ventbench.diagnosis.intermittent import find
 from ventbench.diagnosis.residual_analysis import flow_and_volume, locate, quiet_samples
 from ventbench.diagnosis.result import Diagnosis
+from ventbench.diagnosis.sensor_behind import SensorBehind, find_sensor
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
     describe_otherwise,
@@ -43,6 +47,7 @@ from ventbench.diagnosis.simulator_comparison import (
     mean_error,
     missing_mechanisms,
     refit_at_simulator_parameters,
+    refit_lungs,
 )
 from ventbench.diagnosis.unknown import explained, preference, unplaced_gain
 from ventbench.diagnosis.validation import check_residuals, detection_limits, explained_share
@@ -56,6 +61,7 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 from ventbench.recordings.roles import require_roles
 from ventbench.system_id import Data, Fit, Noise
+from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import lung as parse_lung
 
 if TYPE_CHECKING:
@@ -160,7 +166,13 @@ def diagnose(
                 break
             experiment, missing = reduced
             intermittent.append(missing)
-        diagnosis = _conclude(experiment, alone, excluded, tell, settings)
+        behind = None if by_flow else _behind(experiment, alone, settings)
+        if behind is None:
+            diagnosis = _conclude(experiment, alone, excluded, tell, settings)
+        else:
+            diagnosis = behind.conclude(
+                _conclude(behind.sensed, alone, excluded, tell, settings), settings
+            )
     return replace(
         diagnosis,
         verdict="named" if intermittent else diagnosis.verdict,
@@ -500,6 +512,95 @@ def _helps(
         for model in (conclusion.full, base)
     )
     return nats_full > nats_base
+
+
+@dataclass(frozen=True, eq=False)
+class _Behind:
+    """A simulator that is right but for its sensor, and its rival: the simulator of other lungs."""
+
+    experiment: Experiment  #: with the simulator as given.
+    sensor: SensorBehind  #: what stands behind it.
+    refit: Floats  #: pressures of the simulator with R and C refitted, cmH2O, ``(n, T)``.
+    lungs: tuple[dict[str, Plant], dict[str, Plant]]  #: base models of response and recording.
+
+    @property
+    def sensed(self) -> Experiment:
+        """The experiment with the simulator as its sensor shows it."""
+        shown = self.sensor.readings(self.experiment.before, self.experiment.data.dt)
+        return replace(self.experiment, before=shown)
+
+    def conclude(self, beside: Diagnosis, settings: SelectionConfig) -> Diagnosis:
+        """The diagnosis with the sensor among what is missing.
+
+        Args:
+            beside: what is missing in the simulator as the sensor shows it.
+            settings: every threshold.
+        """
+        experiment, traces = self.experiment, beside.traces
+        breaths, judge = experiment.breaths, experiment.judge
+        given = {"before": experiment.before, "refit": self.refit, "after": traces.after}
+        refitted, chosen = choose(breaths, judge, given)
+        pressures = {
+            "before": experiment.before,
+            "refit": by_lung(breaths, given, refitted),
+            "after": by_lung(breaths, given, chosen),
+        }
+        open_loop = compare_open_loop(breaths, judge, pressures, beside.open_loop.noise_floor)
+        open_loop = replace(open_loop, scatter_error=beside.open_loop.scatter_error)
+        rest = max(open_loop.whole.rmse**2 - open_loop.noise_floor**2, 0.0) ** 0.5
+        tested = experiment.uses.identifying
+        location = locate(
+            breaths.select(tested),
+            pressures["refit"][tested],
+            beside.noise[0],
+            traces.flow[tested],
+            traces.volume[tested],
+            settings=settings.residuals,
+        )
+        plants = {
+            name: behind_sensor(plant, self.sensor.sensor, chosen[name], name, self.lungs)
+            for name, plant in beside.plants.items()
+        }
+        return replace(
+            beside,
+            verdict="named",
+            mechanisms=(self.sensor.missing((open_loop.whole.rmse, rest)), *beside.mechanisms),
+            open_loop=open_loop,
+            location=location,
+            chosen=chosen,
+            plants=plants,
+            traces=replace(traces, **pressures),
+        )
+
+
+def _behind(
+    experiment: Experiment, alone: IdentifiedModel, settings: SelectionConfig
+) -> _Behind | None:
+    """What a sensor behind the simulator explains; None if that is not most of what it lacks."""
+    if experiment.simulators.is_base_physics:
+        return None
+    identifying, data = experiment.uses.identifying, experiment.identification_data
+    response, testing = experiment.before[identifying], experiment.uses.testing[identifying]
+    evaluator, first = alone.evaluator, experiment.breaths.pressure[:, 0]
+    base, refitted = refit_lungs(evaluator, data, testing, response)
+    refit = (
+        experiment.before
+        + alone.pressures(refitted, experiment.data, first)
+        - alone.pressures(base, experiment.data, first)
+    )
+    own_model = alone.pressures(alone.conclusion.full, data, response[:, 0])
+    found = find_sensor(
+        data,
+        testing,
+        experiment.uses.fitted[identifying],
+        response,
+        (own_model, refit[identifying]),
+        settings,
+    )
+    if found is None:
+        return None
+    plants = (estimates.plants_of(base, evaluator), estimates.plants_of(refitted, evaluator))
+    return _Behind(experiment, found, refit, plants)
 
 
 def _ids(breaths: Breaths, uses: Split) -> dict[str, tuple[int, ...]]:

@@ -91,6 +91,28 @@ def identify_both(
     return recording_model, replace(simulator_model, fit=fit)
 
 
+def refit_lungs(
+    evaluator: Evaluator, data: Data, held: Bools, response: Floats
+) -> tuple[FittedModel, FittedModel]:
+    """Base models of a simulator's response and of the recording less what the first one misses.
+
+    Their difference is what other lungs would change of the simulator.
+
+    Args:
+        evaluator: evaluator of the recording.
+        data: n recorded breaths.
+        held: which of them are held out, ``(n,)``.
+        response: pressures of the simulator for the recorded commands, cmH2O, ``(n, T)``.
+    """
+    evaluator, white = replace(evaluator, gain_sd=0.0), Noise((1.0,), (0.0,))
+    training, predictor = data.select(~held), evaluator.training.predictor
+    answered = Partition(training.with_pressure(np.nan_to_num(response[~held])), predictor)
+    base = evaluator.fit(Hypothesis(), white, partition=answered)
+    missed = base.residual[:, 0]  # less what was measured: the response
+    reduced = Partition(training.with_pressure(training.measured[:, 0] + missed), predictor)
+    return base, evaluator.fit(Hypothesis(), white, base, partition=reduced)
+
+
 def with_mechanisms_of(
     simulator_model: IdentifiedModel, recording_model: IdentifiedModel
 ) -> IdentifiedModel:

@@ -36,7 +36,7 @@ from ventbench.task.interfaces import Signals
 from ventbench.task.lungs import Lung
 
 #: Place of the first stage of the SDIRK method, as a share of the substep.
-_GAMMA = 1.0 - 0.5**0.5
+GAMMA = 1.0 - 0.5**0.5
 
 
 @flax.struct.dataclass
@@ -309,10 +309,10 @@ def _substep(
         ahead, share = place
         end = time + share * h
         return _implicit(
-            assembly, now, guess, ahead, commanded_flow, opened, end, _GAMMA * h, peep
+            assembly, now, guess, ahead, commanded_flow, opened, end, GAMMA * h, peep
         ), None
 
-    places = jnp.asarray([[0.0, _GAMMA], [(1.0 - _GAMMA) / _GAMMA, 1.0]], h.dtype)
+    places = jnp.asarray([[0.0, GAMMA], [(1.0 - GAMMA) / GAMMA, 1.0]], h.dtype)
     # Where idle mechanisms are skipped, a loop's bookkeeping takes longer than what it repeats.
     # Where all are computed, two copies would take much longer to compile, above all with slopes.
     unroll = bool(assembly.active)

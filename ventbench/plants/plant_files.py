@@ -22,6 +22,7 @@ from ventbench.base.errors import InputError
 from ventbench.physics.model import Physics
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.sensed import Sensed, Sensor
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.two_balloon import TwoBalloon, two_balloon
 from ventbench.task.interfaces import Plant
@@ -46,6 +47,7 @@ FAMILIES: dict[str, PlantFamily] = {
     "physics": PlantFamily(Physics),
     "corrected": PlantFamily(Corrected),
     "hybrid": PlantFamily(Hybrid),
+    "sensed": PlantFamily(Sensed),
 }
 
 #: Names of fields in plant files, by class and field, where they differ from the attribute's.
@@ -60,7 +62,8 @@ def stored_type(name: str) -> type:
     Raises:
         KeyError: if there is no plant family with such a class.
     """
-    return {family.plant.__name__: family.plant for family in FAMILIES.values()}[name]
+    classes = {family.plant.__name__: family.plant for family in FAMILIES.values()}
+    return {**classes, "Sensor": Sensor}[name]
 
 
 FORMAT = "ventbench-plants-1"

@@ -347,6 +347,29 @@ def test_what_cannot_be_identified():
         mechanics.identify(replace(whole, pressure=np.full_like(whole.pressure, np.nan)))
 
 
+@pytest.mark.parametrize("factor", [1e-5, 1e-3, -1.0, 1e3])
+def test_a_flow_in_another_unit_ends_in_an_answer(factor):
+    """Square flow, 30 readings a second: where it jumps, R is wide by what the elastance says."""
+    rng, time = np.random.default_rng(0), np.arange(90) * 0.033
+    filling = 400.0 + 50.0 * np.sin(3.0 * time + np.arange(10)[:, None])
+    volume = np.cumsum(np.where(time < 1.0, filling, 0.0), axis=1) * 0.033
+    emptied = volume * np.exp(-np.maximum(time - 1.0, 0.0) / 0.4)
+    flow = np.where(time < 1.0, filling, -emptied / 0.4)
+    pressure = 5.0 + np.where(time < 1.0, 0.02 * filling + volume / 20.0, 0.025 * emptied)
+    breaths = make_breaths(
+        pressure=pressure + rng.normal(0.0, 0.05, pressure.shape),
+        flow=factor * flow,
+        time=np.broadcast_to(time, pressure.shape),
+        u_in=np.zeros(pressure.shape),
+        u_out=np.broadcast_to(time >= 1.0, pressure.shape).astype(float),
+        breath_id=np.arange(10),
+        R=np.full(10, 20.0),
+        C=np.full(10, 20.0),
+    )
+    (answer,) = mechanics.identify(breaths)
+    assert not answer.match.label_matches
+
+
 def pretended(R, C, *, label=(20.0, 20.0), quadratic=0.0):
     """What a fit to pressure alone would say of one lung."""
     data = SimpleNamespace(lung=np.zeros(3, int), R=np.full(3, label[0]), C=np.full(3, label[1]))

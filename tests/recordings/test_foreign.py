@@ -186,6 +186,36 @@ def test_breaths_from_pressure_alone_and_from_a_rate(tmp_path):
         import_recording(path, columns=columns, lung="R20C50")
 
 
+def test_breaths_that_a_trigger_recorded_are_split_at_the_gaps(tmp_path):
+    """Each begins with the inspiration itself, so that nothing turns inwards in it."""
+    made = waveforms(cycles=6.0)
+    kept = made["t"] % PERIOD >= 0.1  # the trigger, until which nothing is stored
+    path = tmp_path / "triggered.csv"
+    pd.DataFrame({name: values[kept] for name, values in made.items()}).to_csv(path, index=False)
+    imported = import_recording(path, lung="R20C50", units={"flow": "mL/s"})
+    assert len(imported.breaths) == 6
+    assert "where the clock leaves a gap" in " ".join(imported.understood)
+
+
+def test_a_device_that_paused_between_breaths_has_no_triggers(tmp_path):
+    made = waveforms(cycles=8.5)
+    kept = made["t"] % (2.0 * PERIOD) >= 0.5  # pieces of nearly two breaths
+    path = tmp_path / "paused.csv"
+    pd.DataFrame({name: values[kept] for name, values in made.items()}).to_csv(path, index=False)
+    imported = import_recording(path, lung="R20C50", units={"flow": "mL/s"})
+    assert "where flow turns inwards" in " ".join(imported.understood)
+
+
+def test_names_behind_the_mark_of_a_comment_as_numpy_writes_them(tmp_path):
+    made, path = waveforms(), tmp_path / "savetxt.txt"
+    header = "time_s pressure_cmH2O flow_mL_s"
+    np.savetxt(path, np.column_stack(list(made.values())), header=header, fmt="%.4f")
+    imported = import_recording(path, lung="R20C50")
+    assert len(imported.breaths) == 4
+    assert imported.breaths.flow is not None
+    np.testing.assert_allclose(np.nanmax(imported.breaths.flow), 500.0, rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

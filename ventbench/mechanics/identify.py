@@ -456,7 +456,7 @@ class LungFit:
         peak = max(float(segment.flow.max()) for segment in self.segments)
         quadratic = abs(self._coefficient("turbulent_resistance"))
         extrapolated = _EXTRAPOLATION_ERROR * quadratic * max(flow - peak, 0.0)
-        jumps = self.blur * self._coefficient("elastance")
+        jumps = self.blur * abs(self._coefficient("elastance"))
         half_width = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
         reach = float(np.hypot(half_width, extrapolated)) + jumps  # the same in every breath
         ends = (estimate.value - reach, estimate.value + reach)
@@ -467,7 +467,7 @@ class LungFit:
         tidal = self._tidal_volume()
         elastance = self._derived(lambda x: x("elastance") + x("nonlinear_compliance") * tidal, "")
         half_width = 0.5 * (elastance.ci95[1] - elastance.ci95[0])
-        jumps = elastance.value * self.blur * self.jump / tidal
+        jumps = abs(elastance.value) * self.blur * self.jump / tidal
         reach = half_width + jumps
         low, high = (max(elastance.value + side * reach, 1e-3) for side in (-1.0, 1.0))
         return Estimate(1000.0 / elastance.value, "mL/cmH2O", (1000.0 / high, 1000.0 / low))

@@ -467,7 +467,8 @@ def _header(
     texts = [
         [
             re.sub(r"^(['\"])(.*)\1$", r"\2", cell).lstrip("#%").strip()
-            for cell in cells[: _width(cells)]
+            # The mark of a comment may stand by itself, as NumPy writes a header.
+            for cell in cells[cells[:1] in (["#"], ["%"]) : _width(cells)]
         ]
         for cells in above
     ]

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from proofs.real.parts import lagged
+from ventbench.base import compilation
+from ventbench.diagnosis.corrected import behind_sensor
 from ventbench.diagnosis.sensor_behind import SensorBehind, find_sensor
+from ventbench.physics import physics
+from ventbench.plants.corrected import Corrected
+from ventbench.plants.sensed import readings, sensor
+from ventbench.plants.single_compartment import single_compartment
 from ventbench.system_id import make_data
 from ventbench.system_id.data import Data
+from ventbench.task.lungs import lung
+from ventbench.task.rollouts import open_loop
 
 from . import small
 
@@ -65,3 +75,27 @@ def test_another_lung_is_no_sensor(factor):
     start = BREATHS.pressure[:, :1]
     recorded = start + factor * (BREATHS.pressure - start)
     assert looked_for(recorded, BREATHS.pressure, recorded + 0.3) is None
+
+
+def test_plants_of_all_stages_run_together_and_answer_as_they_should():
+    label = lung("R20C50")
+    beside = {"supply_droop": {"drop": 0.2}}
+    with compilation.float64():
+        plant = Corrected(single_compartment(label), physics(label, beside), physics(label, beside))
+        lungs = (physics(label), physics(lung("R5C50")))
+        behind = sensor({"sensor_lag.tau": 0.06})
+        stages = {
+            stage: behind_sensor(plant, behind, stage, lungs)
+            for stage in ("before", "refit", "after")
+        }
+        commands = (jnp.full((1, 30), x) for x in (20.0, 0.0, 0.03))
+        u_in, u_out, dt = commands
+        answers = {
+            name: np.asarray(open_loop(one, jnp.full((1,), 5.0), u_in, u_out, dt))
+            for name, one in (stages | {"given": plant.simulator, "other": lungs[1]}).items()
+        }
+        shown = np.asarray(readings(behind, answers["given"], dt))
+    assert len({jax.tree.structure(one) for one in stages.values()}) == 1
+    np.testing.assert_allclose(answers["before"], answers["given"], atol=1e-6)
+    np.testing.assert_allclose(answers["after"], shown, atol=1e-6)
+    np.testing.assert_allclose(answers["refit"], answers["other"], atol=0.2)

@@ -36,10 +36,10 @@ def test_a_mechanism_that_is_off_changes_nothing(path):
 
 
 def test_the_plant_reads_what_its_sensor_shows_and_is_scored_by_its_pressure():
-    plant, slow = single_compartment(lung("R20C20")), sensor({"sensor_lag.tau": 0.08})
-    u_in, u_out = jnp.full((1, 40), 20.0), jnp.zeros((1, 40))
-    dt, start = jnp.full((1, 40), 0.03), jnp.full((1,), 5.0)
     with compilation.float64():
+        plant, slow = single_compartment(lung("R20C20")), sensor({"sensor_lag.tau": 0.08})
+        u_in, u_out = jnp.full((1, 40), 20.0), jnp.zeros((1, 40))
+        dt, start = jnp.full((1, 40), 0.03), jnp.full((1,), 5.0)
         alone = open_loop(plant, start, u_in, u_out, dt)
         shown = open_loop(Sensed(plant, slow), start, u_in, u_out, dt)
         np.testing.assert_allclose(shown, readings(slow, alone, dt), atol=1e-9)

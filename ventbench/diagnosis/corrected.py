@@ -26,6 +26,7 @@ from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.settings import CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
+from ventbench.physics.catalogue import parameter
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import parse_rig_id, rig_id
 from ventbench.plants.sensed import Sensed, Sensor
@@ -183,26 +184,25 @@ def choose(
     return refitted, corrected
 
 
-def behind_sensor(
-    plant: Plant, sensor: Sensor, stage: Stage, lung: str, lungs: tuple[Plants, Plants]
-) -> Plant:
+def behind_sensor(plant: Any, sensor: Sensor, stage: Stage, lungs: tuple[Any, ...]) -> Corrected:
     """A corrected plant whose simulator is read through a sensor.
 
+    Plants of all stages have one structure, so that they can be run together.
+
     Args:
-        plant: what was corrected beside the sensor, or was not.
+        plant: what was corrected beside the sensor, a :class:`Corrected`.
         sensor: the sensor.
         stage: what is chosen: the simulator as given, refitted, or with the sensor.
-        lung: label of the plant.
-        lungs: base models of the simulator's response and of the recording, by label.
+        lungs: base models of the simulator's response and of the recording.
     """
-    given = plant.simulator if isinstance(plant, Corrected) else plant
-    if stage == "before":
-        return given
-    if stage == "refit":
-        return Corrected(given, lungs[1][lung], lungs[0][lung])
-    if isinstance(plant, Corrected):
-        return Corrected(Sensed(given, sensor), plant.with_mechanisms, plant.without_mechanisms)
-    return Sensed(given, sensor)
+    if stage == "after":
+        return plant.replace(simulator=Sensed(plant.simulator, sensor))
+    physics = plant.without_mechanisms
+    neutral = {path: parameter(path).neutral for path in physics.names if "." in path}
+    had, wanted = (physics.having(**neutral, **lung.parameters()) for lung in lungs)
+    off = tuple(np.asarray(parameter(path).neutral) for path in sensor.names)
+    through = Sensed(plant.simulator, sensor.replace(values=off))  # type: ignore[attr-defined]
+    return Corrected(through, wanted if stage == "refit" else had, had)
 
 
 def _compared(breaths: Breaths, mask: Bools) -> Bools:

@@ -557,14 +557,20 @@ class _Behind:
             traces.volume[tested],
             settings=settings.residuals,
         )
-        plants = {
-            name: behind_sensor(plant, self.sensor.sensor, chosen[name], name, self.lungs)
-            for name, plant in beside.plants.items()
-        }
+        with compilation.float64():
+            plants = {
+                name: behind_sensor(
+                    plant, self.sensor.sensor, chosen[name], tuple(of[name] for of in self.lungs)
+                )
+                for name, plant in beside.plants.items()
+            }
         return replace(
             beside,
             verdict="named",
-            mechanisms=(self.sensor.missing((open_loop.whole.rmse, rest)), *beside.mechanisms),
+            mechanisms=(
+                self.sensor.missing((open_loop.whole.rmse, rest)),
+                *(m for m in beside.mechanisms if m.name != self.sensor.name),  # more of the same
+            ),
             open_loop=open_loop,
             location=location,
             chosen=chosen,

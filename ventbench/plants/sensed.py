@@ -12,6 +12,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
@@ -36,7 +37,7 @@ class SensorState:
 class Sensor:
     """Mechanisms between a pressure and its reading."""
 
-    values: tuple[Array, ...]  #: one array ``()`` or ``(...)`` for each name.
+    values: tuple[Any, ...]  #: one array ``()`` or ``(...)`` for each name.
     names: tuple[str, ...] = flax.struct.field(pytree_node=False)  #: paths of the parameters.
 
     def init(self, reading: Array) -> SensorState:
@@ -139,5 +140,8 @@ class Sensed:
 
 
 def sensor(values: Mapping[str, ArrayLike]) -> Sensor:
-    """A sensor of parameters by path, ``{"sensor_lag.tau": 0.08}``."""
-    return Sensor(tuple(jnp.asarray(x, float) for x in values.values()), tuple(values))
+    """A sensor of parameters by path, ``{"sensor_lag.tau": 0.08}``.
+
+    Its leaves are NumPy's, and take the precision in force where they are used.
+    """
+    return Sensor(tuple(np.asarray(x, float) for x in values.values()), tuple(values))

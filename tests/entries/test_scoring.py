@@ -579,3 +579,17 @@ def test_entries_on_a_cluster_have_the_scores_that_they_have_here(tmp_path):
         there = scores("--scheduler", cluster.scheduler_address)
     assert list(there) == ["pid_robust", "pid_best"]
     assert there == scores()
+
+
+@pytest.mark.parametrize(
+    ("shape", "cell"),
+    [((2, 4, 1, 3), (1, slice(None), 0, 2)), ((2, 1, 3, 4), (1, 0, 2)), ((2, 1, 3), (1, 0, 2))],
+    ids=["stacked by a mechanism", "behind the batch", "one"],
+)
+def test_cells_that_wait_keep_all_their_states(shape, cell):
+    mask = np.zeros((2, 1, 3), bool)
+    mask[1, 0, 2] = True
+    chosen = np.asarray(cells._select(jnp.asarray(mask), jnp.ones(shape), jnp.zeros(shape)))
+    assert chosen.shape == shape
+    assert np.all(chosen[cell] == 1.0)
+    assert chosen.sum() == np.size(chosen[cell])

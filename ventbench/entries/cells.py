@@ -402,10 +402,17 @@ def _expire(plants: Plant, scenario: Scenario, loop: env.LoopState) -> Array:
 
 @jax.jit
 def _select(mask: Array, new: Any, old: Any) -> Any:
-    """Take the new state in some cells and the old one in the rest, mask of the batch shape."""
+    """Take the new state in some cells and the old one in the rest, mask of the batch shape.
+
+    Several states of a part stand behind the batch, or, stacked by a mechanism, behind its leading
+    axis.
+    """
 
     def choose(x: Array, y: Array) -> Array:
-        shape = mask.shape + (1,) * (x.ndim - mask.ndim)
+        several = (1,) * (x.ndim - mask.ndim)
+        shape = (*mask.shape, *several)
+        if x.shape[: mask.ndim] != mask.shape:
+            shape = (*mask.shape[:1], *several, *mask.shape[1:])
         return jnp.where(mask.reshape(shape), x, y)
 
     return jax.tree.map(choose, new, old)

@@ -69,6 +69,14 @@ def test_what_explains_the_recording_as_well_is_preferred():
     assert looked_for(recorded, BREATHS.pressure, rival) is None
 
 
+def test_a_trifle_beside_larger_errors_is_no_finding_though_all_rivals_are_worse():
+    """A lag of 6 ms passes the test of likelihood beside 2 cmH2O, and hardly changes them."""
+    rng, response = np.random.default_rng(4), BREATHS.pressure
+    slow = np.stack([lagged(t, p, 0.006) for t, p in zip(BREATHS.time, response, strict=True)])
+    recorded = slow + 4.0 * ODD + rng.normal(0.0, 0.02, slow.shape)
+    assert looked_for(recorded, response, response + 9.0) is None
+
+
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_another_lung_is_no_sensor(factor):
     """The pressures of a lung with another compliance, of which a refit knows."""

@@ -206,6 +206,13 @@ def test_a_device_that_paused_between_breaths_has_no_triggers(tmp_path):
     assert "where flow turns inwards" in " ".join(imported.understood)
 
 
+def test_a_table_of_one_row_is_refused_without_a_warning(tmp_path):
+    path = tmp_path / "row.csv"
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match="no column is the pressure"):
+        import_recording(path, lung="R20C50")
+
+
 def test_names_behind_the_mark_of_a_comment_as_numpy_writes_them(tmp_path):
     made, path = waveforms(), tmp_path / "savetxt.txt"
     header = "time_s pressure_cmH2O flow_mL_s"

@@ -39,7 +39,9 @@ class SensorBehind:
     sensor: Sensor  #: the sensor.
     name: str  #: its mechanism.
     parameters: dict[str, Estimate]  #: by short name.
-    confidence: float  #: posterior probability among mechanisms of the sensor, and none.
+    #: posterior probability among mechanisms of the sensor, none, and what else explains the
+    #: recording, by testing breaths.
+    confidence: float
     alternatives: tuple[str, ...]  #: other mechanisms, the likeliest first.
     nats: float  #: log-likelihood that testing breaths gain.
     worth: float  #: root-mean-square error that it takes from testing breaths, cmH2O.
@@ -87,8 +89,8 @@ def find_sensor(
 ) -> SensorBehind | None:
     """The mechanism of a sensor that explains most, if testing breaths ask for it; else None.
 
-    It must also err less on them than what explains them otherwise: the recording's own model, or
-    the simulator with another lung.
+    It must also err less on them than the simulator as given, and than what explains them
+    otherwise: the recording's own model, or the simulator with another lung.
 
     Args:
         data: n recorded breaths of T samples.
@@ -114,18 +116,17 @@ def find_sensor(
         return None
     if not is_consistent(gains, settings.plausibility):
         return None
-    # Each against the best: by all breaths, and tempered as the posterior of a search is.
-    everything = np.ones(len(held), bool)
-    likeliest = log_likelihood(best.error, everything).sum()
-    behind = {
-        fit.name: likeliest - log_likelihood(fit.error, everything).sum()
-        for fit in fits
-        if fit is not best
-    }
-    odds = {name: 1.0 / preference(nats) - 1.0 for name, nats in behind.items()}
+    # Each against the best, tempered as the posterior of a search is.
+    likeliest = float(log_likelihood(best.error, held).sum())
+
+    def odds_of(error: Floats) -> float:
+        return 1.0 / preference(likeliest - float(log_likelihood(error, held).sum())) - 1.0
+
+    odds = {fit.name: odds_of(fit.error) for fit in fits if fit is not best}
     listed = sorted((n for n in odds if odds[n] > _LISTED), key=lambda n: -odds[n])
+    others = [given, *(rival - data.measured[:, 0] for rival in rivals)]
     error = float(np.sqrt(_square(best.error, weight, held)))
-    least = min(_square(rival - data.measured[:, 0], weight, held) for rival in rivals)
+    least = min(_square(other, weight, held) for other in others)
     if error >= settings.simulator.residual_model_share * np.sqrt(least):
         return None
     final = _fit(best.name, data, fitted, response)
@@ -134,7 +135,7 @@ def find_sensor(
         sensor(dict(zip(paths, final.values, strict=True))),
         best.name,
         _estimates(final, np.clip(final.error[fitted], -bound, bound)),
-        1.0 / (1.0 + sum(odds.values())),
+        1.0 / (1.0 + sum(odds.values()) + sum(map(odds_of, others))),
         tuple(listed),
         float(gains.sum()),
         float(np.sqrt(_square(given, weight, held))) - error,

@@ -437,7 +437,7 @@ def _check_needed(
         open_ = likely or [name for name, x in headers.items() if not (x.role or x.excluded)]
         if len(accepted) > 1 and (not open_ or layout.columns):
             continue
-        onwards = {n: (np.diff(table.columns[n]) >= 0).mean() > 0.9 for n in open_}
+        onwards = {n: np.mean(np.diff(table.columns[n], prepend=-np.inf) >= 0) > 0.9 for n in open_}
         open_.sort(key=lambda name: onwards[name] != is_time)
         columns = f"{table.file}: no column is {quantity}; the columns are {table.names}"
         role = next((headers[n].role for n in likely), None) or accepted[0]

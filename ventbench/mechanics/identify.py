@@ -92,29 +92,22 @@ def _symptom(breaths: Breaths) -> str:
     for saturation in find_saturation(breaths):
         if saturation.column == signal:
             return str(saturation)
-    into, out, together = [], [], []
-    for i in range(len(breaths)):
-        valid = breaths.valid[i] & np.isfinite(breaths.pressure[i])
-        if breaths.flow is not None:
-            valid = valid & np.isfinite(breaths.flow[i])
-            flow = np.where(valid, np.nan_to_num(breaths.flow[i]), 0.0)
-            steps = flow * breaths.dt[i]
-            volume = np.cumsum(steps)
-        else:
-            assert breaths.volume is not None
-            valid = valid & np.isfinite(breaths.volume[i])
-            volume = np.nan_to_num(breaths.volume[i])
-            steps = np.where(valid[1:] & valid[:-1], np.diff(volume), 0.0)
-        if valid.sum() < 3:
-            continue
-        into.append(float(steps[steps > 0].sum()))
-        out.append(float(-steps[steps < 0].sum()))
-        p, v = breaths.pressure[i, valid], volume[valid]
-        if np.ptp(p) > 0 and np.ptp(v) > 0:
-            together.append(float(np.corrcoef(p, v)[0, 1]))
-    if not into:
+    values = breaths.flow if breaths.flow is not None else breaths.volume
+    assert values is not None
+    known = breaths.valid & np.isfinite(breaths.pressure) & np.isfinite(values)
+    use = np.flatnonzero(known.sum(axis=1) >= 3)
+    if not len(use):
         return f"{signal} and pressure are hardly ever known together"
+    if breaths.flow is not None:
+        steps = np.where(known, values * breaths.dt, 0.0)
+        volume = np.cumsum(steps, axis=1)
+    else:
+        steps = np.where(known[:, 1:] & known[:, :-1], np.diff(values, axis=1), 0.0)
+        volume = values
+    into, out = (np.maximum(sign * steps[use], 0.0).sum(axis=1) for sign in (1.0, -1.0))
     inspired, expired = float(np.median(into)), float(np.median(out))
+    pairs = ((breaths.pressure[i, known[i]], volume[i, known[i]]) for i in use)
+    together = [np.corrcoef(p, v)[0, 1] for p, v in pairs if np.ptp(p) > 0 and np.ptp(v) > 0]
     if expired < _CLOSES[0] * inspired:
         return (
             f"of {inspired:.0f} mL that flow in, {expired:.0f} mL are seen to leave (median of the "
@@ -134,9 +127,6 @@ def _symptom(breaths: Breaths) -> str:
             return f"the peak flow is {peak:.3g} mL/s; its unit may be another one"
     return f"pressure and {signal} do not move together as those of one lung do"
 
-
-#: Units of R and C.
-_UNITS = ("cmH2O/(L/s)", "mL/cmH2O")
 
 #: Share of clipped pressures, and residual, cmH2O, above which a note warns the reader.
 _NOTED_CLIPPING, _NOTED_NOISE = 0.02, 1.0
@@ -273,10 +263,10 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     label = Lung(float(breaths.R[0]), float(breaths.C[0]))
     best = _best_for_label(full, plain, label)
     source = "pressure and flow" if breaths.flow is not None else "pressure and volume"
-    noise = float(full.fitted.sigma / np.sqrt(1.0 - full.fitted.autocorrelation**2))
+    noise = float(np.sqrt(full.fitted.variance))
     notes = (*unlikely, *_notes(breaths, at_lung, table, noise))
-    samples = sum(len(segment) for segment in at_lung)
-    problem = problem_with(breaths, best.resistance(0.0), best.compliance())
+    R, C = best.resistance(0.0), best.compliance()
+    problem = problem_with(breaths, R, C)
     terms = (
         *(() if leaks is None else (leaks,)),
         *_with_equivalent_lag(delayed_by, best),
@@ -288,36 +278,14 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
         "clipped": any(saturation.column == "flow" for saturation in find_saturation(breaths)),
     }
     faults = tuple(fault for fault in FAULTS if shows[fault])
-    if problem is not None:
-        R, C = (Estimate(math.nan, unit, (math.nan, math.nan)) for unit in _UNITS)
+    if problem is None:
+        match = match_label(label, best.resistance, C, source)
+    else:
+        R, C = (Estimate(math.nan, x.unit, (math.nan, math.nan)) for x in (R, C))
         match = LungMatch(name, R.value, C.value, R.ci95, C.ci95, False, source)
-        return Mechanics(
-            name,
-            R,
-            C,
-            full.offset(),
-            (),
-            match,
-            noise,
-            len(table),
-            samples,
-            (problem, *notes),
-            faults,
-        )
-    match = match_label(label, best.resistance, best.compliance(), source)
-    return Mechanics(
-        name,
-        best.resistance(0.0),
-        best.compliance(),
-        full.offset(),
-        terms,
-        match,
-        noise,
-        len(table),
-        samples,
-        notes,
-        faults,
-    )
+        terms, notes = (), (problem, *notes)
+    offset, count, samples = full.offset(), len(table), sum(map(len, at_lung))
+    return Mechanics(name, R, C, offset, terms, match, noise, count, samples, notes, faults)
 
 
 def _drop_isolated(breaths: Breaths) -> tuple[Breaths, list[str]]:

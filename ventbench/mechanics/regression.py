@@ -165,9 +165,9 @@ class RegressionFit:
     grid: int  #: index of the model of noise in :data:`GRID`.
 
     @property
-    def autocorrelation(self) -> float:
-        """Autocorrelation between neighbouring samples of the noise."""
-        return GRID[self.grid][0]
+    def variance(self) -> float:
+        """Variance of the noise, autocorrelation included, cmH2O2."""
+        return self.sigma**2 / (1.0 - GRID[self.grid][0] ** 2)
 
     @property
     def zero_precision(self) -> float:

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 from ventbench.base.arrays import Bools, Floats, Ints, runs
 from ventbench.base.errors import InputError
@@ -111,7 +112,7 @@ def _bridged(time: Floats, flow: Floats) -> tuple[Floats, Bools]:
     at = np.flatnonzero(finite)
     if finite.all() or len(at) < 2:
         return flow, bridged
-    volume = np.ptp(integrate(time[at], flow[at]))
+    volume = np.ptp(cumulative_trapezoid(flow[at], time[at], initial=0.0))
     for k in np.flatnonzero(np.diff(at) > 1):
         before, after = at[k], at[k + 1]
         gap, change = time[after] - time[before], abs(flow[after] - flow[before])
@@ -135,7 +136,9 @@ def _smoothed(
         return None
     half = max(1, round(WINDOW / float(np.median(np.diff(time)))))
     step = max(1, half // _PER_HALF_WINDOW)
-    filled: Any = integrate(time, flow) if volume is None and flow is not None else volume
+    filled: Any = volume
+    if volume is None and flow is not None:
+        filled = cumulative_trapezoid(flow, time, initial=0.0)
     flows = np.isfinite(filled)
     flows &= True if flow is None else np.isfinite(flow)
     fine = np.concatenate(
@@ -148,7 +151,8 @@ def _smoothed(
     value, change = window_weights(time, half, fine)
     filled = filled - filled[np.isfinite(filled)][0]
     at = np.isfinite(pressure)
-    dose = integrate(time, np.interp(time, time[at], pressure[at]))
+    known = np.interp(time, time[at], pressure[at])
+    dose = cumulative_trapezoid(known, time, initial=0.0)
     t, v, dose = (weighted_sum(windows(x, half)[fine - half], value) for x in (time, filled, dose))
     p = weighted_sum(windows(pressure, half)[fine[rows] - half], value[rows])
     if flow is None:
@@ -236,9 +240,3 @@ def windows(values: Floats, half: int) -> Floats:
 def weighted_sum(samples: Floats, weights: Floats) -> Floats:
     """Weighted sum of each window, ``(c,)``."""
     return np.einsum("cw,cw->c", samples, weights)
-
-
-def integrate(time: Floats, values: Floats) -> Floats:
-    """Integral from the first sample to each one, by the trapezoidal rule."""
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time)
-    return np.concatenate([[0.0], np.cumsum(steps)])

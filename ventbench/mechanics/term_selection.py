@@ -126,29 +126,54 @@ def _columns(selected: list[SelectedTerm]) -> tuple[int, ...]:
     return (*range(len(BASE)), *(term.column for term in selected))
 
 
+@dataclass(frozen=True)
+class _Model:
+    """Columns that are fitted together."""
+
+    table: CrossProducts  #: cross products of b breaths.
+    columns: tuple[int, ...]  #: indices of the columns.
+    positive: bool = False  #: whether the coefficient of the last one must be positive.
+
+    def fit(self, which: Bools) -> RegressionFit:
+        """Fit some breaths, bool ``(b,)``."""
+        return fit(self.table, which, self.columns)
+
+    def value(self, fitted: RegressionFit, which: Bools) -> float:
+        """Log-likelihood of some breaths, with the prior; -inf if it is not allowed."""
+        if self.positive and fitted.coefficients[-1] <= 0.0:
+            return -np.inf
+        return float(log_likelihood(self.table, fitted)[which].sum()) + fitted.log_prior
+
+
+def _values(models: Sequence[_Model], which: Bools) -> Floats:
+    """Largest log-likelihood of each model on some breaths, ``(n,)``."""
+    return np.array([model.value(model.fit(which), which) for model in models])
+
+
+def _held_out(models: Sequence[_Model], null: _Model) -> tuple[float, Floats]:
+    """Log-likelihood ratio of the best of some models on held-out breaths, and its gain in each."""
+    ratios, gains = [], []
+    for train in splits(len(null.table)):
+        best = models[int(np.argmax(_values(models, train)))] if len(models) > 1 else models[0]
+        richer, plain = best.fit(train), null.fit(~train)
+        values = log_likelihood(best.table, richer)
+        # Split likelihood ratio: since the null hypothesis is fitted to the held-out breaths
+        # themselves, a ratio above 1 / alpha has a probability below alpha, whatever the model.
+        ratio = float((values - log_likelihood(null.table, plain))[~train].sum()) - plain.log_prior
+        ratios.append(ratio if np.isfinite(best.value(richer, train)) else -np.inf)
+        gain = values - log_likelihood(null.table, null.fit(train))
+        gains.append(np.where(train, np.nan, gain))
+    return float(np.logaddexp.reduce(ratios) - np.log(len(ratios))), np.nanmean(gains, axis=0)
+
+
 def _trial(table: CrossProducts, timing: float, columns: tuple[int, ...], name: str) -> _Trial:
     """Try one more term: its best column on all breaths, and its gain on held-out breaths."""
     every = np.ones(len(table), bool)
-    column = _best_column(table, every, columns, name)
-    fitted = fit(table, every, (*columns, column))
-    ratios, gains = [], []
-    for train in splits(len(table)):
-        trained = _best_column(table, train, columns, name)
-        richer = fit(table, train, (*columns, trained))
-        # Split likelihood ratio: since the null hypothesis is fitted to the held-out breaths
-        # themselves, a ratio above 1 / alpha has a probability below alpha, whatever the model.
-        null = fit(table, ~train, columns)
-        ratio = log_likelihood(table, richer) - log_likelihood(table, null)
-        ratio_of_all = float(ratio[~train].sum()) - null.log_prior
-        ratios.append(ratio_of_all if _allowed(name, richer) else -np.inf)
-        gains_of_breaths = log_likelihood(table, richer) - log_likelihood(
-            table, fit(table, train, columns)
-        )
-        gains.append(np.where(train, np.nan, gains_of_breaths))
-    nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
-    by_breath = np.nanmean(gains, axis=0)
+    models = [_Model(table, (*columns, c), name in POSITIVE) for c in columns_of(name)]
+    best = models[int(np.argmax(_values(models, every)))]
+    fitted, column = best.fit(every), best.columns[-1]
+    nats, by_breath = _held_out(models, _Model(table, columns))
     size = effect_size(table, fitted, column)
-    gain = float(by_breath.sum())
     swing = float(np.sqrt(table.products[:, 0, -1, -1].sum() / table.freedom.sum()))
     nonlinear = 0.0 if name in _DYNAMIC else _LINEARITY * swing
     strengths = dict(zip(fitted.columns, fitted.coefficients, strict=True))
@@ -158,11 +183,11 @@ def _trial(table: CrossProducts, timing: float, columns: tuple[int, ...], name: 
         nats > LEAST_NATS
         and float(np.mean(by_breath > 0)) >= _LEAST_AGREEMENT
         and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * fitted.sigma, nonlinear)
-        and _allowed(name, fitted)
+        and np.isfinite(best.value(fitted, every))
         and abs(fitted.coefficients[-1]) >= least
         and _plausible(table, fitted)
     )
-    return _Trial(name, column, nats, gain, passes)
+    return _Trial(name, column, nats, float(by_breath.sum()), passes)
 
 
 def _plausible(table: CrossProducts, fitted: RegressionFit) -> bool:
@@ -170,25 +195,6 @@ def _plausible(table: CrossProducts, fitted: RegressionFit) -> bool:
     sd = np.sqrt(np.diag(covariance(table, fitted))[:2])
     resistance, elastance = fitted.coefficients[:2]
     return resistance > -2.0 * sd[0] and elastance > 0.0 and sd[1] < _MOST_UNCERTAINTY * elastance
-
-
-def _best_column(table: CrossProducts, which: Bools, columns: tuple[int, ...], name: str) -> int:
-    """The column of a term with the highest likelihood on some breaths."""
-    options = columns_of(name)
-    if len(options) == 1:
-        return options[0]
-
-    def value(column: int) -> float:
-        fitted = fit(table, which, (*columns, column))
-        if not _allowed(name, fitted):
-            return -np.inf
-        return float(log_likelihood(table, fitted)[which].sum()) + fitted.log_prior
-
-    return max(options, key=value)
-
-
-def _allowed(name: str, fitted: RegressionFit) -> bool:
-    return name not in POSITIVE or fitted.coefficients[-1] > 0.0
 
 
 def splits(count: int) -> list[Bools]:
@@ -230,31 +236,32 @@ def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None
     if len({segment.breath for segment in segments}) < FEWEST_BREATHS:
         return tuple(segments), None
 
-    def tables_of(family: _DelayFamily, change: _Change) -> list[CrossProducts]:
-        tables = []
-        for strength in family.grid:
-            changed = [change(k, strength) for k in range(len(segments))]
-            tables.append(cross_products(changed, _COLUMNS))
-        return tables
+    def models_of(family: _DelayFamily, change: _Change) -> list[_Model]:
+        return [
+            _Model(
+                cross_products([change(k, x) for k in range(len(segments))], _COLUMNS),
+                tuple(range(len(_COLUMNS))),
+            )
+            for x in family.grid
+        ]
 
-    sensor = tables_of(_SENSOR, lambda k, lag: replace(segments[k], lag=lag))
-    every = np.ones(len(sensor[0]), bool)
-    best = max(range(len(sensor)), key=lambda k: _value(sensor[k], every))
-    smooth = predicted(segments, sensor[best], _SENSOR.grid[best])
-    circuit = tables_of(_CIRCUIT, lambda k, c: behind_circuit(segments[k], smooth[k], c))
+    sensor = models_of(_SENSOR, lambda k, lag: replace(segments[k], lag=lag))
+    every = np.ones(len(sensor[0].table), bool)
+    of_sensor = _values(sensor, every)
+    best = int(np.argmax(of_sensor))
+    smooth = predicted(segments, sensor[best].fit(every), _SENSOR.grid[best])
+    circuit = models_of(_CIRCUIT, lambda k, c: behind_circuit(segments[k], smooth[k], c))
+    of_circuit = _values(circuit, every)
     candidates = {
         family.name: estimate
-        for family, tables in ((_CIRCUIT, circuit), (_SENSOR, sensor))
-        if (estimate := _delay(family, tables)) is not None
+        for family, models in ((_CIRCUIT, circuit), (_SENSOR, sensor))
+        if (estimate := _delay(family, models)) is not None
     }
     if not candidates:
-        small = _peak(_SENSOR, sensor, every)
+        small = _peak(_SENSOR, of_sensor)
         return tuple(replace(segment, lag=small) for segment in segments), None
-    gains = {
-        _CIRCUIT.name: max(_value(table, every) for table in circuit),
-        _SENSOR.name: max(_value(table, every) for table in sensor),
-    }
-    none, most = _value(circuit[0], every), max(gains[name] for name in candidates)
+    gains = {_CIRCUIT.name: of_circuit.max(), _SENSOR.name: of_sensor.max()}
+    none, most = of_circuit[0], max(gains[name] for name in candidates)
     least = most - max(LEAST_NATS, _ALTERNATIVE_SHARE * (most - none))
     chosen = next(estimate for name, estimate in candidates.items() if gains[name] >= least)
     alternatives = tuple(name for name in gains if name != chosen.name and gains[name] >= least)
@@ -268,13 +275,12 @@ def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None
 
 
 def predicted(
-    segments: Sequence[Segment], table: CrossProducts, lag: float
+    segments: Sequence[Segment], fitted: RegressionFit, lag: float
 ) -> list[tuple[Floats, Floats]]:
     """Pressures of the lung that fits best if its sensor lags, and their derivatives, ``(m,)``.
 
-    ``table`` has the cross products of the segments with that lag, s.
+    ``fitted`` is the fit of :data:`_COLUMNS` with that lag, s.
     """
-    fitted = fit(table, np.ones(len(table), bool), range(len(_COLUMNS)))
     columns = [COLUMNS[c] for c in _COLUMNS]
     result = []
     for segment in segments:
@@ -364,47 +370,27 @@ _SENSOR = _DelayFamily(
 )
 
 
-def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> Term | None:
+def _delay(family: _DelayFamily, models: Sequence[_Model]) -> Term | None:
     """The strength of a delay; None if held-out breaths do not need it."""
-    null, count = tables[0], len(tables[0])
-    columns = range(null.products.shape[-1] - 1)
-    ratios = []
-    for train in splits(count):
-        best = max(tables, key=lambda table: _value(table, train))
-        ratio = log_likelihood(best, fit(best, train, columns))
-        null_fit = fit(null, ~train, columns)
-        ratio = ratio - log_likelihood(null, null_fit)
-        ratios.append(float(ratio[~train].sum()) - null_fit.log_prior)
-    nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
+    count = len(models[0].table)
     every = np.ones(count, bool)
-    value = _peak(family, tables, every)
+    nats = _held_out(models, models[0])[0]
+    value = _peak(family, _values(models, every))
     if nats <= LEAST_NATS or value < family.least:
         return None
-    jackknife = [_peak(family, tables, np.arange(count) != i) for i in range(count)]
+    jackknife = [_peak(family, _values(models, np.arange(count) != i)) for i in range(count)]
     sd = float(np.sqrt((count - 1) * np.var(jackknife)))
     reach = t_quantile(max(count - 1, 4)) * max(sd, family.deviation)
     ends = (max(value - reach, 0.0), value + reach)
-    nearest = tables[round(value / family.grid[1])]
-    variances = [_residual_variance(table, every) for table in (null, nearest)]
-    effect = float(np.sqrt(max(variances[0] - variances[1], 0.0)))
+    nearest = models[round(value / family.grid[1])]
+    explained = models[0].fit(every).variance - nearest.fit(every).variance
+    effect = float(np.sqrt(max(explained, 0.0)))
     strength = {family.parameter: Estimate(value, family.unit, ends)}
     return Term(family.name, strength, nats, effect, ())
 
 
-def _value(table: CrossProducts, which: Bools) -> float:
-    fitted = fit(table, which, range(table.products.shape[-1] - 1))
-    return float(log_likelihood(table, fitted)[which].sum()) + fitted.log_prior
-
-
-def _residual_variance(table: CrossProducts, which: Bools) -> float:
-    """Variance of the residual, autocorrelation included, cmH2O2."""
-    fitted = fit(table, which, range(table.products.shape[-1] - 1))
-    return fitted.sigma**2 / (1.0 - fitted.autocorrelation**2)
-
-
-def _peak(family: _DelayFamily, tables: Sequence[CrossProducts], which: Bools) -> float:
-    """Strength of the largest likelihood, by a parabola through the best of the grid."""
-    values = np.array([_value(table, which) for table in tables])
+def _peak(family: _DelayFamily, values: Floats) -> float:
+    """Strength of the largest of values on its grid, by a parabola through the best."""
     k = int(np.argmax(values))
     if k in (0, len(values) - 1):
         return family.grid[k]

@@ -99,7 +99,8 @@ def _matlab(file: str) -> Table:
     with readable(file, "a MATLAB file"):
         sizes.check_matlab(file)
         content = loadmat(file, simplify_cells=True)
-    return _variables(file, content, "MATLAB file")
+    variables = {name: x for name, x in content.items() if not name.startswith("__")}
+    return _of_document(file, variables, "MATLAB file")
 
 
 def _numpy(file: str) -> Table:
@@ -107,82 +108,96 @@ def _numpy(file: str) -> Table:
     with readable(file, "NumPy", "; save arrays of numbers by np.save or np.savez"):
         sizes.check_numpy(file)
         loaded = np.load(file, allow_pickle=False)
-        arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
-
-    def content(array: NDArray[Any]) -> Any:
-        if array.dtype.names:
-            return {name: content(array[name]) for name in array.dtype.names}
-        return (
-            array.astype("datetime64[ns]").astype(float) * 1e-9
-            if array.dtype.kind == "M"
-            else array
-        )
-
-    variables = {name: content(array) for name, array in arrays.items()}
-    return _variables(file, variables, "NumPy file")
+        arrays = loaded if isinstance(loaded, np.ndarray) else dict(loaded)
+    return _of_document(file, arrays, "NumPy file")
 
 
-def _variables(file: str, content: dict[str, Any], kind: str) -> Table:
-    """The columns among the variables of a file."""
-    flat: dict[str, NDArray[Any]] = {}
-    scalars: dict[str, float] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):
-            _flatten(name, value, flat, scalars)
-    if not flat:
+def _json(file: str) -> Table | None:
+    """Rows of a JSON document, or of a line each; None if the text is no JSON."""
+    text = decoded(file)[0]
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError:
+        try:
+            content = [json.loads(line) for line in text.splitlines() if line.strip()]
+        except json.JSONDecodeError:
+            return None
+    return _of_document(file, content, "JSON")
+
+
+def _of_document(file: str, content: Any, kind: str) -> Table:
+    """The table in records, lists and arrays: their longest columns."""
+    columns, beside = dict[str, NDArray[Any]](), dict[str, Any]()
+    for path, value in _leaves(content).items():
+        array = np.squeeze(value if isinstance(value, np.ndarray) else np.array(value, object))
+        if array.ndim == 0:
+            beside[path.rpartition(".")[2]] = array.item()
+        elif array.ndim == 1:
+            columns[path] = array
+        elif array.ndim == 2:
+            rows = array if array.shape[0] >= array.shape[1] else array.T
+            columns |= {f"{path}.{k}".lstrip("."): x for k, x in enumerate(rows.T, 1)}
+    counts = Counter(map(len, columns.values()))
+    longest = max(counts, default=0)
+    length = longest if counts[longest] > 1 else max(counts, key=lambda n: counts[n], default=0)
+    used = {path: x for path, x in columns.items() if len(x) == length > 1}
+    if len(used) < 2:
         raise InputError(
-            f"{file} holds no column of numbers (variables: "
-            f"{', '.join(n for n in content if not n.startswith('__')) or 'none'}); a MATLAB table "
-            "object must be saved as a struct or as columns"
+            f"{file} is {kind} without a table (it has {few([*columns, *beside], 5) or 'nothing'})"
+            ": a list of records, columns of equal length by name, or rows beside a list of their "
+            "names are wanted; a MATLAB table object must be saved as a struct or as columns"
         )
-    counts = Counter(map(len, flat.values()))
-    longest = max(counts)
-    length = longest if counts[longest] > 1 else counts.most_common(1)[0][0]
-    columns = {name: v for name, v in flat.items() if len(v) == length}
-    # Short names, where they are unique: `data.Paw` is `Paw`.
-    last = Counter(name.rpartition(".")[2] for name in columns)
-    columns = {
-        name.rpartition(".")[2] if last[name.rpartition(".")[2]] == 1 else name: v
-        for name, v in columns.items()
-    }
-    mismatched = [name for name, v in flat.items() if len(v) != length]
-    notes = [f"{kind} with {len(columns)} columns of {length} rows."]
-    if mismatched:
-        notes.append(f"Columns of other lengths were left out ({few(mismatched, 5)}).")
-    return Table(file, columns, rate=_stated_rate(scalars), notes=tuple(notes))
+    omitted = [path for path in columns if path not in used]
+    while len({path.partition(".")[:2] for path in used}) == 1 and "." in next(iter(used)):
+        used = {path.partition(".")[2]: x for path, x in used.items()}  # all of `data.Paw`
+    table = _of_values(file, used, kind)
+    if omitted:
+        table = table.noted(f"Columns of other lengths were left out ({few(omitted, 5)}).")
+    stated = ((n, str(beside.get(key))) for n in table.columns for key in (n, f"{n}_unit"))
+    units = {name: unit for name, unit in stated if is_unit(unit)}
+    return replace(table, rate=_stated_rate(beside), units=table.units | units)
+
+
+def _leaves(value: Any, path: str = "") -> dict[str, Any]:
+    """Columns and single values of a document by their paths, whose parts are joined by points."""
+    if isinstance(value, np.ndarray) and value.dtype.names:
+        value = {name: value[name] for name in value.dtype.names}
+    if isinstance(value, list) and value and all(isinstance(x, dict) for x in value):
+        from pandas import json_normalize
+
+        frame = json_normalize(value)
+        return {f"{path}.{key}".lstrip("."): frame[key].to_numpy() for key in frame}
+    if not isinstance(value, dict):
+        return {path: value}
+    leaves: dict[str, Any] = {}
+    for name, inner in _by_name(value).items():
+        leaves |= _leaves(inner, f"{path}.{name}".lstrip("."))
+    return leaves
+
+
+def _by_name(content: dict[str, Any]) -> dict[str, Any]:
+    """A record with lists by name where it holds rows beside their names, or columns by row."""
+    inner = [tuple(x) if isinstance(x, dict) else () for x in content.values()]
+    if len(inner) > 1 and len(inner[0]) > 1 and len(set(inner)) == 1:  # as pandas writes them
+        if len(inner[0]) < len(content):
+            return {"": list(content.values())}
+        return {name: list(x.values()) for name, x in content.items()}
+    lists = {name: x for name, x in content.items() if isinstance(x, list) and x}
+    for name, rows in lists.items():
+        widths = {len(row) if isinstance(row, list) else 0 for row in rows}
+        titles = (n for n, x in lists.items() if {len(x)} == widths and isinstance(x[0], str))
+        if (title := next(titles, None)) is not None:
+            values = map(list, zip(*rows, strict=True))
+            rest = {n: x for n, x in content.items() if n not in (name, title)}
+            return rest | {name: dict(zip(map(str, lists[title]), values, strict=True))}
+    return content
 
 
 def _stated_rate(beside: Mapping[str, Any]) -> float | None:
-    """Sampling rate, Hz, among the numbers that stand beside columns."""
-    named = {re.sub(r"[^a-z]|hz$", "", n.rpartition(".")[2].lower()): v for n, v in beside.items()}
-    rates = (named[name] for name in RATES if isinstance(named.get(name), int | float))
+    """Sampling rate, Hz, among the values that stand beside columns."""
+    plain = {re.sub(r"[^a-z]|hz$", "", name.lower()): value for name, value in beside.items()}
+    rates = (plain[name] for name in RATES if isinstance(plain.get(name), int | float))
     return next((float(rate) for rate in rates if rate > 0.0), None)
-
-
-def _flatten(
-    name: str, value: Any, flat: dict[str, NDArray[Any]], scalars: dict[str, float]
-) -> None:
-    """Collect the columns and single numbers of a MATLAB variable."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            _flatten(f"{name}.{key}".lstrip("."), inner, flat, scalars)
-        return
-    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
-        for key in value[0]:  # an array of records
-            _flatten(f"{name}.{key}", [row.get(key) for row in value], flat, scalars)
-        return
-    try:
-        array = np.squeeze(np.asarray(value, float))
-    except (TypeError, ValueError):
-        return
-    if array.ndim == 0:
-        scalars[name] = float(array)
-    elif array.ndim == 1 and len(array) > 1:
-        flat[name] = array
-    elif array.ndim == 2:
-        rows = array if array.shape[0] >= array.shape[1] else array.T
-        for k in range(rows.shape[1]):
-            flat[f"{name}.{k + 1}".lstrip(".")] = rows[:, k]
 
 
 def _channels(
@@ -251,69 +266,6 @@ def _wfdb(file: str) -> Table:
     )
 
 
-def _json(file: str) -> Table | None:
-    """Rows of a JSON document, or of a line each; None if the text is no JSON."""
-    text = decoded(file)[0]
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError:
-        try:
-            content = [json.loads(line) for line in text.splitlines() if line.strip()]
-        except json.JSONDecodeError:
-            return None
-    if (columns := _rows_within(content)) is None:
-        raise InputError(
-            f"{file} is JSON without a table: a list of records, lists of equal length by name, or "
-            "rows beside a list of their names are wanted"
-        )
-    table, beside = _of_values(file, columns, "JSON"), dict[str, Any]()
-    for name, value in _flat(content).items() if isinstance(content, dict) else ():
-        if not isinstance(value, list):
-            beside[name.rpartition(".")[2]] = value
-    stated = ((n, str(beside.get(key))) for n in table.columns for key in (n, f"{n}_unit"))
-    units = {name: unit for name, unit in stated if is_unit(unit)}
-    return replace(table, rate=_stated_rate(beside), units=table.units | units)
-
-
-def _rows_within(content: Any) -> dict[str, Sequence[Any]] | None:
-    """The longest table in a document: records, named lists, or rows beside their names."""
-    tables: list[dict[str, Sequence[Any]]] = []
-    if isinstance(content, dict) and len(content) > 1:
-        inner = [tuple(x) if isinstance(x, dict) else () for x in content.values()]
-        if len(inner[0]) > 1 and len(set(inner)) == 1:  # as pandas writes them, by name or by row
-            if len(inner[0]) < len(content):
-                return _rows_within(list(content.values()))
-            content = {name: list(x.values()) for name, x in content.items()}
-    if isinstance(content, list) and len(content) > 1 and all(isinstance(x, dict) for x in content):
-        records = [_flat(record) for record in content]
-        names = dict.fromkeys(name for record in records[:1000] for name in record)
-        tables.append({name: [record.get(name) for record in records] for name in names})
-    elif isinstance(content, dict):
-        lists = {name: x for name, x in content.items() if isinstance(x, list) and len(x) > 1}
-        plain = {k: x for k, x in lists.items() if not isinstance(x[0], dict | list)}
-        for rows in (x for x in lists.values() if isinstance(x[0], list)):
-            names = next((x for x in plain.values() if len(x) == len(rows[0])), None)
-            if names is not None and all(len(row) == len(names) for row in rows):
-                columns = zip(*rows, strict=True)
-                tables.append(dict(zip(map(str, names), columns, strict=True)))
-        longest = max(map(len, plain.values()), default=0)
-        tables.append({name: x for name, x in plain.items() if len(x) == longest})
-        tables += filter(None, map(_rows_within, content.values()))
-    return max(
-        (x for x in tables if len(x) > 1), key=lambda x: len(next(iter(x.values()))), default=None
-    )
-
-
-def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A record without records in it: their names are joined by points."""
-    flat: dict[str, Any] = {}
-    for name, value in record.items():
-        flat |= (
-            _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-        )
-    return flat
-
-
 def _of_values(file: str, columns: Mapping[str, Any], kind: str) -> Table:
     """Columns of any values: numbers where they are, words elsewhere."""
     from pandas import Series
@@ -348,7 +300,7 @@ def _mcap(file: str) -> Table:
         for _, channel, message in make_reader(stream).iter_messages():
             if channel.message_encoding != "json":
                 return _rosbag(file)
-            record = {"time": 1e-9 * message.log_time} | _flat(json.loads(message.data))
+            record = {"time": 1e-9 * message.log_time} | json.loads(message.data)
             topics.setdefault(channel.topic, []).append(record)
     return _of_topics(file, topics, "MCAP")
 
@@ -369,39 +321,36 @@ def _rosbag(file: str) -> Table:
     ):
         for connection, at, data in bag.messages():
             message = bag.deserialize(data, connection.msgtype)
-            record = {"time": 1e-9 * at} | _flat(_fields(message))
-            topics.setdefault(connection.topic, []).append(record)
+            topics.setdefault(connection.topic, []).append({"time": 1e-9 * at} | _fields(message))
     return _of_topics(file, topics, "ROS bag")
 
 
 def _fields(message: Any) -> dict[str, Any]:
     """Numbers and words of a message, and of those within it but their headers."""
-    values: dict[str, Any] = {}
-    for name, value in vars(message).items():
-        if hasattr(value, "__dict__") and not isinstance(value, np.ndarray):
-            values |= {} if name == "header" else {name: _fields(value)}
-        elif isinstance(value, bool | int | float | str) and not name.startswith("__"):
-            values[name] = value
-    return values
+    return {
+        name: _fields(value) if hasattr(value, "__dict__") else value
+        for name, value in vars(message).items()
+        if name not in ("header", "__msgtype__") and not isinstance(value, np.ndarray | list)
+    }
 
 
 def _of_topics(file: str, topics: dict[str, list[dict[str, Any]]], kind: str) -> Table:
     """The topics of the most messages as one table: a row a time, the last value of each."""
-    from pandas import DataFrame, concat
+    from pandas import concat, json_normalize
 
     if not topics:
         raise InputError(f"{file} holds no messages")
     most = max(map(len, topics.values()))
-    used = {topic: rows for topic, rows in topics.items() if 2 * len(rows) >= most}
-    names = {key for rows in used.values() for key in rows[0]} - {"time"}
-    unique = len(used) == 1 or sum(len(rows[0]) - 1 for rows in used.values()) == len(names)
-    frames = []
-    for topic, messages in used.items():
-        prefix = "" if unique else f"{topic}/"
-        frames.append(DataFrame(messages).set_index("time").add_prefix(prefix).reset_index())
-    merged = concat(frames).groupby("time").last().reset_index()
+    frames = {
+        topic: json_normalize(messages).set_index("time")
+        for topic, messages in topics.items()
+        if 2 * len(messages) >= most
+    }
+    names = Counter(name for frame in frames.values() for name in frame)
+    if max(names.values()) > 1:
+        frames = {topic: frame.add_prefix(f"{topic}/") for topic, frame in frames.items()}
+    merged = concat(frames.values()).groupby(level="time").last().reset_index()
     table = _of_values(file, {str(key): x for key, x in merged.items()}, kind)
-    if not (omitted := [topic for topic in topics if topic not in used]):
+    if not (omitted := [topic for topic in topics if topic not in frames]):
         return table
-    note = f"Topics of fewer messages were left out ({', '.join(omitted)})."
-    return table.noted(note)
+    return table.noted(f"Topics of fewer messages were left out ({', '.join(omitted)}).")

@@ -22,7 +22,7 @@ from ventbench.recordings.foreign import Imported, import_recording
 from ventbench.recordings.foreign.formats import read_table
 from ventbench.recordings.foreign.layouts import LAYOUTS
 from ventbench.recordings.foreign.tables import _TEXTS as TEXTS
-from ventbench.recordings.read import read_simulated, simulated_pressures
+from ventbench.recordings.read import simulated_pressures
 from ventbench.recordings.sources import _REFUSED as REFUSED
 
 FORMS = Path(__file__).parent / "forms"
@@ -106,7 +106,7 @@ def test_a_submission_is_sent_to_its_recording() -> None:
     with pytest.raises(InputError, match=r"diagnose the recording with --plant .*submission"):
         import_recording(FORMS / "submission.csv.gz", lung="R20C50")
     recorded = load(FORMS / "kaggle.csv.gz")
-    table = read_simulated(FORMS / "submission.csv.gz")
+    table = read_table(FORMS / "submission.csv.gz").columns
     answers = simulated_pressures(table, "submission.csv.gz", recorded)
     np.testing.assert_array_equal(answers[recorded.valid], recorded.pressure[recorded.valid])
 

@@ -54,7 +54,8 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.clocks import sampling_intervals
-from ventbench.recordings.read import COLUMNS, read_simulated, simulated_pressures
+from ventbench.recordings.foreign.formats import read_table
+from ventbench.recordings.read import COLUMNS, simulated_pressures
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNGS, Lung, lung
 
@@ -180,7 +181,7 @@ def _by_text(text: str) -> Simulators:
     if path.is_file():
         name = path.name.lower()
         if name.endswith((".csv", ".csv.gz", ".parquet")):
-            return _of_table(read_simulated(path), path.name, str(path), files.sha256(path))
+            return _of_table(read_table(path).columns, path.name, str(path), files.sha256(path))
         if name.endswith(".fmu"):
             raise InputError(
                 f"{path} is an FMU, whose machine code nothing here runs; give --plant module:name "

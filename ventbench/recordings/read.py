@@ -59,21 +59,19 @@ def simulated_pressures(
     """
     import pandas as pd
 
-    names = [column for column in COLUMNS if column in table]
-    if "breath_id" not in table and "id" in table and names:  # as the competition's submissions
+    column = next((name for name in COLUMNS if name in table), None)
+    if "breath_id" not in table and "id" in table:  # as the competition's submissions
         table = _by_rows(table, name, breaths)
-    if "breath_id" not in table or not names:
+    if "breath_id" not in table or column is None:
         raise InputError(
             f"{name}: columns breath_id and {COLUMNS[0]} are needed; it has {', '.join(table)}"
         )
-    column = names[0]
     if column == COLUMNS[-1] and sha256 is not None and sha256 == breaths.sha256:
         raise InputError(f"{name} is the recording itself; it has no column {COLUMNS[0]}")
-    values = _numbers(table[column], name, column)
-    times = next((_numbers(table[key], name, key) for key in _TIMES if key in table), None)
-    columns = {key: _numbers(table[key], name, key) for key in ("R", "C", "u_in") if key in table}
-    ids = _numbers(table["breath_id"], name, "breath_id")
-    rows_of = pd.Series(ids).groupby(ids).indices
+    used = [key for key in ("breath_id", column, *_TIMES, "R", "C", "u_in") if key in table]
+    columns = {key: _numbers(table[key], name, key) for key in used}
+    values, times = columns[column], next((columns[k] for k in _TIMES if k in columns), None)
+    rows_of = pd.Series(columns["breath_id"]).groupby(columns["breath_id"]).indices
     answers = np.full(breaths.pressure.shape, np.nan)
     for i, number in enumerate(breaths.breath_id.tolist()):
         sampled = breaths.time[i, breaths.valid[i]]
@@ -85,7 +83,7 @@ def simulated_pressures(
             raise InputError(
                 f"{name}: breath {number} has a blank or infinite {column}; simulate every sample"
             )
-        for key in set(columns) - {"u_in"}:
+        for key in {"R", "C"} & columns.keys():
             if columns[key][rows[0]] != getattr(breaths, key)[i]:
                 raise InputError(
                     f"{name}: breath {number} is of {key} {columns[key][rows[0]]:g}, in the "
@@ -140,25 +138,6 @@ def _at_times(
             "simulate the whole breath"
         )
     return np.interp(times, at, values)
-
-
-def read_simulated(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a table of simulated pressures by name, of CSV, gzipped CSV or Parquet.
-
-    Raises:
-        InputError: if it cannot be read.
-    """
-    import pyarrow as pa
-    from pyarrow import csv, parquet
-
-    try:
-        if path.suffix in (".parquet", ".pq"):
-            table = parquet.read_table(path)
-        else:
-            table = csv.read_csv(path)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: it cannot be read: {str(error).splitlines()[0]}") from None
-    return {name: table.column(name).to_numpy() for name in dict.fromkeys(table.column_names)}
 
 
 def _numbers(values: np.ndarray, file: str, name: str) -> Floats:

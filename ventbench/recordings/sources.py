@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import gzip
 import os
-import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -164,12 +163,6 @@ def _header(file: str, kind: Kind) -> tuple[str, ...]:
     return tuple(next(csv.reader([text])))
 
 
-#: A number that is sound, as the parser takes it; whole ones fit 64 bits.
-_DECIMAL = r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-_NUMBER = re.compile(rf"[ \t]*[+-]?(?:{_DECIMAL}|(?i:nan|inf|infinity))[ \t]*")
-_WHOLE = re.compile(r"[ \t]*(-?[0-9]{1,19})[ \t]*")
-
-
 def data_lines(file: str, kind: Kind) -> Iterator[tuple[int, bytes]]:
     """Yield each data row's line number (the header is line 1) and its bytes; skip blank lines."""
     with open_bytes(file, kind) as stream:
@@ -217,12 +210,12 @@ def _in_line(file: str, number: int, text: bytes, names: Sequence[str]) -> list[
 
 
 def _is_sound(cell: str, integer: bool) -> bool:
-    if cell in BLANKS:
-        return True
-    if not integer:
-        return _NUMBER.fullmatch(cell) is not None
-    match = _WHOLE.fullmatch(cell)
-    return match is not None and -(1 << 63) <= int(match[1]) < 1 << 63
+    """Whether the parser takes a cell, as far as Python's numbers are its own."""
+    try:
+        number = int(cell) if integer else float(cell)
+    except ValueError:
+        return cell in BLANKS
+    return "_" not in cell and (not integer or abs(number) < 1 << 63)
 
 
 def _cells(text: bytes) -> list[str] | None:

@@ -180,19 +180,21 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     data, encoding = decoded(file)
     if not data:
         raise InputError(f"{file} holds no text")
-    above = _beginning(data)
-    for form in _TEXTS["between"].values():
-        marks = (re.match(rf"\s*({form['begin']}|{form['end']})\b", line) for line in above)
-        if form["begin"] in (next(filter(None, marks), None) or " ")[0]:
-            return _delimited_breaths(file, data.decode().split("\n"), encoding, form)
-    data, kind = _plain_lines(data, above)
+    form, kind = _form(file, _beginning(data)), ""
+    if "begin" in form:
+        data, kind = _between(data, form)
+    elif not form:
+        data, kind = _plain_lines(data, _beginning(data))
     above = _beginning(data)
     stated = re.fullmatch(r"\"?sep=(.)\"?", above[0])
     if stated is not None:  # a spreadsheet's own line
         separator, above[0] = separator or stated[1], ""
-    form, begins = _below(file, above)
-    stated_units = [x.split("\t") for x in above[:begins] if x.startswith(form.get("units", "\t"))]
-    above[:begins] = [""] * begins
+    stated_units = []
+    if "line" in form:
+        begins = len(above) - [line.strip() for line in above[::-1]].index(form["line"])
+        mark = form.get("units", "\t")
+        stated_units = [x.split("\t") for x in above[:begins] if x.startswith(mark)]
+        above[:begins] = [""] * begins
     above = _titled(above)
     separator, decimal = _dialect(file, [x for x in above if x.strip()], separator, decimal)
     note = f"Text ({encoding}), {kind}cells "
@@ -204,7 +206,9 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     table = _table(file, data, above[:_LOOKED_AT], separator, decimal, note)
     for units in stated_units:
         table = replace(table, units=dict(zip(list(table.columns)[1:], units[1:], strict=False)))
-    return _by_units(table) if form.get("by_units") else table
+    if "rate" in form:
+        table = replace(table, rate=form["rate"])
+    return _by_units(table) if "by_units" in form else table
 
 
 def decoded(file: str) -> tuple[bytes, str]:
@@ -510,19 +514,15 @@ def _mostly_numbers(cells: list[str]) -> bool:
 def _rate(above: list[list[str]], mark: str) -> float | None:
     """Sampling rate, Hz, that a line above the table states."""
     for cells in above:
-        text = " ".join(cells).replace(mark, ".")
-        if (each := re.search(r"([\d.]+)\s*(m?)s(?:ec)?/sample", text)) is not None:
-            return (1000.0 if each[2] else 1.0) / float(each[1])
-        line = re.split(r"[\s,;:=|]+", " ".join(cells).replace(mark, ".").strip(" #%\"'"))
-        for k in range(1, len(line)):
-            name = re.sub(r"[^a-z]|hz", "", "".join(line[:k]).lower())
-            if not re.fullmatch(r"\d+\.?\d*", line[k]) or float(line[k]) <= 0:
-                continue
-            unit = "".join(line[k + 1 : k + 2]).lower()
-            if name in RATES:
-                return float(line[k]) * (1000.0 if unit == "khz" else 1.0)
-            if name in INTERVALS and unit in ("s", "ms"):
-                return (1.0 if unit == "s" else 1000.0) / float(line[k])
+        text = " ".join(cells).replace(mark, ".").lower()
+        for number in re.finditer(r"(?<![^\s,;:=|])(\d+\.?\d*)[\s,;:=|]*([a-z/]*)", text):
+            value, unit = float(number[1]), number[2]
+            name = re.sub(r"[^a-z]|hz", "", text[: number.start()])
+            if name in RATES and value > 0.0:
+                return value * (1000.0 if unit == "khz" else 1.0)
+            of_sample = unit in ("s/sample", "sec/sample", "ms/sample", "msec/sample")
+            if (of_sample or (name in INTERVALS and unit in ("s", "ms"))) and value > 0.0:
+                return (1000.0 if unit.startswith("m") else 1.0) / value
     return None
 
 
@@ -644,46 +644,12 @@ def clock_seconds(cells: Any) -> Floats | None:
     return np.round(out, 9)
 
 
-def _delimited_breaths(file: str, lines: list[str], encoding: str, form: dict[str, Any]) -> Table:
-    """Breaths between lines that begin and end them, a sample a line."""
-    rows: list[tuple[float, ...]] = []
-    begin, end, units = form["begin"], form["end"], form["units"]
-    breath, first_row, cut = 0, 0, 0
-    inside = False
-    for number, line in enumerate([*lines, begin], 1):
-        if re.match(rf"\s*{begin}\b", line):
-            if inside:  # the breath before has no end
-                cut += 1
-                del rows[first_row:]
-            breath, first_row, inside = breath + 1, len(rows), True
-        elif re.match(rf"\s*{end}\b", line):
-            inside = False
-        elif inside:
-            try:
-                cells = map(float, line.strip(" ,").split(",")[: len(units)])
-                rows.append((number, breath, *cells))
-            except ValueError:
-                raise InputError(
-                    f"{file}, line {number}: {' and '.join(units)} are wanted between {begin} and "
-                    f"{end}, not {line.strip()[:40]!r}"
-                ) from None
-    if not rows:
-        raise InputError(f"{file}: no breath stands between a line {begin} and a line {end}")
-    numbers, breaths, *values = np.array(rows).T
-    each = ", ".join(f"{name} in {unit}" for name, unit in units.items())
-    notes = [
-        f"Text ({encoding}) with breaths between {begin} and {end} ({form['about']}): {each}, "
-        f"{form['rate']:g} Hz."
-    ]
-    if cut:
-        notes.append(f"{cut} breaths without an end were left out.")
-    columns = dict(zip(units, values, strict=True)) | {"breath": breaths}
-    return Table(file, columns, units, numbers.astype(np.int64), form["rate"], tuple(notes))
-
-
-def _below(file: str, lines: list[str]) -> tuple[dict[str, Any], int]:
-    """The form of a text whose table stands below a line, and that line's number; 0 of others."""
+def _form(file: str, lines: list[str]) -> dict[str, Any]:
+    """The form of a text whose rows stand between lines or below one; empty of others."""
     stripped = [line.strip() for line in lines]
+    for form in _TEXTS["between"].values():
+        if any(re.match(rf"{form['begin']}\b", line) for line in stripped):
+            return form
     for form in _TEXTS["below"].values():
         others = form.get("others", {})
         if stripped[0] != form["first"] and stripped[0] not in others:
@@ -693,8 +659,27 @@ def _below(file: str, lines: list[str]) -> tuple[dict[str, Any], int]:
             raise InputError(
                 f"{file} of {form['about']} holds {content}; export a recording ({form['first']})"
             )
-        return form, len(lines) - stripped[::-1].index(form["line"])
-    return {}, 0
+        return form
+    return {}
+
+
+def _between(data: bytes, form: dict[str, Any]) -> tuple[bytes, str]:
+    """Rows of whole breaths with their numbers, of text that marks begins and ends; and the kind."""
+    lines = data.decode().split("\n")
+    rows, begins = [""] * len(lines), list[int]()
+    whole = 0
+    for number, line in enumerate(lines):
+        if re.match(rf"\s*{form['begin']}\b", line):
+            begins.append(number)
+        elif begins and re.match(rf"\s*{form['end']}\b", line):
+            first = begins[-1] + 1
+            rows[first:number] = [f"{len(begins)},{x}" for x in lines[first:number]]
+            whole += 1
+    rows[begins[0]] = ",".join(["breath", *(f"{x} [{unit}]" for x, unit in form["units"].items())])
+    kind = f"breaths between {form['begin']} and {form['end']} ({form['about']}), "
+    if cut := len(begins) - whole:
+        kind += f"{cut} breaths without an end were left out, "
+    return "\n".join(rows).encode(), kind
 
 
 def _plain_lines(data: bytes, above: list[str]) -> tuple[bytes, str]:

@@ -17,7 +17,7 @@ from ventbench.recordings.bad_samples import UNUSABLE, clean, left_out
 from ventbench.recordings.breaths import Breaths, arranged, join
 from ventbench.recordings.roles import few_breaths, findings
 from ventbench.recordings.scan import ProblemLog, Progress, Scanned, scan
-from ventbench.recordings.schema import RecordingError, RecordingProblem
+from ventbench.recordings.schema import OPTIONAL, RecordingError, RecordingProblem
 from ventbench.recordings.sources import Source, open_source
 from ventbench.task.lungs import Lung
 
@@ -240,52 +240,29 @@ class RecordingReport:
         return lines
 
 
-def describe(scanned: Scanned) -> dict[str, Any]:
-    """Return the fields of a report that describe the content of a file."""
-    lengths = scanned.lengths
-    pairs, counts = np.unique(np.column_stack([scanned.R, scanned.C]), axis=0, return_counts=True)
-    return {
-        "rows": int(lengths.sum()),
-        "breaths": len(lengths),
-        "lengths": (int(lengths.min()), int(lengths.max())),
-        "lungs": {Lung(*pair).id: int(n) for pair, n in zip(pairs.tolist(), counts, strict=True)},
-        "interval": _intervals(scanned),
-        "time_inferred": {
-            int(scanned.breath_id[i]): dt for i, dt in scanned.inferred.items() if np.isfinite(dt)
-        },
-        "time_interpolated": int(scanned.time_interpolated.sum()),
-        "time_shifted": int(scanned.time_shifted.sum()),
-        "blank_pressures": int(scanned.blank_pressures.sum()),
-        "optional": scanned.optional,
-    }
-
-
 #: What to do about samples that were left out.
 _ADVICE = "They count as missing; --missing VALUE names further values that do."
 
 
-def role_problems(source: Source, scanned: Scanned) -> dict[str, tuple[RecordingProblem, ...]]:
-    """What was left out, and what the physics of a lung says about the columns, by its level."""
-    file = source.file
-    issues = findings(scanned.figures, scanned.interval, scanned.R, scanned.C)
-    problems = {
-        level: tuple(
-            RecordingProblem(file, f.what, f.advice, column=f.column, value=f"{f.value:g}")
-            for f in issues
-            if f.level == level
-        )
-        for level in ("refused", "suspicious")
-    }
-    unusable = {column for column, share in left_out(scanned.bad).items() if share > UNUSABLE}
-    for samples in scanned.bad:
+def role_problems(
+    source: Source, scanned: Scanned
+) -> tuple[tuple[RecordingProblem, ...], tuple[RecordingProblem, ...]]:
+    """What was left out, and what the physics of a lung says about columns: refused, suspicious."""
+    shares = left_out(scanned.bad)
+    levels: dict[str, list[RecordingProblem]] = {"refused": [], "suspicious": []}
+    for samples in reversed(scanned.bad):
         level, advice = "suspicious", _ADVICE
-        if samples.column in unusable:
+        if shares.get(samples.column, 0.0) > UNUSABLE:
             level, advice = "refused", "That is too much: the recording is unusable."
         places = sorted(x for x, _ in source.locate(samples.rows[:6].tolist()).values())
         message = samples.what(f"{source.place}s", places)
-        problem = RecordingProblem(file, message, advice, column=samples.column)
-        problems[level] = (problem, *problems[level])
-    return problems
+        problem = RecordingProblem(source.file, message, advice, column=samples.column)
+        levels[level].append(problem)
+    for f in findings(scanned.figures, scanned.interval, scanned.R, scanned.C):
+        value = f"{f.value:g}"
+        problem = RecordingProblem(source.file, f.what, f.advice, column=f.column, value=value)
+        levels[f.level].append(problem)
+    return tuple(levels["refused"]), tuple(levels["suspicious"])
 
 
 def _intervals(scanned: Scanned) -> dict[str, float]:
@@ -314,14 +291,14 @@ def check_lengths(scanned: Scanned, log: ProblemLog, *, pad: bool) -> None:
                 f"would make {size} samples of {lengths.sum()}"
             )
             advice = "Put breaths of very different lengths into files of their own."
-            log.add(scanned.starts[at], "breath_id", message, advice, ids[at])
+            log.add(scanned.starts[at], "breath_id", message, advice, values=ids[at])
         return
     usual = int(np.bincount(lengths).argmax())
     for length in np.unique(lengths[lengths != usual]):
         at = np.flatnonzero(lengths == length)
         message = f"breath {{value}} has {length} samples, the others have {usual}"
         advice = "Fix the breath, or pass --pad to fill short ones."
-        log.add(scanned.starts[at], "breath_id", message, advice, ids[at])
+        log.add(scanned.starts[at], "breath_id", message, advice, values=ids[at])
 
 
 def check_inferable(scanned: Scanned, log: ProblemLog) -> None:
@@ -331,8 +308,8 @@ def check_inferable(scanned: Scanned, log: ProblemLog) -> None:
             f"the times of breath {scanned.breath_id[at]} are blank and cannot be inferred: no "
             "breath of the file has times, and u_out does not switch from 0 to 1 in this one"
         )
-        advice, first = "Fill in time_step, in seconds.", scanned.starts[at : at + 1]
-        log.add(first, "time_step", message, advice, np.array([np.nan]))
+        advice = "Fill in time_step, in seconds."
+        log.add(scanned.starts[at : at + 1], "time_step", message, advice)
 
 
 #: Environment variable that names the folder of public recordings.
@@ -386,7 +363,7 @@ def load(
     source = open_source(path)
     log, scanned = _scanned(source, pad=pad, clip=clip, missing=missing, progress=progress)
     log.raise_problems()
-    notes = _report(log, scanned).notes()
+    notes = _report(log, scanned, refuse=False).notes()
     breaths = _assemble(scanned, source.file)
     file = None if source.kind == "table" else source.file
     return replace(breaths, source=file, sha256=source.sha256, notes=notes)
@@ -467,17 +444,7 @@ def check(
             warnings=warnings,
             warning_count=len(warnings),
         )
-    report = _report(log, scanned)
-    if not report.ok:
-        return report
-    if report.blank_pressures == report.rows:
-        message = f"all {report.rows} pressures are blank"
-        advice = "Fill in the pressure in cmH2O: there is nothing to compare a simulator with."
-        refused = (RecordingProblem(source.file, message, advice, column="pressure"),)
-    else:
-        refused = role_problems(source, scanned)["refused"]
-    suspicious = tuple(problem for problem in report.suspicious if problem not in refused)
-    return replace(report, problems=refused, problem_count=len(refused), suspicious=suspicious)
+    return _report(log, scanned, refuse=True)
 
 
 def _scanned(source: Source, *, pad: bool, **options: Any) -> tuple[ProblemLog, Scanned]:
@@ -489,19 +456,42 @@ def _scanned(source: Source, *, pad: bool, **options: Any) -> tuple[ProblemLog, 
     return log, scanned
 
 
-def _report(log: ProblemLog, scanned: Scanned) -> RecordingReport:
-    source = log.source
-    roles = {} if log.counts["problem"] else role_problems(source, scanned)
+def _report(log: ProblemLog, scanned: Scanned, *, refuse: bool) -> RecordingReport:
+    """What a file holds, and what is wrong; ``refuse`` makes unusable columns problems."""
+    source, lengths = log.source, scanned.lengths
+    problems, count, rows = log.listed("problem"), log.counts["problem"], int(lengths.sum())
+    blank = rows - int(scanned.figures["pressure_count"].sum())
+    refused, suspicious = ((), ()) if count else role_problems(source, scanned)
+    if refuse and not count:
+        if blank == rows:
+            message = f"all {rows} pressures are blank"
+            advice = "Fill in the pressure in cmH2O: there is nothing to compare a simulator with."
+            refused = (RecordingProblem(source.file, message, advice, column="pressure"),)
+        problems, count = refused, len(refused)
+    elif not refuse:
+        suspicious = (*refused, *suspicious)
+    pairs, counts = np.unique(np.column_stack([scanned.R, scanned.C]), axis=0, return_counts=True)
     return RecordingReport(
         source.file,
         source.kind,
         source.sha256,
-        log.listed("problem"),
-        log.counts["problem"],
+        problems,
+        count,
         source.warnings + log.listed("warning"),
         len(source.warnings) + log.counts["warning"],
-        roles.get("refused", ()) + roles.get("suspicious", ()),
-        **describe(scanned),
+        suspicious,
+        rows,
+        breaths=len(lengths),
+        lengths=(int(lengths.min()), int(lengths.max())),
+        lungs={Lung(*pair).id: int(n) for pair, n in zip(pairs.tolist(), counts, strict=True)},
+        interval=_intervals(scanned),
+        time_inferred={
+            int(scanned.breath_id[i]): dt for i, dt in scanned.inferred.items() if np.isfinite(dt)
+        },
+        time_interpolated=int(scanned.time_interpolated.sum()),
+        time_shifted=int(scanned.time_shifted.sum()),
+        blank_pressures=blank,
+        optional=tuple(name for name in OPTIONAL if name in source.names),
     )
 
 

@@ -55,10 +55,12 @@ class Rows:
     blank_id: Bools
     first: int = 0  #: row of the file that is the first of these.
 
-    def part(self, start: int, stop: int) -> Rows:
-        """Some of the rows."""
-        columns = {name: values[start:stop] for name, values in self.columns.items()}
-        return Rows(columns, self.blank_id[start:stop], self.first + start)
+    def cell(self, name: str, row: int) -> str:
+        """A cell as it is printed; empty where it is blank."""
+        value = self.columns[name][row].item()
+        if value != value or (name == "breath_id" and self.blank_id[row]):
+            return ""
+        return repr(value).removesuffix(".0")
 
     @cached_property
     def breaths(self) -> Pieces:
@@ -76,42 +78,31 @@ def blocks_of(batches: Iterable[pa.RecordBatch]) -> Iterator[Rows]:
 
     A blank breath_id is that of the row before; at the start of the file, the first one known.
     """
-    pending: list[Rows] = []
-    first, waiting = 0, 0
+    import pyarrow as pa
+
+    pending, first = None, 0
     for batch in batches:
-        columns = {x: to_numpy(batch.column(x), COLUMNS[x].integer) for x in batch.schema.names}
-        blank = np.zeros(batch.num_rows, bool)
-        if batch.column("breath_id").null_count:
-            blank = to_numpy(batch.column("breath_id").is_null()) > 0
-        pending.append(Rows(columns, blank, first))
-        first, waiting = first + len(blank), waiting + len(blank)
-        if waiting < 2 * ROWS:
+        table = pa.Table.from_batches([batch])
+        pending = table if pending is None else pa.concat_tables([pending, table])
+        if pending.num_rows < 2 * ROWS:
             continue
-        rows = _joined(pending)
-        starts = rows.breaths.starts
-        starts = starts[(starts >= ROWS) & (starts < waiting)]
-        if len(starts):
-            cut = int(starts[-1])
-            yield rows.part(0, cut)
-            rows, waiting = rows.part(cut, waiting), waiting - cut
-        pending = [rows]
-    if waiting:
-        yield _joined(pending)
+        starts = _rows(pending, first).breaths.starts
+        if cut := int(starts[-1]) if starts[-1] >= ROWS else 0:
+            yield _rows(pending.slice(0, cut), first)
+            pending, first = pending.slice(cut), first + cut
+    if pending is not None and pending.num_rows:
+        yield _rows(pending, first)
 
 
-def _joined(parts: list[Rows]) -> Rows:
-    """Rows that follow one another, with their blank breath_ids filled."""
-    rows = parts[0]
-    if len(parts) > 1:
-        names = parts[0].columns
-        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in names}
-        rows = Rows(columns, np.concatenate([part.blank_id for part in parts]), parts[0].first)
-    blank = rows.blank_id
+def _rows(table: pa.Table, first: int) -> Rows:
+    """Rows of Arrow, with blank breath_ids filled."""
+    columns = {x: to_numpy(table.column(x), COLUMNS[x].integer) for x in table.column_names}
+    blank = to_numpy(table.column("breath_id").is_null()) > 0
     if blank.any():
-        start = 0 if rows.first else int(np.argmin(blank))
+        start = 0 if first else int(np.argmin(blank))
         before = np.maximum.accumulate(np.where(blank, start, np.arange(len(blank))))
-        rows.columns["breath_id"] = rows.columns["breath_id"][before]
-    return rows
+        columns["breath_id"] = columns["breath_id"][before]
+    return Rows(columns, blank, first)
 
 
 Level = Literal["problem", "warning"]
@@ -125,7 +116,7 @@ class ProblemLog:
     """
 
     source: Source  #: the file.
-    first: int = 0  #: row of the file that is row 0 of what is added.
+    rows: Rows | None = None  #: what is checked; None once all rows have been.
     #: number of problems and of warnings.
     counts: Counter[Level] = field(default_factory=Counter)
     #: row of each, another row that it refers to, and the problem without its place.
@@ -135,32 +126,36 @@ class ProblemLog:
 
     def add(
         self,
-        rows: Ints,
+        where: Bools | Ints,
         column: str,
         what: str,
         advice: str,
-        values: NDArray[Any],
         *,
+        values: Ints | None = None,
         references: Ints | None = None,
         level: Level = "problem",
     ) -> None:
         """Add a problem, or a warning, for each row.
 
         Args:
-            rows: data rows, 0 for `first`, shape (k,); k may be 0.
+            where: mask of `rows` or their numbers, those of the file if `rows` is None; k rows,
+                which may be none.
             column: name of the column.
             what: a phrase; `{value}` stands for the cell and `{other}` for the other row's line.
             advice: a sentence.
-            values: the values, shape (k,).
+            values: what stands for the cells, shape (k,), if `rows` is None.
             references: another row that each problem refers to, shape (k,), or None.
             level: which of the two.
         """
-        self.counts[level] += len(rows)
-        kept, file = self._kept[level], self.source.file
-        for i, row in enumerate(rows[:SHOWN].tolist()):
-            problem = RecordingProblem(file, what, advice, column=column, value=_text(values[i]))
-            reference = None if references is None else int(references[i]) + self.first
-            kept.append((row + self.first, reference, problem))
+        at = np.flatnonzero(where) if where.dtype == bool else where
+        self.counts[level] += len(at)
+        kept, first = self._kept[level], 0 if self.rows is None else self.rows.first
+        for i, row in enumerate(at[:SHOWN].tolist()):
+            value = self.rows.cell(column, row) if self.rows is not None else ""
+            value = value if values is None else str(values[i])
+            problem = RecordingProblem(self.source.file, what, advice, column=column, value=value)
+            reference = None if references is None else int(references[i]) + first
+            kept.append((row + first, reference, problem))
         kept.sort(key=lambda each: each[0])
         del kept[SHOWN:]
 
@@ -192,13 +187,6 @@ class ProblemLog:
         return replace(problem, what=message, line=line, value=value, place=place)
 
 
-def _text(value: np.generic) -> str:
-    number = value.item()
-    if isinstance(number, float):
-        return "" if np.isnan(number) else f"{number!r}".removesuffix(".0")
-    return str(number)
-
-
 #: Rows from which a value that is repeated is reported once.
 _OFTEN = 10
 
@@ -209,68 +197,45 @@ def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str
     With ``clip``, u_in is clipped to 0..100 % with a warning; otherwise it is a problem.
     """
     columns = dict(rows.columns)
-    _add_blank(rows, log, "breath_id", rows.blank_id)
     for name, values in rows.columns.items():
         column = COLUMNS[name]
-        if column.integer:
-            continue
         if not column.blank:
-            _add_blank(rows, log, name, np.isnan(values))
+            blank = rows.blank_id if column.integer else np.isnan(values)
+            message = f"the cell is blank, but {name} is needed in every row"
+            log.add(blank, name, message, "Fill it in or remove the breath.")
         infinite = np.isinf(values)
-        if infinite.any():
-            at = np.flatnonzero(infinite)
-            message = "{value} is infinite"
-            log.add(at, name, message, "Fix the row.", values[at])
+        log.add(infinite, name, "{value} is infinite", "Fix the row.")
         outside = column.outside(values) & ~infinite
         if not outside.any():
             continue
-        at = np.flatnonzero(outside)
-        level, advice = "problem", column.advice
         message = f"{{value}} is outside {column.span}"
-        if name == "u_in" and clip:
-            level, advice = "warning", "It was clipped."
-            columns[name] = np.where(infinite, values, np.clip(values, column.low, column.high))
-        elif name == "u_out":
+        if name == "u_out":
             message = "{value} is neither 0 nor 1"
         elif column.positive:
             message = f"{{value}} is not in {column.span}"
+        if name == "u_in" and clip:
+            log.add(outside, name, message, "It was clipped.", level="warning")
+            columns[name] = np.where(infinite, values, np.clip(values, column.low, column.high))
+            continue
         if name in ("R", "C"):  # the label of a whole recording: one mistake, not one a row
-            _add_once(at, name, message, advice, values[at], log)
-        else:
-            log.add(at, name, message, advice, values[at], level=level)
+            kinds, first, counts = np.unique(values, return_index=True, return_counts=True)
+            often = (counts >= _OFTEN) & outside[first]
+            outside &= ~np.isin(values, kinds[often])
+            log.add(first[often], name, f"{message}, here and in more rows", column.advice)
+        log.add(outside, name, message, column.advice)
     return columns
 
 
-def _add_once(
-    at: Ints, name: str, message: str, advice: str, values: Floats, log: ProblemLog
-) -> None:
-    """Report a value that many rows repeat once."""
-    kinds, first, counts = np.unique(values, return_index=True, return_counts=True)
-    often = counts >= _OFTEN
-    single = ~np.isin(values, kinds[often])
-    log.add(at[single], name, message, advice, values[single])
-    message = f"{message}, here and in more rows"
-    log.add(at[first[often]], name, message, advice, kinds[often])
-
-
-def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: Bools) -> None:
-    if blank.any():
-        message = f"the cell is blank, but {name} is needed in every row"
-        at = np.flatnonzero(blank)
-        log.add(at, name, message, "Fill it in or remove the breath.", np.full(len(at), np.nan))
-
-
 def check_ids(rows: Rows, log: ProblemLog, first_rows: dict[int, int]) -> None:
-    """Check that the rows of each breath follow one another; ``seen`` are first rows by id."""
+    """Check that the rows of each breath follow one another; first rows are by id."""
     starts = rows.breaths.starts
     ids = rows.columns["breath_id"][starts].tolist()
     at = (starts + rows.first).tolist()
     earlier = np.array(list(map(first_rows.setdefault, ids, at))) - rows.first
-    again = np.flatnonzero(earlier != starts)
+    again = earlier != starts
     message = "breath {value} comes again, it is already at {other}"
     advice = "Keep the rows of a breath together, and give each breath an id of its own."
-    values = rows.columns["breath_id"][starts[again]]
-    log.add(starts[again], "breath_id", message, advice, values, references=earlier[again])
+    log.add(starts[again], "breath_id", message, advice, references=earlier[again])
 
 
 def check_lung(rows: Rows, log: ProblemLog) -> None:
@@ -279,36 +244,32 @@ def check_lung(rows: Rows, log: ProblemLog) -> None:
     for name in ("R", "C"):
         values = rows.columns[name]
         first = values[breaths.starts][breaths.owner]
-        with np.errstate(invalid="ignore"):
-            at = np.flatnonzero((values != first) & ~np.isnan(values) & ~np.isnan(first))
-        if len(at) == 0:
-            continue
+        at = np.flatnonzero((values != first) & ~np.isnan(values) & ~np.isnan(first))
         at = at[np.unique(breaths.owner[at], return_index=True)[1]]
         message = f"{name} changes to {{value}} within the breath, which starts at {{other}}"
         advice = "A breath has one lung: give the second part its own breath_id, or fix the row."
-        first_row = breaths.starts[breaths.owner[at]]
-        log.add(at, name, message, advice, values[at], references=first_row)
+        log.add(at, name, message, advice, references=breaths.starts[breaths.owner[at]])
 
 
 def check_single(rows: Rows, log: ProblemLog) -> None:
     """Check that each breath has at least two samples."""
-    at = rows.breaths.starts[rows.breaths.lengths == 1]
     message = "breath {value} has one sample, at least two are needed"
     advice = "Remove it, or keep the rows of a breath together."
-    log.add(at, "breath_id", message, advice, rows.columns["breath_id"][at])
+    log.add(rows.breaths.starts[rows.breaths.lengths == 1], "breath_id", message, advice)
 
 
 def check_row_ids(rows: Rows, log: ProblemLog, last: int) -> int:
     """Warn where the column id, which is not used otherwise, does not increase; return the last."""
     ids = rows.columns["id"]
-    at = np.flatnonzero(np.append(rows.first > 0 and ids[0] <= last, ids[1:] <= ids[:-1]))
+    same = np.append(rows.first > 0 and ids[0] <= last, ids[1:] <= ids[:-1])
     message = "id {value} is not greater than the one before"
     advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
-    log.add(at, "id", message, advice, ids[at], level="warning")
+    log.add(same, "id", message, advice, level="warning")
     return int(ids[-1])
 
 
 _REPEAT = ("the row repeats {other}", "Remove one of the two.")
+_TWICE = "two rows of the breath have the time {value} s, the other is {other}"
 _SORT = "Sort the rows of the breath by time_step, and remove rows that are there twice."
 
 
@@ -320,29 +281,21 @@ def check_times(rows: Rows, log: ProblemLog) -> None:
     """
     time, breath = rows.columns["time_step"], rows.breaths.owner
     finite = np.flatnonzero(np.isfinite(time))
-    previous, current = finite[:-1], finite[1:]
-    late = (time[current] <= time[previous]) & (breath[current] == breath[previous])
-    if late.any():
-        _add_order(rows, log, previous[late], current[late])
-    blank = np.isnan(time)
-    at = np.flatnonzero(blank[1:] & blank[:-1] & (breath[1:] == breath[:-1])) + 1
-    at = at[_same(rows, at - 1, at, rows.columns)] if len(at) else at
-    log.add(at, "id", *_REPEAT, rows.columns["id"][at], references=at - 1)
-
-
-def _add_order(rows: Rows, log: ProblemLog, previous: Ints, current: Ints) -> None:
-    time = rows.columns["time_step"]
-    equal = time[previous] == time[current]
-    names = [name for name in rows.columns if name != "id"]
-    repeat = equal & _same(rows, previous, current, names)
-    two = "two rows of the breath have the time {value} s, the other is {other}"
+    before, at = finite[:-1], finite[1:]
+    late = (time[at] <= time[before]) & (breath[at] == breath[before])
+    before, at = before[late], at[late]
+    equal = time[before] == time[at]
+    repeat = equal & _same(rows, before, at, rows.columns.keys() - {"id"})
     for chosen, message, advice in (
         (repeat, *_REPEAT),
-        (equal & ~repeat, two, _SORT),
+        (equal & ~repeat, _TWICE, _SORT),
         (~equal, "time goes back to {value} s from {other}", _SORT),
     ):
-        at, before = current[chosen], previous[chosen]
-        log.add(at, "time_step", message, advice, time[at], references=before)
+        log.add(at[chosen], "time_step", message, advice, references=before[chosen])
+    blank = np.isnan(time)
+    at = np.flatnonzero(blank[1:] & blank[:-1] & (breath[1:] == breath[:-1])) + 1
+    at = at[_same(rows, at - 1, at, rows.columns)]
+    log.add(at, "id", *_REPEAT, references=at - 1)
 
 
 def _same(rows: Rows, first: Ints, second: Ints, names: Iterable[str]) -> Bools:
@@ -443,8 +396,6 @@ class Scanned:
     time_shifted: Bools  #: breaths that do not start at 0 in the file, (k,) bool.
     #: shortest and longest interval between two samples of each breath, s, (k, 2).
     steps: Floats
-    blank_pressures: Ints  #: samples without pressure, (k,).
-    optional: tuple[str, ...]  #: optional columns of the file.
     figures: dict[str, Floats]  #: of :func:`~.roles.breath_figures`, (k, ...) each.
     bad: tuple[BadSamples, ...]  #: samples that were left out, by rows of the file.
     #: time, s from each breath's first sample, NaN in all of a breath without times; u_in %, u_out
@@ -487,7 +438,7 @@ def scan(
     parts, first_rows, last = [], dict[int, int](), 0
     marks = set(missing)
     for rows in blocks_of(batches()):
-        log.first = rows.first
+        log.rows = rows
         bad = find_bad_samples(rows.columns, marks)
         marks |= {float(samples.values[0]) for samples in bad if samples.kind == "mark"}
         rows.columns.update(blanked(rows.columns, bad))
@@ -498,7 +449,7 @@ def scan(
         columns = check_values(rows, log, clip=clip)
         with np.errstate(all="ignore"):  # infinite values are problems already
             parts.append(_scanned(rows, columns, bad, keep))
-    log.first = 0
+    log.rows = None
     if not parts:
         message = "the file has a header but no rows"
         raise fail(source.file, message, "Write at least one breath.")
@@ -528,8 +479,6 @@ def _scanned(
         time_interpolated=times.interpolated,
         time_shifted=times.shifted,
         steps=np.stack([x.reduceat(inside, starts) for x in (np.fmin, np.fmax)], axis=1),
-        blank_pressures=rows.breaths.sums(np.isnan(samples["pressure"])),
-        optional=tuple(name for name in OPTIONAL if name in samples),
         figures=breath_figures(times.time, samples, rows.breaths),
         bad=tuple(replace(bad_samples, rows=bad_samples.rows + rows.first) for bad_samples in bad),
         samples={"time": times.time, **samples} if keep else {},
@@ -540,29 +489,23 @@ def _together(parts: Sequence[Scanned]) -> Scanned:
     """Parts of a file as one."""
 
     def joined(values: Sequence[Any]) -> Any:
-        if isinstance(values[0], np.ndarray):
-            return np.concatenate(values)
         if isinstance(values[0], dict):
-            return {
-                name: joined([samples.pop(name) for samples in values]) for name in list(values[0])
-            }
-        return values[0]
+            return {name: joined([x.pop(name) for x in values]) for name in list(values[0])}
+        return np.concatenate(values)
 
-    merged: dict[tuple[str, str, float], list[BadSamples]] = {}
+    alike: dict[tuple[str, str, float], list[BadSamples]] = {}
     for samples in (samples for part in parts for samples in part.bad):
         value = float(samples.values[0]) if samples.kind == "mark" else 0.0
-        merged.setdefault((samples.column, samples.kind, value), []).append(samples)
+        alike.setdefault((samples.column, samples.kind, value), []).append(samples)
+    total = int(sum(part.lengths.sum() for part in parts))
     bad = tuple(
-        BadSamples(
-            column,
-            kind,
-            np.concatenate([x.rows for x in same]),
-            np.concatenate([x.values for x in same]),
-            int(sum(part.lengths.sum() for part in parts)),
+        replace(
+            same[0],
+            rows=np.concatenate([x.rows for x in same]),
+            values=np.concatenate([x.values for x in same]),
+            of=total,
         )
-        for (column, kind, _), same in merged.items()
+        for same in alike.values()
     )
-    values: dict[str, Any] = {"bad": bad}
-    for name in {x.name for x in fields(Scanned)} - {"bad"}:
-        values[name] = joined([getattr(part, name) for part in parts])
-    return Scanned(**values)
+    names = {each.name for each in fields(Scanned)} - {"bad"}
+    return Scanned(bad=bad, **{x: joined([getattr(part, x) for part in parts]) for x in names})

@@ -664,7 +664,7 @@ def _form(file: str, lines: list[str]) -> dict[str, Any]:
 
 
 def _between(data: bytes, form: dict[str, Any]) -> tuple[bytes, str]:
-    """Rows of whole breaths with their numbers, of text that marks begins and ends; and the kind."""
+    """Rows of whole breaths, numbered, of text that marks begins and ends; and the kind."""
     lines = data.decode().split("\n")
     rows, begins = [""] * len(lines), list[int]()
     whole = 0

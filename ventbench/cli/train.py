@@ -70,29 +70,6 @@ def simulator(
     typer.echo(f"wrote {out}")
 
 
-@app.command()
-def population(
-    simulators: Annotated[
-        Path,
-        typer.Argument(metavar="DIR", help="Folder that `ventbench train simulator` wrote."),
-    ],
-    recordings: RecordingsDir = None,
-) -> None:
-    """Fit the population of the rigs of simulators, from which draws take rigs of their own.
-
-    Adds `population.npz` to the folder and tells in its manifest how the sessions lie in a
-    population that was fitted without them.
-
-    Example: `ventbench train population runs/my-rig --recordings my-recordings`
-    """
-    from ventbench.train.rigs.population import train_population
-
-    folder = recordings_folder(recordings)
-    with bar("fitting the population") as progress:
-        train_population(folder, simulators, progress=progress)
-    typer.echo(f"wrote {simulators / 'population.npz'}")
-
-
 PLOT = "grid.png"
 
 

@@ -120,13 +120,6 @@ class Frozen:
         """Those of :attr:`held_out_rigs` that entries were trained on before they were held out."""
         return self._of_lungs("seen_rigs")
 
-    @property
-    def roles(self) -> dict[str, dict[str, list[int]]]:
-        """Rigs that are held out and seen, by lung, as :data:`ROLES` holds them."""
-        keys = ("held_out_rigs", "seen_rigs")
-        lungs = self.manifest["lungs"].items()
-        return {lung: {key: entry[key] for key in keys if key in entry} for lung, entry in lungs}
-
     def _of_lungs(self, key: str) -> tuple[tuple[int, ...], ...]:
         return tuple(tuple(entry.get(key, ())) for entry in self.manifest["lungs"].values())
 

@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.task.draws import uniforms
@@ -440,14 +439,8 @@ def _rounded(value: Floats) -> Floats:
     return np.where(up, np.round(value * scale) / scale, np.round(value / scale) * scale)
 
 
-def save_population(population: RigPopulation, path: Path) -> None:
-    """Write a population in one step."""
-    arrays: dict[str, Any] = {name: np.round(x, 8) for name, x in vars(population).items()}
-    files.write_atomically(path, lambda file: np.savez(file, **arrays))
-
-
 def load_population(path: Path) -> RigPopulation:
-    """Read what :func:`save_population` wrote.
+    """Read the means and factors of a population, an ``.npz`` that a release wrote.
 
     Raises:
         InputError: if it is missing or is no population of such rigs.

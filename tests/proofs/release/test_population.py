@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from proofs.release.population import _scatter, fit_population
 from ventbench.base import compilation
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import LUNG, NAMES, from_vector, to_vector
 from ventbench.train.rigs.data import Groups, InspirationData
 from ventbench.train.rigs.fit import simulate
-from ventbench.train.rigs.population import _scatter, design_of, fit_population, scales
+from ventbench.train.rigs.population import design_of, scales
 
 
 def test_lungs_have_means_of_their_own_and_ventilators_share_theirs():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ventbench.train.rigs.population import Prior, Units, fit_mixed, surprise
+from proofs.release.population import Prior, Units, fit_mixed, surprise
 
 
 def prior(p: int, q: int, *, units: float = 0.0, uncorrelated: float = 0.0) -> Prior:

@@ -21,6 +21,7 @@ from ventbench.base.errors import InputError, InputTypeError
 from ventbench.base.text import number
 from ventbench.plants import frozen
 from ventbench.plants.catalog import SimulatorLike, load_simulators, names
+from ventbench.plants.simulators import FrozenSimulators
 from ventbench.plants.stacking import PlantsFor, open_loop_breaths
 from ventbench.recordings import Breaths, load
 from ventbench.task import protocol
@@ -351,7 +352,7 @@ def open_loop(
     breaths: Breaths | Path | str | pd.DataFrame,
     simulator: SimulatorLike = "frozen",
     *,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Callable[[int, int], object] = lambda finished, total: None,
 ) -> OpenLoopReport:
     """Measure how far simulators stray from recorded breaths under the recorded commands.
 
@@ -363,7 +364,7 @@ def open_loop(
         simulator: a name, a file, a plant, plants by lung, a function of commands or an array of
             simulated pressures ``(n, T)``; see :func:`ventbench.load_simulators`.
         progress: called with how many simulations of a breath are done and how many there are,
-            two of each breath.
+            two of each breath for simulators that were trained.
 
     Returns:
         Errors by lung.
@@ -379,18 +380,21 @@ def open_loop(
     """
     breaths = load(breaths)
     tested = load_simulators(simulator, breaths=breaths)
-    finished = 0
+    trained = tested.trained if isinstance(tested, FrozenSimulators) else None
+    finished, total = 0, len(breaths) * (1 if trained is None else 2)
 
     def count(simulated: int) -> None:
         nonlocal finished
         finished += simulated
-        if progress is not None:
-            progress(finished, 2 * len(breaths))
+        progress(finished, total)
 
-    error = mean_errors(tested.pressures(breaths, progress=count), breaths)
-    crossed = mean_errors(tested.pressures(breaths, cross_fitted=True, progress=count), breaths)
-    held_out, unseen = tested.held_out(breaths), tested.unseen(breaths)
-    perhaps = breaths.breath_id[tested.perhaps_copies(breaths)].tolist()
+    crossed = error = mean_errors(tested.pressures(breaths, progress=count), breaths)
+    held_out = unseen = np.ones(len(breaths), bool)
+    perhaps: list[int] = []
+    if trained is not None:
+        crossed = mean_errors(open_loop_breaths(trained.cross_fitted, breaths, count), breaths)
+        held_out, unseen = trained.held_out(breaths), trained.unseen(breaths)
+        perhaps = breaths.breath_id[trained.perhaps_copies(breaths)].tolist()
 
     def figures(index: Ints) -> dict[str, Any]:
         return {

@@ -15,7 +15,7 @@ from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
-from ventbench.plants.simulators import FrozenSimulators, PlantSimulators, Simulators
+from ventbench.plants.simulators import OnePlant, PlantsByLung, PlantSimulators, Simulators
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 
 #: Parts of the ventilator, on which a prescribed flow has no bearing; and clocks of the commands.
@@ -145,8 +145,7 @@ def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: 
     """
     if not isinstance(simulators, PlantSimulators):
         return np.take_along_axis(simulators.pressures(recorded), index, axis=1)
-    external = not isinstance(simulators, FrozenSimulators) and simulators.at_label is None
-    if simulators.is_base_physics or external:
+    if simulators.is_base_physics or isinstance(simulators, OnePlant | PlantsByLung):
         return simulators.pressures(driven)
     raise InputError(
         f"the recording has no valve command, and {simulators.name} needs one; diagnose physics, "

@@ -25,7 +25,6 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -34,7 +33,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.base import compilation, files
+from ventbench.base import files
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
@@ -46,18 +45,18 @@ from ventbench.plants.python_simulators import (
 )
 from ventbench.plants.simulators import (
     FrozenSimulators,
-    PlantSimulators,
+    LabelledPlants,
+    OnePlant,
+    PlantsByLung,
     SimulatedPressures,
     Simulators,
 )
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stacking import PlantsFor, VmappedPlant, nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.clocks import sampling_intervals
 from ventbench.recordings.foreign.formats import read_table
-from ventbench.recordings.read import COLUMNS, simulated_pressures
+from ventbench.recordings.read import COLUMNS
 from ventbench.task.interfaces import Plant
-from ventbench.task.lungs import LUNGS, Lung, lung
+from ventbench.task.lungs import Lung, lung
 
 
 class Stepping(Protocol):
@@ -113,16 +112,8 @@ def load_simulators(
         raise InputTypeError("simulator", simulator, _ACCEPTED)
     if isinstance(simulator, str | Path):
         return _by_text(str(simulator))
-    if isinstance(simulator, Mapping):
-        if any(_is_python(value) for value in simulator.values()):
-            return _python_by_lung(simulator, "the given simulators")
-        digest = _leaves_sha256(simulator)
-        return _plants(dict(simulator), "the given plants", _provenance("plants", digest), digest)
-    if _is_python(simulator):
-        name = getattr(simulator, "__qualname__", type(simulator).__name__)
-        return _of_function(simulator, name)
-    if isinstance(simulator, Plant):
-        return _single(simulator, type(simulator).__name__, _leaves_sha256(simulator))
+    if (found := _of_value(simulator)) is not None:
+        return found
     return _of_array(simulator, breaths)
 
 
@@ -177,7 +168,7 @@ def _by_text(text: str) -> Simulators:
         return named[text]()
     path = Path(text)
     if (path / frozen.MANIFEST).is_file():
-        return _trained(path)
+        return _frozen(frozen.load(path), path.name)
     if path.is_file():
         name = path.name.lower()
         if name.endswith((".csv", ".csv.gz", ".parquet")):
@@ -199,47 +190,23 @@ def _by_text(text: str) -> Simulators:
 
 
 def _official() -> Simulators:
-    return _frozen(frozen.load(), "frozen", LUNGS, official=True)
+    return _frozen(frozen.load(), "frozen")
 
 
-def _trained(path: Path) -> Simulators:
-    """Simulators of a folder; they are the official ones if its manifest is theirs."""
-    loaded = frozen.load(path=path)
-    official = loaded.manifest_sha256 == files.sha256(frozen.folder() / frozen.MANIFEST)
-    return _frozen(loaded, path.name, tuple(lung(key) for key in loaded.lung_ids), official)
-
-
-def _frozen(
-    loaded: frozen.Frozen, name: str, lungs: tuple[Lung, ...], official: bool
-) -> Simulators:
+def _frozen(loaded: frozen.Frozen, name: str) -> Simulators:
     return FrozenSimulators(
         name=name,
         about=loaded.about(),
-        lungs=lungs,
+        lungs=tuple(map(lung, loaded.lung_ids)),
         sha256=loaded.manifest_sha256,
-        official=loaded if official else None,
-        stack=lambda: loaded.plants,
-        of_breaths=loaded.for_breaths,
         trained=loaded,
     )
 
 
-def _at_label(name: str, make: Callable[[Lung], Plant], for_breaths: PlantsFor) -> Simulators:
-    """Simulators that need no more than a label, and so know every lung."""
-
-    def stacked() -> Plant:
-        with compilation.float64():
-            return stack_heterogeneous([make(entry) for entry in LUNGS])
-
-    return PlantSimulators(
-        name=name,
-        about={"kind": name},
-        lungs=LUNGS,
-        stack=stacked,
-        of_breaths=for_breaths,
-        at_label=make,
-        is_base_physics=name == "physics",
-    )
+def _at_label(
+    name: str, make: Callable[[Lung], Plant], make_of_breath: Callable[[Lung], Plant]
+) -> Simulators:
+    return LabelledPlants(name=name, about={"kind": name}, make=make, make_of_breath=make_of_breath)
 
 
 def _named() -> dict[str, Callable[[], Simulators]]:
@@ -248,90 +215,81 @@ def _named() -> dict[str, Callable[[], Simulators]]:
         "frozen": _official,
         "hybrid": _official,  # the kind of plant that the official ones are
         # Of recorded breaths the exact solution is quicker than the general solver.
-        "physics": partial(
-            _at_label, "physics", physics, partial(nominal_plants, single_compartment)
-        ),
+        "physics": partial(_at_label, "physics", physics, single_compartment),
     }
     for name, family in FAMILIES.items():
         if family.for_lung is not None:
-            for_breaths = partial(nominal_plants, family.for_lung)
-            resolvers[name] = partial(_at_label, name, family.for_lung, for_breaths)
+            resolvers[name] = partial(_at_label, name, family.for_lung, family.for_lung)
     return resolvers
 
 
+def _of_value(value: Any, text: str | None = None, sha256: str | None = None) -> Simulators | None:
+    """Simulators that a mapping, a function, a class, an object or a plant is; None for others.
+
+    Args:
+        value: any.
+        text: how ``--plant`` names it, if it does.
+        sha256: of the module that it is from; by default that of the parameters of plants.
+    """
+    if isinstance(value, Mapping):
+        if any(_is_python(entry) for entry in value.values()):
+            return _python_by_lung(value, text or "the given simulators", sha256)
+        digest = sha256 or _leaves_sha256(value)
+        about = {"kind": "plants"} | ({"module": text} if text else {"sha256": digest})
+        return _plants(dict(value), text or "the given plants", about, digest)
+    if _is_python(value):
+        name = text or getattr(value, "__qualname__", type(value).__name__)
+        about, function = (
+            _provenance("function", sha256, function=name),
+            python_simulator(value, name),
+        )
+        return PythonSimulators(name=name, about=about, sha256=sha256, function=function)
+    if isinstance(value, Plant):
+        name, digest = text or type(value).__name__, sha256 or _leaves_sha256(value)
+        about = _provenance("plant", digest, plant=name)
+        return OnePlant(name=name, about=about, sha256=digest, given=value)
+    return None
+
+
 def _plants(
-    plants: dict[str, Plant], name: str, provenance: Mapping[str, Any], sha256: str | None = None
+    plants: dict[str, Plant],
+    name: str,
+    about: Mapping[str, Any],
+    sha256: str,
+    origin: Mapping[str, Any] | None = None,
 ) -> Simulators:
     if not plants:
         raise InputError(f"{name}: there is no plant in it")
+    by_lung: dict[str, Plant] = {}
+    by_clock: dict[str, list[tuple[float, Plant]]] = {}
     for key, plant in plants.items():
         if not isinstance(plant, Plant):
             raise InputError(
                 f"{name}, lung {key}: a {type(plant).__name__} is no plant; it needs init and step"
             )
-    by_lung: dict[str, Plant] = {}
-    by_clock: dict[str, list[tuple[float, Plant]]] = {}
-    for key, plant in plants.items():
         label, interval = parse_rig_id(key)
         if interval is None:
             by_lung[label] = plant
         else:
             by_clock.setdefault(label, []).append((interval, plant))
-
     if unknown := sorted(by_clock.keys() - by_lung.keys()):
         raise InputError(f"{name}: {unknown[0]} is there at ventilators alone; add it by its id")
-
-    def of(label: str, interval: float) -> Plant:
-        rigs = by_clock.get(label, [(interval, by_lung[label])])
-        return min(rigs, key=lambda rig: abs(np.log(rig[0] / interval)))[1]
-
-    def for_breaths(breaths: Breaths) -> Plant:
-        missing = sorted(set(breaths.lung_ids.tolist()) - set(by_lung))
-        if missing:
-            raise InputError(
-                f"the simulator has no lung {missing[0]} of the recording ({name}); it has "
-                f"{', '.join(by_lung)}"
-            )
-        pairs = zip(breaths.lung_ids.tolist(), sampling_intervals(breaths).tolist(), strict=True)
-        return stack_heterogeneous([of(label, interval) for label, interval in pairs])
-
-    return PlantSimulators(
+    return PlantsByLung(
         name=name,
-        about=provenance,
-        lungs=tuple(lung(label) for label in by_lung),
+        about=about,
+        lungs=tuple(map(lung, by_lung)),
         sha256=sha256,
-        stack=lambda: stack_heterogeneous(list(by_lung.values())),
-        of_breaths=for_breaths,
-    )
-
-
-def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
-    def repeated(count: int) -> Plant:
-        return jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), plant)
-
-    return PlantSimulators(
-        name=name,
-        about=_provenance("plant", sha256, plant=name),
-        lungs=LUNGS,
-        sha256=sha256,
-        stack=partial(repeated, len(LUNGS)),
-        of_breaths=lambda breaths: VmappedPlant(repeated(len(breaths))),
+        origin=origin or {},
+        by_lung=by_lung,
+        by_clock=by_clock,
     )
 
 
 def _plant_file(path: Path) -> Simulators:
     digest = files.sha256(path)
-    provenance = _provenance("file", digest, file=path.name)
     plants, origin = load_plants(path)
-    return replace(_plants(plants, path.name, provenance, digest), origin=origin)
-
-
-def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:
-    adapted, provenance = (
-        python_simulator(function, name),
-        _provenance("function", sha256, function=name),
-    )
-    return PythonSimulators(name=name, about=provenance, sha256=sha256, function=adapted)
+    about = _provenance("file", digest, file=path.name)
+    return _plants(plants, path.name, about, digest, origin)
 
 
 def _imported(module: str, attribute: str) -> Simulators:
@@ -349,14 +307,8 @@ def _imported(module: str, attribute: str) -> Simulators:
         sys.path.remove(str(Path.cwd()))
     source = inspect.getsourcefile(loaded)
     digest = files.sha256(Path(source)) if source is not None else None
-    if isinstance(value, Mapping):
-        if any(_is_python(entry) for entry in value.values()):
-            return _python_by_lung(value, text, digest)
-        return _plants(dict(value), text, {"kind": "plants", "module": text}, digest)
-    if _is_python(value):
-        return _of_function(value, text, digest)
-    if isinstance(value, Plant):
-        return _single(value, text, digest)
+    if (found := _of_value(value, text, digest)) is not None:
+        return found
     raise InputError(
         f"--plant {text}: a {type(value).__name__} is neither a function, a plant nor plants by "
         "lung id"
@@ -383,5 +335,4 @@ def _of_table(
     table: Mapping[str, np.ndarray], name: str, file: str, sha256: str | None = None
 ) -> Simulators:
     provenance = _provenance("pressures", sha256, **({} if sha256 is None else {"file": name}))
-    answers = partial(simulated_pressures, table, file, sha256=sha256)
-    return SimulatedPressures(name=name, about=provenance, sha256=sha256, answers=answers)
+    return SimulatedPressures(name=name, about=provenance, sha256=sha256, table=table, file=file)

@@ -49,11 +49,7 @@ class PythonSimulators(Simulators):
     shortage = "is a function of whole commands, not a plant with init and step"
 
     def pressures(
-        self,
-        breaths: Breaths,
-        *,
-        cross_fitted: bool = False,
-        progress: Callable[[int], object] | None = None,
+        self, breaths: Breaths, *, progress: Callable[[int], object] = lambda count: None
     ) -> Floats:
         """See :meth:`Simulators.pressures`; a function that fails or answers oddly is named."""
         answers = np.full(breaths.pressure.shape, np.nan)
@@ -67,8 +63,7 @@ class PythonSimulators(Simulators):
                 place = f"breath {breaths.breath_id[i]}"
                 answer = self._call(u_in, u_out, dt, label, start, place, flow)
                 answers[i, samples], answers[i, ~samples] = answer, answer[-1]
-            if progress is not None:
-                progress(1)
+            progress(1)
         return answers
 
     def respond(

@@ -13,13 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from ventbench.base import compilation
-from ventbench.base.arrays import Bools, Floats
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.physics import physics
 from ventbench.plants import frozen
-from ventbench.plants.stacking import PlantsFor, VmappedPlant, open_loop_breaths, take
+from ventbench.plants.stacking import (
+    VmappedPlant,
+    nominal_plants,
+    open_loop_breaths,
+    stack_heterogeneous,
+    take,
+)
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.clocks import sampling_intervals
+from ventbench.recordings.read import simulated_pressures
 from ventbench.task.interfaces import Plant
-from ventbench.task.lungs import Lung, lung
+from ventbench.task.lungs import LUNGS, Lung, lung
 from ventbench.task.rollouts import open_loop
 
 
@@ -28,8 +37,8 @@ class Simulators(ABC):
     """Simulators of lungs; every kind answers to recorded commands.
 
     One kind has no more than that (:class:`SimulatedPressures`), one answers to any commands
-    (:class:`~ventbench.plants.python_simulators.PythonSimulators`), and one has plants, which can
-    be run in a closed loop and corrected (:class:`PlantSimulators`).
+    (:class:`~ventbench.plants.python_simulators.PythonSimulators`), and the others have plants,
+    which can be run in a closed loop and corrected (:class:`PlantSimulators`).
     """
 
     name: str  #: what messages and reports call them.
@@ -46,15 +55,16 @@ class Simulators(ABC):
     shortage: ClassVar[str] = ""
     #: Whether there are plants, which can be scored and corrected.
     has_plants: ClassVar[bool] = False
-    #: Whether they are the base model of :mod:`ventbench.physics` at the labels, no more.
-    is_base_physics: bool = field(default=False, repr=False)
-    #: The official set if they are it, else None.
-    official: frozen.Frozen | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         """Class, name and lungs."""
         lungs = ", ".join(lung.id for lung in self.lungs) or "lungs by their label"
         return f"<{type(self).__name__} {self.name}: {lungs}>"
+
+    @property
+    def is_base_physics(self) -> bool:
+        """Whether they are the base model of :mod:`ventbench.physics` at the labels, no more."""
+        return False
 
     @property
     def stacked(self) -> Plant:
@@ -94,13 +104,6 @@ class Simulators(ABC):
         """
         raise InputError(f"{self.name} {self.shortage}.")
 
-    def cross_fitted(self, breaths: Breaths) -> Plant:
-        """Plants that have not been trained on the breaths where there are such.
-
-        The same as :meth:`for_breaths` for simulators that are not learned.
-        """
-        return self.for_breaths(breaths)
-
     def plant_of_breath(self, breaths: Breaths, index: int) -> Plant:
         """Return the plant of one recorded breath, without a leading axis; float64 leaves."""
         with compilation.float64():
@@ -108,31 +111,14 @@ class Simulators(ABC):
             inner = stacked.plants if isinstance(stacked, VmappedPlant) else stacked
             return take(inner, 0)
 
-    def held_out(self, breaths: Breaths) -> Bools:
-        """Whether :meth:`cross_fitted` gives a plant that has not seen the breath, ``(n,)``."""
-        return np.ones(len(breaths), bool)
-
-    def unseen(self, breaths: Breaths) -> Bools:
-        """Whether :meth:`for_breaths` gives a plant that has not seen the breath, ``(n,)``."""
-        return np.ones(len(breaths), bool)
-
-    def perhaps_copies(self, breaths: Breaths) -> Bools:
-        """Whether the breath is perhaps one of the training, which blank pressures hide, (n,)."""
-        return np.zeros(len(breaths), bool)
-
     @abstractmethod
     def pressures(
-        self,
-        breaths: Breaths,
-        *,
-        cross_fitted: bool = False,
-        progress: Callable[[int], object] | None = None,
+        self, breaths: Breaths, *, progress: Callable[[int], object] = lambda count: None
     ) -> Floats:
         """Open-loop answers to recorded commands, each from the first recorded pressure.
 
         Args:
             breaths: n breaths of T samples.
-            cross_fitted: True for the answers of the plants of :meth:`cross_fitted`.
             progress: called with numbers of breaths, as they are done.
 
         Returns:
@@ -165,61 +151,33 @@ class Simulators(ABC):
 class SimulatedPressures(Simulators):
     """Pressures of recorded breaths that somebody's simulator gave."""
 
-    answers: Callable[[Breaths], Floats] = field(repr=False)  #: of n breaths, cmH2O, ``(n, T)``.
+    #: columns ``(rows,)`` of the simulated breaths.
+    table: Mapping[str, np.ndarray]
+    file: str  #: what messages call the table.
     shortage = "holds simulated pressures of recorded breaths, not a simulator"
 
     def pressures(
-        self,
-        breaths: Breaths,
-        *,
-        cross_fitted: bool = False,
-        progress: Callable[[int], object] | None = None,
+        self, breaths: Breaths, *, progress: Callable[[int], object] = lambda count: None
     ) -> Floats:
         """See :meth:`Simulators.pressures`."""
-        answers = self.answers(breaths)
+        answers = simulated_pressures(self.table, self.file, breaths, sha256=self.sha256)
         answers[~np.isfinite(breaths.pressure[:, 0])] = np.nan
-        if progress is not None:
-            progress(len(breaths))
+        progress(len(breaths))
         return answers
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class PlantSimulators(Simulators):
-    """Plants of lungs."""
+    """Plants of lungs: a kind says :attr:`stacked` and :meth:`for_breaths`."""
 
-    stack: Callable[[], Plant] = field(repr=False)  #: makes :attr:`stacked`.
-    of_breaths: PlantsFor = field(repr=False)  #: does :meth:`for_breaths`.
-    #: makes the plant of any label, of which :attr:`lungs` are some; None if there are no others.
-    at_label: Callable[[Lung], Plant] | None = field(default=None, repr=False)
     has_plants = True
 
-    @cached_property
-    def stacked(self) -> Plant:
-        """See :attr:`Simulators.stacked`."""
-        return self.stack()
-
-    def plant(self, lung_id: str) -> Plant:
-        """See :meth:`Simulators.plant`."""
-        if self.at_label is None:
-            return super().plant(lung_id)
-        with compilation.float64():
-            return jax.tree.map(np.asarray, self.at_label(lung(lung_id)))
-
-    def for_breaths(self, breaths: Breaths) -> Plant:
-        """See :meth:`Simulators.for_breaths`."""
-        return self.of_breaths(breaths)
-
     def pressures(
-        self,
-        breaths: Breaths,
-        *,
-        cross_fitted: bool = False,
-        progress: Callable[[int], object] | None = None,
+        self, breaths: Breaths, *, progress: Callable[[int], object] = lambda count: None
     ) -> Floats:
         """See :meth:`Simulators.pressures`."""
-        plants_for = self.cross_fitted if cross_fitted else self.for_breaths
         try:
-            return open_loop_breaths(plants_for, breaths, progress)
+            return open_loop_breaths(self.for_breaths, breaths, progress)
         except jax.errors.JAXTypeError as error:
             raise InputError(
                 f"{self.name}: JAX cannot trace this plant's init or step "
@@ -239,28 +197,101 @@ class PlantSimulators(Simulators):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class LabelledPlants(PlantSimulators):
+    """Plants that need no more than a label, and so are there for every lung."""
+
+    make: Callable[[Lung], Plant]  #: makes the plant of a label.
+    #: makes that of a recorded breath, which may solve the same equations more quickly.
+    make_of_breath: Callable[[Lung], Plant]
+    lungs: tuple[Lung, ...] = LUNGS
+
+    @property
+    def is_base_physics(self) -> bool:
+        """See :attr:`Simulators.is_base_physics`."""
+        return self.make is physics
+
+    @cached_property
+    def stacked(self) -> Plant:
+        """See :attr:`Simulators.stacked`."""
+        with compilation.float64():
+            return stack_heterogeneous([self.make(entry) for entry in self.lungs])
+
+    def plant(self, lung_id: str) -> Plant:
+        """See :meth:`Simulators.plant`."""
+        with compilation.float64():
+            return jax.tree.map(np.asarray, self.make(lung(lung_id)))
+
+    def for_breaths(self, breaths: Breaths) -> Plant:
+        """See :meth:`Simulators.for_breaths`."""
+        return nominal_plants(self.make_of_breath, breaths)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class PlantsByLung(PlantSimulators):
+    """Plants of some lungs."""
+
+    by_lung: Mapping[str, Plant]  #: by lung id.
+    #: plants of a lung at several ventilators, each behind its sampling interval, s, by lung id.
+    by_clock: Mapping[str, list[tuple[float, Plant]]]
+
+    @cached_property
+    def stacked(self) -> Plant:
+        """See :attr:`Simulators.stacked`."""
+        return stack_heterogeneous(list(self.by_lung.values()))
+
+    def for_breaths(self, breaths: Breaths) -> Plant:
+        """See :meth:`Simulators.for_breaths`: of several ventilators that of the nearest clock."""
+        ids = breaths.lung_ids.tolist()
+        if missing := sorted(set(ids) - set(self.by_lung)):
+            raise InputError(
+                f"the simulator has no lung {missing[0]} of the recording ({self.name}); it has "
+                f"{', '.join(self.by_lung)}"
+            )
+
+        def at(label: str, interval: float) -> Plant:
+            rigs = self.by_clock.get(label, [(interval, self.by_lung[label])])
+            return min(rigs, key=lambda rig: abs(np.log(rig[0] / interval)))[1]
+
+        pairs = zip(ids, sampling_intervals(breaths).tolist(), strict=True)
+        return stack_heterogeneous([at(label, interval) for label, interval in pairs])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class OnePlant(PlantSimulators):
+    """One plant for every lung."""
+
+    given: Plant  #: the plant.
+    lungs: tuple[Lung, ...] = LUNGS
+
+    def _repeated(self, count: int) -> Plant:
+        return jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), self.given)
+
+    @property
+    def stacked(self) -> Plant:
+        """See :attr:`Simulators.stacked`."""
+        return self._repeated(len(self.lungs))
+
+    def for_breaths(self, breaths: Breaths) -> Plant:
+        """See :meth:`Simulators.for_breaths`."""
+        return VmappedPlant(self._repeated(len(breaths)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class FrozenSimulators(PlantSimulators):
     """Plants that were trained, which know their breaths: the official ones or another folder's."""
 
     trained: frozen.Frozen = field(repr=False)
 
     @property
+    def stacked(self) -> Plant:
+        """See :attr:`Simulators.stacked`."""
+        return self.trained.plants
+
+    @property
     def ensemble(self) -> Plant:
         """See :attr:`Simulators.ensemble`."""
         return self.trained.ensemble
 
-    def cross_fitted(self, breaths: Breaths) -> Plant:
-        """See :meth:`Simulators.cross_fitted`."""
-        return self.trained.cross_fitted(breaths)
-
-    def held_out(self, breaths: Breaths) -> Bools:
-        """See :meth:`Simulators.held_out`."""
-        return self.trained.held_out(breaths)
-
-    def unseen(self, breaths: Breaths) -> Bools:
-        """See :meth:`Simulators.unseen`."""
-        return self.trained.unseen(breaths)
-
-    def perhaps_copies(self, breaths: Breaths) -> Bools:
-        """See :meth:`Simulators.perhaps_copies`."""
-        return self.trained.perhaps_copies(breaths)
+    def for_breaths(self, breaths: Breaths) -> Plant:
+        """See :meth:`Simulators.for_breaths`."""
+        return self.trained.for_breaths(breaths)

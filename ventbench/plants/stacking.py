@@ -140,7 +140,7 @@ class VmappedPlant:
 
 
 def open_loop_breaths(
-    plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] | None = None
+    plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] = lambda count: None
 ) -> Floats:
     """Pressures that plants answer to the commands of recorded breaths with, in batches.
 
@@ -158,6 +158,5 @@ def open_loop_breaths(
             start, *commands = (jnp.asarray(x, float) for x in columns)
             answer = open_loop(plants_for(part), start, *commands)
             parts.append(np.asarray(answer)[: min(batch, n - first)])
-            if progress is not None:
-                progress(len(parts[-1]))
+            progress(len(parts[-1]))
     return np.concatenate(parts)

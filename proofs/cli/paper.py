@@ -22,7 +22,6 @@ from ventbench.cli.options import (
     claim_out,
     emit,
     recordings_folder,
-    waiting,
     written_console,
 )
 
@@ -241,7 +240,7 @@ def adversary(
     """
     from proofs.studies import adversary as work
 
-    with waiting(f"searching for what makes {name} unsafe"):
+    with bar(f"searching for what makes {name} unsafe"):
         unsafe = work.adversary(
             name,
             simulator=plant,

@@ -17,7 +17,6 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.task.lungs import LUNG_IDS, lung
 from ventbench.train.plants import (
     ALL,
-    NETWORKS,
     TrainedControllers,
     check_names,
     plants_to_train_on,
@@ -61,7 +60,7 @@ def test_a_cell_weighs_what_the_normalised_score_divides_by():
 
 def test_networks_are_named_by_lungs_or_all():
     simulators = plants_to_train_on("single_compartment")
-    assert check_names(NETWORKS, simulators) == (*LUNG_IDS, ALL)
+    assert check_names((*LUNG_IDS, ALL), simulators) == (*LUNG_IDS, ALL)
     assert check_names(None, simulators) == LUNG_IDS
     with pytest.raises(InputError, match="not a scored lung"):
         check_names(["R50C10"], simulators)

@@ -1,11 +1,11 @@
-"""Types of arrays that stand everywhere, runs of a mask, and pieces of an array.
+"""Types of arrays that stand everywhere, runs of a mask, batches, and pieces of an array.
 
 Each field and argument says its shape and unit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,6 +22,15 @@ def runs(mask: Bools) -> list[tuple[int, int]]:
     """Starts and ends of the runs of True in a mask ``(n,)``; a run ends before its end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def batches(count: int, size: int) -> Iterator[Ints]:
+    """Indices of ``count`` things in batches ``(size,)``, so that what runs on one compiles once.
+
+    The last thing is repeated to fill the last batch.
+    """
+    for first in range(0, count, size):
+        yield np.minimum(np.arange(first, first + size), count - 1)
 
 
 @dataclass(frozen=True, eq=False)

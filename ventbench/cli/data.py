@@ -19,7 +19,6 @@ from ventbench.cli.options import (
     complete_lungs,
     emit,
     table_of,
-    waiting,
     written_console,
 )
 
@@ -197,7 +196,7 @@ def import_(
         "time": time_unit,
         "u_in": u_in_unit,
     }
-    with waiting(f"reading {file}"):
+    with bar(f"reading {file}"):
         imported = import_recording(
             file,
             columns=_pairs(columns, "--map"),

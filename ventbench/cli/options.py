@@ -25,7 +25,7 @@ from ventbench.base.text import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress, ProgressColumn, TaskID
+    from rich.progress import TaskID
     from rich.table import Table
 
     from ventbench.entries.folder import Submission
@@ -239,18 +239,23 @@ def bars() -> Iterator[Callable[..., None]]:
     Yields what moves them: a function of the name of a bar, which comes when it is first told of,
     how much is done, how much in all (1; None if nobody knows), and a text in place of the name.
     """
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.progress import TimeRemainingColumn as Remaining
 
-    columns = (
+    console = notes()
+    tasks: dict[str, TaskID] = {}
+    with Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         Remaining(),
-    )
-    tasks: dict[str, TaskID] = {}
-    with _progress(*columns) as display:
+        transient=True,
+        console=console,
+        # Where stderr is a file, bars would leave nothing but an empty line.
+        disable=not console.is_terminal,
+        speed_estimate_period=600.0,  # of long work whose steps take minutes
+    ) as display:
 
         def tell(name: str, completed: float, total: float | None = 1.0, text: str = "") -> None:
             if name not in tasks:
@@ -262,24 +267,13 @@ def bars() -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def bar(name: str) -> Iterator[Callable[..., None]]:
-    """Show one of :func:`bars` from the start; yields a function of how much is done and in all."""
+    """Show one of :func:`bars` from the start; yields a function of how much is done and in all.
+
+    Who never calls it shows the time taken by work whose length nobody knows.
+    """
     with bars() as tell:
         tell(name, 0, None)
         yield partial(tell, name)
-
-
-def _progress(*columns: ProgressColumn) -> Progress:
-    from rich.progress import Progress
-
-    console = notes()
-    # Where stderr is a file, bars would leave nothing but an empty line.
-    return Progress(
-        *columns,
-        transient=True,
-        console=console,
-        disable=not console.is_terminal,
-        speed_estimate_period=600.0,  # of long work whose steps take minutes
-    )
 
 
 def read_recording(
@@ -335,16 +329,6 @@ def _keeping(work: Callable[..., ResultT], *job: object) -> ResultT:
 
     compilation.keep()
     return work(*job)
-
-
-def waiting(text: str) -> Progress:
-    """Return a spinner on stderr with the time taken, for work whose length nobody knows."""
-    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-    display = _progress(*columns)
-    display.add_task(text, total=None)
-    return display
 
 
 #: Exit code after Ctrl-C, as shells have it.

@@ -32,8 +32,17 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import Lung, lung
 
-#: What a simulator may ask for, by name.
-_ARGUMENTS = ("u_in", "u_out", "dt", "R", "C", "initial_pressure", "time", "flow")
+_NAMES = ("u_in", "u_out", "dt", "R", "C", "initial_pressure", "time", "flow")
+
+#: What a function may ask for, and what a class or ``reset`` may, by the names they may give it.
+_ARGUMENTS = {name: name for name in _NAMES}
+_LABELS = {
+    "R": "R",
+    "C": "C",
+    "initial_pressure": "initial_pressure",
+    "pressure": "initial_pressure",
+}
+_LABELS_ADVICE = "which a diagnosis does not give; it gives R, C and initial_pressure by name"
 
 _SIGNATURE = "f(u_in, u_out, dt, *, R, C, initial_pressure)"
 
@@ -127,42 +136,60 @@ def python_simulator(value: Any, name: str) -> PythonSimulator:
             f"{name} is a class without `step`; give it step(u_in, u_out, dt), which returns the "
             "pressure, or init(pressure) and step(state, u_in, u_out, dt)"
         )
-    return _call_of(value, name)
+    return _by_name(
+        value,
+        name,
+        _ARGUMENTS,
+        f"which no simulator is given; simulators are called as {_SIGNATURE}, by these names, and "
+        "may also ask for time (s) and flow (mL/s)",
+    )
 
 
-def _call_of(function: Callable[..., Any], name: str) -> PythonSimulator:
-    """Return how to call a function: with those of :data:`_ARGUMENTS` that it names."""
+def _by_name(
+    function: Callable[..., Any], name: str, arguments: Mapping[str, str], advice: str
+) -> Callable[[Mapping[str, Any]], Any]:
+    """Return how to call a function or class: with those arguments that its signature names.
+
+    Args:
+        function: what is called.
+        name: what messages call it.
+        arguments: what an argument is in what is known of a breath, by the name it may have.
+        advice: what to do about a needed argument that has another name.
+
+    Raises:
+        InputError: if there is such an argument, or no signature.
+    """
     try:
-        parameters = inspect.signature(function).parameters
-    except (TypeError, ValueError) as error:  # a function in C
-        raise InputError(f"{name} tells no signature; wrap it in a {_SIGNATURE}") from error
-    needed = {
-        key
-        for key, p in parameters.items()
-        if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
-    }
-    by_name = {key for key, p in parameters.items() if p.kind is not p.POSITIONAL_ONLY}
-    names = by_name & set(_ARGUMENTS)
-    if unknown := [key for key in parameters if key in needed - names]:
-        raise InputError(
-            f"{name} needs {', '.join(unknown)}, which no simulator is given; simulators are "
-            f"called as {_SIGNATURE}, by these names, and may also ask for time (s) and flow (mL/s)"
-        )
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError) as error:  # written in C
+        if "u_in" in arguments:
+            raise InputError(f"{name} tells no signature; wrap it in a {_SIGNATURE}") from error
+        parameters = []
+    named = [p.name for p in parameters if p.kind is not p.POSITIONAL_ONLY and p.name in arguments]
+    needed = [p.name for p in parameters if _needed(p)]
+    if unknown := [key for key in needed if key not in named]:
+        raise InputError(f"{name} needs {', '.join(unknown)}, {advice}")
 
-    def call(arguments: Mapping[str, Any]) -> Any:
-        if "flow" in needed and arguments["flow"] is None:
+    def call(known: Mapping[str, Any]) -> Any:
+        if "flow" in needed and known["flow"] is None:
             raise InputError(f"{name} asks for flow, which the recording does not have")
-        return function(**{key: arguments[key] for key in names})
+        return function(**{key: known[arguments[key]] for key in named})
 
     return call
+
+
+def _needed(parameter: inspect.Parameter) -> bool:
+    """Whether a parameter has no default, and is none of ``*args`` and ``**kwargs``."""
+    several = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
+    return parameter.default is parameter.empty and not several
 
 
 def _stepping(value: Any, name: str) -> PythonSimulator:
     """Return how to run a simulator sample by sample."""
     make = (
-        _call_with_labels(value, f"{name}()")
+        _by_name(value, f"{name}()", _LABELS, _LABELS_ADVICE)
         if isinstance(value, type)
-        else lambda arguments: value
+        else lambda known: value
     )
     owner = value if isinstance(value, type) else type(value)
     has_init = hasattr(value, "init")
@@ -177,27 +204,28 @@ def _stepping(value: Any, name: str) -> PythonSimulator:
         )
 
     def run(arguments: Mapping[str, Any]) -> Floats:
-        simulator = make(arguments)
+        simulator: Any = make(arguments)
         pressures = np.empty(len(arguments["u_in"]))
         pressures[0] = start = arguments["initial_pressure"]
-        commands = zip(
-            arguments["u_in"].tolist(),
-            arguments["u_out"].tolist(),
-            arguments["dt"].tolist(),
-            strict=True,
-        )
-        if has_init:
-            state = simulator.init(start)
-            for k, command in zip(range(1, len(pressures)), commands, strict=False):
+        state = simulator.init(start) if has_init else None
+        if not has_init and hasattr(simulator, "reset"):
+            _by_name(simulator.reset, f"{name}.reset", _LABELS, _LABELS_ADVICE)(arguments)
+        columns = (arguments[key].tolist() for key in ("u_in", "u_out", "dt"))
+        for k, command in zip(range(1, len(pressures)), zip(*columns, strict=True), strict=False):
+            if has_init:
                 answer = simulator.step(state, *command)
                 if not isinstance(answer, tuple) or len(answer) != 2:
                     raise InputError(f"{name}: step must return the next state and the pressure")
-                state, pressures[k] = answer[0], _number(answer[1], name)
-            return pressures
-        if hasattr(simulator, "reset"):
-            _call_with_labels(simulator.reset, f"{name}.reset")(arguments)
-        for k, command in zip(range(1, len(pressures)), commands, strict=False):
-            pressures[k] = _number(simulator.step(*command), name)
+                state, pressure = answer
+            else:
+                pressure = simulator.step(*command)
+            number = np.asarray(pressure, float)
+            if number.size != 1:
+                raise InputError(
+                    f"{name}: step returned a pressure of shape {number.shape}; one number is "
+                    "wanted"
+                )
+            pressures[k] = number.item()
         return pressures
 
     return run
@@ -211,41 +239,6 @@ def _positional(owner: type, method: str) -> int | None:
         return None
     if any(p.kind is p.VAR_POSITIONAL for p in parameters):
         return None
-    needed = [p for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
+    needed = [p for p in parameters if _needed(p)]
     static = isinstance(inspect.getattr_static(owner, method), staticmethod)
     return len(needed) - (0 if static else 1)
-
-
-def _call_with_labels(
-    function: Callable[..., Any], name: str
-) -> Callable[[Mapping[str, Any]], Any]:
-    """Call a class or ``reset`` with those of R, C and the first pressure that it takes."""
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):
-        parameters = []
-    aliases = {"pressure": "initial_pressure"}
-    keys, unknown = {}, []
-    for p in parameters:
-        key = aliases.get(p.name, p.name)
-        if key in ("R", "C", "initial_pressure"):
-            keys[p.name] = key
-        elif p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL):
-            unknown.append(p.name)
-    if unknown:
-        raise InputError(
-            f"{name} needs {', '.join(unknown)}; a diagnosis gives R, C and initial_pressure by "
-            "name"
-        )
-    return lambda arguments: function(
-        **{argument: arguments[key] for argument, key in keys.items()}
-    )
-
-
-def _number(value: Any, name: str) -> float:
-    array = np.asarray(value, float)
-    if array.size != 1:
-        raise InputError(
-            f"{name}: step returned a pressure of shape {array.shape}; one number is wanted"
-        )
-    return float(array.reshape(()))

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from ventbench.base import compilation
-from ventbench.base.arrays import Floats
+from ventbench.base.arrays import Floats, batches
 from ventbench.base.errors import InputError
 from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
@@ -26,7 +26,7 @@ PlantT = TypeVar("PlantT")
 #: Gives the plants of some breaths: parameters of shape ``(n, ...)``.
 PlantsFor = Callable[[Breaths], Plant]
 
-# Breaths simulated together: bounds memory, and the last batch is padded so that all compile once.
+# Breaths simulated together: bounds memory.
 _BATCH = 4096
 
 
@@ -147,16 +147,12 @@ def open_loop_breaths(
     Each breath starts at its first recorded pressure. ``progress`` is called with the number of
     breaths of each batch, as it is done. cmH2O, ``(n, T)``; NaN where the first pressure is blank.
     """
-    n = len(breaths)
-    batch = min(_BATCH, n)
-    parts = []
+    out = np.empty(breaths.pressure.shape)
     with compilation.float64():
-        for first in range(0, n, batch):
-            index = np.minimum(np.arange(first, first + batch), n - 1)
+        for index in batches(len(breaths), min(_BATCH, len(breaths))):
             part = breaths.select(index)
             columns = (part.pressure[:, 0], part.u_in, part.u_out, part.dt)
             start, *commands = (jnp.asarray(x, float) for x in columns)
-            answer = open_loop(plants_for(part), start, *commands)
-            parts.append(np.asarray(answer)[: min(batch, n - first)])
-            progress(len(parts[-1]))
-    return np.concatenate(parts)
+            out[index] = open_loop(plants_for(part), start, *commands)
+            progress(len(np.unique(index)))
+    return out

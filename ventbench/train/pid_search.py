@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
 from ventbench.base import compilation, files
-from ventbench.base.arrays import Bools, Floats
+from ventbench.base.arrays import Bools, Floats, batches
 from ventbench.controllers.pid import PID
 from ventbench.plants.catalog import SimulatorLike
 from ventbench.plants.rigs import Rigs, load_rigs
@@ -42,7 +42,7 @@ from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario, nominal_scenario
 from ventbench.task.interfaces import Plant
 from ventbench.task.metrics.score import controllable_error
-from ventbench.train.plants import check_names, plants_to_train_on
+from ventbench.train.plants import ALL, TrainingPlants, check_names, plants_to_train_on
 
 #: The paper's twenty values of P, I and D, %/cmH2O.
 VALUES = (*(round(0.1 * i, 1) for i in range(10)), *(float(i) for i in range(1, 11)))
@@ -104,15 +104,11 @@ def errors(plants: Plant, gains: Floats) -> NDArray[np.float32]:
         differs from the score by less than 1e-4.
     """
     lungs = jax.tree.leaves(plants)[0].shape[0]
-    count = len(gains)
-    out = np.empty((lungs, count, len(protocol.PIPS)), np.float32)
+    out = np.empty((lungs, len(gains), len(protocol.PIPS)), np.float32)
     cells = nominal_scenario(np.asarray(protocol.PIPS))
-    batch = min(BATCH, count)
     for lung in range(lungs):
         plant = jax.tree.map(lambda x, lung=lung: jnp.asarray(x[lung], jnp.float32), plants)
-        for first in range(0, count, batch):
-            # The last batch is padded with the last gains, so that all compile once.
-            index = np.minimum(np.arange(first, first + batch), count - 1)
+        for index in batches(len(gains), min(BATCH, len(gains))):
             some = jnp.asarray(gains[index], jnp.float32)
             out[lung, index] = np.asarray(_errors(plant, some, cells))
     return out
@@ -168,24 +164,6 @@ def _pressures(plant: Plant, gains: Array, cells: Scenario) -> Array:
     return jax.vmap(run)(gains)
 
 
-def _nominal_plants(rigs: Rigs, lung: int) -> Plant:
-    """Plants of a lung's scored rigs, member 0."""
-    at = slice(lung, lung + 1) if rigs.sessions is None else (0, list(rigs.sessions[lung]))
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[at], rigs.plants)
-
-
-def _nominal_grid(rigs: Rigs, lungs: Sequence[int], gains: Floats, progress: Progress) -> PIDGrid:
-    """Mean error without noise over the rigs of some lungs, member 0."""
-    trajectories = len(gains) * len(protocol.PIPS)
-    grids: list[Floats] = []
-    progress(0, len(lungs) * trajectories)
-    for lung in lungs:
-        grids.append(errors(_nominal_plants(rigs, lung), gains).mean(axis=0, dtype=np.float64))
-        progress(len(grids) * trajectories, len(lungs) * trajectories)
-    names = tuple(rigs.lungs[lung].id for lung in lungs)
-    return PIDGrid(names, protocol.PIPS, gains, np.stack(grids).astype(np.float32))
-
-
 def errors_on_draws(
     rigs: Rigs, rig_draws: Draws, lung: int, gains: Floats, *, together: int = TOGETHER
 ) -> Floats:
@@ -206,16 +184,33 @@ def errors_on_draws(
     if rigs.sessions is not None:  # without the nominal cells
         plants_of_lung = jax.tree.map(lambda x: x[1:], plants_of_lung)
     cell = jax.tree.map(lambda x: np.asarray(x)[lung, 1:], cells)
-    errors = []
-    for first in range(0, len(gains), together):
-        # The last batch is padded, so that all compile once.
-        index = np.minimum(np.arange(first, first + together), len(gains) - 1)
+    out = np.empty((len(gains), cell.pip.shape[-1]))
+    for index in batches(len(gains), together):
         with compilation.float64():
             arrays = jax.tree.map(jnp.asarray, (plants_of_lung, gains[index], cell))
             pressure = np.asarray(_pressures(*arrays))
-        error = controllable_error(pressure, cell.pip[..., None, None]).mean(axis=1)
-        errors.append(error[: len(gains) - first])
-    return np.concatenate(errors)
+        out[index] = controllable_error(pressure, cell.pip[..., None, None]).mean(axis=1)
+    return out
+
+
+def _tuning(
+    lungs: Sequence[str] | None, simulator: SimulatorLike, each: bool, single: bool | None
+) -> tuple[TrainingPlants, dict[str, list[int]]]:
+    """What PIDs are tuned on; and lungs that share a PID, by the lung's id or :data:`ALL`."""
+    trained_on = plants_to_train_on(simulator)
+    names = check_names(lungs, trained_on, all_lungs=False)
+    where = {name: trained_on.names.index(name) for name in names}
+    groups = {name: [at] for name, at in where.items()} if each else {}
+    if len(names) > 1 if single is None else single:
+        groups[ALL] = list(where.values())
+    return trained_on, groups
+
+
+def _result(entries: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Entries of ``best.json`` of the groups of lungs."""
+    lungs = {name: entry for name, entry in entries.items() if name != ALL}
+    result: dict[str, Any] = {"lungs": lungs} if lungs else {}
+    return result | ({"single": entries[ALL]} if ALL in entries else {})
 
 
 def tune_pid(
@@ -227,7 +222,7 @@ def tune_pid(
     each: bool = True,
     single: bool | None = None,
     simulator: SimulatorLike = "frozen",
-    progress: Progress | None = None,
+    progress: Progress = lambda completed, total: None,
 ) -> tuple[PIDGrid, dict[str, Any]]:
     """Run every PID of a grid on simulators without noise, the best on draws, and name the best.
 
@@ -263,48 +258,45 @@ def tune_pid(
         >>> result["lungs"]["R20C50"]["gains"]
         [2.0, 4.0, 0.0]
     """
-    trained_on = plants_to_train_on(simulator)
+    trained_on, groups = _tuning(lungs, simulator, each, single)
     names = check_names(lungs, trained_on, all_lungs=False)
-    where = [trained_on.names.index(name) for name in names]
-    weights, single = trained_on.weights[where], len(names) > 1 if single is None else single
-    rigs = load_rigs(simulator).of_training
-    count = FINALISTS if draws else 1
+    rigs, where = load_rigs(simulator).of_training, [*map(trained_on.names.index, names)]
     candidates = paper_gains() if gains is None else np.asarray(gains, float)
-    grid = _nominal_grid(rigs, where, candidates, progress or (lambda completed, total: None))
-    nominal = grid.error.astype(float)
-    weighted = np.einsum("lgp,lp->lg", nominal, weights)
-    common = np.argsort(weighted.sum(axis=0), kind="stable")[: count if single else 0]
-    ranked = np.argsort(weighted, axis=1, kind="stable")[:, : count if each else 0]
-    lists = [np.concatenate([row, common]) for row in ranked]
-    if draws:
-        rig_draws = rigs.draws(draws, seed=TUNING_SEED, name=TUNING)
-        rows = [
-            errors_on_draws(rigs, rig_draws, lung, candidates[some])
-            for lung, some in zip(where, lists, strict=True)
-        ]
-    else:
-        rows = [error[some] for error, some in zip(nominal, lists, strict=True)]
-    result: dict[str, Any] = {
+    trajectories = len(candidates) * len(protocol.PIPS)
+    by_lung: dict[int, NDArray[np.float32]] = {}
+    progress(0, len(where) * trajectories)
+    for lung in where:
+        sessions = rigs.sessions
+        at = slice(lung, lung + 1) if sessions is None else (0, list(sessions[lung]))
+        plants = jax.tree.map(lambda leaf, at=at: np.asarray(leaf)[at], rigs.plants)
+        of_rigs = errors(plants, candidates)
+        by_lung[lung] = of_rigs.mean(axis=0, dtype=np.float64).astype(np.float32)
+        progress(len(by_lung) * trajectories, len(where) * trajectories)
+    grid = PIDGrid(names, protocol.PIPS, candidates, np.stack([*by_lung.values()]))
+    rig_draws = rigs.draws(draws, seed=TUNING_SEED, name=TUNING) if draws else None
+    entries = {}
+    for name, group in groups.items():
+        weights = trained_on.weights[group]
+        nominal = np.stack([by_lung[lung] for lung in group]).astype(float)
+        order = np.argsort(np.einsum("lgp,lp->g", nominal, weights), kind="stable")
+        finalists = order[: FINALISTS if draws else 1]
+        error = nominal[:, finalists]
+        if rig_draws is not None:
+            some = candidates[finalists]
+            error = np.stack([errors_on_draws(rigs, rig_draws, k, some) for k in group])
+        best = int(np.argmin(np.einsum("lgp,lp->g", error, weights)))
+        of_best = error[:, best].mean(axis=-1).tolist()
+        gain = candidates[finalists[best]].tolist()
+        entries[name] = {"gains": gain, "error": float(np.mean(of_best))}
+        if name == ALL:
+            entries[name]["lungs"] = dict(zip(names, of_best, strict=True))
+    result = {
         "trajectories": int(grid.error.size),
         "pips": list(grid.pips),
         "draws": draws,
+        **_result(entries),
+        "simulators": dict(trained_on.about),
     }
-    if each:
-        result["lungs"] = {}
-        for lung, row, error, weight in zip(names, ranked, rows, weights, strict=True):
-            best = int(np.argmin(error[: len(row)] @ weight))
-            entry = {"gains": grid.gains[row[best]].tolist(), "error": float(error[best].mean())}
-            result["lungs"][lung] = entry
-    if single:
-        together = np.stack([error[len(row) :] for row, error in zip(ranked, rows, strict=True)])
-        best = int(np.argmin(np.einsum("lgp,lp->g", together, weights)))
-        by_lung = together[:, best].mean(axis=-1)
-        result["single"] = {
-            "gains": grid.gains[common[best]].tolist(),
-            "error": float(by_lung.mean()),
-            "lungs": dict(zip(names, by_lung.tolist(), strict=True)),
-        }
-    result["simulators"] = dict(trained_on.about)
     if out is not None:
         grid.save(Path(out) / TABLE)
         files.write_json(Path(out) / RESULT, result)
@@ -350,7 +342,7 @@ def best_pids(
     rig_draws: Draws | None = None,
     groups: Sequence[Sequence[int]] | None = None,
     weights: Floats | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda completed, total: None,
 ) -> BestPIDs:
     """Find the best PID of each lung on the rigs of the training.
 
@@ -365,7 +357,6 @@ def best_pids(
     rig_draws = rigs.draws(draw_tables.COUNT) if rig_draws is None else rig_draws
     groups = [[lung] for lung in range(len(rigs.lungs))] if groups is None else groups
     weight = np.ones(np.shape(rig_draws.cells.pip)[::2]) if weights is None else weights
-    report = progress or (lambda completed, total: None)
 
     def mean_error(group: Sequence[int], rig_draws: Draws, gains: Floats, **options: int) -> Floats:
         per_lung = [
@@ -375,10 +366,10 @@ def best_pids(
 
     few, ends = rig_draws.first(min(4, rig_draws.count)), []
     for completed, group in enumerate(groups):
-        report(completed, len(groups))
+        progress(completed, len(groups))
         starts = _starts(partial(mean_error, group, few))
         ends.append([_search(partial(mean_error, group, rig_draws, together=1), x) for x in starts])
-    report(len(groups), len(groups))
+    progress(len(groups), len(groups))
     best_gains = np.array([[gains for gains, _ in results] for results in ends])
     error = np.array([[error for _, error in results] for results in ends])
     at = (np.arange(len(groups)), np.argmin(error, axis=1))
@@ -392,7 +383,7 @@ def tune_beyond(
     each: bool = True,
     single: bool = True,
     simulator: SimulatorLike = "frozen",
-    progress: Progress | None = None,
+    progress: Progress = lambda completed, total: None,
 ) -> dict[str, Any]:
     """Tune PIDs as :func:`tune_pid` does, but without a grid's edge.
 
@@ -410,23 +401,19 @@ def tune_beyond(
     Raises:
         InputError: if a lung or a simulator is unknown, or there are no draws.
     """
-    trained_on = plants_to_train_on(simulator)
-    names = check_names(lungs, trained_on, all_lungs=False)
+    trained_on, groups = _tuning(lungs, simulator, each, single)
     rigs = load_rigs(simulator).of_training
-    where = [trained_on.names.index(name) for name in names]
     best_gains = best_pids(
         rigs,
         rig_draws=rigs.draws(draws, seed=TUNING_SEED, name=TUNING),
-        groups=[[at] for at in where] * each + [where] * single,
+        groups=list(groups.values()),
         weights=trained_on.weights,
         progress=progress,
     )
     pairs = zip(best_gains.gains.tolist(), best_gains.error.tolist(), strict=True)
     entries = [{"gains": gains, "error": error} for gains, error in pairs]
-    result: dict[str, Any] = {"draws": draws, "simulators": dict(trained_on.about)}
-    if each:
-        result["lungs"] = dict(zip(names, entries, strict=False))
-    return result | ({"single": entries[-1]} if single else {})
+    about = {"draws": draws, "simulators": dict(trained_on.about)}
+    return about | _result(dict(zip(groups, entries, strict=True)))
 
 
 def _starts(errors: Callable[[Floats], Floats]) -> list[Floats]:

@@ -100,9 +100,6 @@ def _weights(official: frozen.Frozen) -> Floats:
 #: Name of the network that serves all lungs and is not told which one it ventilates.
 ALL = "all"
 
-#: Names of the networks that a training makes if not told otherwise: one a lung, and one for all.
-NETWORKS = (*LUNG_IDS, ALL)
-
 
 @dataclass(frozen=True)
 class TrainedControllers:

@@ -73,7 +73,6 @@ WALK: Any = RandomWalk()
 @pytest.mark.slow
 def test_same_seed_same_bits_and_resuming_changes_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(parallel, "SAVE_SECONDS", 0.0)
-    monkeypatch.setattr(parallel, "SAVE_SHARE", 0.0)
     whole = parallel.train(WALK, lungs(0), (0, 1), chunk=2, file=tmp_path / "a.npz")
 
     def stop(share, error):

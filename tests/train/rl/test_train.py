@@ -10,9 +10,9 @@ import pytest
 from submissions.dqn import train as dqn
 from submissions.ppo import train as ppo
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.train.plants import NETWORKS
 from ventbench.train.rl import environment
-from ventbench.train.rl.train import _groups, command, shortened
+from ventbench.train.rl import train as training
+from ventbench.train.rl.train import TrainedPolicies, command, shortened
 
 RECIPES = {"ppo": ppo.RECIPE, "dqn": dqn.RECIPE}
 
@@ -43,11 +43,31 @@ def test_what_cannot_be_trained(asked, said, run, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_networks_of_one_lung_and_of_all_are_trained_apart():
-    one, everything = _groups(NETWORKS, 6)
-    assert (one.names, one.lungs) == (LUNG_IDS, 1)
-    assert (everything.names, everything.lungs) == (("all",), 6)
-    assert _groups(["R5C10"], 6) == [_groups(["R5C10", "all"], 6)[0]]
+def test_networks_of_one_lung_and_of_all_are_trained_apart(monkeypatch, tmp_path):
+    """Each network with each seed; what is kept is that of the lowest error on fresh cells."""
+    given = []
+
+    def train_none(method, lungs, seeds, **options):
+        given.append((method.breaths, lungs.weights.shape[:2], list(seeds)))
+        runs, zeros = len(seeds), np.zeros((len(seeds), 1), np.float32)
+        error = np.arange(runs, 0, -1).astype(np.float32)
+        numbers, seconds = np.arange(runs), np.zeros(1)
+        return TrainedPolicies(numbers, error, numbers[:1], zeros, zeros, seconds, 0.0)
+
+    monkeypatch.setattr(training, "train", train_none)
+    monkeypatch.setattr(training, "_pid_errors", lambda lungs: [0.0] * len(lungs.weights))
+    monkeypatch.setattr(training.residual, "save_policies", lambda path, policies: None)
+    recipe = RECIPES["ppo"]
+    found = training.train_networks(recipe, None, tmp_path, seeds=(3, 4), simulator="physics")
+    assert given == [
+        (recipe.per_lung.breaths, (12, 1), [3, 4] * 6),
+        (recipe.every.breaths, (2, 6), [3, 4]),
+    ]
+    assert {name: int(x) for name, x in found.controllers.items()} == {  # type: ignore[call-overload]
+        **{name: 2 * k + 1 for k, name in enumerate(LUNG_IDS)},
+        "all": 1,
+    }
+    assert all(entry["seed"] == 4 for entry in found.report["networks"].values())
 
 
 @pytest.mark.parametrize("name", RECIPES)

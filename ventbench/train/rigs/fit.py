@@ -415,11 +415,9 @@ def fit(
     data: InspirationData,
     weight: Array,
     around: Centre,
-    scales: Scales | None = None,
-    noise: Noise | None = None,
     config: FitConfig | None = None,
     start: Fitted | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], object] = lambda share: None,
 ) -> tuple[Fitted, float]:
     """Fit all rigs at once, in the precision of the data.
 
@@ -427,8 +425,6 @@ def fit(
         data: n inspirations.
         weight: weight of each breath, ``(n,)``; 0 leaves it out.
         around: centre of the prior.
-        scales: widths of the prior.
-        noise: what differs from breath to breath.
         config: settings of the optimisation.
         start: where to start; the centre if not given.
         progress: called with the share that is done, 0..1.
@@ -436,7 +432,7 @@ def fit(
     Returns:
         The fit, and its loss.
     """
-    scales, noise, config = scales or Scales(), noise or Noise(), config or FitConfig()
+    scales, noise, config = Scales(), Noise(), config or FitConfig()
     count, rigs = data.start.shape[0], around.pooled.session_gain.shape[0]
     fitted = start or Fitted(
         around.pooled,
@@ -449,8 +445,7 @@ def fit(
     for iteration in range(0, config.iterations, CHUNK):
         carry, values = _advance(carry, data, weight, around, scales, noise, config)
         value = float(values[-1])
-        if progress is not None:
-            progress((iteration + CHUNK) / config.iterations)
+        progress((iteration + CHUNK) / config.iterations)
     return carry[0], value
 
 

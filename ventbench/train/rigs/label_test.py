@@ -242,7 +242,6 @@ def label_errors(
     held_out: Sequence[int],
     data: InspirationData,
     labels: Sequence[Lung],
-    scales: Scales,
 ) -> dict[int, list[float]]:
     """Median error of the breaths of some sessions under every label, cmH2O.
 
@@ -251,7 +250,6 @@ def label_errors(
         held_out: the sessions.
         data: all inspirations.
         labels: the settings, as they are numbered.
-        scales: gives the spread of gains.
 
     Returns:
         For each session the error under each label, in their order.
@@ -262,7 +260,7 @@ def label_errors(
     for number in range(len(labels)):
         groups = dataclasses.replace(data.groups, lung=jnp.full_like(data.groups.lung, number))
         each = [
-            _errors(pooled, groups, jnp.asarray(gain * scales.rig_gain), jnp.asarray(start), data)
+            _errors(pooled, groups, jnp.asarray(gain * Scales().rig_gain), jnp.asarray(start), data)
             for gain in _GAINS
             for start in _STARTS
         ]

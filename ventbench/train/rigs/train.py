@@ -28,15 +28,15 @@ from ventbench import simulation
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.base.resume import Format, WorkFolder
+from ventbench.base.resume import Checkpoint, WorkFolder
 from ventbench.plants import frozen, sessions
 from ventbench.plants.frozen import BY_ALL, training_list
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.plant_files import save_plant
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings import Breaths
-from ventbench.task.lungs import LUNG_IDS, Lung, lung
-from ventbench.task.metrics.open_loop import WIDE_OPEN, command_counts
+from ventbench.task.lungs import LUNG_IDS, lung
+from ventbench.task.metrics.open_loop import command_counts
 from ventbench.train.rigs.data import (
     SAMPLES,
     InspirationData,
@@ -50,7 +50,6 @@ from ventbench.train.rigs.data import (
 )
 from ventbench.train.rigs.fit import (
     LAMINAR_SHARE,
-    SHEET_FLOW,
     Centre,
     FitConfig,
     Fitted,
@@ -60,7 +59,6 @@ from ventbench.train.rigs.fit import (
     centre,
     fit,
     fit_expiration,
-    full_flow,
     plants,
 )
 from ventbench.train.rigs.label_test import LabelTest, label_errors, label_tests
@@ -122,9 +120,7 @@ class _Problem:
     full_breaths: WholeBreaths
     weight: Floats
     centre: Centre
-    scales: Scales
-    noise: Noise
-    laminar_share: float
+    config: RigConfig
 
     @property
     def session(self) -> Ints:
@@ -154,7 +150,7 @@ def train_rigs(
     *,
     lungs: Sequence[str] | None = None,
     config: RigConfig | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda stage, share: None,
 ) -> frozen.Frozen:
     """Learn simulators from any folder of recordings in the public schema.
 
@@ -184,22 +180,19 @@ def train_rigs(
         OSError: if a file cannot be read or written.
     """
     folder, out = Path(folder), Path(out)
-    config, report = config or RigConfig(), progress or (lambda stage, share: None)
-    report("reading the recordings", 0.0)
+    config = config or RigConfig()
+    progress("reading the recordings", 0.0)
     data = load_rig_recordings(folder, folds=config.folds, seed=config.seed)
     listed = _listed(data, lungs)
-    # Clocks alone tell sessions apart; no pressure is looked at.
-    table = sessions.find(data.breaths)
-    scales, noise = Scales(), Noise()
-    provenance = _provenance(data, listed, config, scales, noise)
+    provenance = _provenance(data, listed, config)
     parts = WorkFolder(out / "parts", provenance)
     with compilation.float32():  # enough for a fit to noisy recordings, and twice as fast
-        problem = _arrange(data, table, listed, config, scales, noise)
-        fits = _fits(problem, config, parts, report)
-        manifest, members = _assess(problem, listed, fits, out)
-    _write(out, provenance | manifest, members, data)
+        problem = _arrange(data, listed, config)
+        fits = _fits(problem, parts, progress)
+        manifest, simulators = _assess(problem, fits, out)
+    _write(simulators, provenance | manifest)
     parts.delete()
-    report("done", 1.0)
+    progress("done", 1.0)
     return frozen.load(path=out)
 
 
@@ -216,29 +209,21 @@ def _listed(data: RigRecordings, lungs: Sequence[str] | None) -> tuple[str, ...]
     )
 
 
-def _arrange(
-    data: RigRecordings,
-    table: Sessions,
-    listed: tuple[str, ...],
-    config: RigConfig,
-    scales: Scales,
-    noise: Noise,
-) -> _Problem:
+def _arrange(data: RigRecordings, listed: tuple[str, ...], config: RigConfig) -> _Problem:
+    # Clocks alone tell sessions apart; no pressure is looked at.
+    table = sessions.find(data.breaths)
     weight = np.where(np.arange(len(data.breaths)) < data.measured, 1.0, config.reconstructed)
     weight = weight * np.where(np.isin(data.breaths.lung_ids, listed), 1.0, config.unlisted)
     longest = int(np.count_nonzero(data.breaths.inspiratory, axis=1).max())
-    samples = max(SAMPLES, longest + 1)
     return _Problem(
         data,
         listed,
         table,
-        inspirations(data.breaths, table, data.labels, samples),
+        inspirations(data.breaths, table, data.labels, max(SAMPLES, longest + 1)),
         complete_breaths(data.measured_breaths, table, data.labels),
         weight,
         centre(data.labels, len(table), config.laminar_share),
-        scales,
-        noise,
-        config.laminar_share,
+        config,
     )
 
 
@@ -253,13 +238,12 @@ class _Fits:
     tests: list[LabelTest]  #: tests of the labels of all sessions.
 
 
-def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progress) -> _Fits:
-    rng = np.random.default_rng(config.seed)
+def _fits(problem: _Problem, parts: WorkFolder, progress: Progress) -> _Fits:
+    config, rng = problem.config, np.random.default_rng(problem.config.seed)
     m, n = problem.data.measured, len(problem.weight)
     template = Fitted(
         problem.centre.pooled, jnp.zeros(n), jnp.zeros(n), jnp.zeros(len(problem.table))
     )
-    stored = _fitted_format(template)
     total = 1.0 + config.folds + 2.0 * len(problem.rounds) + 0.5 * config.resamples
     completed = 0.0
 
@@ -272,34 +256,29 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
         start: Fitted | None = None,
     ) -> Fitted:
         nonlocal completed
-        cost = 0.5 if start is not None else 1.0
-
-        def compute() -> Fitted:
-            settings = config.fit
-            if start is not None:
-                shorter = min(config.fit.iterations, _RESAMPLED_ITERATIONS)
-                settings = dataclasses.replace(config.fit, iterations=shorter)
-            fitted, _ = fit(
-                problem.inspirations,
-                jnp.asarray(weight),
-                problem.centre,
-                problem.scales,
-                problem.noise,
-                settings,
-                start,
-                lambda share: report(stage, 0.95 * (completed + cost * share) / total),
-            )
-            if expiration:
-                pooled = fit_expiration(
-                    fitted.pooled, problem.full_breaths, jnp.asarray(weight[:m])
-                )
-                fitted = dataclasses.replace(fitted, pooled=pooled)
-            return fitted
-
-        report(stage, 0.95 * completed / total)
-        result = parts.get(name, compute, stored)
+        settings, cost = config.fit, 1.0
+        if start is not None:
+            shorter = min(config.fit.iterations, _RESAMPLED_ITERATIONS)
+            settings, cost = dataclasses.replace(config.fit, iterations=shorter), 0.5
+        began = completed
         completed += cost
-        return result
+
+        def tell(share: float) -> None:
+            progress(stage, 0.95 * (began + cost * share) / total)
+
+        tell(0.0)
+        checkpoint = Checkpoint(parts.checkpoint(name), {})
+        stored, finished = checkpoint.restore(template)
+        if finished:
+            return stored
+        fitted, _ = fit(
+            problem.inspirations, jnp.asarray(weight), problem.centre, settings, start, tell
+        )
+        if expiration:
+            pooled = fit_expiration(fitted.pooled, problem.full_breaths, jnp.asarray(weight[:m]))
+            fitted = dataclasses.replace(fitted, pooled=pooled)
+        checkpoint.save(fitted, 1)
+        return fitted
 
     scored = run("all", "all breaths", problem.weight, expiration=True)
     members = []
@@ -342,16 +321,13 @@ def _label_tests(
     problem: _Problem, scored: Fitted, resampled: Sequence[Fitted], excluding_rigs: Sequence[Fitted]
 ) -> list[LabelTest]:
     data, table = problem.data, problem.table
+    held_out = [index for sessions in problem.rounds for index in sessions]
+    # The only session of its lung cannot be left out.
+    untested = [index for index in range(len(table)) if index not in held_out]
     errors: dict[int, Sequence[float]] = {}
-    for held_out, part in zip(problem.rounds, excluding_rigs, strict=True):
-        errors |= label_errors(
-            part.pooled, held_out, problem.inspirations, data.labels, problem.scales
-        )
-    untested = [index for index in range(len(table)) if index not in errors]
-    if untested:  # the only session of its lung cannot be left out
-        errors |= label_errors(
-            scored.pooled, untested, problem.inspirations, data.labels, problem.scales
-        )
+    for part, some in zip([*excluding_rigs, scored], [*problem.rounds, untested], strict=True):
+        if some:
+            errors |= label_errors(part.pooled, some, problem.inspirations, data.labels)
     counts = [
         np.bincount(part, minlength=len(table))
         for part in (problem.session[: data.measured], problem.session)
@@ -365,7 +341,7 @@ def _label_tests(
         table,
         data.labels,
         (counts[0], counts[1]),
-        problem.laminar_share,
+        problem.config.laminar_share,
     )
 
 
@@ -378,26 +354,8 @@ def _widened(pooled: Pooled, member: int, count: int) -> Pooled:
     return dataclasses.replace(pooled, slopes=pooled.slopes.at[-1].add(shift))
 
 
-def _fitted_format(template: Fitted) -> Format:
-    """Arrays of a fit in the order of its leaves, which the settings determine."""
-    structure = jax.tree.structure(template)
-
-    def write(path: Path, fitted: Fitted) -> None:
-        arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(fitted))}
-        files.write_atomically(path, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
-
-    def read(path: Path) -> Fitted:
-        with np.load(path, allow_pickle=False) as arrays:
-            leaves = [jnp.asarray(arrays[f"leaf{i}"]) for i in range(structure.num_leaves)]
-        return jax.tree.unflatten(structure, leaves)
-
-    return Format(".npz", write, read)
-
-
-def _assess(
-    problem: _Problem, listed: tuple[str, ...], fits: _Fits, out: Path
-) -> tuple[dict[str, Any], Hybrid]:
-    """Choice of rigs and held-out errors; and the plants of all members."""
+def _assess(problem: _Problem, fits: _Fits, out: Path) -> tuple[dict[str, Any], frozen.Frozen]:
+    """Choice of rigs and held-out errors; and the simulators, still without a manifest."""
     data, table, tests = problem.data, problem.table, fits.tests
     of_sessions = groups_of_sessions(table, data.labels)
     pooled = [fits.scored.pooled] + [
@@ -408,51 +366,47 @@ def _assess(
         *(plants(part, of_sessions) for part in pooled),
     )
     of_measured = problem.session[: data.measured]
-    rigs = {name: choose_rigs([t for t in tests if t.lung.id == name], table) for name in listed}
+    rigs = {
+        name: choose_rigs([t for t in tests if t.lung.id == name], table) for name in problem.listed
+    }
 
     measured = data.measured_breaths
-    training = training_list(data.breaths, _held_out_member(data))
+    # The members of the folds follow the scored one.
+    unmeasured = np.full(len(data.breaths) - data.measured, BY_ALL)
+    training = training_list(data.breaths, np.append(data.fold + 1, unmeasured))
     simulators = frozen.Frozen(out, {}, "", table, members, training)
     cross_fitted_error = simulation.open_loop_errors(simulators.cross_fitted, measured)
     unseen = np.full(data.measured, np.nan)
     for held_out, part in zip(problem.rounds, fits.excluding_rigs, strict=True):
-        shared = partial(_shared_plants, part.pooled, table, data.labels)
+
+        def shared(breaths: Breaths, pooled: Pooled = part.pooled) -> Hybrid:
+            wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), pooled)
+            return plants(wide, groups_of(breaths, table, data.labels))
+
         selected = np.isin(of_measured, held_out)
         unseen[selected] = simulation.open_loop_errors(shared, measured)[selected]
+    counted = np.asarray(problem.inspirations.share) > 0
     lungs = {}
-    for name in listed:
+    for name in problem.listed:
         index = measured.by_lung_index.get(name, np.empty(0, np.int64))
         scored = index[np.isin(of_measured[index], rigs[name]["rigs"])]
-        reference = index[of_measured[index] == rigs[name]["session"]]
+        recorded = counted & np.isin(problem.session, rigs[name]["rigs"])[:, None]
         lungs[name] = {
             "R": lung(name).R,
             "C": lung(name).C,
             **rigs[name],
             **_figures("own_rig_", cross_fitted_error[scored]),
-            **_figures("reference_rig_", cross_fitted_error[reference]),
             **_figures("unseen_rig_", unseen[scored]),
             **_figures("held_out_", cross_fitted_error[index]),
-            "recorded_commands": _recorded_commands(problem, rigs[name]["rigs"]),
+            "recorded_commands": command_counts(
+                np.asarray(problem.inspirations.u_in)[recorded]
+            ).tolist(),
         }
     return {
         "lungs": lungs,
-        "valve": _valve(problem, pooled, fits),
         "label_tests": [test.as_dict() for test in tests],
         "sessions": table.to_list(),
-    }, members
-
-
-def _held_out_member(data: RigRecordings) -> Ints:
-    """Member that has not seen each breath; the members of the folds follow the scored one."""
-    unmeasured = len(data.breaths) - data.measured
-    return np.append(data.fold + 1, np.full(unmeasured, BY_ALL))
-
-
-def _shared_plants(
-    pooled: Pooled, table: Sessions, labels: Sequence[Lung], breaths: Breaths
-) -> Hybrid:
-    double_precision = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), pooled)
-    return plants(double_precision, groups_of(breaths, table, labels))
+    }, simulators
 
 
 def choose_rigs(tests: Sequence[LabelTest], table: Sessions) -> dict[str, Any]:
@@ -498,13 +452,6 @@ def _digest(table: Sessions, session: int) -> str:
     return hashlib.sha256(repr(table.table[session]).encode()).hexdigest()
 
 
-def _recorded_commands(problem: _Problem, rigs: Sequence[int]) -> list[int]:
-    """Number of commands in each range whose effect was recorded on some rigs."""
-    counted = np.asarray(problem.inspirations.share) > 0
-    counted = counted & np.isin(problem.session, rigs)[:, None]
-    return command_counts(np.asarray(problem.inspirations.u_in)[counted]).tolist()
-
-
 def _figures(prefix: str, error: Floats) -> dict[str, Any]:
     """Summary to 1e-6 cmH2O, empty where there is no breath, as TOML knows no null."""
     summary = simulation.error_summary(prefix, error)
@@ -513,28 +460,7 @@ def _figures(prefix: str, error: Floats) -> dict[str, Any]:
     return jax.tree.map(lambda x: round(x, 6) if isinstance(x, float) else x, summary)
 
 
-def _valve(problem: _Problem, members: Sequence[Pooled], fits: _Fits) -> dict[str, Any]:
-    """What the recordings say about the valve where it is wide open."""
-    counted = np.asarray(problem.inspirations.share) > 0
-    high = np.asarray(problem.inspirations.u_in) >= WIDE_OPEN
-    measured = np.arange(len(counted)) < problem.data.measured
-    flows = [round(float(np.exp(full_flow(part))), 3) for part in members]
-    resampled_flows = [round(float(np.exp(full_flow(part.pooled))), 3) for part in fits.resampled]
-    return {
-        "wide_open_from": WIDE_OPEN,
-        "samples": int(counted.sum()),
-        "samples_above": int((counted & high).sum()),
-        "measured_samples_above": int((counted & high)[measured].sum()),
-        "data_sheet_flow": SHEET_FLOW,
-        "flow_at_100": flows[0],
-        "flow_at_100_members": flows[1:],
-        "flow_at_100_resampled": resampled_flows,
-    }
-
-
-def _provenance(
-    data: RigRecordings, listed: tuple[str, ...], config: RigConfig, scales: Scales, noise: Noise
-) -> dict[str, Any]:
+def _provenance(data: RigRecordings, listed: tuple[str, ...], config: RigConfig) -> dict[str, Any]:
     return {
         "format": frozen.FORMAT,
         "version": VERSION,
@@ -546,16 +472,16 @@ def _provenance(
         "split": {"by": "breath", "seed": config.seed, "folds": config.folds},
         "recipe": {
             "rigs": dataclasses.asdict(config),
-            "scales": dataclasses.asdict(scales),
-            "noise": dataclasses.asdict(noise),
+            "scales": dataclasses.asdict(Scales()),
+            "noise": dataclasses.asdict(Noise()),
         },
     }
 
 
-def _write(out: Path, manifest: dict[str, Any], members: Hybrid, data: RigRecordings) -> None:
-    unseen = training_list(data.breaths, _held_out_member(data))
-    save_plant(out / frozen.MEMBERS, members)
-    arrays = {**vars(unseen.prints), "fold": unseen.fold}
+def _write(simulators: frozen.Frozen, manifest: dict[str, Any]) -> None:
+    out, training = simulators.folder, simulators.training_breaths
+    save_plant(out / frozen.MEMBERS, simulators.members)
+    arrays = {**vars(training.prints), "fold": training.fold}
     files.write_atomically(out / frozen.TRAINING_LIST, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
     names = (frozen.MEMBERS, frozen.TRAINING_LIST)
     hashes = {"files": {name: {"sha256": files.sha256(out / name)} for name in names}}

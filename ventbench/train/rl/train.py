@@ -81,8 +81,8 @@ class Method(Protocol):
 #: Cells on each lung by which the best policy of a training is chosen, and the seed they come from.
 VALIDATION_CELLS, VALIDATION_SEED = 48, 2021
 
-#: Time between two checkpoints: at least so many seconds, and so many times as long as one takes.
-SAVE_SECONDS, SAVE_SHARE = 5.0, 20.0
+#: Time between two checkpoints, s.
+SAVE_SECONDS = 5.0
 
 #: Called with the share that is done and the lowest error of each run, cmH2O, shape ``(R,)``.
 RunsProgress = Callable[[float, NDArray[np.float32]], None]
@@ -174,7 +174,7 @@ def train(
     chunk: int,
     identity: str = "",
     file: Path | None = None,
-    progress: RunsProgress | None = None,
+    progress: RunsProgress = lambda share, errors: None,
 ) -> TrainedPolicies:
     """Train R policies side by side.
 
@@ -217,7 +217,6 @@ def train(
         if point < points:  # once for nothing, so that no point's time contains the compiling
             jax.block_until_ready(_advance(method, runs, plants, chunk))
         saved = now = time.perf_counter()
-        pause = SAVE_SECONDS
         compiling = compiling + (now - began)
         while point < points:
             runs, errors = _advance(method, runs, plants, chunk)
@@ -227,12 +226,10 @@ def train(
             seconds[point] = seconds[point - 1] + now - before
             if not np.isfinite(curves[:, point]).all():
                 raise FloatingPointError(f"training diverged before point {point} of {points}")
-            if now - saved > pause or point == points:
+            if now - saved > SAVE_SECONDS or point == points:
                 stored.save((runs, curves, seconds, compiling), point)
-                saved = time.perf_counter()
-                pause = max(SAVE_SECONDS, SAVE_SHARE * (saved - now))
-            if progress is not None:
-                progress(point / points, np.asarray(runs.error))
+                saved = now
+            progress(point / points, np.asarray(runs.error))
         return TrainedPolicies(
             policies=jax.tree.map(np.asarray, runs.best),
             validation=np.asarray(runs.error),
@@ -275,21 +272,6 @@ def shortened(method: Any, name: str, steps: int | None) -> Any:
     return replace(method, iterations=iterations)
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Networks that are trained side by side: of ``names``, each on ``lungs`` lungs."""
-
-    names: tuple[str, ...]
-    lungs: int
-
-
-def _groups(names: Sequence[str], lungs: int) -> list[_Group]:
-    """Split networks to train into those of one lung and that of all lungs."""
-    single = tuple(name for name in names if name != ALL)
-    groups = [_Group(single, 1)] if single else []
-    return [*groups, _Group((ALL,), lungs)] if ALL in names else groups
-
-
 def train_networks(
     recipe: Recipe,
     networks: Sequence[str] | None,
@@ -298,7 +280,7 @@ def train_networks(
     seeds: Sequence[int] = (0, 1),
     steps: int | None = None,
     simulator: SimulatorLike = "frozen",
-    progress: Progress | None = None,
+    progress: Progress = lambda label, share, best: None,
 ) -> TrainedControllers:
     """Train networks that correct a PID.
 
@@ -327,68 +309,72 @@ def train_networks(
     """
     began = time.perf_counter()
     name, trained_on = recipe.name, plants_to_train_on(simulator)
-    available = list(trained_on.names)
-    names = check_names(networks, trained_on)
+    names, available = check_names(networks, trained_on), trained_on.names
     if networks is None and len(available) > 1:
         names = (*names, ALL)
-    groups = _groups(names, len(available))
-    methods = [
-        shortened(recipe.per_lung if group.lungs == 1 else recipe.every, name, steps)
-        for group in groups
-    ]
-    report = progress or (lambda *_: None)
-    networks_report, checkpoints, used = {}, [], {}
-    policies: dict[str, Any] = {}
+    lungs_of = {lung: [k] for k, lung in enumerate(available)} | {ALL: [*range(len(available))]}
+    # Networks that see equally many lungs are trained side by side.
+    single = tuple(network for network in names if network != ALL)
+    groups = {"one": (single, recipe.per_lung)} if single else {}
+    if ALL in names:
+        groups["all"] = (ALL,), recipe.every if len(available) > 1 else recipe.per_lung
+    groups = {
+        kind: (group, shortened(method, name, steps)) for kind, (group, method) in groups.items()
+    }
+    best, report = {}, {}
     by_seed: dict[int, dict[str, Any]] = {seed: {} for seed in seeds}
-    for group, settings in zip(groups, methods, strict=True):
-        label, kind = ", ".join(group.names), "all" if ALL in group.names else "one"
-        checkpoints.append(out / f".{name}-{kind}.npz")
-        plants = _lungs(trained_on, group, len(seeds))
+    for kind, (group, method) in groups.items():
+        lungs = _lungs(trained_on, [lungs_of[network] for network in group for _ in seeds])
         trained = train(
-            settings,
-            plants,
-            [seed for _ in group.names for seed in seeds],
+            method,
+            lungs,
+            [seed for _ in group for seed in seeds],
             chunk=recipe.chunk,
-            identity=f"{group.names} {fingerprint(plants)}",
-            file=checkpoints[-1],
-            progress=lambda share, best, label=label: report(label, share, float(best.mean())),
+            identity=f"{group} {fingerprint(lungs)}",
+            file=out / f".{name}-{kind}.npz",
+            progress=lambda share, errors, group=group: progress(
+                ", ".join(group), share, float(errors.mean())
+            ),
         )
-        pids = _pid_errors(plants)
-        used[kind] = asdict(settings)
-        for index, network in enumerate(group.names):
-            networks_report[network] = _best_run(trained, index, seeds)
-            networks_report[network]["error_pid"] = pids[index * len(seeds)]
-            for run, seed in enumerate(seeds, index * len(seeds)):
+        pids = _pid_errors(lungs)
+        for index, network in enumerate(group):
+            runs = slice(index * len(seeds), (index + 1) * len(seeds))
+            for seed, run in zip(seeds, range(runs.start, runs.stop), strict=True):
                 by_seed[seed][network] = jax.tree.map(lambda x, run=run: x[run], trained.policies)
-            policies[network] = by_seed[networks_report[network]["seed"]][network]
+            chosen = seeds[int(np.argmin(trained.validation[runs]))]
+            best[network] = by_seed[chosen][network]
+            report[network] = {
+                "seed": int(chosen),
+                "error_fresh": trained.validation[runs].tolist(),
+                "error_nominal_at_end": trained.curves[runs, -1].tolist(),
+                "breaths": int(trained.episodes[-1]),
+                "training_seconds": round(float(trained.seconds[-1]), 1),
+                "error_pid": pids[runs.start],
+            }
     result = {
         "method": name,
-        "recipes": used,
-        "networks": networks_report,
+        "recipes": {kind: asdict(method) for kind, (_, method) in groups.items()},
+        "networks": report,
         "simulators": dict(trained_on.about),
         "jax": jax.__version__,
         "seconds": round(time.perf_counter() - began, 1),
     }
-    residual.save_policies(out / "weights.npz", policies)
+    residual.save_policies(out / "weights.npz", best)
     for seed in seeds if len(seeds) > 1 else ():
         residual.save_policies(out / f"weights-{seed}.npz", by_seed[seed])
     files.write_json(out / "training.json", result)
-    for checkpoint in checkpoints:
-        checkpoint.unlink(missing_ok=True)
-    return TrainedControllers(policies, result, out)
+    for kind in groups:
+        (out / f".{name}-{kind}.npz").unlink(missing_ok=True)
+    return TrainedControllers(best, result, out)
 
 
-def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> environment.Lungs:
-    """Lungs of each run, an axis of R in front: the seeds of a network in a row."""
-    available = list(trained_on.names)
-    if ALL in group.names:
-        lung_index = np.repeat([list(range(len(available)))], seeds, axis=0)
-    else:
-        lung_index = np.repeat([[available.index(name)] for name in group.names], seeds, axis=0)
-    plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, lung_index], trained_on.plants)
+def _lungs(trained_on: TrainingPlants, of_runs: list[list[int]]) -> environment.Lungs:
+    """Lungs of each run by their indices, an axis of R in front."""
+    index = np.array(of_runs)
+    plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, index], trained_on.plants)
     # (plants, runs, lungs, ...) -> (runs, plants, lungs, ...)
     plants = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), plants)
-    return environment.Lungs(plants, jnp.asarray(trained_on.weights[lung_index]))
+    return environment.Lungs(plants, jnp.asarray(trained_on.weights[index]))
 
 
 def _pid_errors(lungs: environment.Lungs) -> list[float]:
@@ -398,19 +384,6 @@ def _pid_errors(lungs: environment.Lungs) -> list[float]:
         pid = PID(*residual.GAINS)
         errors = jax.jit(jax.vmap(lambda run_lungs: nominal_error(run_lungs, pid)))(lungs)
         return [float(error) for error in errors]
-
-
-def _best_run(trained: TrainedPolicies, network: int, seeds: Sequence[int]) -> dict[str, Any]:
-    """Entries of a network in the report, of which ``seed`` is that of its best run."""
-    first = network * len(seeds)
-    rows = slice(first, first + len(seeds))
-    return {
-        "seed": int(seeds[int(np.argmin(trained.validation[rows]))]),
-        "error_fresh": [float(value) for value in trained.validation[rows]],
-        "error_nominal_at_end": [float(value) for value in trained.curves[rows, -1]],
-        "breaths": int(trained.episodes[-1]),
-        "training_seconds": round(float(trained.seconds[-1]), 1),
-    }
 
 
 def options(description: str, out: Path) -> argparse.ArgumentParser:

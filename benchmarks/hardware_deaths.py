@@ -18,7 +18,6 @@ what is finished; the same command continues.
 from __future__ import annotations
 
 import contextlib
-import json
 import multiprocessing
 import os
 import random
@@ -28,6 +27,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,29 +39,28 @@ import typer
 from hardware_eval import realtime
 from hardware_eval.wire.client import Client, Link, LinkError
 from hardware_eval.wire.messages import Mode
-from ventbench.base import files
+from ventbench.base.resume import WorkFolder
 
-#: The lung must be vented within this time of a death, s: watchdog, deadman, monostable, age of the
-#: readings, each with what their processes need to wake up.
-LIMITS = {
-    "host": 0.100,
-    "device": 0.060,
-    "stopped": 0.060,
-    "deadman": 0.100,
-    "both": 0.100,
-    "bus": 0.070,
-    "supply": 0.010,
-}
 
-#: What the table calls them.
-TITLES = {
-    "host": "host killed",
-    "device": "program killed",
-    "stopped": "program stopped",
-    "deadman": "deadman killed",
-    "both": "both stopped",
-    "bus": "sensor's bus blocked",
-    "supply": "supply lost",
+@dataclass(frozen=True)
+class Death:
+    """What dies."""
+
+    title: str  #: what the table calls it.
+    #: the lung must be vented within this time, s: watchdog, deadman, monostable, age of the
+    #: readings, each with what their processes need to wake up.
+    limit: float
+    signals: tuple[tuple[str, int], ...] = ()  #: which process gets what; none: the host is killed.
+
+
+DEATHS = {
+    "host": Death("host killed", 0.100),
+    "device": Death("program killed", 0.060, (("device", signal.SIGKILL),)),
+    "stopped": Death("program stopped", 0.060, (("device", signal.SIGSTOP),)),
+    "deadman": Death("deadman killed", 0.100, (("deadman", signal.SIGKILL),)),
+    "both": Death("both stopped", 0.100, (("deadman", signal.SIGSTOP), ("device", signal.SIGSTOP))),
+    "bus": Death("sensor's bus blocked", 0.070, (("electronics", signal.SIGUSR2),)),
+    "supply": Death("supply lost", 0.010, (("electronics", signal.SIGUSR1),)),
 }
 
 #: A host runs for a random time in this range before it is killed, s.
@@ -69,21 +70,21 @@ LIFE = (0.05, 0.5)
 PATIENCE = 5.0
 
 
-def host(port: str, started: int) -> None:
-    """Breathe until killed; tells the pipe ``started`` when the first command was obeyed."""
+def breathe(port: str, started: Event) -> None:
+    """Be a host until killed; says that it has ``started`` when the first command was obeyed."""
+    signal.alarm(round(2 * PATIENCE))  # it does not outlive a benchmark that was killed
     realtime.take_priority()
     client = Client(Link(port))
     while True:
         try:
             client.hello()
             client.arm()
-            due, told = time.monotonic(), False
+            due = time.monotonic()
             while True:
                 client.heartbeat()
                 reading = client.command(5.0 + 5.0 * random.random(), 0)
-                if reading.mode is Mode.RUNNING and not told:
-                    os.write(started, b"x")
-                    told = True
+                if reading.mode is Mode.RUNNING and not started.is_set():
+                    started.set()
                 due += 0.03
                 time.sleep(max(due - time.monotonic(), 0.0))
         except LinkError:
@@ -97,25 +98,16 @@ class EmulatedDevice:
 
     Args:
         folder: for its link and its logs.
-        extra: further options of the emulator.
+        options: of the emulator.
     """
 
-    def __init__(self, folder: Path, extra: list[str]) -> None:
-        folder.mkdir()
+    def __init__(self, folder: Path, options: list[str]) -> None:
         self.link = folder / "lung"
         self.valves, self.program = folder / "valves.csv", folder / "program.csv"
-        self._command = [
-            sys.executable,
-            "-m",
-            "tests.hardware_eval.electronics",
-            "--link",
-            str(self.link),
-            "--valves",
-            str(self.valves),
-            "--program",
-            str(self.program),
-            *extra,
-        ]
+        paths = {"--link": self.link, "--valves": self.valves, "--program": self.program}
+        named = [text for option, path in paths.items() for text in (option, str(path))]
+        module = [sys.executable, "-m", "tests.hardware_eval.electronics"]
+        self._command = [*module, *named, *options]
         self._start()
 
     def _start(self) -> None:
@@ -125,30 +117,19 @@ class EmulatedDevice:
         assert told, "the emulator did not start"
         self._ids = {name: int(number) for name, number in re.findall(r"(\w+) (\d+)", told)}
 
-    def die(self, death: str) -> None:
+    def die(self, death: Death) -> None:
         """Bring a death about."""
-        match death:
-            case "device":
-                os.kill(self._ids["device"], signal.SIGKILL)
-            case "stopped":
-                os.kill(self._ids["device"], signal.SIGSTOP)
-            case "deadman":
-                os.kill(self._ids["deadman"], signal.SIGKILL)
-            case "both":
-                os.kill(self._ids["deadman"], signal.SIGSTOP)
-                os.kill(self._ids["device"], signal.SIGSTOP)
-            case "bus":
-                os.kill(self._ids["electronics"], signal.SIGUSR2)
-            case "supply":
-                os.kill(self._ids["electronics"], signal.SIGUSR1)
+        for process, number in death.signals:
+            os.kill(self._ids[process], number)
 
-    def live(self, death: str) -> None:
-        """Undo it."""
-        if death in ("stopped", "both"):
-            os.kill(self._ids["deadman"], signal.SIGCONT)
-            os.kill(self._ids["device"], signal.SIGCONT)
+    def live(self, death: Death) -> None:
+        """Undo it; a blocked bus comes back by itself."""
+        sent = {number for _, number in death.signals}
+        if signal.SIGSTOP in sent:
+            for process in ("deadman", "device"):
+                os.kill(self._ids[process], signal.SIGCONT)
             time.sleep(0.1)
-        if death in ("device", "deadman", "supply"):
+        if sent & {signal.SIGKILL, signal.SIGUSR1}:
             self.end()
             self._start()
 
@@ -166,15 +147,13 @@ class EmulatedDevice:
                 os.kill(self._ids["electronics"], 0)
                 time.sleep(0.02)
 
-    def does(self) -> tuple[float, list[str]]:
-        """Time of the last change of the valves, s, and what they do since."""
-        row = self.valves.read_text().splitlines()[-1].split(",")
-        return float(row[0]), row[1:]
+    def moves(self) -> list[tuple[float, list[str]]]:
+        """The last changes of the valves: when, s, and what they do since."""
+        rows = [line.split(",") for line in self.valves.read_text().splitlines()[-50:]]
+        return [(float(row[0]), row[1:3]) for row in rows]
 
 
-def kill_one(
-    device: EmulatedDevice, death: str, unvented: bool = False
-) -> tuple[float, bool] | None:
+def kill_one(device: EmulatedDevice, death: Death, unvented: bool) -> tuple[float, bool] | None:
     """Start a host, and let something die in its inspiration.
 
     Args:
@@ -187,99 +166,59 @@ def kill_one(
         and whether the machine held the device's process up; None where the lung was vented
         already, because host or device were late.
     """
-    readable, writable = os.pipe()
-    pid = os.fork()
-    if pid == 0:
-        signal.alarm(round(2 * PATIENCE))  # it does not outlive a benchmark that was killed
-        try:
-            host(str(device.link), writable)
-        finally:
-            os._exit(1)
-    os.close(writable)
-    struck = 0.0
+    processes = multiprocessing.get_context("fork")
+    started = processes.Event()
+    host = processes.Process(target=breathe, args=(str(device.link), started), daemon=True)
+    host.start()
     try:
-        if not os.read(readable, 1):
+        if not started.wait(2 * PATIENCE):
             raise SystemExit("the host ended by itself")
         time.sleep(random.uniform(*LIFE))
-        _, valves = device.does()
+        _, valves = device.moves()[-1]
         struck = time.monotonic()
-        if valves[:2] == ["0", "1"]:
+        if valves == ["0", "1"]:
             return None
-        if death != "host":
-            device.die(death)
-            end = struck + PATIENCE
-            while time.monotonic() < end and device.does()[0] <= struck:
-                time.sleep(0.005)
+        if not death.signals:
+            host.kill()
+        device.die(death)
+        delay, ends = float("inf"), ["0", "0" if unvented else "1"]
+        while delay == float("inf") and time.monotonic() < struck + PATIENCE:
+            time.sleep(0.005)
+            after = (at - struck for at, valves in device.moves() if at > struck and valves == ends)
+            delay = next(after, delay)
     finally:
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
-        os.close(readable)
-    end = time.monotonic() + PATIENCE
-    delay, ends = float("inf"), ["0", "0" if unvented else "1"]
-    while time.monotonic() < end:
-        rows = [line.split(",") for line in device.valves.read_text().splitlines()[-50:]]
-        after = [float(row[0]) for row in rows if float(row[0]) > struck and row[1:3] == ends]
-        if after:
-            delay = after[0] - struck
-            break
-        time.sleep(0.005)
-    late = (
-        "DEVICE_LATE" in device.program.read_text().splitlines()[-1] if death == "host" else False
-    )
+        host.kill()
+        host.join()
+    late = not death.signals and "DEVICE_LATE" in device.program.read_text().splitlines()[-1]
     device.live(death)
     return delay, late
 
 
-def work(
-    kills: int, folder: Path, extra: list[str], death: str, unvented: bool
-) -> tuple[list[tuple[float, bool]], int]:
-    """Let things die at one emulator until there are enough delays."""
-    device = EmulatedDevice(folder, extra)
+def deaths(death: Death, normally_open: bool, kills: int, options: list[str]) -> dict[str, Any]:
+    """Let one thing die again and again at an emulator: a row of the table."""
+    unvented = death.title == DEATHS["supply"].title and not normally_open
     delays: list[tuple[float, bool]] = []
-    late = 0
-    while len(delays) < kills:
-        done = kill_one(device, death, unvented)
-        if done is None:
-            late += 1
-        else:
-            delays.append(done)
-    device.end()
-    return delays, late
-
-
-def deaths(
-    death: str, normally_open: bool, kills: int, emulators: int, folder: Path, extra: list[str]
-) -> dict[str, Any]:
-    """Let one thing die again and again: a row of the table."""
-    if not normally_open:
-        extra = [*extra, "--normally-closed"]
-    unvented = death == "supply" and not normally_open
-    shares = [len(range(k, kills, emulators)) for k in range(emulators)]
-    # Processes and no threads: each forks its hosts.
-    with multiprocessing.get_context("fork").Pool(emulators) as pool:
-        parts = pool.starmap(
-            work,
-            [
-                (share, folder / f"{death}-{normally_open}-{k}", extra, death, unvented)
-                for k, share in enumerate(shares)
-            ],
-            chunksize=1,
-        )
-    delays = [each for part, _ in parts for each in part]
-    late = sum(part for _, part in parts)
+    not_counted = 0
+    # In memory: a disk that others write to holds up whoever writes a line.
+    memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
+    with tempfile.TemporaryDirectory(dir=memory) as folder:
+        closed = ["--normally-closed"] * (not normally_open)
+        device = EmulatedDevice(Path(folder), [*options, *closed])
+        while len(delays) < kills:
+            done = kill_one(device, death, unvented)
+            not_counted += done is None
+            delays += [] if done is None else [done]
+        device.end()
     milliseconds = 1e3 * np.array([delay for delay, _ in delays])
     return {
-        "death": death,
-        "valve": "open" if normally_open else "closed",
-        "kills": kills,
         "vents": not unvented,
-        "bound_ms": 1e3 * LIMITS[death],
-        "within": int(np.sum(milliseconds <= 1e3 * LIMITS[death])),
+        "within": int(np.sum(milliseconds <= 1e3 * death.limit)),
         "median_ms": float(np.median(milliseconds)),
         "worst_ms": float(milliseconds.max()),
         "held_up": int(sum(held for _, held in delays)),
-        "not_counted": late,
+        "not_counted": not_counted,
         "delays_ms": sorted(milliseconds.round(2).tolist()),
+        "load": round(os.getloadavg()[0], 1),
     }
 
 
@@ -287,7 +226,6 @@ def main(
     death: list[str] | None = None,
     valve: str | None = None,
     kills: int = 100,
-    emulators: int = 2,
     urgent: Annotated[bool, typer.Option("--realtime")] = False,
     strict: bool = False,
     out: Path = Path("runs/deaths"),
@@ -301,34 +239,30 @@ def main(
     --strict: exit 1 if any delay is too long.
     --out: kept here.
     """
-    extra = ["--realtime"] * urgent
     # Not what it starts: an emulator that compiles would hold up everything else.
     if urgent and not realtime.take_priority():
         raise SystemExit("no real-time scheduling: it wants root, or a limit rtprio")
-    # In memory: a disk that others write to holds up whoever writes a line.
-    memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    rows: list[dict[str, Any]] = []
-    for name in death or LIMITS:
+    work, rows = WorkFolder(out, {"kills": kills}), []
+    for name in death or DEATHS:
         for position in [valve] if valve else ["open", "closed"]:
-            kept = out / f"{name}-{position}-{kills}.json"
-            if not kept.exists():
-                with tempfile.TemporaryDirectory(dir=memory) as folder:
-                    row = deaths(name, position == "open", kills, emulators, Path(folder), extra)
-                files.write_json(kept, {**row, "load": round(os.getloadavg()[0], 1)})
-            rows.append(json.loads(kept.read_text()))
+            options = ["--realtime"] * urgent
+            made = partial(deaths, DEATHS[name], position == "open", kills, options)
+            rows.append((DEATHS[name], work.get(f"{name}-{position}", made)))
     print("| death | within bound | ms: bound, larger median, longest |\n|---|---|---|")
-    for kind, vents in dict.fromkeys((row["death"], row["vents"]) for row in rows):
-        own = [row for row in rows if (row["death"], row["vents"]) == (kind, vents)]
-        count, within = (sum(row[name] for row in own) for name in ("kills", "within"))
-        longest = [max(row[name] for row in own) for name in ("bound_ms", "median_ms", "worst_ms")]
-        title = TITLES[kind] + ("" if vents else ", closed without current: nothing flows")
-        print(f"| {title} | {within}/{count} | {', '.join(f'{ms:.0f}' for ms in longest)} |")
-    loads = [row["load"] for row in rows]
+    for kind, vents in dict.fromkeys((kind, row["vents"]) for kind, row in rows):
+        own = [row for each, row in rows if (each, row["vents"]) == (kind, vents)]
+        within = sum(row["within"] for row in own)
+        median, worst = (max(row[name] for row in own) for name in ("median_ms", "worst_ms"))
+        title = kind.title + ("" if vents else ", closed without current: nothing flows")
+        figures = f"{1e3 * kind.limit:.0f}, {median:.0f}, {worst:.0f}"
+        print(f"| {title} | {within}/{kills * len(own)} | {figures} |")
+    loads, held_up, missed = (
+        [row[x] for _, row in rows] for x in ("load", "held_up", "not_counted")
+    )
     print(f"load {min(loads)} to {max(loads)} on {os.cpu_count()} processors")
-    print(f"held up by the machine for over 40 ms: {sum(row['held_up'] for row in rows)}")
-    missed = sum(row["not_counted"] for row in rows)
-    print(f"not counted, as the lung was vented before the death by a late host: {missed}")
-    if strict and any(row["within"] < row["kills"] for row in rows):
+    print(f"held up by the machine for over 40 ms: {sum(held_up)}")
+    print(f"not counted, as the lung was vented before the death by a late host: {sum(missed)}")
+    if strict and any(row["within"] < kills for _, row in rows):
         raise SystemExit(1)
 
 

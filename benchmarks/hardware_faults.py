@@ -18,14 +18,13 @@ from typing import Any
 import numpy as np
 import typer
 
-from hardware_eval.bench.controllers import ControllerFailedError, Count, PIDController
+from hardware_eval.bench.controllers import ControllerFailedError, PIDController
 from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, run_once
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import selftest
 from hardware_eval.emulation.simulated import PVP_SENSOR
-from hardware_eval.wire.client import Client, LinkError, NoAnswerError
-from hardware_eval.wire.messages import Reading
+from hardware_eval.wire.client import Client, LinkError
 from tests.hardware_eval import faults
 from tests.hardware_eval.faults import FaultKind, FaultyDevice, faulty_lung
 from ventbench.task import protocol
@@ -34,98 +33,23 @@ from ventbench.task import protocol
 REST = 2.0
 
 
-class HostDiedError(BaseException):
-    """``kill -9``: nothing of the host runs after it, not even what cleans up."""
-
-
-def unchanged(wanted: float) -> float:
-    return wanted
-
-
-class Troubled:
-    """A PID that from a moment on does something else.
-
-    Args:
-        device: whose clock tells the moment.
-        lung: whose gains it has.
-        moment: s on that clock.
-        trouble: called with its command from then on; gives the command that is sent.
-    """
-
-    longest_answer, beside = 0.0, Count()
-
-    def __init__(
-        self, device: FaultyDevice, lung: str, moment: float, trouble: Callable[[float], Any]
-    ) -> None:
-        self._pid = PIDController((*CONTROL_GAINS[lung], 0.0))
-        self._device, self._moment, self._trouble = device, moment, trouble
-        self._own = trouble is not unchanged
-        self.began: float | None = None
-
-    def act(self, row: np.ndarray, budget: float) -> float | None:
-        """Next command, %."""
-        wanted = self._pid.act(row, budget)
-        if self._device.clock.now() < self._moment or wanted is None:
-            return wanted
-        if self._own and self.began is None:
-            self.began = self._device.clock.now()
-        return self._trouble(wanted)
-
-    def close(self) -> None:
-        """Nothing to end."""
-
-
-class DeadClient(Client):
-    """A host that says nothing more once it has died."""
-
-    dead = False
-
-    def vent(self) -> Reading:
-        """Vent, unless it is dead."""
-        if self.dead:
-            raise NoAnswerError("the host is dead")
-        return super().vent()
-
-
-class StopKey(Operator):
-    """Presses the emergency stop at a moment."""
-
-    def __init__(self, device: FaultyDevice, moment: float) -> None:
-        self._device, self._moment = device, moment
-
-    def stop(self) -> bool:
-        """Whether the moment has come."""
-        return self._device.clock.now() >= self._moment
-
-
 @dataclass(frozen=True)
 class Fault:
-    """One row of the table.
+    """One row of the table: a fault of lung, valves or sensor, or something else that happens."""
 
-    Attributes:
-        name: as people say it.
-        lung: fault of lung, valves or sensor; None if it is another.
-        controller: what the controller does from then on.
-        device: what is done to the device's line at that moment.
-        key: whether the emergency stop is pressed.
-        dies: whether the host dies.
-        inspiration: whether it begins in an inspiration only.
-    """
-
-    name: str
-    lung: tuple[FaultKind, float] | None = None
-    controller: Callable[[float], Any] | None = None
-    device: Callable[[FaultyDevice], None] | None = None
-    key: bool = False
-    dies: bool = False
-    inspiration: bool = False
+    name: str  #: as people say it.
+    lung: tuple[FaultKind, float] | None = None  #: kind and strength.
+    #: what a controller does from then on, on a device; gives its command, %.
+    controller: Callable[[FaultyDevice], float | None] | None = None
+    key: bool = False  #: whether the emergency stop is pressed.
+    inspiration: bool = False  #: whether it begins in an inspiration only.
 
 
-def raises(wanted: float) -> float:
+def raises(device: FaultyDevice) -> float:
     raise ControllerFailedError("it raised ValueError")
 
 
-def interrupts(wanted: float) -> float:
+def interrupts(device: FaultyDevice) -> float:
     raise KeyboardInterrupt
 
 
@@ -144,62 +68,77 @@ FAULTS = (
     Fault("inspiratory valve stuck", (FaultKind.VALVE_STUCK, 1.0), inspiration=True),
     Fault("inspiratory valve at a tenth", (FaultKind.VALVE_WEAK, 0.1)),
     Fault("expiratory valve stuck closed", (FaultKind.EXPIRATORY_STUCK, 1.0)),
-    Fault("controller opens the valve fully", controller=lambda wanted: 100.0),
+    Fault("controller opens the valve fully", controller=lambda device: 100.0),
     Fault("controller raises an exception", controller=raises, inspiration=True),
-    Fault("controller does not answer", controller=lambda wanted: None, inspiration=True),
+    Fault("controller does not answer", controller=lambda device: None, inspiration=True),
     Fault("Ctrl-C", controller=interrupts, inspiration=True),
     Fault("emergency stop key", key=True),
-    Fault("host killed (kill -9)", dies=True, inspiration=True),
-    Fault("cable pulled", device=FaultyDevice.unplug),
-    Fault("host asleep or stopped", dies=True, inspiration=True),
+    Fault("cable pulled", controller=FaultyDevice.unplug),
 )
+
+
+class Troubled(PIDController):
+    """The paper's PID, which from a moment on, s, does something else if the fault says so."""
+
+    def __init__(self, device: FaultyDevice, lung: str, fault: Fault, moment: float) -> None:
+        super().__init__((*CONTROL_GAINS[lung], 0.0))
+        self._device, self._fault, self._moment = device, fault, moment
+        self.began: float | None = None
+
+    def act(self, row: np.ndarray, budget: float) -> float | None:
+        """Next command, %."""
+        wanted, now = super().act(row, budget), self._device.clock.now()
+        if self._fault.controller is None or now < self._moment:
+            return wanted
+        self.began = self.began or now
+        return self._fault.controller(self._device)
+
+
+class StopKey(Operator):
+    """Presses the emergency stop at a moment, s."""
+
+    def __init__(self, device: FaultyDevice, moment: float) -> None:
+        self._device, self._moment = device, moment
+
+    def stop(self) -> bool:
+        """Whether the moment has come."""
+        return self._device.clock.now() >= self._moment
+
+
+def bench_of(device: FaultyDevice, operator: Operator | None = None) -> Bench:
+    """A bench with a session of the device."""
+    client = Client(device, device.clock)
+    client.hello()
+    return Bench(client, device.clock, DEFAULT, operator or Operator(), rest=REST)
+
+
+def break_lung(device: FaultyDevice, fault: Fault, moment: float) -> None:
+    """Let a fault of lung, valves or sensor begin at a moment, s, and no other."""
+    hal: Any = device.service.hal
+    hal.faults = ()
+    if fault.lung is not None:
+        kind, strength = fault.lung
+        hal.faults = (faults.Fault(kind, moment, strength=strength),)
 
 
 def trial(device: FaultyDevice, lung: str, fault: Fault, moment: float) -> tuple[str, float]:
     """What the bench did, and after how many ms the lung was vented (NaN: it was not)."""
-    hal: Any = device.service.hal
-    client = Client(device, device.clock)
-    client.hello()
     begins = device.clock.now() + REST + moment
-    if fault.lung is not None:
-        hal.faults = (faults.Fault(fault.lung[0], begins, strength=fault.lung[1]),)
-
-    def dies(wanted: float) -> float:
-        DeadClient.dead = True
-        raise HostDiedError
-
-    def acts(wanted: float) -> float:
-        assert fault.device is not None
-        fault.device(device)
-        return wanted
-
-    trouble: Callable[[float], Any] = fault.controller or unchanged
-    if fault.dies:
-        trouble = dies
-    if fault.device is not None:
-        trouble = acts
-    operator = StopKey(device, begins) if fault.key else Operator()
-    bench = Bench(client, device.clock, DEFAULT, operator, rest=REST)
-    run = PlannedRun(0, "scored", "pid", lung, 20.0, 1)
-    controller = Troubled(device, lung, begins, trouble)
-    if fault.dies:
-        bench = Bench(DeadClient(device, device.clock), device.clock, DEFAULT, operator, rest=REST)
-        bench.client.hello()
+    bench = bench_of(device, StopKey(device, begins) if fault.key else None)
+    break_lung(device, fault, begins)
+    controller = Troubled(device, lung, fault, begins)
     try:
-        result = run_once(bench, run, controller)
+        result = run_once(bench, PlannedRun(0, "scored", "pid", lung, 20.0, 1), controller)
         done = "went on" if result.status == "complete" else result.reason.partition(":")[0]
         done = "answers too late" if "answers took" in done else done
     except LinkError:
-        done = "device's watchdog"
-    except HostDiedError:
         done = "device's watchdog"
     except EmergencyStop:
         done = "vented by the key"
     except KeyboardInterrupt:
         done = "vented on the way out"
-    DeadClient.dead = False
     # What the controller or the cable does shows when it is next asked.
-    began = begins if controller.began is None else controller.began
+    began = controller.began or begins
     device.clock.advance(0.3)
     if done == "went on":
         return done, float("nan")
@@ -207,7 +146,20 @@ def trial(device: FaultyDevice, lung: str, fault: Fault, moment: float) -> tuple
     return done, 1e3 * max(vented[-1] - began, 0.0)
 
 
-def clear(device: FaultyDevice) -> None:
+def tested(device: FaultyDevice, lung: str, fault: Fault) -> str:
+    """What the self-test says of a fault of the lung, if it is there from the start."""
+    if fault.lung is None:
+        return ""
+    break_lung(device, fault, device.clock.now())
+    try:
+        sheet = selftest(bench_of(device), lung)
+    except LinkError as error:
+        return f"no-go: {error}"
+    bad = [x.name.replace("_", " ") for x in sheet.findings if not x.ok]
+    return f"no-go: {', '.join(bad)}" if bad else "go"
+
+
+def mend(device: FaultyDevice) -> None:
     """Mend the device, and let the lung empty."""
     hal: Any = device.service.hal
     hal.faults = ()
@@ -224,37 +176,18 @@ def main(trials: int = 10, lung: str = "R20C20", only: str = "") -> None:
     device = FaultyDevice(faulty_lung(lung, sensor=PVP_SENSOR))
     for fault in (fault for fault in FAULTS if only in fault.name):
         done: dict[str, list[float]] = {}
+        last = int((1.0 if fault.inspiration else 3.0) / protocol.DT) - 3
         for _ in range(trials):
-            within = 1.0 if fault.inspiration else 3.0
-            moment = 3.0 + protocol.DT * (
-                1 + int(random.integers(1, int(within / protocol.DT) - 3))
-            )
+            moment = 3.0 + protocol.DT * (1 + int(random.integers(1, last)))
             what, took = trial(device, lung, fault, moment)
             done.setdefault(what, []).append(took)
-            clear(device)
-        found = "" if fault.lung is None else _selftest(device, lung, fault)
+            mend(device)
+        found = tested(device, lung, fault)
+        mend(device)
         times = [x for values in done.values() for x in values if np.isfinite(x)]
         span = f"{np.median(times):.0f}, {max(times):.0f}" if times else "-"
         what = ", ".join(f"{name} ({len(values)})" for name, values in done.items())
         print(f"| {fault.name} | {what} | {span} | {found} |", flush=True)
-
-
-def _selftest(device: FaultyDevice, lung: str, fault: Fault) -> str:
-    """What the self-test says of the fault, if it is there from the start."""
-    hal: Any = device.service.hal
-    assert fault.lung is not None
-    hal.faults = (faults.Fault(fault.lung[0], device.clock.now(), strength=fault.lung[1]),)
-    client = Client(device, device.clock)
-    client.hello()
-    try:
-        bench = Bench(client, device.clock, DEFAULT, Operator(), rest=REST)
-        sheet = selftest(bench, lung)
-        bad = [x.name.replace("_", " ") for x in sheet.findings if not x.ok]
-        found = f"no-go: {', '.join(bad)}" if bad else "go"
-    except LinkError as error:
-        found = f"no-go: {error}"
-    clear(device)
-    return found
 
 
 if __name__ == "__main__":

@@ -16,8 +16,7 @@ and 20 are parabolic; sensor noise of 0.1 to 0.3 cmH2O and the converter's step 
 
     python benchmarks/hardware_guards.py [--lungs 4] [--entry pid_best ...] [--guard lateness ...]
 
-Prints the tables of ``hardware_eval/README.md`` with intervals of 95 % (Clopper-Pearson), and what
-the population's rigs do, on which the bounds of the fallback rest.
+Prints the tables of ``hardware_eval/README.md`` with intervals of 95 % (Clopper-Pearson).
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from scipy import stats
 
 from hardware_eval.bench import fallback, safety, selftest
 from hardware_eval.bench.controllers import Count, Lateness, PIDController
-from hardware_eval.bench.drive import Driven
+from hardware_eval.bench.drive import Commands, Driven
 from hardware_eval.bench.identity import Baseline, KnownLung, measured_lung, white_noise
 from hardware_eval.bench.loop import LATE_SHARE
 from hardware_eval.bench.plan import CONTROL_GAINS
@@ -87,19 +86,23 @@ PLANTS = ("right", "another lung", *SENSORS, STUCK)
 #: times in which it does, s.
 CREEP, CREEP_TIME = (0.04, 0.08), (0.5, 1.8)
 
+#: Forms of what a lung of the generator has, by effect.
+FORMS = {"viscoelasticity": "library", "turbulent_resistance": "quadratic", "leak": "orifice"}
+
 #: Parts of the self-test that could find it; all if not here.
 ALL = selftest.PARTS
 PARTS_OF = {CREEPS: ("sensor", "leak"), LEAKS: ("sensor", "leak")}
+_OF_LUNG = ("sensor", "lung")
+
+#: Families of lungs.
+FAMILIES = ("frozen", "population", "independent")
 
 
 class Lungs(Protocol):
     """Lungs side by side, at rest; arrays of shape ``(n,)``."""
 
-    def hold(self, before: Floats, u_in: Floats, u_out: Floats, begins: bool = False) -> None:
-        """Hold commands, % and 0/1, for a control step; before them others were in force.
-
-        ``begins`` tells that an inspiration does.
-        """
+    def hold(self, u_in: Floats, u_out: Floats) -> None:
+        """Hold commands, % and 0/1, for a control step."""
         ...
 
     def pressure(self) -> Floats:
@@ -111,38 +114,22 @@ class Lungs(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class Mounted:
-    """What is mounted; arrays of shape ``(n,)``.
-
-    Attributes:
-        begin: puts the lungs at rest.
-        gain: of the valve, mL/s per %.
-        sensor: gain of the pressure sensor.
-        flow: gain of the flow sensor.
-        noise: standard deviation, cmH2O.
-    """
-
-    begin: Callable[[], Lungs]
-    gain: Floats
-    sensor: Floats
-    flow: Floats
-    noise: Floats
-
-
 class Generated:
-    """Lungs of the generator; ``dead`` is the dead time of each valve, steps of integration."""
+    """Lungs of the generator, as :func:`generated` draws them."""
 
-    def __init__(self, base: Base, effects: dict[str, Effect], dead: Ints) -> None:
-        n = len(dead)
-        self._rig = Rig(base, effects, np.zeros(n), 0.03, np.zeros(n), np.zeros((2, n)))
+    def __init__(self, drawn: dict[str, Any]) -> None:
+        self._dead, zeros = drawn["dead"], np.zeros(len(drawn["dead"]))
+        base = Base(**drawn["base"])
+        effects = {name: Effect(name, "mild", form, drawn[name]) for name, form in FORMS.items()}
+        self._rig = Rig(base, effects, zeros, 0.03, zeros, np.zeros((2, len(zeros))))
         self._rig.start(np.asarray(base.peep))
-        self._dead = dead
+        self._u_in = zeros
 
-    def hold(self, before: Floats, u_in: Floats, u_out: Floats, begins: bool = False) -> None:
-        """See :class:`Lungs`."""
+    def hold(self, u_in: Floats, u_out: Floats) -> None:
+        """See :class:`Lungs`; a valve stays where it was for its dead time."""
         for fine in range(FINE):
-            self._rig.advance(np.where(fine >= self._dead, u_in, before), u_out, 0.0, STEP)
+            self._rig.advance(np.where(fine >= self._dead, u_in, self._u_in), u_out, 0.0, STEP)
+        self._u_in = u_in
 
     def pressure(self) -> Floats:
         """See :class:`Lungs`."""
@@ -156,22 +143,17 @@ class Generated:
 class Plants:
     """Plants with leaves ``(n, ...)``."""
 
-    def __init__(self, plants: Any, stuck: bool = False) -> None:
+    def __init__(self, plants: Any) -> None:
         self._plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
         start = jnp.full(jax.tree.leaves(plants)[0].shape[0], protocol.PEEP, jnp.float32)
         self._state, self._signals = jax.vmap(lambda plant, x: plant.init(x, x))(plants, start)
-        self._open = 0.0 if stuck else 1.0
-        dt = jnp.float32(protocol.DT)
+        self._u_out = np.ones(len(start))
 
-        def step(plant: Any, state: Any, u: Any, out: Any, begins: Any) -> Any:
-            return plant.step(breath_begun(state, begins), u, out, dt)
-
-        self._step = jax.jit(jax.vmap(step, in_axes=(0, 0, 0, 0, None)))
-
-    def hold(self, before: Floats, u_in: Floats, u_out: Floats, begins: bool = False) -> None:
-        """See :class:`Lungs`."""
-        inputs = (np.float32(self._open * u_in), np.float32(u_out), np.float32(begins))
-        self._state, self._signals = self._step(self._plants, self._state, *inputs)
+    def hold(self, u_in: Floats, u_out: Floats) -> None:
+        """See :class:`Lungs`; a breath begins where the expiratory valve closes."""
+        inputs = (x.astype(np.float32) for x in (u_in, u_out, self._u_out > u_out))
+        self._state, self._signals = _held(self._plants, self._state, *inputs)
+        self._u_out = u_out
 
     def pressure(self) -> Floats:
         """See :class:`Lungs`."""
@@ -182,163 +164,191 @@ class Plants:
         return np.asarray(self._signals.flow, float)
 
 
-def draw(
-    family: str, settings: Sequence[str], fault: str, seed: int, rng: np.random.Generator
-) -> Mounted:
-    """Draw a lung of a family about each setting."""
-    n = len(settings)
+@jax.jit
+@jax.vmap
+def _held(plant: Any, state: Any, u_in: Any, u_out: Any, begins: Any) -> Any:
+    return plant.step(breath_begun(state, begins), u_in, u_out, jnp.float32(protocol.DT))
+
+
+def drawn(
+    family: str, settings: Sequence[str], seed: bytes, rng: np.random.Generator, kind: str = "right"
+) -> tuple[Callable[[Any], Lungs], Any]:
+    """A lung of a family about each setting: what makes them of arrays ``(n, ...)``, and these."""
     if family == "independent":
-        base, effects, dead = generated(settings, fault, rng)
-        begin, gain = partial(Generated, base, effects, dead), np.asarray(base.gain)
-    else:
-        begin = partial(Plants, _rigs(family, settings, seed), fault == STUCK)
-        gain = np.full(n, VALVE_GAIN)
-    sensor, flow = np.full(n, SENSORS.get(fault, 1.0)), 1.0 + FLOW_GAIN * rng.standard_normal(n)
-    return Mounted(begin, gain, sensor, flow, rng.uniform(0.1, 0.3, n))
-
-
-def _rigs(family: str, settings: Sequence[str], seed: int) -> Any:
-    """A plant of each setting, leaves ``(n, ...)``: one of its rigs after the other, or drawn."""
+        return Generated, generated(settings, kind, rng)
     rigs, place = load_rigs(), [lung.id for lung in LUNGS]
     assert rigs.population is not None
     assert rigs.sessions is not None
     chosen = []
     for k, setting in enumerate(settings):
-        lung = place.index(setting)
+        lung, number = place.index(setting), settings[:k].count(setting)
+        plants: Any = rigs.plants
+        at: Any = number % rigs.members
         if family == "population":
-            drawn = rigs.population.rigs(seed.to_bytes(32, "big"), lung, len(settings))
-            chosen.append(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], drawn))
-            continue
-        member, session = (
-            k % rigs.members,
-            rigs.sessions[lung][k // rigs.members % len(rigs.sessions[lung])],
-        )
-        at = (member, session)
-        chosen.append(jax.tree.map(lambda leaf, at=at: np.asarray(leaf)[at], rigs.plants))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
+            plants, at = rigs.population.rigs(seed, lung, number + 1), number
+        else:
+            sessions = rigs.sessions[lung]
+            at = at, sessions[number // rigs.members % len(sessions)]
+        chosen.append(jax.tree.map(lambda leaf, at=at: np.asarray(leaf)[at], plants))
+    return Plants, jax.tree.map(lambda *leaves: np.stack(leaves), *chosen)
 
 
-def generated(
-    settings: Sequence[str], fault: str, rng: np.random.Generator
-) -> tuple[Base, dict[str, Effect], Ints]:
+def generated(settings: Sequence[str], kind: str, rng: np.random.Generator) -> dict[str, Any]:
     """Draw what :class:`Generated` takes, in the ranges of the generator."""
     n, lungs = len(settings), [parse_lung(setting) for setting in settings]
     R = np.array([x.R for x in lungs]) * rng.uniform(0.85, 1.15, n)
     C = np.array([x.C for x in lungs]) * rng.uniform(0.93, 1.07, n)
     # A parabolic 50 would be told from flows far below 1 L/s; no scored lung has it.
     parabolic = (rng.uniform(size=n) < 0.5) & np.array([x.R < 50.0 for x in lungs])
-    gain = NOMINAL_GAIN * rng.uniform(0.9, 1.1, n) * (fault != STUCK)
-    values: dict[str, Any] = {
-        "R": np.where(parabolic, 0.5, R),
-        "C": C,
-        "R_ex": rng.uniform(4.0, 7.0, n),
-        "peep": rng.uniform(4.5, 5.5, n),
-        "gain": gain,
+    gain = NOMINAL_GAIN * rng.uniform(0.9, 1.1, n)
+    outlet, peep = rng.uniform(4.0, 7.0, n), rng.uniform(4.5, 5.5, n)
+    base = Base(np.where(parabolic, 0.5, R), C, outlet, peep, gain)  # type: ignore[arg-type]
+    leak = LEAK / np.sqrt(20.0) if kind == LEAKS else 0.0
+    creep = rng.uniform(*CREEP, n) * (kind in (CREEPS, LEAKS))
+    return {
+        "base": vars(base),
+        "viscoelasticity": {"ratio": creep, "time": rng.uniform(*CREEP_TIME, n)},
+        "turbulent_resistance": {"quadratic": np.where(parabolic, R, 0.0)},
+        "leak": {"conductance": np.full(n, leak)},
+        "dead": rng.integers(0, FINE, n),
     }
-    leak = LEAK / np.sqrt(20.0) if fault == LEAKS else 0.0
-    creep = rng.uniform(*CREEP, n) * (fault in (CREEPS, LEAKS))
-    quadratic: dict[str, Any] = {"quadratic": np.where(parabolic, R, 0.0)}
-    conductance: dict[str, Any] = {"conductance": np.full(n, leak)}
-    relaxing: dict[str, Any] = {"ratio": creep, "time": rng.uniform(*CREEP_TIME, n)}
-    effects = {
-        "viscoelasticity": Effect("viscoelasticity", "mild", "library", relaxing),
-        "turbulent_resistance": Effect("turbulent_resistance", "mild", "quadratic", quadratic),
-        "leak": Effect("leak", "mild", "orifice", conductance),
-    }
-    return Base(**values), effects, rng.integers(0, FINE, n)
+
+
+@dataclass(frozen=True, eq=False)
+class Mounted:
+    """What is mounted, and its sensors; arrays of shape ``(n,)``."""
+
+    begin: Callable[[], Lungs]  #: puts the lungs at rest.
+    noise: Floats  #: of the pressure, standard deviation, cmH2O.
+    sensor: Floats | float = 1.0  #: gain of the pressure sensor.
+    flow: Floats | None = None  #: gain of the flow sensor; None where there is none.
+    opens: float = 1.0  #: share of a command to which the valve opens.
+
+
+def mount(
+    family: str, settings: Sequence[str], kind: str, seed: int, rng: np.random.Generator
+) -> Mounted:
+    """Draw a lung of a family about each setting, and sensors."""
+    n = len(settings)
+    make, arrays = drawn(family, settings, seed.to_bytes(32, "big"), rng, kind)
+    flow, noise = 1.0 + FLOW_GAIN * rng.standard_normal(n), rng.uniform(0.1, 0.3, n)
+    sensor, opens = SENSORS.get(kind, 1.0), float(kind != STUCK)
+    return Mounted(partial(make, arrays), noise, sensor, flow, opens)
+
+
+class Watched:
+    """Mounted lungs under the checks of a session; arrays of shape ``(n,)``.
+
+    Args:
+        mounted: what is mounted.
+        lungs: of it, where they are.
+        labels: under which they are mounted.
+        pips: highest pressures that are meant, cmH2O.
+        random: draws the noise.
+    """
+
+    def __init__(
+        self,
+        mounted: Mounted,
+        lungs: Lungs,
+        labels: Sequence[str],
+        pips: Floats,
+        random: np.random.Generator,
+    ) -> None:
+        self._mounted, self._lungs, self._pips, self._random = mounted, lungs, pips, random
+        self.checks = [safety.init(parse_lung(label)) for label in labels]
+        self.u_in, self._u_out, self._steps = np.zeros(len(pips)), np.ones(len(pips)), 0
+
+    def look(self) -> tuple[Floats, Floats]:
+        """Readings of pressure, cmH2O, and flow, mL/s."""
+        mounted, n, now = self._mounted, len(self.checks), self._steps * protocol.DT
+        noise = mounted.noise * self._random.standard_normal(n)
+        read = mounted.sensor * self._lungs.pressure() + noise
+        read = np.round(read / QUANTUM) * QUANTUM
+        flow = np.full(n, np.nan)
+        if mounted.flow is not None:
+            flow = mounted.flow * self._lungs.flow() + FLOW_NOISE * self._random.standard_normal(n)
+        for i, state in enumerate(self.checks):
+            u_in = float(self.u_in[i])
+            seen = read[i], flow[i], u_in, int(self._u_out[i]), self._pips[i]
+            sample = safety.SafetySample(now, *seen, late=0.0, applied=u_in)
+            self.checks[i] = safety.step(safety.DEFAULT, state, sample)
+        return read, flow
+
+    def hold(self, u_in: Floats, u_out: Floats) -> None:
+        """Hold commands, % and 0/1, for a control step."""
+        self._lungs.hold(self._mounted.opens * u_in, u_out)
+        self.u_in, self._u_out, self._steps = u_in, u_out, self._steps + 1
+
+
+#: What the programs of each part brought.
+Parts = dict[str, list[Driven]]
 
 
 def driven(
-    mounted: Mounted, label: str, rng: np.random.Generator, blind: bool, only: Sequence[str]
-) -> list[dict[str, list[Driven]]]:
-    """Run programs of the self-test on lungs that are mounted under a label; one result a lung.
-
-    ``blind``: without a flow sensor.
-    """
+    mounted: Mounted, label: str, rng: np.random.Generator, only: Sequence[str]
+) -> list[Parts]:
+    """Run programs of the self-test on lungs that are mounted under a label; one result a lung."""
     n = len(mounted.noise)
     lungs = mounted.begin()
-    done: list[dict[str, list[Driven]]] = [{part: [] for part in only} for _ in range(n)]
+    done: list[Parts] = [{part: [] for part in only} for _ in range(n)]
     noises = [0.0] * n
     for part in only:
         each = [selftest.programs(label, noise)[part] for noise in noises]
         for k, (make, _, pip) in enumerate(each[0]):
             lengths = [programs[k][1] for programs in each]
             for _ in range(round(selftest.rest_before(label) / protocol.DT)):
-                lungs.hold(np.zeros(n), np.zeros(n), np.ones(n))
-            columns, trips = _program(lungs, mounted, make, max(lengths), pip, label, rng)
+                lungs.hold(np.zeros(n), np.ones(n))
+            watched = Watched(mounted, lungs, [label] * n, np.full(n, pip), rng)
+            columns = _program(watched, [make() for _ in range(n)], max(lengths))
             for i, steps in enumerate(lengths):
-                own = Driven(*columns[:, :steps, i], trips[i], False, 0)  # type: ignore[arg-type]
+                trips = tuple(trip.message for trip in watched.checks[i].trips)
+                own = Driven(*columns[:, :steps, i], trips, False, 0)  # type: ignore[arg-type]
                 done[i][part].append(own)
         if part == "sensor":
             noises = [white_noise(x[part][0].pressure[17:]) for x in done]
-    return [blinded(each) for each in done] if blind else done
+    return done
 
 
-def _program(
-    lungs: Lungs,
-    mounted: Mounted,
-    make: Any,
-    steps: int,
-    pip: float,
-    label: str,
-    rng: np.random.Generator,
-) -> tuple[Floats, list[tuple[str, ...]]]:
-    """Columns of :class:`Driven`, ``(7, T, n)``, and the trips of each lung."""
-    n, zeros = len(mounted.noise), np.zeros(len(mounted.noise))
-    commands = [make() for _ in range(n)]
-    watched = [safety.init(parse_lung(label)) for _ in range(n)]
-    u_in, u_out, before = zeros.copy(), np.ones(n), zeros.copy()
-    rows = []
+def _program(watched: Watched, programs: Sequence[Commands], steps: int) -> Floats:
+    """Columns of :class:`Driven`, ``(7, T, n)``, of a program on each lung."""
+    zeros, rows = np.zeros(len(programs)), []
     for step in range(steps):
-        read = mounted.sensor * lungs.pressure() + mounted.noise * rng.standard_normal(n)
-        read = np.round(read / QUANTUM) * QUANTUM
-        flow = mounted.flow * lungs.flow() + FLOW_NOISE * rng.standard_normal(n)
-        for i in range(n):
-            now = step * protocol.DT
-            sample = safety.SafetySample(
-                now, read[i], flow[i], u_in[i], int(u_out[i]), pip, 0.0, u_in[i]
-            )
-            watched[i] = safety.step(safety.DEFAULT, watched[i], sample)
-        before = u_in.copy()
-        for i in range(n):
-            wanted, u_out[i] = commands[i](step, float(read[i]))
-            u_in[i], _ = safety.limit_command(safety.DEFAULT, before[i], wanted)
-        rows.append(
-            (zeros + step * protocol.DT, read, flow, u_in.copy(), u_out.copy(), zeros, zeros)
-        )
-        lungs.hold(before, u_in, u_out)
-    trips = [tuple(trip.message for trip in state.trips) for state in watched]
-    return np.moveaxis(np.array(rows), 0, 1), trips
+        read, flow = watched.look()
+        asked = np.array([own(step, float(x)) for own, x in zip(programs, read, strict=True)])
+        pairs = zip(watched.u_in, asked[:, 0], strict=True)
+        u_in = np.array([safety.limit_command(safety.DEFAULT, *pair)[0] for pair in pairs])
+        time, u_out = zeros + step * protocol.DT, asked[:, 1]
+        rows.append((time, read, flow, u_in, u_out, zeros, zeros))
+        watched.hold(u_in, u_out)
+    return np.moveaxis(np.array(rows), 0, 1)
+
+
+#: Flow of a calibrated valve, and its range, mL/s per %.
+Valve = tuple[float, float, float]
+
+
+def blinded(done: Parts, label: str) -> tuple[Parts, Valve]:
+    """The same without a flow sensor, and the valve that it had calibrated."""
+    gain = VALVE_GAIN * measured_lung(done["lung"], label, NOISE)[3]
+    blind = {
+        part: [replace(x, flow=np.full_like(x.flow, np.nan)) for x in each]
+        for part, each in done.items()
+    }
+    return blind, (gain, 0.98 * gain, 1.02 * gain)
 
 
 def judged(
-    done: dict[str, list[Driven]], label: str, gain: float | None, known: KnownLung | None
+    done: Parts, label: str, valve: Valve | None = None, known: KnownLung | None = None
 ) -> dict[str, Any]:
-    """Judge a lung; a valve of known ``gain``, mL/s per %, stands for a flow that is not there."""
-    valve = None if gain is None else (gain, 0.98 * gain, 1.02 * gain)
+    """Judge a lung by what calibration has told."""
+    simulator = "frozen" if parse_lung(label) in LUNGS else None  # else they have no say
     baseline = Baseline(valve, known)
-    judge = partial(selftest.judge, label, done, baseline=baseline)
-    sheet = judge(simulator=None)
-    undecided = any(x.name == "lung" and not x.ok for x in sheet.findings)
-    if undecided and parse_lung(label) in LUNGS:  # else the simulators have no say
-        sheet = judge()
+    sheet = selftest.judge(label, done, simulator=simulator, baseline=baseline)
     trips = [text for each in done.values() for x in each for text in x.trips]
     bad = [x.name for x in sheet.findings if not x.ok] + ["safety"] * bool(trips)
     told = "; ".join(x.text for x in sheet.findings if x.name in ("identity", "lung"))
     return {"bad": bad, "told": told}
-
-
-def blinded(done: dict[str, list[Driven]]) -> dict[str, list[Driven]]:
-    """The same without a flow sensor."""
-    return {
-        part: [replace(x, flow=np.full_like(x.flow, np.nan)) for x in each]
-        for part, each in done.items()
-    }
-
-
-def calibrated(done: dict[str, list[Driven]], label: str) -> KnownLung:
-    """The lung by its calibration."""
-    return measured_lung(done["lung"], label, white_noise(done["sensor"][0].pressure))[0]
 
 
 def of_label(
@@ -351,16 +361,17 @@ def of_label(
     if kind == "another lung":
         others = [x for x in labels_of(family) if x != label]
         settings = [others[k % len(others)] for k in range(lungs)]
-    mounted = draw(family, settings, kind, seed, rng)
-    known: Sequence[KnownLung | None] = [None] * lungs
+    mounted = mount(family, settings, kind, seed, rng)
+    known: list[KnownLung | None] = [None] * lungs
     if kind in ("right", *SENSORS):  # its calibration, when the sensor was right
-        sound = replace(mounted, sensor=np.ones(lungs))
-        first = driven(sound, label, rng, blind, ("sensor", "lung"))
-        known = [calibrated(each, label) for each in first]
+        for k, own in enumerate(driven(replace(mounted, sensor=1.0), label, rng, _OF_LUNG)):
+            probes = blinded(own, label)[0] if blind else own
+            noise = white_noise(probes["sensor"][0].pressure)
+            known[k] = measured_lung(probes["lung"], label, noise)[0]
     results = []
-    for k, own in enumerate(driven(mounted, label, rng, blind, PARTS_OF.get(kind, ALL))):
-        gain = float(mounted.gain[k]) if blind else None
-        results.append({"lung": settings[k], **judged(own, label, gain, known[k])})
+    for k, own in enumerate(driven(mounted, label, rng, PARTS_OF.get(kind, ALL))):
+        parts, valve = blinded(own, label) if blind and "lung" in own else (own, None)
+        results.append({"lung": settings[k], **judged(parts, label, valve, known[k])})
     return results
 
 
@@ -411,41 +422,35 @@ class Outcome:
     outside: Ints  #: answers that it refused.
 
 
-def breathe(lungs: Lungs, labels: Ints, pips: Floats, act: Act, guarded: bool) -> Outcome:
+def breathe(
+    mounted: Mounted, labels: Sequence[str], pips: Floats, act: Act, guarded: bool
+) -> Outcome:
     """Run three breaths; a lung that reaches the device's limit or trips a check is vented."""
-    n, noise = len(labels), np.random.default_rng(list(SEED))
-    states = [fallback.init(LUNGS[k]) for k in labels]
-    watched = [safety.init(LUNGS[k]) for k in labels]
+    n, lungs = len(labels), mounted.begin()
+    watched = Watched(mounted, lungs, labels, pips, np.random.default_rng(list(SEED)))
+    watched.u_in = np.full(n, BIAS)
+    states = [fallback.init(parse_lung(label)) for label in labels]
     ended, vented, tripped = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
     pressure = np.full((n, protocol.BREATHS, protocol.BREATH_STEPS), np.nan)
-    u_in, acting = np.full(n, BIAS), np.zeros(n)
-    ahead = [waveform.targets_ahead(k, 1.0) for k in range(34)]
-    for index in range(protocol.BREATHS * protocol.BREATH_STEPS):
-        breath, step = divmod(index, protocol.BREATH_STEPS)
-        inspired, now = step < protocol.INSPIRATION_STEPS, index * protocol.DT
-        read = np.round((lungs.pressure() + NOISE * noise.standard_normal(n)) / QUANTUM) * QUANTUM
-        for i in np.flatnonzero(~ended):
-            position = float(u_in[i]), int(0 < step <= protocol.INSPIRATION_STEPS) ^ 1
-            sample = safety.SafetySample(now, read[i], np.nan, *position, pips[i], 0.0, u_in[i])
-            watched[i] = safety.step(safety.DEFAULT, watched[i], sample)
-            tripped[i] = bool(watched[i].trips)
+    for breath, step in np.ndindex(pressure.shape[1:]):
+        read, _ = watched.look()
         vented |= ~ended & (read >= protocol.SAFETY_PRESSURE)
+        tripped |= ~ended & np.array([bool(state.trips) for state in watched.checks])
         pressure[:, breath, step] = np.where(ended, pips, read)
         ended |= vented | tripped
-        previous = np.full(n, BIAS) if step == 0 else u_in
+        inspired = step < protocol.INSPIRATION_STEPS
+        wanted = np.full(n, float(waveform.expiratory_command(step)))
         if inspired:
+            previous = np.full(n, BIAS) if step == 0 else watched.u_in
             head = [np.full(n, step * protocol.DT), np.full(n, protocol.DT), read, pips]
-            rows = np.column_stack([*head, np.outer(pips, ahead[step]), previous])
+            ahead = np.outer(pips, waveform.targets_ahead(step, 1.0))
+            rows = np.column_stack([*head, ahead, previous])
             wanted = np.clip(act(rows), 0.0, protocol.U_MAX)
             for i in np.flatnonzero(~ended) if guarded else ():
                 states[i], wanted[i] = fallback.step(
                     fallback.DEFAULT, states[i], step, read[i], pips[i], wanted[i], previous[i]
                 )
-        else:
-            wanted = np.full(n, float(waveform.expiratory_command(step)))
-        u_in = np.where(ended, 0.0, wanted)
-        lungs.hold(acting, u_in, np.full(n, float(not inspired)), step == 0)
-        acting = u_in
+        watched.hold(np.where(ended, 0.0, wanted), np.full(n, float(not inspired)))
     runs = zip(pressure, pips.tolist(), strict=True)
     safe = np.array([measured.is_safe(run, pip, protocol.DT).all() for run, pip in runs])
     taken, outside = (np.array([getattr(x, name) for x in states]) for name in ("taken", "outside"))
@@ -458,9 +463,9 @@ class Runaways:
     Sound ones never do.
     """
 
-    def __init__(self, labels: Ints, *, sound: bool = False) -> None:
+    def __init__(self, labels: Sequence[str], *, sound: bool = False) -> None:
         random = np.random.default_rng(list(SEED))
-        self._pids = [PIDController((*CONTROL_GAINS[LUNGS[k].id], 0.0)) for k in labels]
+        self._pids = [PIDController((*CONTROL_GAINS[label], 0.0)) for label in labels]
         self._moment = random.integers(0, ASKED, len(labels)) + ASKED * sound
         self._kind, self._step = random.integers(0, 3, len(labels)), -1
 
@@ -473,64 +478,13 @@ class Runaways:
         return np.where(self._step >= self._moment, wrong, asked)
 
 
-def controllers(name: str, labels: Ints) -> Act:
+def controllers(name: str, labels: Sequence[str]) -> Act:
     """A bundled entry on each lung, in this process."""
     submission = open_submission(name)
     track = submission.manifest.tracks[0]
-    tasks = [
-        Task(track, LUNGS[k].id if track == "performance" else None, protocol.DT, 34)
-        for k in labels
-    ]
+    told = labels if track == "performance" else [None] * len(labels)
+    tasks = [Task(track, lung, protocol.DT, protocol.INSPIRATION_STEPS) for lung in told]
     return InProcessRunner().start(submission, tasks).act
-
-
-def families(rigs: int) -> dict[str, tuple[Ints, Callable[[Ints], Lungs]]]:
-    """Labels of the rigs of each family, ``(m,)``, and what makes lungs of some of them."""
-    official = load_rigs("frozen")
-    assert official.sessions is not None
-    assert official.population is not None
-    reference = [own[0] for own in official.sessions]
-    frozen = jax.tree.map(lambda x: np.asarray(x)[0, reference], official.plants)
-    each = [official.population.rigs(SEED, k, rigs) for k in range(len(LUNGS))]
-    population = jax.tree.map(lambda *x: np.concatenate(x), *each)
-    once, often = np.arange(len(LUNGS)), np.repeat(np.arange(len(LUNGS)), rigs)
-
-    def taken(plants: Any) -> Callable[[Ints], Lungs]:
-        return lambda at: Plants(jax.tree.map(lambda leaf: np.asarray(leaf)[at], plants))
-
-    settings = [LUNGS[k].id for k in often]
-    base, effects, dead = generated(settings, "right", np.random.default_rng(list(SEED)))
-
-    def strangers(at: Ints) -> Lungs:
-        chosen = {
-            name: replace(
-                effect, parameters={k: np.asarray(v)[at] for k, v in effect.parameters.items()}
-            )
-            for name, effect in effects.items()
-        }
-        values: Any = {name: np.asarray(value)[at] for name, value in vars(base).items()}
-        return Generated(Base(**values), chosen, dead[at])
-
-    return {
-        "frozen": (once, taken(frozen)),
-        "population": (often, taken(population)),
-        "independent": (often, strangers),
-    }
-
-
-def responses(lungs: Lungs, n: int) -> Floats:
-    """Shares of the drop of a step of 50 % that the three readings after its end show, ``(3, n)``.
-
-    The pressure that remains is that of the fifth reading.
-    """
-    shown, before = [], np.zeros(n)
-    for step in range(12):
-        u_in = np.full(n, 50.0 if 4 <= step < 8 else 0.0)
-        lungs.hold(before, u_in, np.zeros(n))
-        before = u_in
-        shown.append(lungs.pressure())
-    held, *after = (x - shown[-1] for x in shown[7:11])
-    return np.array(after) / held
 
 
 def percent(count: int, of: int) -> str:
@@ -541,32 +495,30 @@ def percent(count: int, of: int) -> str:
     return f"{100.0 * count / of:.2f} ({100.0 * found.low:.2f} to {100.0 * found.high:.2f})"
 
 
-def false_alarms(
-    family: str, name: str, labels: Ints, pips: Floats, make: Callable[[], Lungs]
-) -> str:
-    """Row of an entry on lungs of a family."""
-    free = breathe(make(), labels, pips, controllers(name, labels), False)
-    held = breathe(make(), labels, pips, controllers(name, labels), True)
+def false_alarms(name: str, mounted: Mounted, labels: Sequence[str], pips: Floats) -> str:
+    """What an entry's row says of lungs of a family."""
+    free = breathe(mounted, labels, pips, controllers(name, labels), False)
+    held = breathe(mounted, labels, pips, controllers(name, labels), True)
     harmless = ~(free.unsafe | free.vented)
     count = int(harmless.sum())
     failed = int((harmless & (held.outside > LATE_SHARE * ASKED)).sum())
     taken, tripped = (int(x[harmless].sum()) for x in (held.taken, free.tripped))
     return (
-        f"| {family} | {name} | {count} of {len(labels)} | {percent(taken, count * ASKED)} | "
-        f"{percent(failed, count)} | {tripped} |"
+        f"{count} of {len(labels)} | {percent(taken, count * ASKED)} | {percent(failed, count)} | "
+        f"{tripped} |"
     )
 
 
-def misses(family: str, labels: Ints, pips: Floats, make: Callable[[], Lungs]) -> str:
-    """Row of runaways on lungs of a family."""
-    sound = breathe(make(), labels, pips, Runaways(labels, sound=True), False)
-    free = breathe(make(), labels, pips, Runaways(labels), False)
-    held = breathe(make(), labels, pips, Runaways(labels), True)
+def misses(mounted: Mounted, labels: Sequence[str], pips: Floats) -> str:
+    """What the row of runaways says of lungs of a family."""
+    sound = breathe(mounted, labels, pips, Runaways(labels, sound=True), False)
+    free = breathe(mounted, labels, pips, Runaways(labels), False)
+    held = breathe(mounted, labels, pips, Runaways(labels), True)
     harmful = ~(sound.unsafe | sound.vented) & (free.unsafe | free.vented)
     vented = int((harmful & held.vented).sum())
     missed = int((harmful & held.unsafe & ~held.vented).sum())
     count = int(harmful.sum())
-    return f"| {family} | {count} of {len(labels)} | {vented} | {percent(missed, count)} |"
+    return f"{count} of {len(labels)} | {vented} | {percent(missed, count)} |"
 
 
 def is_blamed(entry: float, host: float, random: np.random.Generator, runs: int = 60) -> bool:
@@ -587,27 +539,23 @@ def is_blamed(entry: float, host: float, random: np.random.Generator, runs: int 
 
 def of_fallback(lungs: int, entry: list[str] | None) -> None:
     """Print false alarms of the fallback and of the host's checks, and what the fallback misses."""
-    mounted = []
-    for family, (rig_labels, make) in families(lungs).items():
-        rig, place = (x.ravel() for x in np.indices((len(rig_labels), len(protocol.PIPS))))
-        pips = np.array(protocol.PIPS)[place]
-        mounted.append((family, rig_labels[rig], pips, partial(make, rig)))
+    families = {}
+    for family in FAMILIES:
+        settings = [x.id for x in LUNGS for _ in range(1 if family == "frozen" else lungs)]
+        make, arrays = drawn(family, settings, SEED, np.random.default_rng(list(SEED)))
+        at, place = (x.ravel() for x in np.indices((len(settings), len(protocol.PIPS))))
+        each = jax.tree.map(lambda leaf, at=at: leaf[at], arrays)
+        mounted = Mounted(partial(make, each), np.full(len(at), NOISE))
+        families[family] = mounted, [settings[k] for k in at], np.array(protocol.PIPS)[place]
     print("| lungs | entry | harmless runs | steps taken, % | runs failed, % | checks tripped |")
     print("|---|---|---|---|---|---|")
-    for family, labels, pips, make_all in mounted:
+    for family, cells in families.items():
         for name in entry or bundled():
-            print(false_alarms(family, name, labels, pips, make_all), flush=True)
+            print(f"| {family} | {name} | {false_alarms(name, *cells)}", flush=True)
     print("\n| lungs | runaways that do harm | vented by the device | missed, % |")
     print("|---|---|---|---|")
-    for each in mounted:
-        print(misses(*each), flush=True)
-    labels, make = families(64)["population"]
-    resistive = np.flatnonzero([LUNGS[k].R >= 20.0 for k in labels])  # others show little of it
-    shares = responses(make(resistive), len(resistive))
-    print(f"\ndrop that readings after a flow still show, {len(resistive)} rigs of the population:")
-    for step, own in enumerate(shares, 1):
-        low, middle, high = np.quantile(own, (0.01, 0.5, 0.99))
-        print(f"  {step}: {middle:.2f} ({low:.2f} to {high:.2f}: 98 % of them)")
+    for family, cells in families.items():
+        print(f"| {family} | {misses(*cells)}", flush=True)
 
 
 def of_lateness(sessions: int) -> None:
@@ -674,8 +622,7 @@ def main(
     if Guard.LATENESS in guards:
         of_lateness(sessions)
     if Guard.SELFTEST in guards:
-        chosen = family or ["frozen", "population", "independent"]
-        of_selftest(lungs, chosen, label, blind=blind, seed=seed, out=out)
+        of_selftest(lungs, family or FAMILIES, label, blind=blind, seed=seed, out=out)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ A peak that a resistor makes in a step or two passes the gate, and on rigs that 
 here and there twice as high. No bound of R tells it without refusing commands that do no harm: it
 is left to the device, which vents at 60 cmH2O at once. In the first steps of a breath no reading
 tells the drop of its flow; there, the pressure that remains decides. ``python
-benchmarks/hardware_guards.py`` prints what right rigs do, and how often the fallback is wrong.
+benchmarks/hardware_guards.py`` prints how often the fallback is wrong.
 
 The fallback is the paper's PI of the labelled lung, cut to the largest command that is inside.
 """
@@ -51,7 +51,9 @@ class FallbackSettings:
             a test lung keeps within about half of that.
         apparatus: resistance of tubes and filters, cmH2O/(L/s).
         outlet: largest resistance of the expiratory valve, cmH2O/(L/s).
-        delays: shares of a command's flow that the readings 1, 2 and 3 steps later show.
+        delays: shares of a command's flow that the readings 1, 2 and 3 steps later show; of 192
+            rigs of the population with R 20, 98 % still show 0.25 to 1.10 of a flow one step after
+            its end, and 0 to 0.08 two steps after it.
         noise: most by which a reading is too low, cmH2O.
         readings: newest readings that bound the future.
         hand_back: answers in a row, in time and inside, after which the entry commands again.

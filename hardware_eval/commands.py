@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench
     from hardware_eval.results.evaluate import Line
-    from hardware_eval.wire.client import Client
 
 Port = Annotated[
     str,
@@ -77,7 +76,7 @@ def bench_on(
 
     try:
         person = ConsoleOperator(yes=yes, device=line.device)
-        with _closing(client), person.keys():
+        with contextlib.closing(client), person.keys():
             yield line, Bench(client, line.clock, DEFAULT, person), person
     except EmergencyStop:
         print(ending("stopped: the operator pressed the emergency stop"), file=sys.stderr)
@@ -91,15 +90,6 @@ def bench_on(
         raise InputError(ending(f"{error.filename or 'output'}: {error.strerror}")) from error
     except InputError as error:
         raise InputError(ending(str(error))) from error
-
-
-@contextlib.contextmanager
-def _closing(client: Client) -> Iterator[None]:
-    """Vent and release the line; a disk or an output that fails must not keep it from it."""
-    try:
-        yield
-    finally:
-        client.close()
 
 
 Calibrated = Annotated[

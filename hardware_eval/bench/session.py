@@ -114,7 +114,7 @@ def _runs(
             return "the operator did not confirm the next PIP"
         try:
             place = len(plan.runs) - len(queue), len(plan.runs)
-            result = _one(bench, run, attempts, make_controller, log, place)
+            result = _one(bench, run, attempts, make_controller, log.append, place)
         except LinkError as error:
             # The device has vented or will: by the vent that follows, or by its watchdog.
             log.append({"type": "event", "what": "link", "message": str(error)})
@@ -169,21 +169,21 @@ def _one(
     run: PlannedRun,
     attempts: dict[int, int],
     make_controller: MakeController,
-    log: RawLog,
+    log: Callable[[dict[str, Any]], None],
     place: tuple[int, int],
 ) -> RunResult:
     done, total = place
     attempt = attempts.get(run.number, 0)
     attempts[run.number] = attempt + 1
-    log.append({"type": "run_begins", "run": run.number, "attempt": attempt, "time": time.time()})
+    log({"type": "run_begins", "run": run.number, "attempt": attempt, "time": time.time()})
     try:
         controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
     except ControllerFailedError as error:
-        log.append(_ended(run, attempt, "failed", str(error)))
+        log(_ended(run, attempt, "failed", str(error)))
         return RunResult("failed", str(error), (), (), 0, 0)
 
     def write(index: int, breath: BreathLog) -> None:
-        log.append(breath.line(run, attempt, index))
+        log(breath.line(run, attempt, index))
         for show in bench.shows:
             show(run, breath, done, total)
 
@@ -206,7 +206,7 @@ def _one(
         bench.operator.tell(trip.alarm)
     if not result.trips and math.isfinite(result.vented_after):
         bench.operator.tell(f"high priority alarm: {result.reason}")
-    log.append(
+    log(
         {
             **_ended(run, attempt, result.status, result.reason),
             **{name: getattr(result, name) for name in _COUNTED},
@@ -251,29 +251,19 @@ def dry_run(
 
     problems: list[str] = []
     errors: list[tuple[str, str, float, float]] = []
-    seen: set[tuple[Any, ...]] = set()
-    mounted, bench = "", None
-    for run in plan.runs:
-        key = (run.kind == "control", run.entry, run.lung, run.pip)
-        if key in seen or run.kind == "perturbed":
-            continue
-        seen.add(key)
-        if bench is None or run.lung != mounted:
-            device, mounted = LoopbackDevice(simulated_lung(run.lung)), run.lung
-            client = Client(device, device.clock)
-            client.hello()
-            bench = Bench(client, device.clock, settings, Operator(), (), rest, fallback)
-        try:
-            controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
-        except ControllerFailedError as error:
-            problems.append(f"{run.entry} on {run.lung}: {error}")
-            continue
-        try:
-            result = run_once(bench, run, controller)
-        finally:
-            controller.close()
-        if result.status != "complete":
-            problems.append(f"{run.entry} on {run.lung} at PIP {run.pip:g}: {result.reason}")
-        elif run.kind != "control":
-            errors.append((run.entry, run.lung, run.pip, round(result.error, 6)))
+    for lung in plan.lungs:
+        device = LoopbackDevice(simulated_lung(lung))
+        client = Client(device, device.clock)
+        client.hello()
+        bench = Bench(client, device.clock, settings, Operator(), (), rest, fallback)
+        distinct: dict[tuple[str, float], PlannedRun] = {}
+        for run in plan.runs:
+            if run.lung == lung and run.kind != "perturbed":
+                distinct.setdefault((run.entry, run.pip), run)
+        for run in distinct.values():
+            result = _one(bench, run, {}, make_controller, lambda line: None, (0, 0))
+            if result.status != "complete":
+                problems.append(f"{run.entry} on {lung} at PIP {run.pip:g}: {result.reason}")
+            elif run.kind != "control":
+                errors.append((run.entry, lung, run.pip, round(result.error, 6)))
     return problems, errors

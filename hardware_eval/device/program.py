@@ -31,9 +31,9 @@ from hardware_eval.wire.messages import (
     Flag,
     Hello,
     HostMessage,
+    Kept,
     Mode,
     Packet,
-    ParserState,
     Reading,
     Reason,
     Refusal,
@@ -154,7 +154,7 @@ class DeviceState:
     stepped: int  #: time of the last step, us.
     #: the last valid pressures, oldest first, at most :data:`NOISE_WINDOW`, cmH2O.
     newest: tuple[float, ...] = ()
-    parser: ParserState = field(default_factory=ParserState)  #: place in the stream of bytes.
+    kept: Kept = None  #: bytes of a frame that has not come whole.
     mode: Mode = Mode.CLOSED  #: what the device does with the valves.
     session: int | None = None  #: number of the open session, None before the first.
     sequence: int = 0  #: last sequence number of the session.
@@ -208,8 +208,8 @@ def step(
             state = _vented(state, causes)
     answers: list[bytes] = []
     if data:
-        parser, events = feed_bytes(state.parser, data)
-        state = replace(state, parser=parser)
+        kept, events = feed_bytes(state.kept, data)
+        state = replace(state, kept=kept)
         for event in events:
             if isinstance(event, Fault):
                 state = _counted(state, event.value)

@@ -7,12 +7,11 @@ real time.
 
 from __future__ import annotations
 
-import heapq
 import os
 import time
 import tty
+from collections import deque
 from collections.abc import Callable
-from itertools import count
 from pathlib import Path
 
 from hardware_eval.device.port import Guard, Port
@@ -41,23 +40,20 @@ class LoopbackDevice:
         self.latency = latency
         self.service = DeviceService(hal, settings or DeviceSettings(), self.start)
         self._next = self.start + PERIOD
-        self._order = count()
-        self._incoming: list[tuple[float, int, bytes]] = []
-        self._outgoing: list[tuple[float, int, bytes]] = []
+        self._incoming: deque[tuple[float, bytes]] = deque()  # each with when it arrives, s
+        self._outgoing: deque[tuple[float, bytes]] = deque()
         self.clock.carry(self._run_until)
 
     def write(self, data: bytes) -> None:
         """Send bytes to the device."""
-        arrival = self.clock.now() + self.latency
-        heapq.heappush(self._incoming, (arrival, next(self._order), data))
+        self._incoming.append((self.clock.now() + self.latency, data))
 
     def read(self, timeout: float) -> bytes:
         """Wait for bytes from the device; empty if none come within ``timeout``, s."""
         deadline = self.clock.now() + timeout
         while True:
-            now, ready = self.clock.now(), b""
-            while self._outgoing and self._outgoing[0][0] <= now:
-                ready += heapq.heappop(self._outgoing)[2]
+            now = self.clock.now()
+            ready = _arrived(self._outgoing, now)
             if ready or now >= deadline:
                 return ready
             coming = [self._next, deadline]
@@ -71,7 +67,7 @@ class LoopbackDevice:
 
     def answer(self, now: float, data: bytes) -> None:
         """Put bytes of the device on the way to the host."""
-        heapq.heappush(self._outgoing, (now + self.latency, next(self._order), data))
+        self._outgoing.append((now + self.latency, data))
 
     def close(self) -> None:
         """Nothing to release; the device goes on."""
@@ -89,12 +85,18 @@ class LoopbackDevice:
             now = min(self._next, arrival)
             if now > instant:
                 return
-            data = b""
-            while self._incoming and self._incoming[0][0] <= now:
-                data += heapq.heappop(self._incoming)[2]
+            data = _arrived(self._incoming, now)
             if self._next <= now:
                 self._next += PERIOD
             self.turn(now, data)
+
+
+def _arrived(line: deque[tuple[float, bytes]], now: float) -> bytes:
+    """Take what has arrived by now, s, off a line, which keeps the order."""
+    data = b""
+    while line and line[0][0] <= now:
+        data += line.popleft()[1]
+    return data
 
 
 class Emulator(Guard):

@@ -233,14 +233,9 @@ def control(session: Session) -> dict[str, Any]:
         figures[lung] = {"errors": [round(error, 4) for error in errors]}
         if len(errors) >= 3:
             place = np.linspace(0.0, 1.0, len(errors))
-            slope, offset = np.polyfit(place, errors, 1)
-            residual = np.asarray(errors) - slope * place - offset
-            variance = float(residual @ residual) / (len(errors) - 2)
-            deviation = math.sqrt(variance / float(np.sum((place - place.mean()) ** 2)))
-            figures[lung] |= {
-                "drift": round(float(slope), 4),
-                "standard_error": round(deviation, 4),
-            }
+            line, covariance = np.polyfit(place, errors, 1, cov=True)
+            error = math.sqrt(covariance[0, 0])
+            figures[lung] |= {"drift": round(float(line[0]), 4), "standard_error": round(error, 4)}
     return figures
 
 

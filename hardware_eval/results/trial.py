@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -41,20 +42,27 @@ DRAWS, SEED = 1000, 0
 def as_mounted(errors: Floats) -> tuple[Floats, Floats, Floats]:
     """Mean over cells of repeats, its standard error and degrees of freedom, ``(...)`` each.
 
-    Errors have shape ``(..., cells, repeats)``, two repeats at least. Where none differs it is 0.
+    Errors have shape ``(..., cells, repeats)``; of one repeat there is no standard error, with no
+    degree of freedom. Where none differs it is 0.
     """
     *_, cells, repeats = errors.shape
+    mean = errors.mean(axis=(-1, -2))
+    if repeats < 2:
+        return mean, np.full(mean.shape, np.nan), np.zeros(mean.shape)
     variance = errors.var(axis=-1, ddof=1) / repeats / cells**2
     total = variance.sum(axis=-1)
     freedom = total**2 / np.maximum((variance**2).sum(axis=-1) / (repeats - 1), 1e-300)
-    return errors.mean(axis=(-1, -2)), np.sqrt(total), np.maximum(freedom, 1.0)
+    return mean, np.sqrt(total), np.maximum(freedom, 1.0)
 
 
 def mounted_anew(by_mounting: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean over two mountings or more, the last axis, its standard error and degrees of freedom."""
+    """Mean over mountings, the last axis, its standard error (one has none), and its freedom."""
     count = by_mounting.shape[-1]
+    mean = by_mounting.mean(axis=-1)
+    if count < 2:
+        return mean, np.full(mean.shape, np.nan), np.zeros(mean.shape)
     error = by_mounting.std(axis=-1, ddof=1) / math.sqrt(count)
-    return by_mounting.mean(axis=-1), error, np.full(error.shape, count - 1.0)
+    return mean, error, np.full(mean.shape, count - 1.0)
 
 
 #: Rank correlations of two orders, by the names of a trial.
@@ -153,89 +161,66 @@ def analyse(logs: Sequence[Path]) -> Trial:
     Raises:
         InputError: if a log holds no plan, is not finished, or is of another trial.
     """
-    measured, simulated, mountings = _tables(logs)
-    entries: dict[str, EntryTrial] = {}
-    missing: list[str] = []
-    for name, errors in measured.items():
-        entries[name] = _entry(errors, simulated[name], mountings)
-        if not np.isfinite(errors).all():
-            missing.append(f"{name} has no score: a run of it failed")
-    some = next(iter(measured.values()))
-    if not all(np.isfinite(table).all() for table in simulated.values()):
+    names, mountings, measured, simulated = _tables(logs)
+    entries = {
+        name: _entry(errors, predicted, mountings)
+        for name, errors, predicted in zip(names, measured, simulated, strict=True)
+    }
+    scored = np.array([bool(np.isfinite(errors).all()) for errors in measured])
+    missing = [f"{names[int(k)]} has no score: a run of it failed" for k in np.flatnonzero(~scored)]
+    if not np.isfinite(simulated).all():
         missing.append("No gap and no rank agreement: the log has no whole dry run")
-    if some.shape[-1] < 2:
+    if measured.shape[-1] < 2:
         missing.append("No interval as mounted: it needs two repeats at least")
     if len(mountings) < 2:
         missing.append("No interval mounted anew: it needs two lungs or sessions at least")
-    both = [
-        name
-        for name in measured
-        if np.isfinite(measured[name]).all() and np.isfinite(simulated[name]).all()
-    ]
+    both = scored & np.isfinite(simulated).all(axis=(1, 2))
     agrees: dict[str, Interval] = {}
-    if len(both) > 1:
-        agrees = agreement(
-            np.stack([simulated[name].mean(axis=1) for name in both]),
-            np.stack([measured[name].mean(axis=(1, 2)) for name in both]),
-        )
+    if both.sum() > 1:
+        agrees = agreement(simulated[both].mean(axis=2), measured[both].mean(axis=(2, 3)))
     return Trial(entries, agrees, tuple(missing))
 
 
 def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> EntryTrial:
     """One entry: errors ``(M, P, K)``, NaN where a run failed; in simulation ``(M, P)``."""
-    repeats = errors.shape[-1]
-    by_mounting = errors.mean(axis=(1, 2)) - simulated.mean(axis=1)
-    predicted = dict(zip(mountings, simulated.mean(axis=1).tolist(), strict=True))
-    means = errors.mean(axis=(1, 2)).tolist()
-    scores = {name: Interval(mean) for name, mean in zip(mountings, means, strict=True)}
-    gaps = {name: Interval(float(gap)) for name, gap in zip(mountings, by_mounting, strict=True)}
-    score, gap = Interval(float(errors.mean())), Interval(float(by_mounting.mean()))
+    count, pips, repeats = errors.shape
+
+    def by_mounting(values: Floats) -> dict[str, Interval]:
+        each = np.stack(as_mounted(values), axis=1)
+        return {name: interval(*x) for name, x in zip(mountings, each, strict=True)}
+
+    apart, error, _ = as_mounted(errors - simulated[..., None])
     within = between = math.nan
     if repeats > 1:
-        flat = errors.reshape(1, -1, repeats)
-        score = interval(*(x[0] for x in as_mounted(flat)))
-        mean, error, freedom = as_mounted(errors - simulated[..., None])
-        gaps = {name: interval(mean[k], error[k], freedom[k]) for k, name in enumerate(mountings)}
-        own = np.stack(as_mounted(errors), axis=1)
-        scores = {name: interval(*x) for name, x in zip(mountings, own, strict=True)}
         within = float(np.sqrt(errors.var(axis=-1, ddof=1).mean()))
-        if len(mountings) > 1:
-            excess = by_mounting.var(ddof=1) - (error**2).mean()
-            between = float(np.sqrt(np.maximum(excess, 0.0)))
-    if len(mountings) > 1:
-        gap = interval(*mounted_anew(by_mounting))
+        if count > 1:
+            between = math.sqrt(max(apart.var(ddof=1) - (error**2).mean(), 0.0))
     done = np.isfinite(errors).sum(axis=(1, 2))
     share = stats.binomtest(int(done.sum()), errors.size).proportion_ci(method="exact")
-    success = Interval(float(done.sum()) / errors.size, float(share.low), float(share.high))
-    each = errors[0].size
     return EntryTrial(
-        score,
-        scores,
-        predicted,
-        gap,
-        gaps,
-        success,
-        {name: (int(n), each) for name, n in zip(mountings, done, strict=True)},
+        interval(*as_mounted(errors.reshape(-1, repeats))),
+        by_mounting(errors),
+        dict(zip(mountings, simulated.mean(axis=1).tolist(), strict=True)),
+        interval(*mounted_anew(apart)),
+        by_mounting(errors - simulated[..., None]),
+        Interval(float(done.sum()) / errors.size, float(share.low), float(share.high)),
+        {name: (int(n), pips * repeats) for name, n in zip(mountings, done, strict=True)},
         within,
         between,
     )
 
 
-def _tables(logs: Sequence[Path]) -> tuple[dict[str, Floats], dict[str, Floats], list[str]]:
-    """Errors on the bench ``(M, P, K)`` and in simulation ``(M, P)`` by entry; the mountings."""
-    plans = []
-    measured: dict[str, list[Floats]] = {}
-    simulated: dict[str, list[Floats]] = {}
-    mountings: list[str] = []
-    hashes: dict[str, str] = {}
-    for number, log in enumerate(logs, 1):
-        session = read_session(log)
+def _tables(logs: Sequence[Path]) -> tuple[Sequence[str], list[str], Floats, Floats]:
+    """Entries and mountings; errors on the bench ``(E, M, P, K)``, in simulation ``(E, M, P)``."""
+    sessions = [read_session(log) for log in logs]
+    first = sessions[0].plan
+    mountings, hashes = list[str](), dict[str, str]()
+    measured, simulated = [], []
+    for number, session in enumerate(sessions, 1):
         log, plan = session.path, session.plan
-        plans.append((sorted(plan.entries), plan.pips, plan.repeats, plan.track))
-        if plans[-1] != plans[0]:
-            raise InputError(
-                f"{log} is of another trial than {logs[0]}: entries, PIPs, repeats or track differ"
-            )
+        for key, of in (("entries", sorted), ("pips", tuple), ("repeats", int), ("track", str)):
+            if of(getattr(plan, key)) != of(getattr(first, key)):
+                raise InputError(f"{log} is of another trial than {logs[0]}: {key} differ")
         complete = complete_runs(session.logged)
         ended = {
             (x["entry"], x["lung"], x["pip"], x["repeat"]): x.get("error")
@@ -249,21 +234,15 @@ def _tables(logs: Sequence[Path]) -> tuple[dict[str, Floats], dict[str, Floats],
                 if hashes.setdefault(name, digest) != digest:
                     raise InputError(f"{log}: the files of {name} changed; it is another entry")
             predicted |= {(e, lung, pip): x for e, lung, pip, x in line.get("simulated", ())}
-        left = len(plan.entries) * len(plan.lungs) * len(plan.pips) * plan.repeats - len(ended)
-        if left:
+        lungs = sorted(plan.lungs)
+        cells = list(product(first.entries, lungs, plan.pips))
+        shape = len(first.entries), len(lungs), len(plan.pips)
+        if left := len(cells) * plan.repeats - len(ended):
             raise InputError(f"{log}: {left} scored runs are left; `run` continues the plan")
-        for lung in sorted(plan.lungs):
-            mountings.append(lung if len(logs) == 1 else f"{lung} of session {number}")
-            for name in plan.entries:
-                cells = [
-                    [ended[name, lung, pip, k] for k in range(1, plan.repeats + 1)]
-                    for pip in plan.pips
-                ]
-                measured.setdefault(name, []).append(np.array(cells, float))
-                guess = [predicted.get((name, lung, pip), math.nan) for pip in plan.pips]
-                simulated.setdefault(name, []).append(np.array(guess, float))
-    return (
-        {name: np.stack(tables) for name, tables in measured.items()},
-        {name: np.stack(tables) for name, tables in simulated.items()},
-        mountings,
-    )
+        repeats = range(1, plan.repeats + 1)
+        errors = [[ended[*cell, repeat] for repeat in repeats] for cell in cells]
+        measured.append(np.array(errors, float).reshape(*shape, -1))
+        simulated.append(np.reshape([predicted.get(cell, math.nan) for cell in cells], shape))
+        mountings += [x if len(logs) == 1 else f"{x} of session {number}" for x in lungs]
+    tables = np.concatenate(measured, axis=1), np.concatenate(simulated, axis=1)
+    return first.entries, mountings, *tables

@@ -38,10 +38,10 @@ from hardware_eval.wire.messages import (
     Heartbeat,
     Hello,
     HostMessage,
+    Kept,
     Message,
     Mode,
     Packet,
-    ParserState,
     Reading,
     Reason,
     Refusal,
@@ -90,18 +90,6 @@ AnswerT = TypeVar("AnswerT", Welcome, Reading, Counters)
 
 class LinkError(InputError):
     """The base of all errors of the link."""
-
-
-class PortMissingError(LinkError):
-    """There is no such port."""
-
-
-class PortBusyError(LinkError):
-    """Another program has the port."""
-
-
-class PortForbiddenError(LinkError):
-    """The user may not open the port."""
 
 
 class DisconnectedError(LinkError):
@@ -237,8 +225,7 @@ class Link:
             patience: time after which :meth:`reopen` gives up, s.
 
         Raises:
-            LinkError: if it cannot be opened: PortMissingError, PortBusyError and
-                PortForbiddenError say why.
+            LinkError: if it cannot be opened; it says why, and what to do.
         """
         self.url = url
         self._patience = patience
@@ -278,7 +265,7 @@ class Link:
                 return
             except LinkError as error:
                 if time.monotonic() + pause > end:
-                    raise type(error)(f"{error} (tried for {self._patience:g} s)") from error
+                    raise LinkError(f"{error} (tried for {self._patience:g} s)") from error
             time.sleep(pause)
             pause = min(pause * _FACTOR, _LONGEST_PAUSE)
 
@@ -302,7 +289,7 @@ class Link:
             port.timeout = READ_SLICE  # fixed: pyserial configures the port anew at each change
             port.open()
         except ValueError as error:
-            raise PortMissingError(f"port {self.url!r}: {error}; {_PORTS}") from error
+            raise LinkError(f"port {self.url!r}: {error}; {_PORTS}") from error
         except (OSError, serial.SerialException) as error:
             raise self._not_opened(error) from error
         return cast(serial.Serial, port)  # others, such as sockets, have the same methods
@@ -310,17 +297,17 @@ class Link:
     def _not_opened(self, error: OSError) -> LinkError:
         number = error.errno or getattr(error.__cause__ or error.__context__, "errno", None)
         if number in (errno.EACCES, errno.EPERM):
-            return PortForbiddenError(
+            return LinkError(
                 f"port {self.url}: you may not open it; join its group (on Debian: sudo usermod "
                 "-aG dialout $USER, then log in again)"
             )
         if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "lock" in str(error):
-            return PortBusyError(
+            return LinkError(
                 f"port {self.url}: another program has it; close that program (fuser {self.url} "
                 "names it)"
             )
         if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ECONNREFUSED):
-            return PortMissingError(
+            return LinkError(
                 f"port {self.url}: it is not there ({error.strerror or error}); is the cable in "
                 "and the device on? `python -m serial.tools.list_ports` lists the ports"
             )
@@ -434,7 +421,7 @@ class Client:
         self.welcome: Welcome | None = None
         self.reading: Reading | None = None
         self.transport, self._clock, self._timeout = transport, clock or RealClock(), timeout
-        self._parser = ParserState()
+        self._kept: Kept = None
         self._session, self._sequence = 0, 0
         self._round_trips: deque[float] = deque(maxlen=_REMEMBERED)
         self._pressure_limit: float | None = None
@@ -553,7 +540,7 @@ class Client:
             LinkError: if the port does not come back.
         """
         self.transport.reopen()
-        self._parser = ParserState()
+        self._kept = None
         return self.hello(self._pressure_limit)
 
     def close(self) -> None:
@@ -631,7 +618,7 @@ class Client:
             left = deadline - self._clock.now()
             if left <= 0.0:
                 return None
-            self._parser, events = feed_bytes(self._parser, self.transport.read(left))
+            self._kept, events = feed_bytes(self._kept, self.transport.read(left))
             answers = [message for event in events if (message := self._expected(event))]
             if answers:
                 return answers[-1]

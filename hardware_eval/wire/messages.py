@@ -15,7 +15,7 @@ import struct
 from binascii import crc32
 from dataclasses import dataclass, fields
 from enum import Enum, IntEnum, IntFlag
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 from cobs import cobs
 
@@ -448,17 +448,6 @@ def _or_nan(number: int, steps: int) -> float:
 LONGEST_FRAME = LONGEST_PACKET + 1
 
 
-class ParserMode(Enum):
-    """Place in the stream."""
-
-    #: Before the first zero byte, or in a frame that became too long: waits for a zero byte.
-    HUNTING = "hunting"
-    #: After a zero byte.
-    BETWEEN = "between"
-    #: Inside a frame.
-    INSIDE = "inside"
-
-
 class Fault(Enum):
     """What was wrong with the bytes between two zero bytes."""
 
@@ -470,36 +459,28 @@ class Fault(Enum):
     MALFORMED = "malformed"
 
 
-class ParserState(NamedTuple):
-    """Place in the stream and the bytes of the frame so far."""
-
-    mode: ParserMode = ParserMode.HUNTING
-    kept: bytes = b""
+#: Bytes of the frame so far; None before the first zero byte, or in a frame that became too long,
+#: until a zero byte comes.
+Kept = bytes | None
 
 
 Event = Packet | Fault
 
 
-def feed(state: ParserState, byte: int) -> tuple[ParserState, Event | None]:
-    """Take one byte, 0..255; returns the next state, and the event that it completes, if any."""
-    if byte == 0:
-        ended = _finished(state.kept) if state.mode is ParserMode.INSIDE else None
-        return ParserState(ParserMode.BETWEEN), ended
-    if state.mode is ParserMode.HUNTING:
-        return state, None
-    if len(state.kept) >= LONGEST_FRAME:
-        return ParserState(ParserMode.HUNTING), Fault.FRAMING
-    return ParserState(ParserMode.INSIDE, state.kept + bytes((byte,))), None
-
-
-def feed_bytes(state: ParserState, data: bytes) -> tuple[ParserState, list[Event]]:
-    """Take bytes one by one; returns the next state and all events in order."""
+def feed_bytes(kept: Kept, data: bytes) -> tuple[Kept, list[Event]]:
+    """Take bytes; returns what is kept of the frame that has begun, and all events in order."""
     events: list[Event] = []
-    for byte in data:
-        state, event = feed(state, byte)
-        if event is not None:
-            events.append(event)
-    return state, events
+    for place, piece in enumerate(data.split(b"\0")):
+        if place:  # a zero byte came before it
+            if kept:
+                events.append(_finished(kept))
+            kept = b""
+        if kept is not None:
+            kept += piece
+            if len(kept) > LONGEST_FRAME:
+                events.append(Fault.FRAMING)
+                kept = None
+    return kept, events
 
 
 def _finished(frame: bytes) -> Event:

@@ -17,9 +17,9 @@ from hardware_eval.wire.messages import (
     Heartbeat,
     Hello,
     HostMessage,
+    Kept,
     Message,
     Packet,
-    ParserState,
     Reading,
     Reason,
     Refusal,
@@ -75,7 +75,7 @@ class Probe:
         self.transport, self.clock, self.random = transport, clock, Random(0)
         self.session = self.sequence = 0
         self.watchdog = WATCHDOG
-        self._parser = ParserState()
+        self._kept: Kept = None
         self.heard: list[Packet] = []
 
     def hello(self, limit: float | None = None) -> Welcome:
@@ -142,7 +142,7 @@ class Probe:
         """What the device sends within a time; with ``first``, until it has sent something."""
         end, heard = self.clock.now() + seconds, []
         while (left := end - self.clock.now()) > 0.0 and not (first and heard):
-            self._parser, events = feed_bytes(self._parser, self.transport.read(left))
+            self._kept, events = feed_bytes(self._kept, self.transport.read(left))
             faults = [event for event in events if not isinstance(event, Packet)]
             if faults:
                 raise DiffersError(f"the device sent what is no frame ({faults[0].value})")

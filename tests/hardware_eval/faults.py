@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import heapq
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -255,4 +254,4 @@ class FaultyDevice(LoopbackDevice):
     def answer(self, now: float, data: bytes) -> None:
         if self.plugged:
             due, data = self.line.to_host(now, data)
-            heapq.heappush(self._outgoing, (due + self.latency, next(self._order), data))
+            self._outgoing.append((due + self.latency, data))

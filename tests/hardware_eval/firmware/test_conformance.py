@@ -15,7 +15,7 @@ from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.wire.client import NoAnswerError
 from hardware_eval.wire.conformance import CLAUSES, NOT_TRIED, Clause, conformance
-from hardware_eval.wire.messages import Capability, Packet, ParserState, feed_bytes
+from hardware_eval.wire.messages import Capability, Packet, feed_bytes
 from tests.hardware_eval.firmware.core import CoreService, loopback
 from tests.hardware_eval.stand_in import Bench
 
@@ -82,7 +82,7 @@ def test_a_device_answers_the_table_byte_by_byte(harness: Path, device: str) -> 
     rows = re.findall(row, PROTOCOL.read_text("utf-8"), re.M)
     assert len(rows) == 16
     for name, frame in rows:
-        _, (packet,) = feed_bytes(ParserState(), bytes.fromhex(frame))
+        _, (packet,) = feed_bytes(None, bytes.fromhex(frame))
         assert isinstance(packet, Packet)
         assert packet.message.kind.name.lower() == name
     bench = Bench(identity=Identity("bench", b"12345678", bytes(range(32)), Capability.NONE))

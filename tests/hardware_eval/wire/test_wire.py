@@ -27,7 +27,6 @@ from hardware_eval.wire.messages import (
     Kind,
     Mode,
     Packet,
-    ParserState,
     Reading,
     Reason,
     Refusal,
@@ -36,7 +35,6 @@ from hardware_eval.wire.messages import (
     Welcome,
     decode,
     encode,
-    feed,
     feed_bytes,
     to_frame,
     to_packet,
@@ -91,7 +89,7 @@ def packets(draw: st.DrawFn) -> Packet:
 
 
 def _events(data: bytes) -> list[Event]:
-    return feed_bytes(ParserState(), data)[1]
+    return feed_bytes(None, data)[1]
 
 
 @QUICK
@@ -183,20 +181,22 @@ def test_after_any_garbage_the_next_frame_is_read(
 @QUICK
 @given(st.lists(packets(), max_size=4), st.lists(st.integers(1, 40), max_size=60))
 def test_how_bytes_are_cut_into_reads_does_not_matter(sent: list[Packet], sizes: list[int]) -> None:
-    stream, state, events = b"".join(map(encode, sent)), ParserState(), []
+    stream, kept, events = b"".join(map(encode, sent)), None, []
     for size in sizes:
-        state, more = feed_bytes(state, stream[:size])
+        kept, more = feed_bytes(kept, stream[:size])
         events, stream = events + more, stream[size:]
-    assert events + feed_bytes(state, stream)[1] == sent
+    assert events + feed_bytes(kept, stream)[1] == sent
 
 
 @QUICK
 @given(st.binary(max_size=2000))
 def test_the_parser_keeps_at_most_one_frame(garbage: bytes) -> None:
-    state = ParserState()
+    kept, events = None, []
     for byte in garbage:
-        state, _ = feed(state, byte)
-        assert len(state.kept) <= LONGEST_FRAME
+        kept, more = feed_bytes(kept, bytes([byte]))
+        assert len(kept or b"") <= LONGEST_FRAME
+        events += more
+    assert (kept, events) == feed_bytes(None, garbage)
 
 
 def test_a_frame_too_long_is_one_fault() -> None:

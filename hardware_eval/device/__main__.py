@@ -16,9 +16,10 @@ from ventbench.base.errors import InputError
 
 try:
     from hardware_eval.device import deadman
-    from hardware_eval.device.port import Guard, Port
+    from hardware_eval.device.guard import Guard
     from hardware_eval.device.program import DeviceService, DeviceSettings
     from hardware_eval.wire.client import BAUD_RATE
+    from hardware_eval.wire.port import Port
 except InputError as missing:  # an extra that brings the wire
     print(f"python -m hardware_eval.device: {missing}", file=sys.stderr)
     raise SystemExit(2) from None

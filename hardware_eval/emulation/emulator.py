@@ -14,10 +14,11 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from hardware_eval.device.port import Guard, Port
+from hardware_eval.device.guard import Guard
 from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
 from hardware_eval.emulation.firmware import Firmware
 from hardware_eval.realtime import VirtualClock
+from hardware_eval.wire.port import Port
 from ventbench.base.errors import InputError
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -171,40 +172,41 @@ def _tables(session: Session, name: str) -> dict[str, Any]:
         for line in session.of_type("run")
         if (line["status"], line["entry"], line["kind"]) == ("failed", name, "scored")
     }
-    errors, pressures, commands = [], [], []
-    stops, safe, peaks = [], [], []
-    for lung in session.lungs:
-        peak, passed = -math.inf, True
-        for tables in (errors, pressures, commands):
-            tables.append([[] for _ in plan.pips])
-        for place, pip in enumerate(plan.pips):
-            for repeat in range(1, plan.repeats + 1):
-                cell = {"lung": lung, "pip": pip, "repeat": repeat}
-                measured_run = runs.get((lung, pip, repeat))
-                if measured_run is None:
-                    reason, passed = failed.get((lung, pip, repeat), "stopped"), False
-                    stops.append({**cell, "reason": reason[:_REASON]})
-                    for tables in (errors, pressures, commands):
-                        tables[-1][place].append(None)
-                    continue
-                inspired = measured.scored([breath.pressure for breath in measured_run])
-                u_in = measured.scored([breath.u_in for breath in measured_run])
-                milli = np.round(1000.0 * inspired)
-                errors[-1][place].append(measured.mean_error(milli / 1000.0, pip))
-                pressures[-1][place].append(
-                    [[None if math.isnan(x) else int(x) for x in row] for row in milli]
-                )
-                commands[-1][place].append(np.round(10.0 * u_in).astype(int).tolist())
-                peak = max(peak, *(measured.highest(breath.pressure) for breath in measured_run))
-                passed &= all(measured.is_safe(x.pressure, pip, protocol.DT) for x in measured_run)
-        safe.append(passed)
-        peaks.append(round(peak, 3) if math.isfinite(peak) else 0.0)
+    cells = list(product(session.lungs, plan.pips, range(1, plan.repeats + 1)))
+    rows = [_cell(runs[cell], cell[1]) if cell in runs else _STOPPED for cell in cells]
+    grid = np.array(rows).reshape(len(session.lungs), len(plan.pips), plan.repeats)
+
+    def table(column: str) -> list[list[list[Any]]]:
+        return [[[row[column] for row in cell] for cell in lung] for lung in grid]
+
+    stops = [
+        {"lung": cell[0], "pip": cell[1], "repeat": cell[2], "reason": reason[:_REASON]}
+        for cell, reason in ((x, failed.get(x, "stopped")) for x in cells if x not in runs)
+    ]
+    peaks = [max(row["peak"] for row in lung.flat) for lung in grid]
     return {
-        "errors": errors,
-        "trace": {"pressure_milli_cmH2O": pressures, "u_in_tenths_percent": commands},
+        "errors": table("error"),
+        "trace": {"pressure_milli_cmH2O": table("milli"), "u_in_tenths_percent": table("tenths")},
         "stops": stops,
-        "safe": safe,
-        "peak_pressure_cmH2O": peaks,
+        "safe": [all(row["safe"] for row in lung.flat) for lung in grid],
+        "peak_pressure_cmH2O": [round(peak, 3) if math.isfinite(peak) else 0.0 for peak in peaks],
+    }
+
+
+#: What a record says of a run that failed.
+_STOPPED = {"error": None, "milli": None, "tenths": None, "safe": False, "peak": -math.inf}
+
+
+def _cell(breaths: list[BreathLog], pip: float) -> dict[str, Any]:
+    """What a record says of a run that completed."""
+    milli = np.round(1000.0 * measured.scored([breath.pressure for breath in breaths]))
+    u_in = measured.scored([breath.u_in for breath in breaths])
+    return {
+        "error": measured.mean_error(milli / 1000.0, pip),
+        "milli": [[None if math.isnan(x) else int(x) for x in row] for row in milli],
+        "tenths": np.round(10.0 * u_in).astype(int).tolist(),
+        "safe": all(measured.is_safe(breath.pressure, pip, protocol.DT) for breath in breaths),
+        "peak": max(measured.highest(breath.pressure) for breath in breaths),
     }
 
 

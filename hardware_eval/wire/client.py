@@ -1,10 +1,7 @@
 """The host's end of the wire: a link that carries bytes, and a client that sends messages over it.
 
-A link is a serial line: anything that pyserial opens, with errors that say what to do. Two threads
-read and write its port. Even where neither has to wait for the device, both can take long on a busy
-machine: the kernel moves the bytes of a terminal in threads of ordinary priority, and waits for
-them. The control loop puts bytes into a queue and takes them out of one, so that the port never
-holds it up.
+A link is a serial line or a socket that pyserial opens, with errors that say what to do; a thread
+carries its bytes (:mod:`hardware_eval.wire.port`).
 
 The client waits for the answer of each message.
 """
@@ -14,13 +11,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import math
+import os
 import secrets
-import threading
 import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from queue import Empty, Queue, SimpleQueue
 from typing import Protocol, TypeVar, cast
 from urllib.parse import urlsplit
 
@@ -52,6 +47,7 @@ from hardware_eval.wire.messages import (
     feed_bytes,
     milliseconds,
 )
+from hardware_eval.wire.port import Port
 from ventbench.base.errors import InputError
 
 #: Bits per second; USB devices ignore it. A control step then takes 9 ms of a real UART.
@@ -59,12 +55,6 @@ BAUD_RATE = 115_200
 
 #: What a port is.
 _PORTS = "write a device such as /dev/ttyACM0, or socket://HOST:PORT"
-
-#: Longest time in which the port does not take what is written, s.
-WRITE_TIMEOUT = 1.0
-
-#: The reading thread looks this often whether the port is to be closed, s.
-READ_SLICE = 0.05
 
 #: When a port has gone: the first pause between two attempts to open it, s, the factor by which
 #: each pause exceeds the one before, and the longest, s.
@@ -149,79 +139,18 @@ class Transport(Protocol):
         ...
 
 
-class _Traffic:
-    """The threads of an open port.
-
-    Attributes:
-        outbox: what is to be sent; None ends the thread.
-        broken: what went wrong with the port; None if nothing did.
-    """
-
-    def __init__(self, port: serial.Serial) -> None:
-        self.outbox: SimpleQueue[bytes | None] = SimpleQueue()
-        self.broken: Exception | None = None
-        # A signal whose handler outlasts the timeout would let SimpleQueue wait for ever.
-        self._inbox: Queue[bytes] = Queue()
-        self._port, self._ended = port, False
-        self._threads = [
-            threading.Thread(target=work, name=f"port {work.__name__}", daemon=True)
-            for work in (self._receive, self._send)
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def take(self, timeout: float) -> bytes:
-        """What arrived; waits ``timeout``, s, if nothing has."""
-        try:
-            data = self._inbox.get(timeout=max(timeout, 0.0))
-            while not self._inbox.empty():
-                data += self._inbox.get_nowait()
-        except Empty:
-            return b""
-        return data
-
-    def end(self) -> None:
-        """End both threads, once what is left has been sent."""
-        self._ended = True
-        self.outbox.put(None)
-        for thread in self._threads:
-            thread.join()
-
-    def _receive(self) -> None:
-        take_priority()
-        with self._breaks():
-            while not self._ended and self.broken is None:
-                if data := self._port.read(1):
-                    waiting = self._port.in_waiting
-                    self._inbox.put(data + self._port.read(waiting) if waiting else data)
-
-    def _send(self) -> None:
-        take_priority()
-        with self._breaks():
-            while (data := self.outbox.get()) is not None:
-                self._port.write(data)
-
-    @contextlib.contextmanager
-    def _breaks(self) -> Iterator[None]:
-        try:
-            yield
-        except (OSError, TypeError, serial.SerialException) as error:
-            self.broken = self.broken or error
-            self._inbox.put(b"")  # wakes whoever waits
-
-
 class Link:
     """An open port.
 
     Attributes:
-        url: a device such as ``/dev/ttyACM0``, ``socket://host:port`` or ``loop://``.
+        url: a device such as ``/dev/ttyACM0``, or ``socket://host:port``.
     """
 
     def __init__(self, url: str, patience: float = 60.0) -> None:
         """Open a port.
 
         Args:
-            url: whatever :func:`serial.serial_for_url` takes.
+            url: what :func:`serial.serial_for_url` takes and has a descriptor.
             patience: time after which :meth:`reopen` gives up, s.
 
         Raises:
@@ -230,24 +159,24 @@ class Link:
         self.url = url
         self._patience = patience
         self._port = self._open()
-        self._traffic = _Traffic(self._port)
+        self._traffic = self._begun()
 
     def write(self, data: bytes) -> None:
         """Send bytes; returns before they are sent. DisconnectedError if the port has gone."""
-        if self._traffic.broken is not None:
-            raise self._disconnected(self._traffic.broken)
-        self._traffic.outbox.put(data)
+        if self._traffic.broken:
+            raise self._disconnected()
+        self._traffic.send(data)
 
     def read(self, timeout: float) -> bytes:
         """Wait for bytes; empty if none come within ``timeout``, s, or DisconnectedError."""
         data = self._traffic.take(timeout)
-        if not data and self._traffic.broken is not None:
-            raise self._disconnected(self._traffic.broken)
+        if not data and self._traffic.broken:
+            raise self._disconnected()
         return data
 
     def close(self) -> None:
         """Send what is left, and release the port."""
-        self._traffic.end()
+        self._traffic.close()
         self._port.close()
 
     def reopen(self) -> None:
@@ -261,7 +190,7 @@ class Link:
         while True:
             try:
                 self._port = self._open()
-                self._traffic = _Traffic(self._port)
+                self._traffic = self._begun()
                 return
             except LinkError as error:
                 if time.monotonic() + pause > end:
@@ -277,6 +206,11 @@ class Link:
             return False
         return isinstance(self._port, serial.Serial)
 
+    def _begun(self) -> Port:
+        """What carries bytes on the open port, until that goes away."""
+        lines = [self._port.fileno()]
+        return Port(lambda: lines.pop() if lines else None, lambda line: None, take_priority)
+
     def _open(self) -> serial.Serial:
         try:
             if self.url.startswith("socket:") and urlsplit(self.url).port is None:
@@ -285,9 +219,9 @@ class Link:
             if isinstance(port, serial.Serial):
                 port.exclusive = True  # a second program would steal bytes
                 port.dtr = port.rts = False  # asserted, they restart common boards
-            port.write_timeout = WRITE_TIMEOUT
-            port.timeout = READ_SLICE  # fixed: pyserial configures the port anew at each change
+            port.timeout = 0  # its descriptor is read
             port.open()
+            os.set_blocking(port.fileno(), False)
         except ValueError as error:
             raise LinkError(f"port {self.url!r}: {error}; {_PORTS}") from error
         except (OSError, serial.SerialException) as error:
@@ -313,10 +247,8 @@ class Link:
             )
         return LinkError(f"port {self.url} cannot be opened: {error}; {_PORTS}")
 
-    def _disconnected(self, error: Exception) -> DisconnectedError:
-        return DisconnectedError(
-            f"port {self.url} went away: {error}; the device vents the lung by itself"
-        )
+    def _disconnected(self) -> DisconnectedError:
+        return DisconnectedError(f"port {self.url} went away; the device vents the lung by itself")
 
 
 @dataclass(frozen=True)

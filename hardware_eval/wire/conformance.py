@@ -181,10 +181,10 @@ def _sessions(host: Probe) -> None:
             host.refused(message, Reason.SESSION, session=other)
         host.refused(Command(200.0, 0, 0), Reason.SESSION, session=other)
     _shows(host.reading(), "after strangers", Mode.READY)
-    old, since = host.session, host.inspire()
+    old = host.session
+    host.inspire()
     host.hello()
     _shows(host.reading(), "after a second host", Mode.READY)
-    host.in_time(since)
     host.refused(Heartbeat(), Reason.SESSION, session=old)
 
 
@@ -230,17 +230,11 @@ def _not_armed(host: Probe) -> None:
 
 def _commands(host: Probe) -> None:
     with host.counting(commands=4):
-        since = host.arm()
+        host.arm()
         for u_in, u_out in ((12.34, 0), (0.01, 1), (100.0, 1), (0.0, 0)):
-            sent, command = host.clock.now(), host.command(u_in, u_out)
-            host.in_time(since)
-            reading = host.ask(command, Reading)
-            host.in_time(since)
+            reading = host.ask(host.command(u_in, u_out), Reading)
             _shows(reading, "after a command", Mode.RUNNING, u_in, u_out)
-            kept = host.reading()
-            host.in_time(sent)
-            _shows(kept, "after a heartbeat", Mode.RUNNING, u_in, u_out)
-            since = sent
+            _shows(host.reading(), "after a heartbeat", Mode.RUNNING, u_in, u_out)
 
 
 def _out_of_range(host: Probe) -> None:
@@ -248,11 +242,10 @@ def _out_of_range(host: Probe) -> None:
         for armed in (True, False):
             for u_in, u_out in ((100.01, 0), (655.35, 1), (5.0, 2), (5.0, 255)):
                 host.hello()
-                since = host.arm() if armed else host.clock.now()
+                if armed:
+                    host.arm()
                 command = host.command(u_in, u_out, age=0 if armed else 9999)
-                host.in_time(since)
                 refusal = host.refused(command, Reason.OUT_OF_RANGE)
-                host.in_time(since)
                 for seen in (refusal, host.reading()):
                     _vented(seen, "after a command out of range", Flag.OUT_OF_RANGE)
                 host.refused(host.command(5.0, 0), Reason.NOT_ARMED)
@@ -260,20 +253,14 @@ def _out_of_range(host: Probe) -> None:
 
 def _stale(host: Probe) -> None:
     with host.counting(stale=4):
-        since = host.arm()
+        host.arm()
         for age in (101, 5000, 1 << 31, -10_000):
-            stale = host.command(50.0, 0, age)
-            host.in_time(since)
-            host.refused(stale, Reason.STALE)
-            host.in_time(since)
-        reading = host.reading()
-        host.in_time(since)
-        _shows(reading, "after stale commands", Mode.RUNNING)
+            host.refused(host.command(50.0, 0, age), Reason.STALE)
+        _shows(host.reading(), "after stale commands", Mode.RUNNING)
         asked = host.clock.now()
         fresh = host.command(50.0, 0, age=50)
-        host.in_time(since)
         got = host.raw(host.frame(fresh)).message
-        host.sequence += 1
+        host.sequence, host.fed = host.sequence + 1, asked
         if host.clock.now() - asked > 0.030:
             raise LateError
         equal("a command on a reading of 50 ms", told(got), "reading")
@@ -284,9 +271,8 @@ def _stale(host: Probe) -> None:
 
 def _vent(host: Probe) -> None:
     for session, step in ((None, 1), (host.session ^ 0x5A5A5A5A, 1), (None, 0)):
-        since = host.inspire()
+        host.inspire()
         reading = host.ask(Vent(), Reading, step=step, session=session)
-        host.in_time(since)
         _vented(reading, "after a vent", Flag.HOST_VENTED)
         host.refused(host.command(30.0, 0), Reason.NOT_ARMED)
     host.arm()
@@ -294,7 +280,7 @@ def _vent(host: Probe) -> None:
 
 
 def _rearm(host: Probe) -> None:
-    host.in_time(host.inspire())
+    host.inspire()
     _shows(host.ask(Arm(), Reading), "after arming again", Mode.RUNNING)
 
 
@@ -316,14 +302,11 @@ def _watchdog(
 ) -> None:
     """The device vents between the watchdog's time and its bound after the last command."""
     before = host.counters().watchdog
-    first = host.clock.now()
-    host.arm()
-    if not armed_only:
-        command = host.command(30.0, 0)
-        sent = host.clock.now()
-        host.in_time(first)
-        host.ask(command, Reading)
-        first = sent
+    if armed_only:
+        host.arm()
+    else:
+        host.inspire()
+    first, host.fed = host.fed, math.inf  # it vents on purpose
     last = host.clock.now()  # the device took it before
     lived = False
     while True:
@@ -352,16 +335,11 @@ def _watchdog(
 
 
 def _feeds(host: Probe) -> None:
-    since = host.arm()
+    host.arm()
     for k in range(8):
-        host.clock.sleep_until(since + 0.045)
-        command = host.command(20.0 + k, k % 2)
-        host.in_time(since)
-        sent = host.clock.now()
-        reading = host.ask(command, Reading)
-        host.in_time(since)
+        host.clock.sleep_until(host.fed + 0.045)
+        reading = host.ask(host.command(20.0 + k, k % 2), Reading)
         equal("mode under commands 45 ms apart", reading.mode.name, "RUNNING")
-        since = sent
 
 
 def _noise(host: Probe) -> object:
@@ -479,10 +457,7 @@ def _judged(host: Probe, text: str, check: Callable[[Probe], None]) -> Clause:
     for _ in range(_ATTEMPTS):
         before = None
         try:
-            host.hear(0.01)
-            host.heard.clear()
-            host.hello()
-            before = host.counters()
+            before = _anew(host)
             host.hello()
             check(host)
         except LateError:
@@ -500,13 +475,19 @@ def _judged(host: Probe, text: str, check: Callable[[Probe], None]) -> Clause:
     return Clause(text, False, f"{reason}, {_ATTEMPTS} times in a row")
 
 
+def _anew(host: Probe) -> Counters:
+    """Leave what was before, and open a session; the device's counters."""
+    host.hear(0.01)
+    host.heard.clear()
+    host.fed = math.inf
+    host.hello()
+    return host.counters()
+
+
 def _by_itself(host: Probe, before: Counters) -> bool:
     """Whether sensor, pressure or lateness have made the device vent since."""
     try:
-        host.hear(0.01)
-        host.heard.clear()
-        host.hello()
-        after = host.counters()
+        after = _anew(host)
     except DiffersError:
         return False
     names = ("sensor", "overpressure", "device_late")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from random import Random
 from typing import TypeVar
@@ -19,6 +20,7 @@ from hardware_eval.wire.messages import (
     HostMessage,
     Kept,
     Message,
+    Mode,
     Packet,
     Reading,
     Reason,
@@ -68,6 +70,8 @@ class Probe:
         sequence: last sequence number that the device has consumed.
         watchdog: what the device told at the last hello, s.
         heard: packets that nobody has asked for yet.
+        fed: when the device's watchdog started at the earliest, s; infinite where it cannot vent,
+            or may. An answer that comes when it can have run out says nothing of what was asked.
     """
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
@@ -77,12 +81,13 @@ class Probe:
         self.watchdog = WATCHDOG
         self._kept: Kept = None
         self.heard: list[Packet] = []
+        self.fed = math.inf
 
     def hello(self, limit: float | None = None) -> Welcome:
         """Open a session of another number."""
         self.session, self.sequence = self.random.getrandbits(32), 0
         welcome = self.ask(Hello(pressure_limit=limit), Welcome)
-        self.watchdog = welcome.watchdog
+        self.watchdog, self.fed = welcome.watchdog, math.inf
         return welcome
 
     def frame(self, message: Message, step: int = 1, session: int | None = None) -> bytes:
@@ -103,7 +108,8 @@ class Probe:
         ``session`` is given.
         """
         header = self.session if session is None else session, self.sequence + step
-        got = self.raw(self.frame(message, step, session))
+        sent, got = self.clock.now(), self.raw(self.frame(message, step, session))
+        self.in_time()
         if (got.session, got.sequence) != header:
             raise DiffersError(
                 f"{message.kind.name.lower()} {header[1]} of session {header[0]:#x} was answered "
@@ -115,6 +121,10 @@ class Probe:
                 f"{message.kind.name.lower()} was answered with {told(got.message)}, not with "
                 f"{answer.kind.name.lower()}"
             )
+        if isinstance(got.message, Reading | Refusal) and got.message.mode is not Mode.RUNNING:
+            self.fed = math.inf
+        elif isinstance(got.message, Reading) and isinstance(message, Arm | Command):
+            self.fed = sent
         return got.message
 
     def refused(
@@ -157,9 +167,9 @@ class Probe:
         """The device's counters."""
         return self.ask(Statistics(), Counters)
 
-    def arm(self) -> float:
-        """Begin a run; returns when the watchdog started at the earliest, s."""
-        before = self.clock.now()
+    def arm(self) -> None:
+        """Begin a run."""
+        self.fed = self.clock.now()
         got = self.raw(self.frame(Arm())).message
         self.sequence += 1
         if isinstance(got, Refusal) and got.flags & _SENSOR:
@@ -167,15 +177,11 @@ class Probe:
         if not isinstance(got, Reading):
             raise DiffersError(f"arm was answered with {told(got)}")
         equal("mode after arming", got.mode.name, "RUNNING")
-        return before
 
-    def inspire(self) -> float:
-        """Arm and open the inspiratory valve; returns when it was armed at the earliest, s."""
-        since = self.arm()
-        command = self.command(30.0, 0)
-        self.in_time(since)
-        self.ask(command, Reading)
-        return since
+    def inspire(self) -> None:
+        """Arm and open the inspiratory valve."""
+        self.arm()
+        self.ask(self.command(30.0, 0), Reading)
 
     @contextlib.contextmanager
     def counting(self, **more: int) -> Iterator[None]:
@@ -191,9 +197,9 @@ class Probe:
         newest = milliseconds(self.reading().time)
         return Command(u_in, u_out, (newest - age) & 0xFFFFFFFF)
 
-    def in_time(self, since: float) -> None:
+    def in_time(self) -> None:
         """Go on only if the watchdog cannot have run out."""
-        if self.clock.now() - since > WATCHDOG - ANSWER:
+        if self.clock.now() - self.fed > WATCHDOG - ANSWER:
             raise LateError
 
 

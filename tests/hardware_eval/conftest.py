@@ -17,14 +17,6 @@ from tests.hardware_eval.faults import FaultyDevice, faulty_lung
 LUNG = "R5C20"
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _ports_are_patient() -> Iterator[None]:
-    """A host that stands still for a second must not look like a port that has gone."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hardware_eval.wire.client.WRITE_TIMEOUT", 600.0)
-        yield
-
-
 @pytest.fixture
 def scored_only(tmp_path: Path) -> Path:
     """A plan of scored runs alone."""

@@ -21,11 +21,12 @@ import numpy as np
 import pytest
 
 from hardware_eval.device import __main__ as board
-from hardware_eval.device.port import Guard, Port
+from hardware_eval.device.guard import Guard
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves, load_machine
 from hardware_eval.wire.client import Client, Link
 from hardware_eval.wire.messages import PROTOCOL_VERSION, Capability, Hello, Mode, Packet, encode
+from hardware_eval.wire.port import Port
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 

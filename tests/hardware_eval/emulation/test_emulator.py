@@ -7,12 +7,12 @@ import os
 import socket
 import threading
 import time
+import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import serial
 
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.wire.client import (
@@ -163,21 +163,32 @@ def test_patience_with_a_lost_port_ends(emulator: PulledEmulator, tmp_path: Path
         link.reopen()
 
 
-def test_a_socket_and_a_loop_are_links_too() -> None:
-    loop = Link("loop://")
-    loop.write(b"abc")
-    assert loop.read(PATIENCE) == b"abc"
-    assert loop.read(0.001) == b""
+def test_a_socket_is_a_link_too_and_what_has_no_descriptor_is_none() -> None:
+    with pytest.raises(LinkError, match="socket://"):
+        Link("loop://")
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = Link(f"socket://127.0.0.1:{server.getsockname()[1]}")
         device, _ = server.accept()
         with device:
             link.write(encode(Packet(0, 1, Vent())))
             assert device.recv(100) == encode(Packet(0, 1, Vent()))
+            assert link.read(0.001) == b""
+            device.sendall(b"abc")
+            assert link.read(PATIENCE) == b"abc"
         with pytest.raises(DisconnectedError, match="vents the lung by itself"):
             link.read(PATIENCE)
         link.close()
 
 
-def test_pyserial_is_the_link() -> None:
-    assert isinstance(Link("loop://")._port, serial.SerialBase)
+def test_what_was_written_is_sent_before_the_port_is_released() -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    for k in range(50):
+        link = Link(os.ttyname(slave))
+        link.write(bytes([k]) * 40)
+        link.close()
+        link.close()
+        link.write(b"lost")
+        assert os.read(master, 100) == bytes([k]) * 40
+    os.close(slave)
+    os.close(master)

@@ -178,10 +178,7 @@ def simulate_breaths(
     import pandas as pd
 
     if not isinstance(table, pd.DataFrame):
-        try:
-            table = pd.read_csv(table, encoding="utf-8-sig")
-        except (ValueError, UnicodeDecodeError) as error:  # the parser's errors are ValueErrors
-            raise InputError(f"{table} is not a CSV file in UTF-8: {error}") from error
+        table = _read_csv(table)
     lacking = [name for name in ("breath_id", "u_in") if name not in table]
     if lacking:
         raise InputError(f"the table has no column {lacking[0]}; it has {', '.join(table)}")
@@ -228,10 +225,7 @@ def read_controls(path: Path | str, *, by_breath: bool = False) -> list[Controls
     """
     import pandas as pd
 
-    try:
-        texts = pd.read_csv(path, dtype=str, keep_default_na=False, encoding="utf-8-sig")
-    except (ValueError, UnicodeDecodeError) as error:  # the parser's errors are ValueErrors
-        raise InputError(f"{path} is not a CSV file in UTF-8: {error}") from error
+    texts = _read_csv(path, dtype=str, keep_default_na=False)
     if texts.empty or "u_in" not in texts:
         raise InputError(f"{path} needs a header line with a column u_in, and at least one row")
 
@@ -258,6 +252,15 @@ def read_controls(path: Path | str, *, by_breath: bool = False) -> list[Controls
     check("time_step", back, "s is not later than the row before, in one breath.")
     parts = zip(*(np.split(column, starts) for column in (time, u_in, u_out)), strict=True)
     return [Controls(*part) for part in parts]
+
+
+def _read_csv(path: Path | str, **options: Any) -> pd.DataFrame:
+    import pandas as pd
+
+    try:
+        return pd.read_csv(path, encoding="utf-8-sig", **options)
+    except ValueError as error:  # those of the parser and of UTF-8 too
+        raise InputError(f"{path} is not a CSV file in UTF-8: {error}") from error
 
 
 def _steps(count: int) -> Floats:

@@ -47,6 +47,7 @@ def hybrid(**changes) -> Hybrid:
         closing_conductance=0.1,
         opening_delay=0.011,
         closing_delay=0.0105,
+        closing_lag=1e-9,  # at once
         rest=5.2,
     )
     assert set(changes) <= set(values)

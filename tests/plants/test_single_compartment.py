@@ -84,11 +84,3 @@ def test_vary_and_gradient():
     # p = p0 + R q + q dt / C, so dp/dC = - q dt / C^2 (C in mL: 1000 times)
     expected = -0.228 * 0.03 * 1000 / 45.0**2
     assert jax.grad(final)(45.0) == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("kwargs", [{"gain": 0.0}, {"R_ex": -1.0}])
-def test_parameters_must_be_positive(kwargs):
-    with pytest.raises(ValueError, match="must be positive"):
-        single_compartment(Lung(5, 10), **kwargs)
-    with pytest.raises(ValueError, match="R = 0 must be positive"):
-        single_compartment(Lung(0, 10))

@@ -22,7 +22,21 @@ def test_fractions():
 
 
 @pytest.mark.parametrize(
-    "text", ["", "R5", "C10", "r5c10", "R5C10 ", "R-5C10", "R5C1e3", "xR5C10", "R5.C1", "R5C10\n"]
+    "text",
+    [
+        "",
+        "R5",
+        "C10",
+        "r5c10",
+        "R5C10 ",
+        "R-5C10",
+        "R5C1e3",
+        "xR5C10",
+        "R5.C1",
+        "R5C10\n",
+        "R0C10",
+        "R5C0",
+    ],
 )
 def test_not_an_id(text):
     with pytest.raises(ValueError, match="is not a lung id; write R<cmH2O"):

@@ -131,12 +131,7 @@ def pid(
     with bar("PIDs") as progress:
         if beyond:
             result = tune_beyond(
-                names,
-                draws=draws,
-                each=not robust,
-                single=lung is None,
-                simulator=plant,
-                progress=progress,
+                names, draws=draws, each=not robust, simulator=plant, progress=progress
             )
             files.write_json(out / RESULT, result)
             written = [RESULT]

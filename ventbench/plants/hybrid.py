@@ -81,8 +81,7 @@ class HybridState:
     plays: tuple[Array, ...]  #: position of each play, %, one array a play.
     u_in: Array  #: last command, %.
     peep: Array  #: end-expiratory pressure, cmH2O.
-    #: opening of the expiratory valve, 0..1; None where it closes at once.
-    outlet: Array | None = None
+    outlet: Array  #: opening of the expiratory valve, 0..1.
 
 
 @flax.struct.dataclass
@@ -108,9 +107,7 @@ class Hybrid:
     opening_delay: Array  #: delay of the expiratory valve when it opens, s.
     closing_delay: Array  #: delay of the expiratory valve when it closes, s.
     rest: Array  #: command that held the flow before the first sample, %.
-    #: time constant with which the expiratory valve closes after its delay, s; None for a valve
-    #: that closes at once.
-    closing_lag: Array | None = None
+    closing_lag: Array  #: time constant with which the expiratory valve closes after its delay, s.
 
     def valve(self, u_in: Array) -> Array:
         """Flow that a steady command gives, L/s: monotone in ``u_in``, %."""
@@ -150,7 +147,7 @@ class Hybrid:
             plays=tuple(rest for _ in PLAYS),
             u_in=rest,
             peep=pressure if peep is None else peep + zero,
-            outlet=None if self.closing_lag is None else zero + 1.0,
+            outlet=zero + 1.0,
         )
         return state, self._signals(state, pressure)
 
@@ -187,11 +184,9 @@ class Hybrid:
         for target, wide in zip(targets, wides, strict=True):
             inflow = target + (flow - target) * self.valve_lag / h * (1.0 - lag)  # mean over h
             flow = target + (flow - target) * lag
-            if self.closing_lag is not None:
-                # It opens with a spring and closes against the pressure.
-                wide = jnp.maximum(wide, jnp.asarray(opening) * jnp.exp(-h / self.closing_lag))
-                opening = wide
-            outlet = conductance * wide
+            # It opens with a spring and closes against the pressure.
+            opening = jnp.maximum(wide, opening * jnp.exp(-h / self.closing_lag))
+            outlet = conductance * opening
             elastic, drop, pressure = self._fill(elastic, drop, inflow, outlet, behind, h)
             sensor = pressure + (sensor - pressure) * smooth
         change = (u_in - state.u_in) / DIRECTION_WIDTH
@@ -356,7 +351,7 @@ def to_vector(plant: Hybrid) -> Floats:
     """Numbers of rigs.
 
     Args:
-        plant: leaves ``(...)``, with a closing lag.
+        plant: leaves ``(...)``.
 
     Returns:
         Shape ``(..., len(NAMES))``, in the order of :data:`NAMES`: logarithms, but for the offset

@@ -56,22 +56,15 @@ class Rigs:
                 does not have 32 bytes.
         """
         sessions = self.sessions or tuple((0,) for _ in self.lungs)
-        if seed == draw_tables.DEVELOPMENT_SEED or self.population is None:
-            return draw_tables.build(sessions, self.members, seed=seed, name=name, pips=pips).first(
-                n
-            )
-        by_lung = [
-            self.population.rigs(seed, lung, draw_tables.COUNT) for lung in range(len(sessions))
-        ]
-        sampled_rigs = jax.tree.map(lambda *leaves: np.stack(leaves), *by_lung)
+        of_round: dict[str, Any] = {}
+        if seed != draw_tables.DEVELOPMENT_SEED and self.population is not None:
+            by_lung = [
+                self.population.rigs(seed, lung, draw_tables.COUNT) for lung in range(len(sessions))
+            ]
+            sampled_rigs = jax.tree.map(lambda *leaves: np.stack(leaves), *by_lung)
+            of_round = {"held_out": self.held_out, "sampled_rigs": sampled_rigs}
         return draw_tables.build(
-            sessions,
-            self.members,
-            held_out=self.held_out,
-            sampled_rigs=sampled_rigs,
-            seed=seed,
-            name=name,
-            pips=pips,
+            sessions, self.members, seed=seed, name=name, pips=pips, **of_round
         ).first(n)
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 import flax.struct
 import jax.numpy as jnp
 from jax import Array
-from numpy.typing import ArrayLike
 
 from ventbench.physics.mechanism import EXPIRATORY_RESISTANCE, VALVE_GAIN
 from ventbench.task.interfaces import Signals
@@ -73,15 +72,7 @@ class SingleCompartment:
         return {"R": self.R, "C": self.C, "gain": self.gain, "R_ex": self.R_ex}
 
 
-def single_compartment(
-    lung: Lung, *, gain: ArrayLike = VALVE_GAIN, R_ex: ArrayLike = EXPIRATORY_RESISTANCE
-) -> SingleCompartment:
-    """Build a :class:`SingleCompartment` lung of a label; gain and R_ex as of the class.
-
-    Raises:
-        ValueError: if a parameter is not positive.
-    """
-    for name, value in (("R", lung.R), ("C", lung.C), ("gain", gain), ("R_ex", R_ex)):
-        if not jnp.all(jnp.asarray(value) > 0):
-            raise ValueError(f"single compartment: {name} = {value} must be positive")
-    return SingleCompartment(*(jnp.asarray(x, float) for x in (lung.R, lung.C, gain, R_ex)))
+def single_compartment(lung: Lung) -> SingleCompartment:
+    """Build a :class:`SingleCompartment` lung of a label, behind the PVP's valves."""
+    values = (lung.R, lung.C, VALVE_GAIN, EXPIRATORY_RESISTANCE)
+    return SingleCompartment(*(jnp.asarray(x, float) for x in values))

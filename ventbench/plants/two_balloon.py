@@ -7,7 +7,6 @@ from dataclasses import replace
 import flax.struct
 import jax.numpy as jnp
 from jax import Array
-from numpy.typing import ArrayLike
 
 from ventbench.plants.single_compartment import EXPIRATORY_RESISTANCE, VALVE_GAIN
 from ventbench.task import protocol
@@ -113,28 +112,8 @@ class TwoBalloon:
         """Nothing is known of its physics; see :class:`~ventbench.task.interfaces.Plant`."""
 
 
-def two_balloon(
-    lung: Lung,
-    *,
-    gain: ArrayLike = VALVE_GAIN,
-    R_ex: ArrayLike = EXPIRATORY_RESISTANCE,
-    K: ArrayLike = BALLOON_PRESSURE,
-    supply: ArrayLike = SUPPLY_PRESSURE,
-) -> TwoBalloon:
-    """Build a :class:`TwoBalloon` lung of a label; what it does not say is as of the class.
-
-    Raises:
-        ValueError: if a parameter is not positive, or the supply reaches 95 % of the balloon's
-            peak pressure (beyond it a balloon's pressure falls as it grows).
-    """
-    values = (lung.R, lung.C, gain, R_ex, K, supply)
-    for name, value in zip(("R", "C", "gain", "R_ex", "K", "supply"), values, strict=True):
-        if not jnp.all(jnp.asarray(value) > 0):
-            raise ValueError(f"two-balloon model: {name} = {value} must be positive")
-    peak = PEAK * jnp.asarray(K)
-    if not jnp.all(jnp.asarray(supply) < 0.95 * peak):
-        raise ValueError(
-            f"two-balloon model: supply {supply} cmH2O must stay below 95 % of the balloon's peak "
-            f"pressure, {peak} cmH2O; raise K or lower the supply"
-        )
+def two_balloon(lung: Lung) -> TwoBalloon:
+    """Build a :class:`TwoBalloon` lung of a label, behind the PVP's valves."""
+    valves = (VALVE_GAIN, EXPIRATORY_RESISTANCE)
+    values = (lung.R, lung.C, *valves, BALLOON_PRESSURE, SUPPLY_PRESSURE)
     return TwoBalloon(*(jnp.asarray(x, float) for x in values))

@@ -72,10 +72,10 @@ class Data:
         return replace(self, measured=measured, weight=weight)
 
 
-def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None = None) -> Data:
+def make_data(breaths: Breaths, *, flow: bool = False) -> Data:
     """Make the data of a fit from a recording, with its flow if that is asked for.
 
-    Positions, the place of each breath in its recording, are evenly from 0 to 1 if not given.
+    Positions, the place of each breath in its recording, are evenly from 0 to 1.
 
     Raises:
         InputError: if there is no breath, no pressure or, when asked for, no flow.
@@ -91,12 +91,11 @@ def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | Non
         weight[:, 1, 0] = 0.0  # a breath starts at rest
     if not weight[:, 0].any():
         raise InputError("no pressure is measured in these breaths")
-    if position is None:
-        position = np.linspace(0.0, 1.0, len(breaths)) if len(breaths) > 1 else np.zeros(1)
+    position = np.linspace(0.0, 1.0, len(breaths))
     names = ("u_in", "u_out", "dt", "R", "C")
     plain = {name: getattr(breaths, name).astype(float) for name in names}
     masked = np.where(weight > 0, measured, 0.0)
-    return Data(measured=masked, weight=weight, position=np.asarray(position, float), **plain)
+    return Data(measured=masked, weight=weight, position=position, **plain)
 
 
 @dataclass(frozen=True)

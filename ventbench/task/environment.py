@@ -43,16 +43,17 @@ class Scenario:
     noise: Array
 
 
-def nominal_scenario(pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Scenario:
-    """Cells without noise or deviation, of a PIP of any shape and a PEEP, cmH2O.
+def nominal_scenario(pip: ArrayLike) -> Scenario:
+    """Cells without noise or deviation, of a PIP of any shape, cmH2O.
 
     Raises:
-        InputError: if a PIP does not exceed its PEEP.
+        InputError: if a PIP does not exceed the PEEP.
     """
-    pip, peep = np.broadcast_arrays(np.asarray(pip, float), np.asarray(peep, float))
-    if not np.all(pip > peep):
-        raise InputError(f"PIP {pip} cmH2O must exceed PEEP {peep} cmH2O")
+    pip = np.asarray(pip, float)
+    if not np.all(pip > protocol.PEEP):
+        raise InputError(f"PIP {pip} cmH2O must exceed PEEP {protocol.PEEP} cmH2O")
     ones, zeros = np.ones(pip.shape), np.zeros(pip.shape)
+    peep = protocol.PEEP * ones
     noise = np.zeros((*pip.shape, protocol.BREATHS, protocol.INSPIRATION_STEPS))
     gain = np.ones((*pip.shape, protocol.BREATHS))
     arrays = (pip, peep, peep, protocol.DT * ones, ones, ones, zeros, gain, zeros, noise)

@@ -34,10 +34,10 @@ def lung(lung_id: str) -> Lung:
         lung_id: id of the lung, such as ``"R20C50"``.
 
     Raises:
-        InputError: if the text is not a lung id.
+        InputError: if the text is not a lung id, or R or C is 0.
     """
     match = _ID.fullmatch(lung_id)
-    if match is None:
+    if match is None or not all(map(float, match.groups())):
         raise InputError(
             f"{lung_id!r} is not a lung id; write R<cmH2O/(L/s)>C<mL/cmH2O>, such as R20C50"
         )

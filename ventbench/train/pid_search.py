@@ -194,14 +194,14 @@ def errors_on_draws(
 
 
 def _tuning(
-    lungs: Sequence[str] | None, simulator: SimulatorLike, each: bool, single: bool | None
+    lungs: Sequence[str] | None, simulator: SimulatorLike, each: bool
 ) -> tuple[TrainingPlants, dict[str, list[int]]]:
     """What PIDs are tuned on; and lungs that share a PID, by the lung's id or :data:`ALL`."""
     trained_on = plants_to_train_on(simulator)
     names = check_names(lungs, trained_on, all_lungs=False)
     where = {name: trained_on.names.index(name) for name in names}
     groups = {name: [at] for name, at in where.items()} if each else {}
-    if len(names) > 1 if single is None else single:
+    if len(names) > 1:
         groups[ALL] = list(where.values())
     return trained_on, groups
 
@@ -220,7 +220,6 @@ def tune_pid(
     gains: ArrayLike | None = None,
     draws: int = draw_tables.COUNT,
     each: bool = True,
-    single: bool | None = None,
     simulator: SimulatorLike = "frozen",
     progress: Progress = lambda completed, total: None,
 ) -> tuple[PIDGrid, dict[str, Any]]:
@@ -237,9 +236,7 @@ def tune_pid(
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
         draws: number of draws for tuning that decide among the :data:`FINALISTS` best; 0 to decide
             without noise, as in the paper.
-        each: put the best gains of each lung into the result.
-        single: put the best gains for all lungs together into the result; if not given, where there
-            are several lungs.
+        each: put the best gains of each lung into the result, beside those for all of several.
         simulator: simulators with plants of these lungs; see :func:`ventbench.load_simulators`. Of
             the frozen ones each lung has all its rigs but the held-out one.
         progress: see :data:`Progress`.
@@ -258,7 +255,7 @@ def tune_pid(
         >>> result["lungs"]["R20C50"]["gains"]
         [2.0, 4.0, 0.0]
     """
-    trained_on, groups = _tuning(lungs, simulator, each, single)
+    trained_on, groups = _tuning(lungs, simulator, each)
     names = check_names(lungs, trained_on, all_lungs=False)
     rigs, where = load_rigs(simulator).of_training, [*map(trained_on.names.index, names)]
     candidates = paper_gains() if gains is None else np.asarray(gains, float)
@@ -381,7 +378,6 @@ def tune_beyond(
     *,
     draws: int = draw_tables.COUNT,
     each: bool = True,
-    single: bool = True,
     simulator: SimulatorLike = "frozen",
     progress: Progress = lambda completed, total: None,
 ) -> dict[str, Any]:
@@ -390,8 +386,7 @@ def tune_beyond(
     Args:
         lungs: ids; all lungs of the simulators if not given.
         draws: number of draws for tuning, at least 1.
-        each: find the best gains of each lung.
-        single: find the best gains for all of them together.
+        each: find the best gains of each lung, beside those for all of several together.
         simulator: see :func:`ventbench.load_simulators`.
         progress: called with the number of PIDs found, and of all.
 
@@ -401,7 +396,7 @@ def tune_beyond(
     Raises:
         InputError: if a lung or a simulator is unknown, or there are no draws.
     """
-    trained_on, groups = _tuning(lungs, simulator, each, single)
+    trained_on, groups = _tuning(lungs, simulator, each)
     rigs = load_rigs(simulator).of_training
     best_gains = best_pids(
         rigs,

@@ -356,6 +356,19 @@ def breath_errors(fitted: Fitted, data: InspirationData) -> Array:
     return jnp.where(data.share > 0, simulate(plant, start, data) - data.pressure, 0.0)
 
 
+def robust(error: Array, share: Array, softness: float, saturation: float) -> Array:
+    """Mean absolute error of each breath, cmH2O, ``(n,)``; large ones count less and less.
+
+    Args:
+        error: cmH2O, shape ``(n, samples)``.
+        share: weight of each sample in its breath, of the same shape.
+        softness: error below which it turns from absolute to square, cmH2O.
+        saturation: mean error above which a breath counts less, cmH2O.
+    """
+    breath = jnp.sum(share * (jnp.sqrt(error**2 + softness**2) - softness), axis=1)
+    return saturation * jnp.log1p(breath / saturation)
+
+
 def loss(
     fitted: Fitted,
     data: InspirationData,
@@ -366,10 +379,8 @@ def loss(
     config: FitConfig,
 ) -> Array:
     """Negative logarithm of the posterior for each breath of weight one."""
-    soft = config.softness
     error = breath_errors(fitted, data)
-    breath = jnp.sum(data.share * (jnp.sqrt(error**2 + soft**2) - soft), axis=1)
-    breath = noise.saturation * jnp.log1p(breath / noise.saturation)
+    breath = robust(error, data.share, config.softness, noise.saturation)
     breath = breath * noise.independent / noise.pressure
     # A breath that counts for nothing still keeps its own latent values at zero.
     width = jnp.where(data.start_measured > 0, noise.start, noise.unknown_start_scale)
@@ -476,17 +487,15 @@ def fit_expiration(pooled: Pooled, data: WholeBreaths, weight: Array) -> Pooled:
     optimiser = optax.adam(
         optax.cosine_decay_schedule(EXPIRATORY_LEARNING_RATE, EXPIRATORY_ITERATIONS, 0.01)
     )
-    soft, saturation = EXPIRATORY_SOFTNESS, EXPIRATORY_SATURATION
 
     def loss(parameters: dict[str, Array]) -> Array:
         plant = plants(replace(pooled, **parameters), data.groups)
         simulated = open_loop(plant, data.pressure[:, 0], data.u_in, data.u_out, data.dt)
         error = jnp.where(data.share > 0, simulated - data.pressure, 0.0)
-        breath = jnp.sum(data.share * (jnp.sqrt(error**2 + soft**2) - soft), axis=1)
-        breath = saturation * jnp.log1p(breath / saturation)
+        breath = robust(error, data.share, EXPIRATORY_SOFTNESS, EXPIRATORY_SATURATION)
         moves = [
-            jnp.sum(((parameters[name] - start[name]) / EXPIRATORY_WIDTHS[name]) ** 2)
-            for name in EXPIRATORY_WIDTHS
+            jnp.sum(((parameters[name] - start[name]) / width) ** 2)
+            for name, width in EXPIRATORY_WIDTHS.items()
         ]
         prior = 0.5 * EXPIRATORY_PRIOR * sum(moves)
         return (jnp.sum(weight * breath) + prior) / jnp.maximum(jnp.sum(weight), 1.0)

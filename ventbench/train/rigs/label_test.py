@@ -72,6 +72,13 @@ def label_gain(R: float, label: float, laminar_share: float) -> float:
     return 2.0 * R / (linear + math.sqrt(linear**2 + 4.0 * square * R))
 
 
+#: What the manifest holds of a test, by the digits after the point.
+_DIGITS = {
+    2: ("R", "R_interval", "C", "C_interval", "C_by_resistor"),
+    3: ("gain", "gain_uncertainty", "error_own_label"),
+}
+
+
 @dataclass(frozen=True)
 class LabelTest:
     """What the test of one session found."""
@@ -188,15 +195,9 @@ class LabelTest:
             "lung": self.lung.id,
             "measured": self.measured,
             "breaths": self.breaths,
-            "R": round(self.R, 2),
-            "R_interval": [round(limit, 2) for limit in self.R_interval],
-            "C": round(self.C, 2),
-            "C_interval": [round(limit, 2) for limit in self.C_interval],
-            "gain": [round(gain, 3) for gain in self.gain],
-            "gain_uncertainty": round(self.gain_uncertainty, 3),
-            "C_by_resistor": [round(C, 2) for C in self.C_by_resistor],
-            "error_own_label": round(self.error_own_label, 3),
         }
+        for digits, names in _DIGITS.items():
+            row |= {name: np.round(getattr(self, name), digits).tolist() for name in names}
         if self.best_other_label is not None and self.error_best_other_label is not None:
             row["best_other_label"] = self.best_other_label
             row["error_best_other_label"] = round(self.error_best_other_label, 3)

@@ -14,7 +14,7 @@ treat one environment; ``jax.vmap`` makes many, and all random numbers of an epi
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -243,13 +243,13 @@ def load_lungs(
     Raises:
         InputError: if there are no such simulators or rigs, or they have no plants.
     """
-    if rigs not in get_args(Literal["training", "reference"]):
+    chosen = {"training": slice(None), "reference": slice(1)}
+    if rigs not in chosen:
         raise InputError(f"rigs is {rigs!r}; choose training or reference")
     trained_on = plants_to_train_on(simulator)
-    members = slice(None) if rigs == "training" else slice(1)
     with compilation.float32():
         plants = jax.tree.map(
-            lambda leaf: jnp.asarray(np.asarray(leaf)[members], jnp.float32), trained_on.plants
+            lambda leaf: jnp.asarray(np.asarray(leaf)[chosen[rigs]], jnp.float32), trained_on.plants
         )
         return Lungs(plants, jnp.asarray(trained_on.weights, jnp.float32))
 

@@ -18,45 +18,22 @@ from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.make import make
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Limits, built_in, find
-from proofs.diagnosers import classifier, forward_search, lisdd
+from proofs.diagnosers import classifier, lisdd
 from proofs.diagnosers.common import Templates
 from proofs.diagnosers.gaussian_process import _Process
 from proofs.diagnosers.sindy import thresholded_least_squares
 from proofs.diagnosers.ventbench import CALIBRATION, hypotheses
-from tests.physics import cases
-from ventbench.system_id import make_data
 
 
 def test_the_project_enters_itself_and_its_rivals() -> None:
     assert built_in() == (
         "classifier",
-        "forward_search",
         "gaussian_process",
         "lisdd",
         "refit",
         "sindy",
         "ventbench",
     )
-
-
-@pytest.mark.slow
-def test_a_forward_search_finds_efforts_breath_by_breath() -> None:
-    efforts = {1: (5.0, 0.25), 2: (3.0, 1.1), 4: (6.0, 0.4), 6: (-3.0, 0.2)}  # cmH2O, s
-
-    def each(i: int) -> dict[str, dict[str, float]]:
-        if i not in efforts:
-            return {}
-        amplitude, onset = efforts[i]
-        return {"patient_effort": {"amplitude": amplitude, "onset": onset, "duration": 0.9}}
-
-    data = make_data(cases.recording(8, {}, noise=0.2, seed=3, each=each))
-    found = forward_search.fitted_to(data, ("patient_effort",))
-    truth = np.array([efforts.get(i, (0.0, 0.0))[0] for i in range(8)])
-    np.testing.assert_allclose(found.value("patient_effort.amplitude"), truth, atol=0.6)
-    onset = found.value("patient_effort.onset")
-    for i, (_, seconds) in efforts.items():
-        assert onset[i] == pytest.approx(seconds, abs=0.06)
-    assert found.value("patient_effort.duration")[0] == pytest.approx(0.9, abs=0.06)
 
 
 def test_a_process_learns_a_smooth_discrepancy_and_tells_it_from_noise() -> None:

@@ -152,51 +152,30 @@ def _size_is_right(case: JudgedCase) -> bool:
     return all(estimate.error <= _SIZE for estimate in case.estimates)
 
 
+#: Least share of right answers, by the kind of the question.
+_LEAST = {
+    "strong alone": 0.98,
+    "mild alone": 0.94,
+    "below the detection limit": 0.99,
+    "outside": 0.90,
+    "form": 0.90,
+    "pair": 0.90,
+}
+
+
 def by_kind(cases: Sequence[JudgedCase]) -> list[Figure]:
-    """Shares of the likeliest answers, by the kind of the question."""
-    single = [c for c in cases if c.kind == "single"]
-    seen = [c for c in single if c.visible]
-    strong = [c for c in seen if c.strengths == ("strong",)]
-    mild = [c for c in seen if c.strengths == ("mild",)]
-    under = [c for c in cases if c.kind in ("single", "form", "outside") and not c.visible]
-    null = [c for c in cases if c.kind == "null"]
-    outside = [c for c in cases if c.kind == "outside" and c.visible]
-    form = [c for c in cases if c.kind == "form" and c.visible]
-    pair = [c for c in cases if c.kind == "pair" and c.visible]
-    four = [c for c in cases if c.kind == "four"]
-    masked = [c for c in cases if c.kind == "masked" and c.visible]
-    return [
-        share("strong: right name and nothing else", (c.right for c in strong), least=0.98),
-        share("mild: right name and nothing else", (c.right for c in mild), least=0.94),
-        share("mild: a wrong name", (bool(c.false) for c in mild), most=0.02),
-        share(
-            "below the detection limit: silence or the right answer",
-            (c.right for c in under),
-            least=0.99,
-        ),
-        share("nothing missing: false names", (bool(c.named) for c in null), most=0.0),
-        share("nothing missing: said so", (c.silent for c in null)),
-        share(
-            "outside the library: right place or equivalent name",
-            (c.right for c in outside),
-            least=0.90,
-        ),
-        share(
-            "library effect called unknown",
-            (bool(c.answered) and not c.named for c in seen + form),
-            most=0.05,
-        ),
-        share("other form: right name and no other", (c.right for c in form), least=0.90),
-        share("pair: both and only both", (c.right for c in pair), least=0.90),
-        share(
-            "four: terms found",
-            (bool(c.answered & effect.terms) for c in four for effect in c.truth if effect.seen),
-            least=0.90,
-        ),
-        mean("four: spurious names a case", [len(c.false) for c in four], most=0.25),
-        share("masked: right name and nothing else", (c.right for c in masked)),
-        share("masked: a wrong name", (bool(c.false) for c in masked)),
-    ]
+    """Right answers and wrong names, by the kind of the question."""
+    kinds: dict[str, list[JudgedCase]] = {}
+    for case in cases:
+        kind = f"{case.strengths[0]} alone" if case.kind == "single" else case.kind
+        kind = kind if case.visible else "below the detection limit"
+        kinds.setdefault(kind, []).append(case)
+    figures = []
+    for kind, own in kinds.items():
+        right = (case.right for case in own)
+        figures.append(share(f"{kind}: right and nothing else", right, least=_LEAST.get(kind)))
+        figures.append(share(f"{kind}: a wrong name", (bool(case.false) for case in own)))
+    return figures
 
 
 def _parameters(cases: Sequence[JudgedCase]) -> list[Figure]:

@@ -105,19 +105,9 @@ class JudgedCase:
         return self.leading[0] if self.leading else frozenset()
 
     @property
-    def named(self) -> frozenset[str]:
-        """Names among the answered terms."""
-        return frozenset(term for term in self.answered if not term.startswith(UNKNOWN))
-
-    @property
     def false(self) -> frozenset[str]:
         """Answered names that are not in the rig."""
-        return frozenset(term for term in self.named if term in self.wrong)
-
-    @property
-    def silent(self) -> bool:
-        """Whether the answer is that nothing is missing."""
-        return not self.problem and not self.answered
+        return self.answered & self.wrong.keys()
 
     @property
     def right(self) -> bool:

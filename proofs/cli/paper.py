@@ -13,7 +13,6 @@ from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     InProcess,
     JsonFile,
-    OneTrack,
     PlantName,
     RecordingsDir,
     Workers,
@@ -225,7 +224,6 @@ def adversary(
         list[str] | None,
         typer.Option(help="Stressor that may act; may be repeated. Default: all, and the rig."),
     ] = None,
-    track: OneTrack = None,
     plant: PlantName = "frozen",
     in_process: InProcess = False,
     json: JsonFile = None,
@@ -244,7 +242,6 @@ def adversary(
         unsafe = work.adversary(
             name,
             simulator=plant,
-            track=track,
             lungs=lung or (),
             stressors=stressor or (),
             sandbox=not in_process,

@@ -11,7 +11,6 @@ effects, R and C it does not tell.
 from __future__ import annotations
 
 import hashlib
-import json
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import recordings
+from proofs.diagnosers.common import see
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
@@ -41,15 +40,12 @@ _BANDS, _AFTER = ((0.5, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 15.0)), (1, 3, 8)
 
 def diagnose(folder: Path) -> dict[str, Any]:
     """Answer a case."""
-    question = json.loads((folder / "case.json").read_text())
-    breaths = recordings.load(folder / question["recording"])
-    apart = np.isin(breaths.breath_id, question["withheld"])
-    seen, asked, weights = breaths.select(~apart), breaths.select(apart), load()
+    case, weights = see(folder), load()
+    seen, asked = case.breaths.select(~case.apart), case.breaths.select(case.apart)
     (chances,) = probabilities(weights, summaries(seen)[None])
-    told = zip(asked.breath_id.tolist(), predicted(seen, asked), asked.valid, strict=True)
     return {
         "hypotheses": hypotheses(weights["terms"].tolist(), chances),
-        "pressures": {str(breath): p[valid].tolist() for breath, p, valid in told},
+        "pressures": case.pressures(predicted(seen, asked)),
     }
 
 

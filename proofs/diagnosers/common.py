@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base import compilation
-from ventbench.physics.catalogue import library, mechanism
 from ventbench.recordings import load
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import START, Data, Fit, Predictor, make_data, parameter_values
@@ -57,20 +56,6 @@ class Seen:
             for breath, row, count in zip(ids.tolist(), predicted, counts, strict=True)
         }
 
-    def predict(self, fitted: Fit) -> Floats:
-        """Pressures of the withheld breaths by a fitted model, cmH2O, ``(k, T)``.
-
-        They start from the mean start of the fitted breaths, and so does what each breath has of
-        its own.
-        """
-        test = self.data.select(self.apart)
-        simulator = Predictor(test, fitted.problem.predictor.names)
-        values = parameter_values(test, simulator.names, {})
-        for column, name in enumerate((*simulator.names, START)):
-            if name != "position":
-                values[:, column] = np.mean(fitted.column(name))
-        return simulator.predict(values)[:, 0]
-
 
 def see(folder: Path) -> Seen:
     """Read the folder of a case; compiled functions are kept on the disk."""
@@ -91,24 +76,17 @@ def intervals(fitted: Fit, paths: Iterable[str]) -> dict[str, dict[str, float]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Templates:
-    """A refitted model to first order, over all breaths, for rivals that are linear."""
+class Refitted:
+    """A refitted model over all breaths, for rivals that explain what it leaves."""
 
     pressure: Floats  #: the model's pressures, cmH2O, ``(n, T)``.
     flow: Floats  #: its flow into the lung, L/s, ``(n, T)``.
     residual: Floats  #: recorded minus modelled, cmH2O, 0 where ``weight`` is, ``(n, T)``.
     weight: Floats  #: 1 where a pressure is recorded, but for the first sample, ``(n, T)``.
-    refit: Floats  #: changes of pressure by R, C, R_ex and PEEP, ``(4, n, T)``.
-    #: change of pressure by each mechanism at its mild strength, ``(n, T)``, by name.
-    effects: dict[str, Floats]
 
 
-#: Relative step of R, C and R_ex, and step of PEEP, cmH2O, of a refit to first order.
-_STEPS = {"R": 0.05, "C": 0.05, "R_ex": 0.05, "PEEP": 0.2}
-
-
-def templates(seen: Seen, fitted: Fit, names: Iterable[str]) -> Templates:
-    """Linearise a refit in its parameters, and in the strengths of mechanisms."""
+def simulated(seen: Seen, fitted: Fit) -> Refitted:
+    """Simulate all breaths by a refit; withheld ones start from the mean start of the others."""
     data = seen.data
     two = np.concatenate([data.measured, np.zeros_like(data.measured)], axis=1)
     weight = np.concatenate([data.weight, np.zeros_like(data.weight)], axis=1)
@@ -120,46 +98,7 @@ def templates(seen: Seen, fitted: Fit, names: Iterable[str]) -> Templates:
         column = (*simulator.names, START).index(path)
         values[:, column] = np.mean(fitted.column(path))
     values[~seen.apart, -1] = fitted.column(START)
-    first = simulator.predict(values)
-
-    def changed(new: Mapping[str, float]) -> Floats:
-        moved = values.copy()
-        for path, value in new.items():
-            moved[:, simulator.names.index(path)] = value
-        return simulator.predict(moved)[:, 0] - first[:, 0]
-
-    def stepped(path: str, step: float) -> Floats:
-        value = float(values[0, simulator.names.index(path)])
-        return changed({path: value + (step if path == "PEEP" else step * value)})
-
+    pressure, flow = np.moveaxis(simulator.predict(values), 1, 0)
     counted = data.weight[:, 0].copy()
     counted[:, 0] = 0.0
-    return Templates(
-        first[:, 0],
-        1e-3 * first[:, 1],
-        counted * (data.measured[:, 0] - first[:, 0]),
-        counted,
-        np.stack([stepped(path, step) for path, step in _STEPS.items()]),
-        {
-            name: changed(
-                {
-                    f"{name}.{p.name}": p.mild
-                    for p in mechanism(name).description.parameters
-                    if not p.shape
-                }
-            )
-            for name in names
-        },
-    )
-
-
-def candidates() -> tuple[str, ...]:
-    """Mechanisms of the library, but for efforts, which differ from breath to breath."""
-    return tuple(name for name in library() if name != "patient_effort")
-
-
-def strength(name: str, multiple: float) -> dict[str, dict[str, float]]:
-    """Estimate of a strength as a multiple of the mild one, without an interval of its own."""
-    about = mechanism(name).description.strength
-    value = about.neutral + multiple * (about.mild - about.neutral)
-    return {f"{name}.{about.name}": estimated(value, value, value)}
+    return Refitted(pressure, 1e-3 * flow, counted * (data.measured[:, 0] - pressure), counted)

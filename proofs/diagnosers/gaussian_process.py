@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from scipy.stats import Covariance, multivariate_normal
 
-from proofs.diagnosers.common import Seen, Templates, intervals, see, templates
+from proofs.diagnosers.common import Refitted, Seen, intervals, see, simulated
 from ventbench.system_id import fit
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,7 @@ def diagnose(folder: Path) -> dict[str, Any]:
     """Answer a case."""
     seen = see(folder)
     fitted = fit(seen.observed)
-    model = templates(seen, fitted, ())
+    model = simulated(seen, fitted)
     x = _inputs(seen, model)
     rng = np.random.default_rng(0)
     where = np.flatnonzero(model.weight.ravel() > 0)
@@ -59,7 +59,7 @@ def diagnose(folder: Path) -> dict[str, Any]:
     }
 
 
-def _inputs(seen: Seen, model: Templates) -> Floats:
+def _inputs(seen: Seen, model: Refitted) -> Floats:
     """Flow, volume, command, its change, time in the breath and the breath's number, scaled."""
     data = seen.data
     volume = np.cumsum(model.flow * data.dt, axis=1)

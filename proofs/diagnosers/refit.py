@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from proofs.diagnosers.common import intervals, see
+from proofs.diagnosers.common import intervals, see, simulated
 from ventbench.system_id import fit
 
 
@@ -15,6 +15,6 @@ def diagnose(folder: Path) -> dict[str, Any]:
     fitted = fit(seen.observed)
     return {
         "hypotheses": [{"terms": [], "probability": 1.0}],
-        "pressures": seen.pressures(seen.predict(fitted)),
+        "pressures": seen.pressures(simulated(seen, fitted).pressure[seen.apart]),
         "parameters": intervals(fitted, ("R", "C")),
     }

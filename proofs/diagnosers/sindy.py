@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from proofs.diagnosers.common import Seen, Templates, intervals, see, templates
+from proofs.diagnosers.common import Refitted, Seen, intervals, see, simulated
 from ventbench.system_id import fit
 
 Floats = NDArray[np.float64]
@@ -55,7 +55,7 @@ def diagnose(folder: Path) -> dict[str, Any]:
     """Answer a case."""
     seen = see(folder)
     fitted = fit(seen.observed)
-    model = templates(seen, fitted, ())
+    model = simulated(seen, fitted)
     terms = _library(seen, model)
     x = np.stack([term.ravel() for term in terms.values()], axis=1)
     scale = np.maximum(x.std(axis=0), 1e-9)
@@ -104,7 +104,7 @@ def thresholded_least_squares(x: Floats, y: Floats, threshold: float) -> Floats:
     return np.where(kept, found, 0.0)
 
 
-def _library(seen: Seen, model: Templates) -> dict[str, Floats]:
+def _library(seen: Seen, model: Refitted) -> dict[str, Floats]:
     """Candidate terms at each sample, ``(n, T)`` each."""
     data, p, q = seen.data, model.pressure, model.flow
     u, dt, out = data.u_in, data.dt, data.u_out

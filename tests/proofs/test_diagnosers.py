@@ -18,8 +18,7 @@ from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.make import make
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Limits, built_in, find
-from proofs.diagnosers import classifier, lisdd
-from proofs.diagnosers.common import Templates
+from proofs.diagnosers import classifier
 from proofs.diagnosers.gaussian_process import _Process
 from proofs.diagnosers.sindy import thresholded_least_squares
 from proofs.diagnosers.ventbench import CALIBRATION, hypotheses
@@ -29,7 +28,6 @@ def test_the_project_enters_itself_and_its_rivals() -> None:
     assert built_in() == (
         "classifier",
         "gaussian_process",
-        "lisdd",
         "refit",
         "sindy",
         "ventbench",
@@ -46,19 +44,6 @@ def test_a_process_learns_a_smooth_discrepancy_and_tells_it_from_noise() -> None
     assert process.evidence > 50.0
     assert process.scales[0] < process.scales[1], "only the first input matters"
     assert _Process(x, noise).evidence < 2.0
-
-
-def test_energy_is_found_in_the_region_that_has_it() -> None:
-    rng = np.random.default_rng(1)
-    regions = np.tile(np.repeat(np.arange(8), 25), (40, 1))
-    residual = 0.1 * rng.standard_normal(regions.shape)
-    residual[regions == 5] *= 3.0
-    model = Templates(
-        residual, residual, residual, np.ones(regions.shape), residual[None], {"leak": residual}
-    )
-    guilty, noise = lisdd._energy(model, regions)
-    assert guilty == {5}
-    assert noise == pytest.approx(0.1, rel=0.1)
 
 
 def test_sparse_regression_finds_the_terms_that_act() -> None:

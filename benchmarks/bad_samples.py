@@ -12,6 +12,7 @@ many have a false effect, and how often R and C are in their intervals of 95 %. 
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import typer
 
 from ventbench.mechanics import identify
@@ -94,8 +95,7 @@ def main(draws: int = 60, seed: int = 0, sound: bool = False) -> None:
 
     --sound: spoil nothing.
     """
-    false: dict[str, int] = dict.fromkeys(KINDS, 0)
-    covered: dict[str, list[bool]] = {kind: [] for kind in KINDS}
+    rows = []
     for draw in range(draws):
         rng = np.random.default_rng([seed, draw])
         kind = KINDS[draw % len(KINDS)]
@@ -109,22 +109,19 @@ def main(draws: int = 60, seed: int = 0, sound: bool = False) -> None:
         )
         (lung,) = identify(imported.breaths)
         names = [term.name for term in lung.terms]
-        false[kind] += bool(names)
         held = [low <= truth <= high for truth, (low, high) in ((R, lung.R.ci95), (C, lung.C.ci95))]
-        covered[kind] += held
+        rows.append((kind, bool(names), np.mean(held)))
         if names or not all(held):
             found = [f"{x.value:.4g} [{x.ci95[0]:.4g}, {x.ci95[1]:.4g}]" for x in (lung.R, lung.C)]
             truth = f"for {R:.4g}, {C:.4g}"
             print(f"{draw:3d} {kind:9s} {100 * share:.2f} %:", *found, truth, *names)
-    for kind, every in covered.items():
-        if every:
-            print(
-                f"{kind:9s} false effects {false[kind]}, intervals that hold {np.mean(every):.3f}"
-            )
-    held = float(np.mean([held for every in covered.values() for held in every]))
-    good = held >= COVERED and not sum(false.values())
+    table = pd.DataFrame(rows, columns=["kind", "false effects", "intervals that hold"])
+    by_kind = table.groupby("kind", sort=False)
+    print(by_kind.agg({"false effects": "sum", "intervals that hold": "mean"}).round(3))
+    false, held = table["false effects"].sum(), table["intervals that hold"].mean()
+    good = held >= COVERED and not false
     print(
-        f"{draws} recordings: {sum(false.values())} with a false effect, {held:.3f} of the "
+        f"{draws} recordings: {false} with a false effect, {held:.3f} of the "
         f"intervals hold (none, and {COVERED:g} at least: {'yes' if good else 'NO'})"
     )
     raise typer.Exit(not good)

@@ -149,22 +149,6 @@ def trained_on(
     return {"promised": promised, "rig": nominal, "draws": drawn.tolist()}
 
 
-def difference(first: Floats, second: Floats, resamples: int = 2000) -> tuple[float, float, float]:
-    """Mean of ``first - second`` over seeds and draws, and its 95 % bootstrap interval.
-
-    Args:
-        first: shape ``(seeds, draws)``.
-        second: of the same shape, paired.
-        resamples: of seeds and draws, with replacement.
-    """
-    apart, random = first - second, np.random.default_rng(0)
-    seeds = random.integers(len(apart), size=(resamples, len(apart)))
-    drawn = random.integers(apart.shape[1], size=(resamples, apart.shape[1]))
-    means = [apart[np.ix_(s, d)].mean() for s, d in zip(seeds, drawn, strict=True)]
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(apart.mean()), float(low), float(high)
-
-
 def run(
     name: str, out: Path, breaths: int, iterations: int, seeds: Sequence[int], updates: int
 ) -> dict[str, Any]:
@@ -215,34 +199,23 @@ def table(name: str, result: Mapping[str, Any]) -> str:
     if all(row["residual"] for row in rows.values()):
         kinds.append(("residual", "network"))
 
-    def parts(label: str, kind: str) -> list[dict[str, Any]]:
-        return rows[label][kind] if kind == "residual" else [rows[label][kind]]
-
-    def drawn(label: str, kind: str) -> Floats:
-        return np.array([part["draws"] for part in parts(label, kind)])
-
     head = ["trained on"]
     for _, title in kinds:
-        head += [f"{title}: promised", "on the rig", "20 draws", "difference to the R-C lung"]
+        head += [f"{title}: promised", "on the rig", "20 draws"]
     lines = [
         f"**{words[0].upper()}{words[1:]}.** The diagnosis names {missing}.",
         "",
         f"| {' | '.join(head)} |",
         f"|{' --- |' * len(head)}",
     ]
-    for label in rows:
+    for label, row in rows.items():
         cells = [label]
         for kind, _ in kinds:
-            own = drawn(label, kind)
-            cells += [
-                f"{np.mean([part['promised'] for part in parts(label, kind)]):.3f}",
-                f"{np.mean([part['rig'] for part in parts(label, kind)]):.3f}",
-                f"{own.mean():.3f}",
+            parts = row[kind] if kind == "residual" else [row[kind]]
+            figures = [
+                np.mean([part[name] for part in parts]) for name in ("promised", "rig", "draws")
             ]
-            apart = difference(own, drawn(SIMULATORS[0], kind))
-            cells.append(
-                "" if label == SIMULATORS[0] else "{:+.3f} [{:+.3f}, {:+.3f}]".format(*apart)
-            )
+            cells += [f"{value:.3f}" for value in figures]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

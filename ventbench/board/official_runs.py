@@ -238,7 +238,7 @@ def difference(recorded: Floats, again: Floats) -> str:
 
 
 #: Processor time of a plain entry on a track, sandbox included, s; the robustness track has the
-#: stressed runs too. By ``benchmarks/executor_scaling.py``; networks take up to twice as long.
+#: stressed runs too. As ``time ventbench score pid_robust`` counts; networks take twice as long.
 SECONDS = {"performance": 13.0, "robustness": 58.0}
 
 Progress = Callable[[str, int, int], None]

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from proofs.studies.networks import Progress, Tell, finish
+from proofs.studies import BASE, Progress, Tell, chosen, trained
 from submissions.residual_mlp.train import ResidualConfig, fit
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
-from ventbench.base.resume import WorkFolder
 from ventbench.board.replay import spread
 from ventbench.plants import frozen
 from ventbench.plants.rigs import Rigs
@@ -29,9 +28,6 @@ from ventbench.train import pid_search
 
 #: Published draws to score on.
 DRAWS = 20
-
-#: Name of the variant that all others are compared with.
-BASE = "base"
 
 #: Figures by which trainings are compared.
 FIGURES = ("nominal", "draws", "exploitation")
@@ -109,7 +105,6 @@ def compare(
         InputError: if ``out`` holds other trainings.
         FloatingPointError: if a training diverges.
     """
-    chosen = {k: v for k, v in variants(config).items() if only is None or k in (BASE, *only)}
     gains = gains or best_single(simulators)
     about = {
         "config": asdict(config),
@@ -117,25 +112,15 @@ def compare(
         "draws": draws,
         "simulators": simulators.about(),
     }
-    work = WorkFolder((out / "rows").resolve(), about)
-    trainings = {
-        f"{name.replace(' ', '-')}-{seed}": (name, seed) for name in chosen for seed in seeds
+    rows = (out / "rows").resolve()
+    jobs = {
+        (name, str(seed)): (simulators, gains, variant, seed, draws, rows / f"{name}-{seed}.npz")
+        for name, variant in chosen(variants(config), only).items()
+        for seed in seeds
     }
-    jobs = {}
-    for part, (name, seed) in trainings.items():
-        own = (0.0, 0.0, 0.0) if chosen[name].direct else gains
-        checkpoint = work.checkpoint(part)
-        jobs[part] = (simulators, own, chosen[name].config, seed, draws, checkpoint)
-    finish(
-        work,
-        _trained,
-        jobs,
-        workers=workers,
-        progress=lambda part, share: progress(trainings[part][0], share),
-    )
+    found = trained(out, about, _trained, jobs, workers, progress)
     runs = pd.DataFrame(
-        {"variant": name, "seed": seed} | work.read(part)
-        for part, (name, seed) in trainings.items()
+        {"variant": name, "seed": int(seed)} | row for (name, seed), row in found.items()
     )
     files.write_text(out / "runs.csv", runs.round(5).to_csv(index=False))
     files.write_text(out / "summary.csv", summary(runs).round(4).to_csv(index=False))
@@ -183,24 +168,20 @@ def stored(runs: pd.DataFrame, config: ResidualConfig) -> dict[str, Any]:
 def _trained(
     simulators: frozen.Frozen,
     gains: Gains,
-    config: ResidualConfig,
+    variant: Variant,
     seed: int,
     draws: int,
     checkpoint: Path,
-    tell: Tell | None,
+    tell: Tell,
 ) -> dict[str, float]:
-    def told(done: int, total: int, _: float) -> None:
-        if tell is not None:
-            tell(done / total)
-
     with compilation.float32():
         controller = fit(
             jax.tree.map(np.asarray, simulators.ensemble),
-            gains,
-            config=config,
+            (0.0, 0.0, 0.0) if variant.direct else gains,
+            config=variant.config,
             seed=seed,
             checkpoint=checkpoint,
-            progress=told,
+            progress=lambda done, total, _: tell(done / total),
             keep=True,
         )
     error, exploitation = score_controller(simulators, controller, draws)

@@ -1,33 +1,24 @@
-"""Ablation of the paper's simulator: windows, width, depth and boundary networks.
-
-:func:`finish` runs the trainings of any study that are not finished, here or beside each other.
-"""
+"""Ablation of the paper's simulator: windows, width, depth and boundary networks."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from proofs.studies import stitched
+from proofs.studies import BASE, Progress, Tell, chosen, stitched, trained
 from proofs.studies.stitched import Architecture, Training
 from ventbench.base import files
-from ventbench.base.executor import InProcess, executor
-from ventbench.base.resume import WorkFolder, kept_results
 from ventbench.recordings import Breaths, join, load
 from ventbench.simulation import mean_errors
 from ventbench.task.lungs import LUNG_IDS, RECORDED_LUNGS
 from ventbench.task.metrics import bootstrap
 from ventbench.train.rigs.data import assign_folds
-
-#: Name of the variant that all others are compared with.
-BASE = "base"
 
 #: Files of the public recordings that the networks learn from.
 MEASURED, RECONSTRUCTED = "pvp_quicklung.csv", "pvp_quicklung_reconstructed.csv"
@@ -95,27 +86,20 @@ def compare(
     data = measured, reconstructed, assign_folds(measured, count=members, seed=SEED)
     judged = measured.select(np.isin(measured.lung_ids, LUNG_IDS))
     hashes = {name: files.sha256(folder / name) for name in (MEASURED, RECONSTRUCTED)}
-    chosen = {k: v for k, v in variants(base).items() if only is None or k in (BASE, *only)}
     about = {
         "architecture": asdict(base),
         "config": asdict(config),
         "recordings": hashes,
         "members": members,
     }
-    work = WorkFolder((out / "rows").resolve(), about)
-    parts = {name.replace(" ", "-"): name for name in chosen}
-    jobs = {part: (data, chosen[name], config, members) for part, name in parts.items()}
-    finish(
-        work,
-        _judged,
-        jobs,
-        workers=workers,
-        progress=lambda part, share: progress(parts[part], share),
-    )
+    jobs = {
+        (name,): (data, shape, config, members)
+        for name, shape in chosen(variants(base), only).items()
+    }
     columns = {"breath_id": judged.breath_id, "lung": judged.lung_ids}
     tables = [
-        pd.DataFrame({"variant": name, **columns, "error": work.read(part)})
-        for part, name in parts.items()
+        pd.DataFrame({"variant": name, **columns, "error": errors})
+        for (name,), errors in trained(out, about, _judged, jobs, workers, progress).items()
     ]
     breaths = pd.concat(tables, ignore_index=True)
     files.write_text(out / "breaths.csv", breaths.round(5).to_csv(index=False))
@@ -151,7 +135,7 @@ def stored(breaths: pd.DataFrame) -> dict[str, Any]:
 
 
 def _judged(
-    data: TrainingData, shape: Architecture, config: Training, members: int, tell: Tell | None
+    data: TrainingData, shape: Architecture, config: Training, members: int, tell: Tell
 ) -> list[float]:
     """Open-loop error of each scored breath by the network that has not seen it, cmH2O, ``(n,)``.
 
@@ -171,50 +155,5 @@ def _judged(
         simulated = stitched.simulate(network, judged.pressure[:, 0], judged.u_in, judged.dt)
         unseen = (judged.lung_ids == name) & (fold[scored] == member)
         error[unseen] = mean_errors(np.asarray(simulated), judged)[unseen]
-        if tell is not None:
-            tell((member + (at + 1) / len(LUNG_IDS)) / members)
+        tell((member + (at + 1) / len(LUNG_IDS)) / members)
     return error.tolist()
-
-
-#: Called with what is trained and the share of all that is done.
-Progress = Callable[[str, float], None]
-
-#: Takes the share of a training that is done.
-Tell = Callable[[float], None]
-
-
-def finish(
-    work: WorkFolder,
-    function: Callable[..., Any],
-    jobs: Mapping[str, tuple[Any, ...]],
-    *,
-    workers: int = 0,
-    progress: Progress = lambda *_: None,
-) -> None:
-    """Compute the results that a folder does not have yet.
-
-    Args:
-        work: keeps each result as soon as it is there.
-        function: of a module; takes the arguments of a job, then :data:`Tell` or None, and returns
-            JSON values.
-        jobs: arguments by name of the result.
-        workers: processes, each with a training at a time; 0 for this one alone.
-        progress: what happens within a training can only be told where it runs in this process.
-
-    Raises:
-        InputError: if a worker process has died.
-    """
-    done = 0
-
-    def tell(name: str, share: float) -> None:
-        progress(name, (done + share) / len(jobs))
-
-    with executor(workers) as pool:
-        here = isinstance(pool, InProcess)
-        told = {
-            name: (*arguments, partial(tell, name) if here else None)
-            for name, arguments in jobs.items()
-        }
-        for name, _ in kept_results(work, pool, function, told):
-            done += 1
-            tell(name, 0.0)

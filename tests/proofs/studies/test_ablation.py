@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from proofs.__main__ import app
 from proofs.paper.paper import load_stored
-from proofs.studies import controllers, networks
+from proofs.studies import BASE, controllers, networks
 from proofs.studies.stitched import Architecture, Training
 from submissions.residual_mlp.train import ResidualConfig
 from tests.train.conftest import synthetic
@@ -55,7 +55,7 @@ class Textbook:
 def test_each_variant_differs_in_one_thing():
     config = ResidualConfig()
     found = controllers.variants(config)
-    assert found[controllers.BASE] == controllers.Variant(found["base"].meaning, config)
+    assert found[BASE] == controllers.Variant(found["base"].meaning, config)
     for name, one in found.items():
         changed = [k for k, v in asdict(one.config).items() if v != asdict(config)[k]]
         wanted = 0 if name in ("base", "direct") else 2 if name == "twice as far back" else 1
@@ -64,7 +64,7 @@ def test_each_variant_differs_in_one_thing():
     base = networks.ARCHITECTURE
     for name, one in networks.variants(base).items():
         changed = [k for k, v in asdict(one).items() if v != asdict(base)[k]]
-        assert len(changed) == (name != networks.BASE)
+        assert len(changed) == (name != BASE)
         if changed:
             assert name.endswith(f" {getattr(one, changed[0])}")
 

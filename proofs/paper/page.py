@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import html
 import io
-import re
 from typing import Any
 
 import numpy as np
+from markdown_it import MarkdownIt
 
-from proofs.paper.report import Chart, Reproduction, Section, Table
+from proofs.paper.report import Chart, Reproduction
 from ventbench.base.errors import require
 from ventbench.palette import GREY, INK, LINE, QUIET, RUNS, SOFT
 
@@ -20,14 +20,14 @@ _HEAD = f"""<!doctype html>
 body {{ font: 16px/1.5 system-ui, sans-serif; color: {INK}; max-width: 60rem; margin: 2rem auto;
   padding: 0 1rem; }}
 h2 {{ margin-top: 3rem; border-top: 1px solid {LINE}; padding-top: 1rem; }}
-.place, figcaption {{ color: {QUIET}; font-size: 0.875rem; }}
+h2 + p em, figcaption {{ color: {QUIET}; font-size: 0.875rem; }}
 figure {{ margin: 1rem 0; }}
 figure svg {{ max-width: 100%; height: auto; }}
-.wide {{ overflow-x: auto; }}
-table {{ border-collapse: collapse; font-size: 0.875rem; font-variant-numeric: tabular-nums; }}
+table {{ display: block; overflow-x: auto; border-collapse: collapse; font-size: 0.875rem;
+  font-variant-numeric: tabular-nums; }}
 th, td {{ padding: 0.25rem 0.75rem; text-align: right; border-bottom: 1px solid {LINE}; }}
 th {{ background: {SOFT}; }}
-th:first-child, td:first-child, .claims td, .claims th {{ text-align: left; }}
+th:first-child, td:first-child, table:first-of-type * {{ text-align: left; }}
 </style></head><body>
 """
 
@@ -38,46 +38,14 @@ def page(reproduction: Reproduction) -> str:
     Raises:
         InputError: if matplotlib is missing.
     """
-    about = ", ".join(f"{name} {value}" for name, value in reproduction.about.items())
-    claims = tuple((s.place, s.claim, s.verdict, s.finding) for s in reproduction.sections)
-    summary = Table("", ("paper", "claim", "here", "figures here"), claims)
-    parts = [
-        _HEAD,
-        f'<h1>The paper, reproduced</h1><p class="place">{html.escape(about)}</p>',
-        _table(summary, "claims"),
-        *map(_section, reproduction.sections),
-        "</body></html>\n",
-    ]
-    return "\n".join(parts)
+    text = reproduction.to_markdown(_figure)
+    return f"{_HEAD}{MarkdownIt().enable('table').render(text)}</body></html>\n"
 
 
-def _section(section: Section) -> str:
-    texts = [
-        f"<h2>{_text(section.title)}</h2>",
-        f'<p class="place">{_text(f"{section.place}; {section.source}")}</p>',
-        f"<p>Paper: {_text(section.claim)}</p>",
-        f"<p>Here (<b>{section.verdict}</b>): {_text(section.finding)}</p>",
-    ]
-    for chart in section.charts:
-        caption = f"<figcaption>{_text(chart.caption)}</figcaption>"
-        texts.append(f"<figure>{svg(chart)}{caption}</figure>")
-    texts += [f"<p>{_text(table.caption)}:</p>{_table(table)}" for table in section.tables]
-    return "\n".join(texts)
-
-
-def _text(text: str) -> str:
-    """Text as HTML, with code between backquotes."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
-
-
-def _table(table: Table, kind: str = "") -> str:
-    def row(cells: tuple[Any, ...], tag: str) -> str:
-        texts = (_text(table.text(cell)) for cell in cells)
-        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
-
-    rows = "".join(row(cells, "td") for cells in table.rows)
-    head = row(table.columns, "th")
-    return f'<div class="wide"><table class="{kind}"><thead>{head}</thead>{rows}</table></div>'
+def _figure(chart: Chart) -> str:
+    """A chart with its caption as a block of HTML in Markdown, which ends at a blank line."""
+    drawn = " ".join(svg(chart).split("\n"))
+    return f"<figure>{drawn}<figcaption>{html.escape(chart.caption)}</figcaption></figure>"
 
 
 def svg(chart: Chart) -> str:

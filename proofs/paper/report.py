@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -39,12 +39,11 @@ class Table:
 
     def to_markdown(self) -> str:
         """The table as it is shown."""
-        rows = [[self.text(cell) for cell in row] for row in self.rows]
+        rows = [[self._text(cell) for cell in row] for row in self.rows]
         texts = [self.columns, ["---"] * len(self.columns), *rows]
         return "\n".join(f"| {' | '.join(row)} |" for row in texts)
 
-    def text(self, cell: Cell) -> str:
-        """A cell as it is shown."""
+    def _text(self, cell: Cell) -> str:
         if cell is None:
             return "-"
         return cell if isinstance(cell, str) else f"{cell:.{self.digits}f}"
@@ -97,8 +96,8 @@ class Reproduction:
         """JSON values, null where a number is missing."""
         return json_values(dataclasses.asdict(self))
 
-    def to_markdown(self) -> str:
-        """The comparison as a page of documentation."""
+    def to_markdown(self, picture: Callable[[Chart], str] | None = None) -> str:
+        """The comparison as a page of documentation, with a picture of each chart where given."""
         about = ", ".join(f"{name} {value}" for name, value in self.about.items())
         parts = ["# The paper, reproduced", f"Figures of: {about}.", "## Claims"]
         claims = tuple((s.place, s.claim, s.verdict, s.finding) for s in self.sections)
@@ -106,6 +105,7 @@ class Reproduction:
         for section in self.sections:
             parts += [f"## {section.title}", f"*{section.place}; {section.source}*"]
             parts += [f"Paper: {section.claim}", f"Here (**{section.verdict}**): {section.finding}"]
+            parts += map(picture, section.charts) if picture else ()
             for table in section.tables:
                 parts += [f"{table.caption}:", table.to_markdown()]
         return "\n\n".join(parts) + "\n"

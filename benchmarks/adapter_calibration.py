@@ -13,7 +13,7 @@ Usage:
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from scipy.special import expit
 from proofs.challenge.contract import PUBLISHED
 from proofs.challenge.figures import calibration_error, interval
 from proofs.challenge.folder import ChallengeFolder
-from proofs.challenge.judge import FLOOR, JudgedCase
+from proofs.challenge.judge import JudgedCase
 from proofs.challenge.reveal import reveal
 from proofs.challenge.truth import is_right
 from proofs.diagnosers.ventbench import CALIBRATION, Calibration, hypotheses
@@ -36,16 +36,21 @@ FOLDS, DRAWS = 10, 2000
 Case = tuple[dict[str, Any], JudgedCase]
 
 
-def told(case: Case, shares: Calibration) -> dict[frozenset[str], float]:
-    """Probabilities that a verdict gets, by terms."""
-    answer = hypotheses(case[0], PUBLISHED, shares)
-    return {frozenset(each["terms"]): each["probability"] for each in answer}
-
-
-def log_score(case: Case, given: dict[frozenset[str], float]) -> float:
-    """As the judge has it."""
-    belief = sum(p for terms, p in given.items() if is_right(terms, case[1].truth))
-    return -float(np.log(max(belief, FLOOR)))
+def rejudged(case: Case, shares: Calibration) -> JudgedCase:
+    """The case as it is judged with other shares of the parts."""
+    notes, judged = case
+    answer = hypotheses(notes, PUBLISHED, shares)
+    given = {frozenset(each["terms"]): each["probability"] for each in answer}
+    right = {terms for terms in given if is_right(terms, judged.truth)}
+    most = max(given.values())
+    leading = tuple(terms for terms, p in given.items() if p >= most - 1e-6)
+    return replace(
+        judged,
+        belief=sum(given[terms] for terms in right),
+        leading=leading,
+        confidence=min(most * len(leading), 1.0),
+        isolation=float(not right.isdisjoint(leading)),
+    )
 
 
 def fitted(cases: list[Case]) -> Calibration:
@@ -54,23 +59,16 @@ def fitted(cases: list[Case]) -> Calibration:
     def cost(z: np.ndarray) -> float:
         prior = -np.sum(np.log(expit(z)) + np.log(expit(-z)))
         shares = Calibration(*expit(z).tolist())
-        return float(sum(log_score(case, told(case, shares)) for case in cases) + prior)
+        return float(sum(rejudged(case, shares).log_score for case in cases) + prior)
 
     return Calibration(*expit(minimize(cost, np.zeros(len(fields(Calibration)))).x).tolist())
 
 
-def told_and_right(case: Case, given: dict[frozenset[str], float]) -> tuple[float, float]:
-    """Confidence in the likeliest hypotheses, and whether one of them is right."""
-    most = max(given.values())
-    leading = [terms for terms, p in given.items() if p >= most - 1e-6]
-    right = any(is_right(terms, case[1].truth) for terms in leading)
-    return min(most * len(leading), 1.0), float(right)
-
-
-def tell(what: str, scores: list[float], believed: list[tuple[float, float]]) -> None:
+def tell(what: str, cases: list[JudgedCase]) -> None:
     """Print log score and calibration error with their intervals."""
-    values = np.array(believed)
-    low, high = interval(np.array(scores), lambda x: x.mean(axis=1))
+    scores = np.array([case.log_score for case in cases])
+    values = np.array([(case.confidence, float(case.isolation > 0.0)) for case in cases])
+    low, high = interval(scores, lambda x: x.mean(axis=1))
     error = float(calibration_error(values[None])[0])
     span = interval(values, calibration_error)
     rng = np.random.default_rng(0)
@@ -78,7 +76,7 @@ def tell(what: str, scores: list[float], believed: list[tuple[float, float]]) ->
     drawn[..., 1] = rng.uniform(size=drawn.shape[:2]) < values[:, 0]
     chance = float(calibration_error(drawn).mean())
     print(
-        f"{what}: log score {np.mean(scores):.2f} ({low:.2f} to {high:.2f}), ECE {error:.3f} "
+        f"{what}: log score {scores.mean():.2f} ({low:.2f} to {high:.2f}), ECE {error:.3f} "
         f"({span[0]:.3f} to {span[1]:.3f}), by chance {chance:.3f}"
     )
 
@@ -95,23 +93,14 @@ def main(folders: list[Path], seed: list[str]) -> None:
         cases += [
             (answers[n]["answer"]["notes"], c) for (_, n), c in judged.items() if not c.problem
         ]
-    tell(
-        "as answered",
-        [c.log_score for _, c in cases],
-        [(c.confidence, float(c.isolation > 0.0)) for _, c in cases],
-    )
+    tell("as answered", [judged for _, judged in cases])
+    tell("with the shares in the code", [rejudged(case, CALIBRATION) for case in cases])
     groups = np.random.default_rng(0).permutation(len(cases)) % FOLDS
-    apart: list[dict[frozenset[str], float]] = [{} for _ in cases]
+    apart = []
     for fold in range(FOLDS):
         shares = fitted([case for case, group in zip(cases, groups, strict=True) if group != fold])
-        for k in np.flatnonzero(groups == fold):
-            apart[k] = told(cases[k], shares)
-    for what, every in (
-        ("with the shares in the code", [told(case, CALIBRATION) for case in cases]),
-        ("fitted, cases left out", apart),
-    ):
-        pairs = list(zip(cases, every, strict=True))
-        tell(what, [log_score(*pair) for pair in pairs], [told_and_right(*pair) for pair in pairs])
+        apart += [rejudged(cases[k], shares) for k in np.flatnonzero(groups == fold)]
+    tell("fitted, cases left out", apart)
     print({name: round(share, 2) for name, share in asdict(fitted(cases)).items()})
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Literal
 
@@ -52,6 +52,24 @@ def in_turn(values: tuple, count: int, rng: np.random.Generator) -> list:
     """At least ``count`` values, each once a round, in a new random order each round."""
     rounds = count // len(values) + 1
     return [values[i] for _ in range(rounds) for i in rng.permutation(len(values))]
+
+
+def combined(
+    names: Sequence[str],
+    size: int,
+    rivals: Iterable[Set[str]],
+    alone: Collection[str],
+    rng: np.random.Generator,
+) -> list[str]:
+    """Names of effects in one rig, sorted: none that comes alone, and no two of a set of rivals."""
+    chosen: list[str] = []
+    for index in rng.permutation(len(names)):
+        name = names[index]
+        if name not in alone and not any(name in r and r & set(chosen) for r in rivals):
+            chosen.append(name)
+        if len(chosen) == size:
+            break
+    return sorted(chosen)
 
 
 def held_levels(

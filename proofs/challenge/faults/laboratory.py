@@ -123,7 +123,12 @@ def record(case: Case, rng: np.random.Generator, *, share: float = 1.0) -> Breat
         u = np.where((seen > _RELIEF) | (u_out[:, k] == 1), 0.0, np.clip(u, 0.0, 100.0))
         return np.round(np.round(u / case.log_step) * case.log_step, 6)
 
-    return _run(case, rng, time, u_out, command, np.arange(n), noise)
+    rest = base.peep + 0.2 * rng.standard_normal(n)
+    u_in, readings = _run(case, time, u_out, command, np.arange(n), rest)
+    pressure = readings + noise
+    if case.step:
+        pressure = case.step * np.round(pressure / case.step)
+    return logged(case, np.arange(n), time, u_in, u_out, _saturated(case, pressure))
 
 
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
@@ -136,20 +141,20 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int) -> Floats:
         seed: not used; which breaths are affected belongs to the case.
     """
     assert isinstance(case, FaultsCase)
-    quiet = np.zeros(breaths.time.shape)
-    rng = np.random.default_rng(seed)
-    simulated = _run(
+    _, readings = _run(
         case,
-        rng,
         breaths.time,
         breaths.u_out,
         lambda k, pressure: breaths.u_in[:, k],
         breaths.breath_id - 1,
-        quiet,
         start,
-        exact=True,
     )
-    return simulated.pressure
+    return np.round(_saturated(case, readings), 6)
+
+
+def _saturated(case: FaultsCase, pressure: Floats) -> Floats:
+    effects = {effect.name: effect for effect in case.effects}
+    return np.minimum(pressure, parameter(effects, "saturation", "level", np.inf))
 
 
 def active(case: Case, breaths: Breaths) -> Bools | None:
@@ -172,23 +177,18 @@ def active(case: Case, breaths: Breaths) -> Bools | None:
 
 def _run(
     case: FaultsCase,
-    rng: np.random.Generator,
     time: Floats,
     u_out: NDArray[np.int8],
     command: Command,
     number: Ints,
-    noise: Floats,
-    start: Floats | None = None,
-    *,
-    exact: bool = False,
-) -> Breaths:
-    """Simulate breaths side by side and log them; ``exact``: without converter."""
+    rest: Floats,
+) -> tuple[Floats, Floats]:
+    """Simulate breaths side by side from rest at ``rest``, cmH2O; commands and readings."""
     assert case.base is not None
     (n, samples), base, faults = time.shape, case.base, _Faults(case, number)
     R = base.R * (1.0 + faults.course("resistance"))
     C = 1e-3 * base.C * (1.0 + faults.course("compliance"))
     gain = 1e-3 * base.gain * (1.0 + faults.course("gain"))
-    rest = base.peep + 0.2 * rng.standard_normal(n) if start is None else start
     p = rest.astype(float).copy()
     trapped = faults.value("trapped_gas", "pressure") * (0.7 + 0.6 * faults.random[:, 2])
     volume = (rest + trapped) * C
@@ -216,11 +216,7 @@ def _run(
             )
             history.append(p + _swing(faults, (p - volume / C) / R, now))
             clock.append(now)
-    pressure = _log(faults, np.array(clock).T, np.array(history).T, time, noise)
-    if case.step and not exact:
-        pressure = case.step * np.round(pressure / case.step)
-    pressure = np.minimum(pressure, parameter(faults.effects, "saturation", "level", np.inf))
-    return logged(case, number, time, u_in, u_out, pressure)
+    return u_in, _log(faults, np.array(clock).T, np.array(history).T, time)
 
 
 def _moved(faults: _Faults, u: Floats) -> Floats:
@@ -290,9 +286,9 @@ def _step(
     return after, volume + h * inner * (after - inside)
 
 
-def _log(faults: _Faults, clock: Floats, history: Floats, time: Floats, noise: Floats) -> Floats:
+def _log(faults: _Faults, clock: Floats, history: Floats, time: Floats) -> Floats:
     """Readings at the times of the log, whose clock may be another one, cmH2O."""
     at = time - faults.value("clock_offset", "offset")
     at = at / (1.0 + faults.value("clock_skew", "skew"))
     seen = np.array([np.interp(t, c, p) for t, c, p in zip(at, clock, history, strict=True)])
-    return seen + faults.course("zero")[:, None] + noise
+    return seen + faults.course("zero")[:, None]

@@ -17,7 +17,7 @@ from hardware_eval.emulation.cases import (
     draw_grid,
     rotate,
 )
-from proofs.challenge.questions import Kind
+from proofs.challenge.questions import Kind, combined
 from ventbench.task.lungs import LUNGS, Lung
 
 #: Share of each kind in a challenge of all kinds.
@@ -51,7 +51,9 @@ def of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[Case]:
             if kind == "null":
                 yield _null(lung, rng)
             else:
-                yield draw_case(lung, _combination(2 if kind == "pair" else 4, rng), rng)
+                names = combined(LIBRARY, 2 if kind == "pair" else 4, CLASSES, _SINGLE_ONLY, rng)
+                effects = tuple(draw_effect(name, "strong", rng) for name in names)
+                yield draw_case(lung, effects, rng)
         return
     several = tuple(name for name in LIBRARY if len(EFFECTS[name].forms) > 1)
     names = {"form": several, "outside": OUTSIDE}.get(kind, LIBRARY)
@@ -60,19 +62,6 @@ def of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[Case]:
             yield _masked(lung, draw_effect(name, strength, rng, form), rng)
         else:
             yield draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
-
-
-def _combination(size: int, rng: np.random.Generator) -> tuple[Effect, ...]:
-    """Strong effects, no two of the same class."""
-    chosen: list[str] = []
-    for index in rng.permutation(len(LIBRARY)):
-        name = LIBRARY[index]
-        if name in _SINGLE_ONLY or any(name in c and c & set(chosen) for c in CLASSES):
-            continue
-        chosen.append(name)
-        if len(chosen) == size:
-            break
-    return tuple(draw_effect(name, "strong", rng) for name in sorted(chosen))
 
 
 def _null(lung: Lung, rng: np.random.Generator) -> Case:

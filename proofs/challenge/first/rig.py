@@ -19,6 +19,9 @@ from proofs.challenge.questions import logged, parameter
 from ventbench.base.arrays import Floats, Ints
 from ventbench.recordings.breaths import Breaths
 
+#: Takes the number of a sample and its reading, cmH2O, ``(n,)``; returns commands, %, not clipped.
+Command = Callable[[int, Floats], Floats]
+
 #: Means of the sampling interval that a breath may have, s.
 INTERVALS = (0.0319, 0.0340)
 
@@ -113,7 +116,7 @@ def record(
     """
     base = case.base or draw_base(case.lung_R, case.lung_C, rng)
     time = sampling_times(case.breaths, case.samples, case.jitter, rng)
-    command = RecordingController(case, time, rng, share).command
+    command = recording_controller(case, time, rng, share)
     u_out = (time >= INSPIRATION).astype(np.int8)
     return _run(case, base, time, u_out, command, np.arange(len(time)), rng, steps)
 
@@ -148,7 +151,7 @@ def _run(
     base: Base,
     time: Floats,
     u_out: NDArray[np.int8],
-    command: Callable[[int, Floats], Floats],
+    command: Command,
     number: Ints,
     rng: np.random.Generator,
     steps: int | None = None,
@@ -204,7 +207,9 @@ _INTEGRAL_SHARE = 0.06
 INSPIRATION = 1.0
 
 
-class RecordingController:
+def recording_controller(
+    case: Case, time: Floats, rng: np.random.Generator, share: float = 1.0
+) -> Command:
     """PI control to a target; some breaths add a disturbance, others follow a programme.
 
     Args:
@@ -213,39 +218,34 @@ class RecordingController:
         rng: source of gains, targets and programmes.
         share: scales pressures above PEEP and commands; 1 for the usual ones.
     """
+    n = len(time)
+    # cmH2O at the next sample per %: by resistance, and by the volume of 32 ms of flow.
+    jump = 1e-3 * NOMINAL_GAIN * (case.lung_R + 32.0 / case.lung_C)
+    highest = max(_LARGEST_LOOP_GAIN / jump, 0.5)
+    proportional = rng.choice(_GRID[np.less_equal(_GRID, highest)], n)
+    integral = rng.choice(_GRID, n)
+    target = share * rng.uniform(10.0, 35.0, n) + (1.0 - share) * _PEEP
+    summed = np.zeros(n)
+    explores = (rng.uniform(size=n) < 0.5) & (case.style == "mixed")
+    programmed = explores & (rng.uniform(size=n) < 0.5)
+    added = share * _disturbance(case, time, rng)
+    added = np.where((explores & ~programmed)[:, None], added, 0.0)
+    programme = np.where(programmed[:, None], share * _programme(case, time, rng), np.nan)
+    kind = rng.integers(0, 3, n)
+    bias = np.where(explores, np.where(kind == 0, 0.0, rng.uniform(0.0, 6.0, n)), 5.0)
 
-    def __init__(
-        self, case: Case, time: Floats, rng: np.random.Generator, share: float = 1.0
-    ) -> None:
-        n = len(time)
-        self._time = time
-        # cmH2O at the next sample per %: by resistance, and by the volume of 32 ms of flow.
-        jump = 1e-3 * NOMINAL_GAIN * (case.lung_R + 32.0 / case.lung_C)
-        highest = max(_LARGEST_LOOP_GAIN / jump, 0.5)
-        gains = _GRID[np.less_equal(_GRID, highest)]
-        self._kp = rng.choice(gains, n)
-        self._ki = rng.choice(_GRID, n)
-        self._target = share * rng.uniform(10.0, 35.0, n) + (1.0 - share) * _PEEP
-        self._sum = np.zeros(n)
-        explores = (rng.uniform(size=n) < 0.5) & (case.style == "mixed")
-        programmed = explores & (rng.uniform(size=n) < 0.5)
-        added = share * _disturbance(case, time, rng)
-        self._added = np.where((explores & ~programmed)[:, None], added, 0.0)
-        self._programme = np.where(programmed[:, None], share * _programme(case, time, rng), np.nan)
-        kind = rng.integers(0, 3, n)
-        self._bias = np.where(explores, np.where(kind == 0, 0.0, rng.uniform(0.0, 6.0, n)), 5.0)
-        self._soft = ~explores
-
-    def command(self, k: int, measured: Floats) -> Floats:
-        """Command after sample ``k``, %, not yet clipped, ``(n,)``; ``measured`` in cmH2O."""
-        t = self._time[:, k]
-        error = self._target - measured
-        self._sum = self._sum + _INTEGRAL_SHARE * (error - self._sum)
-        closed = self._kp * error + self._ki * self._sum + self._added[:, k]
-        inspired = np.where(np.isnan(self._programme[:, k]), closed, self._programme[:, k])
+    def command(k: int, measured: Floats) -> Floats:
+        nonlocal summed
+        t = time[:, k]
+        error = target - measured
+        summed = summed + _INTEGRAL_SHARE * (error - summed)
+        closed = proportional * error + integral * summed + added[:, k]
+        inspired = np.where(np.isnan(programme[:, k]), closed, programme[:, k])
         inspired = np.where(measured > _HIGHEST, 0.0, inspired)
         risen = -np.expm1(-np.maximum(t - 1.5, 0.0) * 5.0)
-        return np.where(t < INSPIRATION, inspired, self._bias * np.where(self._soft, risen, 1.0))
+        return np.where(t < INSPIRATION, inspired, bias * np.where(explores, 1.0, risen))
+
+    return command
 
 
 def _steady_command(case: Case, pressure: float | Floats) -> float | Floats:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, Strength
-from proofs.challenge.questions import Kind, in_turn, read_families
+from proofs.challenge.questions import Kind, combined, in_turn, read_families
 from ventbench.task.lungs import Lung
 
 #: Form of an effect whose parameter means the same as the library's of that name.
@@ -94,7 +94,8 @@ def of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[Strang
         strength: Strength = ("mild", "strong")[(k + flip) % 2]
         effects: tuple[Effect, ...] = ()
         if kind in ("pair", "four"):
-            effects = _several(2 if kind == "pair" else 4, rng)
+            several = combined(INSIDE, 2 if kind == "pair" else 4, _RIVALS, _ALONE, rng)
+            effects = tuple(_effect(name, "strong", rng) for name in several)
         elif kind != "null":
             effects = (_effect(names[k], strength, rng),)
         yield _laboratory(lungs[k], effects, kind, rng)
@@ -110,17 +111,6 @@ def _effect(name: str, strength: Strength, rng: np.random.Generator) -> Effect:
         size = min(size, 0.5)
     further = {key: float(rng.uniform(*span)) for key, span in family.ranges}
     return Effect(name, strength, form, {family.parameter: float(size)} | further)
-
-
-def _several(size: int, rng: np.random.Generator) -> tuple[Effect, ...]:
-    chosen: list[str] = []
-    for name in rng.permutation(np.array(INSIDE)).tolist():
-        clash = any(name in rivals and rivals & set(chosen) for rivals in _RIVALS)
-        if name not in _ALONE and not clash:
-            chosen.append(name)
-        if len(chosen) == size:
-            break
-    return tuple(_effect(name, "strong", rng) for name in sorted(chosen))
 
 
 def _laboratory(

@@ -114,10 +114,12 @@ def _refitted(
         step = np.linalg.lstsq(jacobian, remaining.ravel(), rcond=None)[0]
         shift = np.sum((error - np.tensordot(step, slopes, 1)) * by_start, axis=1) / square
         limited = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
-        tried = [(base, start + share * shift) for share in _STEP_SHARES]
-        for k, share in enumerate(_STEP_SHARES):
+        tried = []
+        for share in _STEP_SHARES:
+            rig = base
             for key, value in zip(_REFITTED, limited, strict=True):
-                tried[k] = _changed(tried[k][0], key, share * float(value)), tried[k][1]
+                rig = _changed(rig, key, share * float(value))
+            tried.append((rig, start + share * shift))
         errors = run(*tried)
         better = np.flatnonzero(np.sum(errors**2, axis=(1, 2)) < np.sum(error**2))
         if not better.size:

@@ -12,21 +12,13 @@ from typing import Any
 
 import msgspec
 
-from hardware_eval.emulation.cases import Case, encrypt, random_generator, unseal
-from proofs.challenge.faults.effects import FaultsCase
+from hardware_eval.emulation.cases import encrypt, random_generator, unseal
+from proofs.challenge.generators import GENERATORS
 from proofs.challenge.questions import DrawnCase
-from proofs.challenge.stranger.effects import StrangerCase
 from ventbench.base import files
 from ventbench.base.errors import InputError
 
 _FORMAT = "ventbench-challenge-1"
-
-#: Class of the cases of each generator.
-_CASES: dict[str, type[Case]] = {
-    "first": Case,
-    "stranger": StrangerCase,
-    "faults": FaultsCase,
-}
 
 
 class Withheld(msgspec.Struct, frozen=True):
@@ -63,14 +55,12 @@ def encode_answers(secret: str, drawn: list[DrawnCase], nats: list[list[float]])
 
 def decode_answers(text: bytes) -> Truth:
     """Return the cases and the nats of their effects from the plain text of the answers."""
-    return [
-        (
-            DrawnCase(entry["kind"], msgspec.convert(case, _CASES[case.get("generator", "first")])),
-            [float(nats) for nats in entry["nats"]],
-        )
-        for entry in json.loads(text)["cases"]
-        for case in (entry["case"],)
-    ]
+    truth = []
+    for entry in json.loads(text)["cases"]:
+        generator = GENERATORS[entry["case"].get("generator", "first")]
+        case = msgspec.convert(entry["case"], generator.case)
+        truth.append((DrawnCase(entry["kind"], case), [float(nats) for nats in entry["nats"]]))
+    return truth
 
 
 @dataclass(frozen=True)

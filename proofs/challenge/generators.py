@@ -35,6 +35,7 @@ class Generator:
     replay: Callable[..., Floats]
     #: where in a recording the effects of a case act, ``(n, T)``, or None if everywhere.
     active: Callable[[Case, Breaths], Bools | None] = lambda case, breaths: None
+    case: type[Case] = Case  #: class of its cases.
     compared: int = 8  #: most breaths by which it is measured how far an effect can be detected.
 
     def draw(
@@ -63,10 +64,22 @@ class Generator:
 
 FIRST = Generator("first", plan.SHARES, plan.of_kind, rig.record, rig.replay)
 STRANGER = Generator(
-    "stranger", stranger.SHARES, stranger.of_kind, laboratory.record, laboratory.replay
+    "stranger",
+    stranger.SHARES,
+    stranger.of_kind,
+    laboratory.record,
+    laboratory.replay,
+    case=stranger.StrangerCase,
 )
 FAULTS = Generator(
-    "faults", faults.SHARES, faults.of_kind, bedside.record, bedside.replay, bedside.active, 1000
+    "faults",
+    faults.SHARES,
+    faults.of_kind,
+    bedside.record,
+    bedside.replay,
+    bedside.active,
+    faults.FaultsCase,
+    1000,
 )
 GENERATORS: dict[str, Generator] = {entry.name: entry for entry in (FIRST, STRANGER, FAULTS)}
 

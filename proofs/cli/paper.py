@@ -97,8 +97,8 @@ def samples(
 ) -> None:
     """Compare how many breaths policy gradient, PPO and DQN need for a score.
 
-    Writes samples.csv (the curves), summary.csv and study-samples.png. Ctrl-C keeps the finished
-    work; the same command continues. The picture needs the extra `view`.
+    Writes study-samples.png. Ctrl-C keeps the finished work; the same command continues. The
+    picture needs the extra `view`.
 
     Example: `python -m proofs study samples --lung R20C50 --seeds 5`
     """
@@ -143,8 +143,8 @@ def controllers(
     """Remove or change one part of the residual controller at a time.
 
     Each variant is trained with each seed as one network for all six lungs. Reports the nominal
-    score, the score on the 20 published draws and the exploitation index. Writes runs.csv and
-    summary.csv. Ctrl-C keeps the finished trainings; the same command continues.
+    score, the score on the 20 published draws and the exploitation index. Ctrl-C keeps the finished
+    trainings; the same command continues.
 
     Example: `python -m proofs study controllers --seeds 3 --updates 1000`
     """
@@ -186,8 +186,8 @@ def networks(
     """Change windows, width, depth and boundary networks of the paper's simulators, one at a time.
 
     The networks are trained on the public recordings in five folds. Each breath is simulated, open
-    loop, by the network that was not trained on it. Writes breaths.csv and summary.csv. Ctrl-C
-    keeps the finished trainings; the same command continues.
+    loop, by the network that was not trained on it. Ctrl-C keeps the finished trainings; the same
+    command continues.
 
     Example: `python -m proofs study networks --recordings ../shared/recordings`
     """

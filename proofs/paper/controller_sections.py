@@ -376,17 +376,17 @@ def reinforcement(errors: Mapping[str, Floats]) -> Section:
 def sample_efficiency(samples: Mapping[str, Any]) -> Section:
     """Error against experience (the paper's figure 11)."""
     methods = {row["method"]: row for row in samples["methods"]}
-    columns = (
-        "final",
-        "low95",
-        "high95",
-        "episodes",
-        "at_100_episodes",
-        "episodes_to_best_pid",
-        "episodes_to_2_percent",
-        "seconds",
-        "compile_seconds",
-    )
+    columns = {
+        "final": "final",
+        "low95": "from",
+        "high95": "to",
+        "episodes": "breaths",
+        "at_100_episodes": "score at 100 breaths",
+        "episodes_to_best_pid": "breaths to the best PID",
+        "episodes_to_2_percent": "breaths to within 2 %",
+        "seconds": "seconds, two cores",
+        "compile_seconds": "compiling, s",
+    }
     rows = tuple(
         (name, *(f"{x:,}" if isinstance(x, int) else x for x in map(row.get, columns)))
         for name, row in methods.items()
@@ -408,18 +408,7 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
     slow: Verdict = "agrees" if all(n is None or n >= MANY for n in late) else "differs"
     table = Table(
         f"{samples['lung']}: score without noise, cmH2O (interquartile mean, 95 %), and breaths",
-        (
-            "method",
-            "final",
-            "from",
-            "to",
-            "breaths",
-            "score at 100 breaths",
-            "breaths to the best PID",
-            "breaths to within 2 %",
-            "seconds, two cores",
-            "compiling, s",
-        ),
+        ("method", *columns.values()),
         rows,
     )
     return Section(

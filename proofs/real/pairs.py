@@ -32,6 +32,7 @@ from proofs.challenge.figures import wilson
 from proofs.real.parts import slower_sensor
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.base.resume import WorkFolder
 from ventbench.mechanics.identify import Mechanics, Term, identify
 from ventbench.mechanics.labels import TOLERANCE_C, TOLERANCE_R, Estimate
 from ventbench.recordings.breaths import Breaths
@@ -294,15 +295,12 @@ def run(
     asked = [pair for pair in pairs(material) if pair.kind in chosen and pair.split == split]
     if sealed:
         _open(out / "opened.json", chosen)
-    answers = []
+    work, answers = WorkFolder(out / split, {"leaks": LEAKS, "lags": LAGS}), []
     for done, pair in enumerate(asked):
         progress(done, len(asked))
-        path = out / split / f"{hashlib.sha256(pair.name.encode()).hexdigest()[:16]}.json"
-        stored = _stored(path, pair)
-        if stored is None:
-            stored = answer(pair, material)
-            files.write_json(path, asdict(stored))
-        answers.append(stored)
+        name = hashlib.sha256(pair.name.encode()).hexdigest()[:16]
+        stored = work.get(name, lambda pair=pair: asdict(answer(pair, material)))
+        answers.append(msgspec.convert(stored, Answered))
     progress(len(asked), len(asked))
     return answers
 
@@ -319,14 +317,6 @@ def _open(path: Path, kinds: tuple[str, ...]) -> None:
             )
         opened.setdefault(kind, {"opened": now, "version": ventbench.__version__})
     files.write_json(path, opened)
-
-
-def _stored(path: Path, pair: Pair) -> Answered | None:
-    try:
-        value = msgspec.json.decode(path.read_bytes(), type=Answered)
-    except (OSError, msgspec.DecodeError):
-        return None
-    return value if value.pair == pair else None
 
 
 def report(answers: list[Answered]) -> str:

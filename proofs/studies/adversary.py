@@ -165,18 +165,11 @@ class Critical:
     physics: dict[str, str]  #: what deviates, in physical units, by name of the quantity.
 
     def lines(self) -> list[str]:
-        """Say it to a person."""
-        if self.severity is None:
-            assert self.excess is not None
-            return [
-                f"{self.lung}: nothing unsafe up to severity 1; the worst stays "
-                f"{-self.excess:.1f} cmH2O below the limit, at PIP {self.pip:g}"
-            ]
-        what = "the controller fails" if self.excess is None else "unsafe"
-        first = f"{self.lung}: {what} at severity {self.severity:.2f}, PIP {self.pip:g}"
-        if not self.physics:
-            return [f"{first}, without any stressor"]
-        return [f"{first}:", *(f"  {name}: {value}" for name, value in self.physics.items())]
+        """Say it to a person; where nothing was found, with the worst physics of severity 1."""
+        at = "nothing unsafe up to" if self.severity is None else "unsafe at"
+        severity = 1 if self.severity is None else self.severity
+        first = f"{self.lung}: {at} severity {severity:.3g}, PIP {self.pip:g}"
+        return [first, *(f"  {name}: {value}" for name, value in self.physics.items())]
 
 
 def adversary(

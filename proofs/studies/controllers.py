@@ -14,7 +14,7 @@ import pandas as pd
 
 from proofs.studies import BASE, Progress, Tell, chosen, trained
 from submissions.residual_mlp.train import ResidualConfig, fit
-from ventbench.base import compilation, files
+from ventbench.base import compilation
 from ventbench.base.arrays import Floats
 from ventbench.board.replay import spread
 from ventbench.plants import frozen
@@ -85,7 +85,7 @@ def compare(
 ) -> pd.DataFrame:
     """Train one network for all six lungs by each variant with each seed.
 
-    Finished trainings are read from ``out``, where ``runs.csv`` and ``summary.csv`` are written.
+    Finished trainings are read from ``out``.
 
     Args:
         simulators: simulators to train through and to score on.
@@ -119,12 +119,9 @@ def compare(
         for seed in seeds
     }
     found = trained(out, about, _trained, jobs, workers, progress)
-    runs = pd.DataFrame(
+    return pd.DataFrame(
         {"variant": name, "seed": int(seed)} | row for (name, seed), row in found.items()
     )
-    files.write_text(out / "runs.csv", runs.round(5).to_csv(index=False))
-    files.write_text(out / "summary.csv", summary(runs).round(4).to_csv(index=False))
-    return runs
 
 
 def best_single(simulators: frozen.Frozen) -> Gains:

@@ -62,7 +62,7 @@ def compare(
     """Train each variant on each scored lung, once for each fold of the measured breaths.
 
     Each breath is judged by the network that has not seen it. What is finished is read from
-    ``out``, where ``breaths.csv`` and ``summary.csv`` are written.
+    ``out``.
 
     Args:
         folder: folder of the public recordings.
@@ -101,10 +101,7 @@ def compare(
         pd.DataFrame({"variant": name, **columns, "error": errors})
         for (name,), errors in trained(out, about, _judged, jobs, workers, progress).items()
     ]
-    breaths = pd.concat(tables, ignore_index=True)
-    files.write_text(out / "breaths.csv", breaths.round(5).to_csv(index=False))
-    files.write_text(out / "summary.csv", summary(breaths).round(4).to_csv(index=False))
-    return breaths
+    return pd.concat(tables, ignore_index=True)
 
 
 def summary(breaths: pd.DataFrame) -> pd.DataFrame:

@@ -72,20 +72,6 @@ class SampleStudy:
     start: float  #: nominal score of the PID that is corrected, cmH2O.
     best_pid: float  #: nominal score of the best PID of the paper's grid on this lung, cmH2O.
 
-    def points(self) -> pd.DataFrame:
-        """One row for each point of each curve."""
-        parts = []
-        for curve in self.curves:
-            columns = {
-                "method": curve.method,
-                "episodes": curve.episodes,
-                "seconds": np.round(curve.seconds, 3),
-                **dict(zip(("iqm", "low95", "high95"), curve.bands, strict=True)),
-            }
-            columns |= {f"seed{i}": row for i, row in enumerate(curve.scores)}
-            parts.append(pd.DataFrame(columns))
-        return pd.concat(parts, ignore_index=True).round(5)
-
     def summary(self) -> pd.DataFrame:
         """One row for each method; ``episodes_...`` is blank where it is not reached."""
         return pd.DataFrame([self._row(curve) for curve in self.curves])
@@ -214,7 +200,7 @@ def sample_efficiency(
     Args:
         lung: one of the six scored lungs.
         seeds: one for each training of a method.
-        out: folder of the checkpoints, ``samples.csv`` and ``summary.csv``.
+        out: folder of the checkpoints.
         share: share of the full length of each training.
         progress: see :data:`Progress`.
 
@@ -246,10 +232,8 @@ def sample_efficiency(
             LearningCurve(name, trained.episodes, seconds, trained.compile_seconds, scores)
         )
     grid = pid_search.errors(single, pid_search.paper_gains())[0].mean(axis=-1)
-    study = SampleStudy(lung.id, tuple(curves), float(curves[0].scores[0, 0]), float(grid.min()))
-    files.write_text(out / "samples.csv", study.points().to_csv(index=False))
-    files.write_text(out / "summary.csv", study.summary().to_csv(index=False))
-    return study
+    start, best = float(curves[0].scores[0, 0]), float(grid.min())
+    return SampleStudy(lung.id, tuple(curves), start, best)
 
 
 #: What the curves are called in the picture.
@@ -262,9 +246,6 @@ CURVE_LABELS = {
 
 _CURVE_COLORS = dict(zip(CURVE_LABELS, (RUNS[0], RUNS[3], RUNS[1], RUNS[2]), strict=True))
 
-#: Dots per inch of the picture.
-_DPI = 110
-
 
 def learning_curves_png(study: SampleStudy) -> bytes:
     """Draw score against breaths of experience and against time.
@@ -275,31 +256,26 @@ def learning_curves_png(study: SampleStudy) -> bytes:
         InputError: if matplotlib is missing.
     """
     require("matplotlib")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 4.6), dpi=_DPI, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    figure = Figure(figsize=(11.0, 4.6), dpi=110, layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     _curves(left, study, lambda curve: curve.episodes)
     _curves(right, study, lambda curve: curve.seconds)
     left.set_xlabel("breaths of experience of one training")
     right.set_xlabel("seconds, all seeds together, without compiling")
     left.set_ylabel("score without noise, cmH2O")
-    lines, names = left.get_legend_handles_labels()
-    order = [names.index(name) for name in CURVE_LABELS.values() if name in names]
-    shown = [lines[i] for i in order], [names[i] for i in order]
-    right.legend(*shown, loc="upper right", frameon=False, fontsize=9)
+    right.legend(loc="upper right", frameon=False, fontsize=9)
     seeds = len(study.curves[0].scores)
     figure.suptitle(f"{study.lung}: interquartile mean and 95 % band of {seeds} seeds", fontsize=11)
-    canvas.draw()
     output = io.BytesIO()
     figure.savefig(output, format="png")
     return output.getvalue()
 
 
 def _curves(axes: Any, study: SampleStudy, across: Callable[[LearningCurve], Any]) -> None:
-    for curve in study.curves:
+    names = list(CURVE_LABELS)
+    for curve in sorted(study.curves, key=lambda curve: names.index(curve.method)):
         x, color = across(curve)[1:], _CURVE_COLORS[curve.method]
         middle, low, high = curve.bands[:, 1:]
         axes.fill_between(x, low, high, color=color, alpha=0.2, linewidth=0)

@@ -2,8 +2,8 @@
 
 It learns inspirations, as the paper's does (section 4.3 and appendix B; authors' code for the
 boundary networks). From both windows, the command now included, a network gives a *jump* and a
-*rate*; the next pressure is ``p + jump_scale jump (u - u_before) / control_scale + rate_scale rate
-dt / REFERENCE_DT``. For an R-C lung the jump is R times the step of flow, whatever dt, and the rate
+*rate*; the next pressure is ``p + change_scale (jump (u - u_before) / control_scale + rate dt /
+REFERENCE_DT)``. For an R-C lung the jump is R times the step of flow, whatever dt, and the rate
 is flow / C, so that a network is right at any interval. The interval is no input, since in the
 recordings it betrays the rig. The first N_B steps use a network each. Where commands come from a
 feedback law, the command now tells the pressure now, and a network, the paper's too, can learn to
@@ -85,8 +85,9 @@ class Scales(NamedTuple):
     pressure_scale: Any  #: cmH2O.
     control_mean: Any  #: %.
     control_scale: Any  #: %.
-    jump_scale: Any  #: cmH2O for a unit jump output at a command step of ``control_scale``.
-    rate_scale: Any  #: cmH2O in ``REFERENCE_DT`` for a unit rate output.
+    #: cmH2O for a unit jump output at a command step of ``control_scale``, and in ``REFERENCE_DT``
+    #: for a unit rate output.
+    change_scale: Any
 
 
 @flax.struct.dataclass
@@ -123,7 +124,7 @@ class Network:
                 (controls - scales.control_mean) / scales.control_scale,
             ]
             jump, rate = self._outputs(jnp.concatenate(features, axis=1), index).T
-            rise = scales.jump_scale * jump * change + scales.rate_scale * rate * dt / REFERENCE_DT
+            rise = scales.change_scale * (jump * change + rate * dt / REFERENCE_DT)
             after = pressures[:, -1] + rise
             pressures = jnp.concatenate([pressures[:, 1:], after[:, None]], axis=1)
             return (pressures, controls), after
@@ -143,27 +144,27 @@ class Network:
 
 
 def untrained(key: Array, shape: Architecture, scales: Scales) -> Network:
-    """Draw a network in float32 with LeCun-normal weights, those of outputs scaled by 0.1."""
-    inputs, count, width = shape.pressures + shape.controls, shape.boundaries, shape.boundary_width
-    general_key, hidden_key, output_key = jax.random.split(key, 3)
-    sizes = (inputs, *([shape.width] * (shape.depth - 1)), 2)
+    """Draw a network in float32."""
+    inputs = shape.pressures + shape.controls
+    general_key, boundary_key = jax.random.split(key)
+    general = _layers(general_key, (inputs, *([shape.width] * (shape.depth - 1)), 2))
+    boundary: Layers = ()
+    if shape.boundaries:
+        keys = jax.random.split(boundary_key, shape.boundaries)
+        boundary = jax.vmap(lambda key: _layers(key, (inputs, shape.boundary_width, 2)))(keys)
+    as_float32 = Scales(*(jnp.asarray(value, jnp.float32) for value in scales))
+    return Network(general, boundary, as_float32, (shape.pressures, shape.controls))
+
+
+def _layers(key: Array, sizes: tuple[int, ...]) -> Layers:
+    """Draw LeCun-normal weights of layers, those of the output scaled by 0.1, and zero biases."""
     factors = [n**-0.5 for n in sizes[:-1]]
     factors[-1] *= 0.1
-    keys = jax.random.split(general_key, len(factors))
-    general = tuple(
+    keys = jax.random.split(key, len(factors))
+    return tuple(
         (factor * jax.random.normal(key, (n, m), jnp.float32), jnp.zeros(m, jnp.float32))
         for factor, key, n, m in zip(factors, keys, sizes[:-1], sizes[1:], strict=True)
     )
-    boundary: Layers = ()
-    if count:
-        # Drawn side by side.
-        hidden = inputs**-0.5 * jax.random.normal(hidden_key, (inputs, count * width), jnp.float32)
-        output = jax.random.normal(output_key, (count * width, 2), jnp.float32)
-        hidden = jnp.moveaxis(hidden.reshape(inputs, count, width), 1, 0)
-        output = 0.1 * width**-0.5 * output.reshape(count, width, 2)
-        boundary = ((hidden, jnp.zeros_like(hidden[:, 0])), (output, jnp.zeros_like(output[:, 0])))
-    as_float32 = Scales(*(jnp.asarray(value, jnp.float32) for value in scales))
-    return Network(general, boundary, as_float32, (shape.pressures, shape.controls))
 
 
 def inspirations(breaths: Breaths, weight: Floats, window: int) -> Inspirations:
@@ -215,8 +216,7 @@ def scales_of(data: Inspirations) -> Scales:
         pressure_scale=max(float(pressure.std()), 1.0),
         control_mean=float(u_in.mean()),
         control_scale=max(float(u_in.std()), 1.0),
-        jump_scale=max(change, 0.1),
-        rate_scale=max(change, 0.1),
+        change_scale=max(change, 0.1),
     )
 
 

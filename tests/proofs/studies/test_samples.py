@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 
 import jax
 import numpy as np
-import pandas as pd
 import pytest
 from scipy.stats import trim_mean
 from typer.testing import CliRunner
@@ -71,13 +71,6 @@ def test_summary_says_when_a_score_was_reached(made):
     assert never["episodes_to_best_pid"].tolist() == [None, None]
 
 
-def test_table_has_a_row_for_each_point(made):
-    points = made.points()
-    assert len(points) == 10
-    assert points["iqm"].iloc[4] == pytest.approx(2.02)
-    assert {f"seed{i}" for i in range(5)} < set(points.columns)
-
-
 def test_what_is_stored_has_the_form_of_the_papers_page(made):
     stored, known = made.stored(), load_stored()["samples"]
     assert stored.keys() == known.keys()
@@ -112,16 +105,11 @@ def test_study_samples(tmp_path):
     section = controller_sections.sample_efficiency(kept["samples"])
     methods = ["policy-gradient-short", "policy-gradient", "ppo", "dqn"]
     assert [row[0] for row in section.tables[0].rows] == methods
-    summary = pd.read_csv(tmp_path / "summary.csv").set_index("method")
-    assert list(summary.index) == methods
-    points = pd.read_csv(tmp_path / "samples.csv")
-    start = points[(points.method == "ppo") & (points.episodes == 0)]
+    (start,) = re.findall(r"the corrected PID has ([\d.]+)", " ".join(result.output.split()))
     plant = jax.tree.map(lambda leaf: leaf[-1:], frozen.load().plants)  # R20C50
     corrected = pid_search.errors(plant, np.array([GAINS], float))[0].mean()
-    assert start["iqm"].item() == pytest.approx(corrected, abs=2e-3)
+    assert float(start) == pytest.approx(corrected, abs=2e-3)
     assert (tmp_path / "study-samples.png").stat().st_size < 300_000
-    again = CliRunner().invoke(app, asked)
+    again = CliRunner().invoke(app, [*asked, "--store", str(store)])
     assert again.exit_code == 0, again.output
-    pd.testing.assert_frame_equal(
-        summary, pd.read_csv(tmp_path / "summary.csv").set_index("method")
-    )
+    assert json.loads(store.read_text()) == kept

@@ -27,7 +27,7 @@ from ventbench.task.rollouts import open_loop
 
 SHAPE = Architecture(pressures=3, controls=4, width=24, depth=3, boundary_width=8)
 SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
-SCALES = Scales(16.0, 9.0, 13.0, 16.0, 2.0, 2.0)
+SCALES = Scales(16.0, 9.0, 13.0, 16.0, 2.0)
 #: Shared, so that it is compiled once.
 LONG = Training(steps=600)
 T = 31
@@ -131,7 +131,7 @@ def test_each_boundary_step_has_its_own_network_then_the_general_one(boundaries)
         boundary = (hidden, (weights, jnp.asarray([[0.0, 1.0], [0.0, 2.0]])))
     network = Network(general, boundary, network.scales, network.windows)
     pressure = simulate(network, jnp.full(1, 5.0), jnp.full((1, 6), 7.0), jnp.full((1, 6), 0.033))
-    rises = np.diff(pressure[0]) / SCALES.rate_scale
+    rises = np.diff(pressure[0]) / SCALES.change_scale
     np.testing.assert_allclose(rises, [1, 2, 3, 3, 3] if boundaries else [3] * 5, atol=1e-5)
 
 

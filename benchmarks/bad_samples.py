@@ -118,7 +118,8 @@ def main(draws: int = 60, seed: int = 0, sound: bool = False) -> None:
     table = pd.DataFrame(rows, columns=["kind", "false effects", "intervals that hold"])
     by_kind = table.groupby("kind", sort=False)
     print(by_kind.agg({"false effects": "sum", "intervals that hold": "mean"}).round(3))
-    false, held = table["false effects"].sum(), table["intervals that hold"].mean()
+    false = sum(wrong for _, wrong, _ in rows)
+    held = float(np.mean([share for _, _, share in rows]))
     good = held >= COVERED and not false
     print(
         f"{draws} recordings: {false} with a false effect, {held:.3f} of the "

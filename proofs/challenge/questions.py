@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import dataclass
 from typing import Literal
 
@@ -55,7 +55,7 @@ def in_turn(values: tuple, count: int, rng: np.random.Generator) -> list:
 
 
 def combined(
-    names: Sequence[str],
+    names: tuple[str, ...],
     size: int,
     rivals: Iterable[Set[str]],
     alone: Collection[str],

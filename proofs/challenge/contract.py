@@ -118,7 +118,7 @@ class Question(msgspec.Struct, frozen=True):
     vocabulary: dict[str, Any]  #: places, and names with place, meaning and parameters.
 
 
-def pose(folder: Path, breaths: Breaths, withheld: tuple[int, ...], seconds: float) -> Question:
+def pose(folder: Path, breaths: Breaths, withheld: tuple[int, ...], seconds: float) -> None:
     """Write the folder of a case.
 
     Args:
@@ -131,7 +131,6 @@ def pose(folder: Path, breaths: Breaths, withheld: tuple[int, ...], seconds: flo
     question = Question(RECORDING, label, withheld, RIG, seconds, PUBLISHED)
     write(breaths, folder / RECORDING)
     files.write_json(folder / QUESTION, msgspec.to_builtins(question))
-    return question
 
 
 def decode(data: bytes, samples: dict[int, int]) -> Answer:

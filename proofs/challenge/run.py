@@ -122,7 +122,10 @@ def find(given: str) -> Diagnoser:
     """
     path = Path(given)
     if ":" in given:
-        return _named(given.replace(".", "_").replace(":", "-"), given, None)
+        name = given.replace(".", "_").replace(":", "-")
+        if not _SHORT_NAME.fullmatch(name):
+            raise InputError(f"{name!r}: a name has letters, digits, _ and -, 60 at most")
+        return Diagnoser(name, given)
     if given.isidentifier() and importlib.util.find_spec(f"{BUILT_IN}.{given}") is not None:
         return Diagnoser(given, f"{BUILT_IN}.{given}:diagnose")
     if path.is_dir():
@@ -154,13 +157,7 @@ def _of_folder(folder: Path) -> Diagnoser:
         raise InputError(f"{path}: name {printable(manifest.name)} {NAME_RULE}")
     if manifest.function.count(":") != 1:
         raise InputError(f"{path}: function is {manifest.function!r}; give file:function")
-    return _named(manifest.name, manifest.function, folder.resolve())
-
-
-def _named(name: str, function: str, folder: Path | None) -> Diagnoser:
-    if not _SHORT_NAME.fullmatch(name):
-        raise InputError(f"{name!r}: a name has letters, digits, _ and -, 60 at most")
-    return Diagnoser(name, function, folder)
+    return Diagnoser(manifest.name, manifest.function, folder.resolve())
 
 
 def run(diagnoser: Diagnoser, case: Path, limits: Limits) -> Outcome:

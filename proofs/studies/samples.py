@@ -19,7 +19,6 @@ import numpy as np
 import optax
 import pandas as pd
 from jax import Array
-from numpy.typing import NDArray
 
 from submissions.dqn.train import DQN
 from submissions.ppo.train import PPO
@@ -57,10 +56,10 @@ class LearningCurve:
         each = [over_seeds(scores) for scores in self.scores.T]
         return np.array([(x.value, x.low, x.high) for x in each]).T
 
-    def first_below(self, score: float) -> int | None:
-        """Index of the first point whose interquartile mean is at or below a score."""
+    def episodes_to(self, score: float) -> int | None:
+        """Breaths until the interquartile mean is at or below a score; None if it never is."""
         points = np.flatnonzero(self.bands[0] <= score)
-        return int(points[0]) if points.size else None
+        return int(self.episodes[points[0]]) if points.size else None
 
 
 @dataclass(frozen=True)
@@ -91,13 +90,7 @@ class SampleStudy:
 
     def _row(self, curve: LearningCurve) -> dict[str, object]:
         final, low, high = curve.bands[:, -1].tolist()
-        close = curve.first_below((1.0 + CLOSE) * final)
-        better = curve.first_below(self.best_pid)
         at_100 = int(np.flatnonzero(curve.episodes <= 100)[-1])
-
-        def at(array: NDArray[np.generic], index: int | None) -> object:
-            return None if index is None else array[index].item()
-
         return {
             "method": curve.method,
             "final": round(final, 3),
@@ -105,9 +98,8 @@ class SampleStudy:
             "high95": round(high, 3),
             "episodes": int(curve.episodes[-1]),
             "at_100_episodes": round(float(curve.bands[0, at_100]), 3),
-            "episodes_to_best_pid": at(curve.episodes, better),
-            "episodes_to_2_percent": at(curve.episodes, close),
-            "seconds_to_2_percent": at(np.round(curve.seconds, 2), close),
+            "episodes_to_best_pid": curve.episodes_to(self.best_pid),
+            "episodes_to_2_percent": curve.episodes_to((1.0 + CLOSE) * final),
             "seconds": round(float(curve.seconds[-1]), 1),
             "compile_seconds": round(curve.compile_seconds, 1),
         }

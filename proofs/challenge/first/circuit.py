@@ -235,11 +235,8 @@ class Circuit:
         self._double = "valve_lag" in effects and effects["valve_lag"].form == "two lags"
         self._drop = parameter(effects, "supply_droop", "drop")
         self._recovery = parameter(effects, "supply_droop", "recovery")
-        self._subtract = (
-            "supply_droop" in effects
-            and self._drop
-            and (effects["supply_droop"].form == "subtractive")
-        )
+        droop = effects.get("supply_droop")
+        self._subtract = droop is not None and droop.form == "subtractive"
         self._tubing = 1e-3 * parameter(effects, "circuit_compliance", "compliance")
         self._mass = parameter(effects, "inertance", "inertance")
         self._stress = parameter(effects, "viscoelasticity", "ratio") / self._recoil.C

@@ -65,7 +65,6 @@ def test_summary_says_when_a_score_was_reached(made):
     assert rows.loc["ppo", "at_100_episodes"] == pytest.approx(2.52)
     assert rows.loc["ppo", "episodes_to_best_pid"] == 120
     assert rows.loc["ppo", "episodes_to_2_percent"] == 180
-    assert rows.loc["ppo", "seconds_to_2_percent"] == 3.0
     assert rows.loc["dqn", "episodes_to_best_pid"] == 0  # better from the start
     never = SampleStudy("R20C50", made.curves, 3.0, 0.5).summary()
     assert never["episodes_to_best_pid"].tolist() == [None, None]

@@ -197,11 +197,9 @@ def test_a_folder_runs_apart_unless_told_otherwise(monkeypatch):
 
     monkeypatch.setattr("ventbench.sandbox.runner.SandboxRunner", Refuses)
     entry, rigs = open_submission("pid_best"), load_rigs("physics")
-    frozen_rigs = load_rigs()
     for work in (
         lambda: DOOR.score("pid_best", simulator="physics"),
         lambda: scoring.run_protocol(entry, rigs),
-        lambda: scoring.transfer(entry, frozen_rigs),
     ):
         with pytest.raises(SandboxError, match="apart"):
             work()

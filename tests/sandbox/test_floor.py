@@ -92,7 +92,6 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
                 "score pid_best",
                 "score pid_best --plant physics",
                 "score pid_robust --stress 1",
-                "board transfer pid_best",
             )
         ),
     ],

@@ -37,7 +37,7 @@ _PANELS = {
 _GROUPS = {
     listing: (simulators.lungs, score.stressors, score.entries, data.examples),
     data.app: (simulators.open_loop,),
-    board.app: (simulators.coverage, score.transfer, score.headroom),
+    board.app: (simulators.coverage, score.headroom),
 }
 for _panel, _commands in _PANELS.items():
     for _command in _commands:

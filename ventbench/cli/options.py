@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, NoReturn, TypeVar
 
 import typer
 
@@ -83,10 +83,6 @@ Entries = Annotated[
         help="Folders or names of bundled submissions.",
         autocompletion=complete_entries,
     ),
-]
-OneTrack = Annotated[
-    Literal["performance", "robustness"] | None,
-    typer.Option(help="What the controller is told; default: the first of the submission."),
 ]
 Sources = Annotated[
     list[Path] | None,

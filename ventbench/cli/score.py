@@ -1,4 +1,4 @@
-"""``ventbench score``, ``transfer``, ``new``, ``check``: work on submissions; and limits of scores.
+"""``ventbench score``, ``new``, ``check``: work on submissions; and limits of scores.
 
 The limits are the bounds of any controller (``headroom``).
 """
@@ -16,7 +16,6 @@ from ventbench.cli.options import (
     Entries,
     InProcess,
     JsonFile,
-    OneTrack,
     PlantName,
     Scheduler,
     Workers,
@@ -31,7 +30,6 @@ from ventbench.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
     from ventbench.entries.cells import Progress
@@ -141,7 +139,6 @@ def score(
         console.print(str(result), soft_wrap=True, markup=False, highlight=False)
     if len(scores) > 1 or draws:
         console.print(_table(results))
-    _compare(console, scores)
     if out is not None:
         for path in _keep(out, scores, report):
             console.print(f"wrote {path}", soft_wrap=True)
@@ -208,22 +205,6 @@ def _table(results: list[dict[str, Any]]) -> Table:
     )
 
 
-def _compare(console: Console, scores: list[Score]) -> None:
-    """Paired differences under missing physics to the first entry."""
-    import math
-
-    stressed = [(score.submission.manifest.name, score.stressed) for score in scores]
-    stressed_runs = [(name, runs) for name, runs in stressed if runs is not None]
-    for name, runs in stressed_runs[1:]:
-        first, base = stressed_runs[0]
-        difference, (low, high) = runs.difference(base)
-        if math.isfinite(difference):
-            console.print(
-                f"{name} less {first}: {difference:+.3f} cmH2O, paired 95 % interval "
-                f"{low:+.3f}..{high:+.3f}"
-            )
-
-
 def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
     """Write a folder for each entry, with one for each track in it where there are several."""
     from dataclasses import replace
@@ -243,44 +224,6 @@ def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
         written.append(pages.write_report(out / "report.html", runs, values))
         written.append(pages.write_rerun(out / "scores.rrd", runs))
     return written
-
-
-def transfer(
-    names: Entries, track: OneTrack = None, in_process: InProcess = False, json: JsonFile = None
-) -> None:
-    """Score controllers on every rig and every member of the ensemble, without noise.
-
-    Columns: the reference rig of each lung, which the nominal score uses; the same rig in the other
-    members of the ensemble; the lung's other rigs; the rig on which no entry of ours was trained.
-
-    Example: `ventbench board transfer pid_best residual_mlp --json transfer.json`
-    """
-    from ventbench.entries import scoring as transfers
-    from ventbench.entries.cells import runner_of
-    from ventbench.entries.folder import open_submission
-    from ventbench.plants.rigs import load_rigs
-
-    opened = [open_submission(name) for name in names]
-    rigs, results = load_rigs(), []
-    for entry in opened:
-        chosen = track or entry.manifest.tracks[0]
-        with bar(f"running {entry.label}") as running:
-            runner = runner_of(entry, sandbox=not in_process)
-            runs = transfers.transfer(entry, rigs, track=chosen, runner=runner, progress=running)
-        groups = transfers.by_group(runs, rigs)
-        results.append({"name": entry.manifest.name, "track": chosen, "groups": groups})
-    plants = results[0]["groups"]
-    columns = ("entry", *(f"{group}\n{plants[group]['plants']} plants" for group in plants))
-    errors = [[result["groups"][group]["error_cmH2O"] for group in plants] for result in results]
-    rows = [
-        (
-            f"{result['name']}, {result['track']}",
-            *("-" if value is None else f"{value:.3f}" for value in row),
-        )
-        for result, row in zip(results, errors, strict=True)
-    ]
-    title = "Mean |pressure - target| on rigs, cmH2O (lower is better)"
-    written_console({"entries": results}, json).print(table_of(title, columns, rows))
 
 
 def new(
@@ -375,8 +318,6 @@ def headroom(
 
     Example: `ventbench board headroom --check data/bounds-v2.npz`
     """
-    import numpy as np
-
     from ventbench.base.executor import executor
     from ventbench.entries import reference as references
     from ventbench.plants.rigs import load_rigs
@@ -410,14 +351,10 @@ def headroom(
         "file": str(out),
         "sha256": sha256,
         "gains": computed.gains.tolist(),
-        "searches": pids.search_gains.tolist(),
-        "search_errors": pids.search_errors.tolist(),
         "searches_agree": pids.agree.tolist(),
-        "distance": np.round(computed.attainable - computed.lower, 6).tolist(),
         "attainable": float(computed.attainable.mean()),
         "lower": float(computed.lower.mean()),
         "pid": float(computed.pid.mean()),
-        "largest_gap": float(np.max(computed.attainable - computed.lower)),
     }
     written_console(summary, json).print(
         f"wrote {out}\nmean over cells, first step left out: best attainable "

@@ -26,7 +26,7 @@ import numpy as np
 from ventbench.base import compilation
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.entries.cells import PlantError, Runner, runner_of, step_through
+from ventbench.entries.cells import PlantError, Runner, by_breath, runner_of, step_through
 from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.runs import number
 from ventbench.entries.scoring import enter
@@ -293,7 +293,7 @@ class _Bench:
             scenario = nominal_scenario(pip.ravel())
             try:
                 run = step_through(
-                    plants, scenario, self._runner, self._entry, self._tasks, changing=True
+                    by_breath(plants), scenario, self._runner, self._entry, self._tasks
                 )
             except PlantError as error:  # such physics cannot be: the search goes round it
                 broken = divmod(error.index, len(self._lungs))

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 from typing import Protocol as Interface
 
@@ -54,6 +54,20 @@ class Cells:
     draw: Ints  #: counted from 1; 0 without deviations, ``(n,)``.
     rig: Ints  #: session of each lung, ``(L, n)``.
     member: Ints  #: member of the ensemble, ``(L, n)``.
+
+    def batches(self) -> Iterator[tuple[Index, Sequence[Plant], Scenario]]:
+        """Cells that run side by side: index in ``(S, L, n, P)``, plants of each breath, scenario.
+
+        Without stressors all at once; else draw by draw, all conditions and lungs of one. Call it
+        within ``float64()``.
+        """
+        if len(self.conditions) == 1:
+            plants = as_float64(self.plants, len(self.lungs))
+            yield (0,), [plants] * protocol.BREATHS, self.scenario
+            return
+        for draw in range(len(self.draw)):
+            plants, scenario = self.stressed(draw)
+            yield (slice(None), slice(None), draw, 0), by_breath(plants), scenario
 
     def stressed(self, draw: int) -> tuple[Stressed, Scenario]:
         """One draw under every condition, as 64-bit arrays: call it within ``float64()``.
@@ -166,41 +180,6 @@ def _stressed_cells(rigs: Rigs, draws: Draws, chosen: tuple[Condition, ...]) -> 
     return Cells(rigs.lungs, chosen, plants, scenario, nominal, every, draws.rig, draws.member)
 
 
-class ControllerSession(Interface):
-    """Controllers of all cells of one submission, between start and close."""
-
-    @property
-    def failures(self) -> Mapping[int, Failure]:
-        """What went wrong up to now, by index of the cell; a failed cell stays failed."""
-        ...
-
-    def ask(self, cells: Ints, observations: Floats) -> None:
-        """Give some controllers, ``(n,)``, their next observations, ``(n, ROW)``; see :func:`pack`.
-
-        Each is asked by itself, once for each step of each inspiration, in order, after its answer.
-        """
-        ...
-
-    def answers(self) -> tuple[Ints, Floats]:
-        """Take the commands that have come, and wait for one if there is none.
-
-        Cells, shape ``(m,)``, and their ``u_in``, %: finite, 0 for a failed cell, not clipped.
-        """
-        ...
-
-    def act(self, observations: Floats) -> Floats:
-        """Ask every controller and wait; see ``sandbox.pipes.PolledControllers``."""
-        ...
-
-    def processor_time(self) -> float:
-        """Processor time that the controllers have had, s, as the system counts it."""
-        ...
-
-    def close(self) -> None:
-        """End all controllers; may be called more than once."""
-        ...
-
-
 class Runner(Interface):
     """Starts sessions."""
 
@@ -209,7 +188,7 @@ class Runner(Interface):
         """Layers that keep a submission apart, for the record; None makes a result not official."""
         ...
 
-    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> PolledControllers:
         """Make and reset one fresh controller of a submission for each task, which is a cell's.
 
         A controller that cannot be made or reset is a failure of its cell, found in the session.
@@ -255,7 +234,7 @@ class InProcessSession(PolledControllers):
                 self.failures[index] = failed.failure
 
     def ask(self, cells: Ints, observations: Floats) -> None:
-        """Ask some controllers for their next command; see :class:`ControllerSession`."""
+        """Ask some controllers for their next command, as of the base class."""
         for index, row in zip(cells.tolist(), observations.tolist(), strict=True):
             self._answers[index] = 0.0
             if index in self._cells:
@@ -266,12 +245,12 @@ class InProcessSession(PolledControllers):
                     del self._cells[index]
 
     def answers(self) -> tuple[Ints, Floats]:
-        """Take the commands; see :class:`ControllerSession`."""
+        """Take the commands, as of the base class."""
         commands, self._answers = self._answers, {}
         return np.array(list(commands), np.int64), np.array(list(commands.values()))
 
     def processor_time(self) -> float:
-        """Processor time of this process, s; see :class:`ControllerSession`."""
+        """Processor time of this process, s."""
         return time.process_time()
 
     def close(self) -> None:
@@ -289,7 +268,7 @@ class InProcessRunner:
 
     sandbox: Mapping[str, Any] | None = None
 
-    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> PolledControllers:
         """Make and reset one fresh controller for each cell; see :class:`Runner`."""
         return InProcessSession(submission, tasks)
 
@@ -322,8 +301,8 @@ def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
     return SandboxRunner()
 
 
-#: Series of a :class:`ProtocolRun`.
-_SERIES = ("pressure", "requested", "u_in", "expired", "volume")
+#: Index of some cells in arrays of batch shape ``(S, L, n, P)``.
+Index = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -338,7 +317,7 @@ class ProtocolRun:
     u_in: Floats  #: what was applied, %.
     #: airway pressure of the expirations, cmH2O, ``(..., BREATHS, steps)``.
     expired: Floats
-    volume: Floats | None  #: gas in the lung, mL; None where the plants have no such signal.
+    volume: Floats  #: gas in the lung, mL; NaN where the plants have no such signal.
     failures: Mapping[tuple[int, ...], Failure]  #: what failed, by index of the cell.
     #: time on the clock that an answer took on average, s, each time that some came.
     act_seconds: Floats
@@ -365,6 +344,11 @@ def as_float64(plants: PlantT, count: int) -> PlantT:
         return leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
     return jax.tree.map(convert, plants)
+
+
+def by_breath(plants: PlantT) -> list[PlantT]:
+    """Plants of each breath, of leaves ``(L, BREATHS, ...)``."""
+    return [jax.tree.map(lambda x, k=k: x[:, k], plants) for k in range(protocol.BREATHS)]
 
 
 def _strong(tree: Any) -> Any:
@@ -418,7 +402,7 @@ def _select(mask: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(choose, new, old)
 
 
-def _of_cells(values: Array, batch: tuple[int, ...]) -> Floats:
+def _of_cells(values: Array | float, batch: tuple[int, ...]) -> Floats:
     return np.broadcast_to(np.asarray(values), batch).ravel()
 
 
@@ -431,25 +415,22 @@ class PlantError(FloatingPointError):
 
 
 def step_through(
-    plants: Plant,
+    plants: Sequence[Plant],
     scenario: Scenario,
     runner: Runner,
     submission: Submission,
     tasks: Sequence[Task],
-    *,
-    changing: bool = False,
     count: Callable[[], object] = lambda: None,
 ) -> ProtocolRun:
     """Run a submission on every lung and cell. Call it within ``compilation.float64()``.
 
     Args:
-        plants: from :func:`as_float64`, L lungs; leaves may have the cells' batch shape too,
-            ``(L, ..., )`` with axes of length 1 where cells share a plant.
+        plants: of each breath, from :func:`as_float64`, L lungs; leaves may have the batch
+            shape of the cells too, ``(L, ...)``, with axes of length 1 where cells share a plant.
         scenario: cells of each lung, batch shape ``(L, ...)``.
         runner: runs the controllers.
         submission: whose they are.
         tasks: what is told of each lung, length L.
-        changing: the plants are others in each breath: leaves ``(L, BREATHS, ...)``.
         count: called after each round: once every cell has one more command.
 
     Raises:
@@ -461,11 +442,9 @@ def step_through(
     pressure, requested, applied, volume = (np.zeros((cells, ROUNDS)) for _ in range(4))
     cell_tasks = [task for task in tasks for _ in range(cells // len(tasks))]
     breaths = range(protocol.BREATHS)
-    parts = [jax.tree.map(lambda x, k=k: x[:, k], plants) if changing else plants for k in breaths]
-    initial = [_begin(part, scenario, k) for k, part in enumerate(parts)]
+    initial = [_begin(part, scenario, k) for k, part in enumerate(plants)]
     loop, seconds = initial[0][1], []
     ends = [rest for _, rest in initial]
-    has_volume = loop.signals.volume is not None
     # Cells go on by themselves: what one takes, no other one waits for.
     answered, ready = np.zeros(cells, np.int64), np.arange(cells)
     with compilation.float32():  # a submission that uses JAX finds it as it is elsewhere
@@ -475,8 +454,8 @@ def step_through(
             at = np.minimum(answered, ROUNDS - 1).reshape(batch)
             rows = pack(_observe(scenario, loop, at // steps, at % steps))
             pressure[ready, answered[ready]] = _of_cells(loop.signals.scored, batch)[ready]
-            if has_volume:
-                volume[ready, answered[ready]] = _of_cells(loop.signals.volume, batch)[ready]
+            inside = np.nan if loop.signals.volume is None else loop.signals.volume
+            volume[ready, answered[ready]] = _of_cells(inside, batch)[ready]
             start = time.perf_counter()
             with compilation.float32():
                 session.ask(ready, rows[ready])
@@ -501,9 +480,8 @@ def step_through(
                 finished = (over & (answered // steps == k + 1)).reshape(batch)
                 if finished.any():
                     ends[k] = _select(finished, loop, ends[k])
-                    loop = (
-                        _select(finished, initial[k + 1][1], loop) if k + 1 < len(initial) else loop
-                    )
+                    if k + 1 < len(initial):
+                        loop = _select(finished, initial[k + 1][1], loop)
             ready = ready[answered[ready] < ROUNDS]
         failures = dict(session.failures)
     finally:
@@ -523,10 +501,7 @@ def step_through(
     pressure, requested, applied, volume = (
         x.reshape(shape) for x in (pressure, requested, applied, volume)
     )
-    recorded_volume = volume if has_volume else None
-    return ProtocolRun(
-        pressure, requested, applied, expired, recorded_volume, by_cell, np.array(seconds)
-    )
+    return ProtocolRun(pressure, requested, applied, expired, volume, by_cell, np.array(seconds))
 
 
 def run_cells(
@@ -538,46 +513,36 @@ def run_cells(
 ) -> ProtocolRun:
     """Run a submission on cells, batch shape ``(S, L, n, P)``. Call it within ``float64()``.
 
-    Without stressors all cells run together; else the draws run one after the other, all
-    conditions and lungs of one together. Arguments and errors as of :func:`step_through`.
+    Arguments and errors as of :func:`step_through`.
     """
-    lungs, conditions = len(cells.lungs), len(cells.conditions)
-    if conditions == 1:
-        plants = as_float64(cells.plants, lungs)
-        run = step_through(plants, cells.scenario, runner, submission, tasks, count=count)
-        return _reshaped(run, lambda x: x[None], lambda at: (0, *at))
-    runs = []
-    for draw in range(len(cells.draw)):
-        plants, scenario = cells.stressed(draw)
-        condition_tasks = list(tasks) * conditions
+    told = list(tasks) * len(cells.conditions)
+
+    def run(_: Index, plants: Sequence[Plant], scenario: Scenario) -> ProtocolRun:
         try:
-            run = step_through(
-                plants, scenario, runner, submission, condition_tasks, changing=True, count=count
-            )
+            return step_through(plants, scenario, runner, submission, told, count)
         except PlantError as error:
-            name = cells.conditions[error.index // lungs].id
-            raise FloatingPointError(
-                f"the plant under {name} answered with NaN or infinity"
-            ) from error
-        runs.append(
-            _reshaped(
-                run,
-                lambda x: x.reshape(conditions, lungs, 1, *x.shape[1:]),
-                lambda at, draw=draw: (*divmod(at[0], lungs), draw, 0),
-            )
-        )
+            condition, lung = divmod(error.index, len(tasks))
+            where = cells.conditions[condition].id
+            raise FloatingPointError(f"{PlantError(lung)}, under {where}") from error
 
-    series = {name: np.stack([getattr(run, name) for run in runs], axis=2) for name in _SERIES}
-    failures = {at: failure for run in runs for at, failure in run.failures.items()}
-    seconds = np.concatenate([run.act_seconds for run in runs])
-    return ProtocolRun(**series, failures=failures, act_seconds=seconds)
+    return gather(cells, run)
 
 
-def _reshaped(
-    run: ProtocolRun,
-    shape: Callable[[Floats], Floats],
-    index: Callable[[tuple[int, ...]], tuple[int, ...]],
+def gather(
+    cells: Cells, run: Callable[[Index, Sequence[Plant], Scenario], ProtocolRun]
 ) -> ProtocolRun:
-    series = {name: shape(x) for name in _SERIES if (x := getattr(run, name)) is not None}
-    failures = {index(at): failure for at, failure in run.failures.items()}
-    return replace(run, **series, failures=failures)
+    """Run each of :meth:`Cells.batches`, and join what comes: batch shape ``(S, L, n, P)``."""
+    shape = (len(cells.conditions), *cells.pips.shape)
+    index = np.moveaxis(np.indices(shape), 0, -1)
+    series: dict[str, Any] = {}
+    failures, seconds = {}, []
+    for at, plants, scenario in cells.batches():
+        part = run(at, plants, scenario)
+        own = index[at].reshape(*np.shape(scenario.pip), len(shape))
+        failures |= {tuple(own[cell].tolist()): what for cell, what in part.failures.items()}
+        seconds.append(part.act_seconds)
+        for name in ("pressure", "requested", "u_in", "expired", "volume"):
+            values = getattr(part, name)
+            whole = series.setdefault(name, np.empty((*shape, *values.shape[-2:])))
+            whole[at] = values.reshape(whole[at].shape)
+    return ProtocolRun(**series, failures=failures, act_seconds=np.concatenate(seconds))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base import VERSION, files
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Floats
 from ventbench.entries.cells import Protocol
 from ventbench.entries.folder import Submission
 from ventbench.entries.runs import CellFailure, Runs, number
@@ -53,8 +53,6 @@ class Score:
             first, cmH2O, shape ``(L, 1 + K, P)``.
         figures: secondary figures of the scored nominal inspirations by name, shape
             ``(L, P, scored breaths)``; NaN where one does not exist.
-        below: nominal commands below 0 %, shape ``(L,)``.
-        above: nominal commands above 100 %, shape ``(L,)``.
         trajectories: nominal runs with their expirations.
         sandbox: the runner's layers; None in this process.
         timing: seconds, by name; the only numbers that differ from run to run.
@@ -67,8 +65,6 @@ class Score:
     stressed: Runs | None
     controllable: Floats
     figures: Mapping[str, Floats]
-    below: Ints
-    above: Ints
     trajectories: Trajectories
     sandbox: Mapping[str, Any] | None
     timing: Mapping[str, float]
@@ -184,11 +180,8 @@ class Score:
             "official": self.official,
             "complete": self.complete,
             "safe": bool(np.all(self.safe)),
-            "draws": self._draws(lung_score(self.drawn), published=True),
-            **self._normalised(),
+            **self._figures(slice(None)),
             "lungs": {lung: self._lung(i) for i, lung in enumerate(self.lungs)},
-            **self._secondary(slice(None)),
-            "clipped": self._clipped(slice(None)),
             "failures": [failure.to_json() for failure in self.failures],
             "stress": self._stress(),
             "sandbox": None if self.sandbox is None else dict(self.sandbox),
@@ -239,14 +232,12 @@ class Score:
         columns: dict[str, Any] = {"score_cmH2O": self.by_lung}
         if len(self.drawn):
             columns["draws_cmH2O"] = lung_score(self.drawn).mean(axis=0)
-        if (values := self.normalised) is not None:
-            ranked = self.ranked
-            columns["normalised"] = (
-                values[:, 1:][:, ranked].mean((1, 2)) if len(ranked) else values[:, 0].mean(1)
-            )
-            if len(ranked) > ranked.sum():
-                training = values[:, 1:][:, ~ranked].mean((1, 2))
-                columns["held_out_gap"] = columns["normalised"] - training
+        if self.normalised is not None:
+            means = [self._normalised(slice(i, i + 1)) for i in range(len(self.lungs))]
+            scores = [(x["draws"] or {"score": x["nominal"]})["score"] for x in means]
+            columns["normalised"] = np.array(scores, float)
+            if not self.ranked.all():
+                columns["held_out_gap"] = np.array([x["held_out_gap"] for x in means], float)
         columns |= {"safe": self.safe, "peak_cmH2O": self.peak}
         return pd.DataFrame(columns, index=pd.Index(self.lungs, name="lung"))
 
@@ -324,85 +315,74 @@ class Score:
             "pips": {f"{pip:g}": number(error) for pip, error in pips},
             "safe": bool(self.safe[i]),
             "peak_pressure_cmH2O": number(self.peak[i]),
-            "draws": self._draws(lung_score(self.drawn)[:, i : i + 1], first=i),
-            **self._normalised(i),
-            **self._secondary(slice(i, i + 1)),
-            "clipped": self._clipped(slice(i, i + 1)),
+            **self._figures(slice(i, i + 1)),
         }
 
-    def _draws(
-        self,
-        values: Floats,
-        *,
-        first: int = 0,
-        published: bool = False,
-        selection: Bools | slice = slice(None),
-    ) -> dict[str, Any] | None:
-        """Mean over some draws, ``(k, lungs)``, of all lungs or of those from ``first`` on.
-
-        Its interval resamples draws, rigs and members.
-        """
-        if not len(values):
-            return None
-        assert self.rig_draws is not None
-        means = values.mean(axis=1)
-        score, ci95 = math.nan, (math.nan, math.nan)
-        if np.isfinite(means).all():  # a draw that failed must not be left out of a mean
-            lungs = slice(first, first + values.shape[1])
-            rig, member = (
-                self.rig_draws.rig[lungs, selection],
-                self.rig_draws.member[lungs, selection],
-            )
-            score = float(values.mean())
-            ci95 = bootstrap.limits(bootstrap.resampled_scores(values.T, rig, member))
-        identity = self.rig_draws.about()
-        return {
-            "score": number(score),
-            "ci95": [number(limit) for limit in ci95],
-            "values": [number(value) for value in means],
-            **(identity if published else {}),
-        }
-
-    def _normalised(self, lung: int | None = None) -> dict[str, Any]:
-        """Normalised score of a lung or of all; null without a reference.
-
-        ``draws`` are those on rigs that nobody trained on, which rank; ``training`` is the score on
-        rigs of the training, and ``held_out_gap`` the difference.
-        """
-        values, reference = self.normalised, self.protocol.reference
-        if values is None or reference is None:
-            return {"normalised": None}
-        lungs = slice(None) if lung is None else slice(lung, lung + 1)
-        by_draw, ranked = lung_score(values[lungs, 1:]).T, self.ranked
-        training = by_draw[~ranked].mean() if len(ranked) > ranked.sum() else math.nan
-        return {
-            "normalised": {
-                "nominal": number(np.mean(values[lungs, 0])),
-                "draws": self._draws(by_draw[ranked], first=lung or 0, selection=ranked),
-                "training": number(training),
-                "held_out_gap": number(by_draw[ranked].mean() - training) if ranked.any() else None,
-                "attainable_cmH2O": float(reference.attainable[lungs].mean()),
-                "pid_cmH2O": float(reference.pid[lungs].mean()),
-            }
-        }
-
-    def _secondary(self, lungs: slice) -> dict[str, Any]:
+    def _figures(self, lungs: slice) -> dict[str, Any]:
+        """What is said of one lung and of all: draws, normalised, secondary figures, clipping."""
+        draws = self._mean(lung_score(self.drawn)[:, lungs], lungs)
+        if draws is not None and self.rig_draws is not None and lungs == slice(None):
+            draws |= self.rig_draws.about()
         means, missing = {}, {}
         for name, values in self.figures.items():
             finite = values[lungs][~np.isnan(values[lungs])]
             means[name] = number(np.mean(finite)) if finite.size else None
-            missing[name] = int(values[lungs].size - finite.size)
-        missing = {name: count for name, count in missing.items() if count}
-        return {"secondary": means, "secondary_missing": missing}
-
-    def _clipped(self, lungs: slice) -> dict[str, Any]:
-        below, above = int(self.below[lungs].sum()), int(self.above[lungs].sum())
-        total = self.requested[0, 0].size * len(self.below[lungs])
+            if finite.size < values[lungs].size:
+                missing[name] = int(values[lungs].size - finite.size)
+        requested = self.requested[lungs, 0]
+        below, above = int(np.sum(requested < 0.0)), int(np.sum(requested > protocol.U_MAX))
         return {
-            "below": below,
-            "above": above,
-            "commands": total,
-            "share": (below + above) / total,
+            "draws": draws,
+            "normalised": self._normalised(lungs),
+            "secondary": means,
+            "secondary_missing": missing,
+            "clipped": {
+                "below": below,
+                "above": above,
+                "commands": requested.size,
+                "share": (below + above) / requested.size,
+            },
+        }
+
+    def _mean(
+        self, values: Floats, lungs: slice, selection: Bools | slice = slice(None)
+    ) -> dict[str, Any] | None:
+        """Mean over the selected draws of values ``(k, lungs)``.
+
+        Its interval resamples draws, rigs and members.
+        """
+        if not len(values) or self.rig_draws is None:
+            return None
+        means, ci95 = values.mean(axis=1), (math.nan, math.nan)
+        if np.isfinite(means).all():  # a draw that failed must not be left out of a mean
+            rig, member = (x[lungs, selection] for x in (self.rig_draws.rig, self.rig_draws.member))
+            ci95 = bootstrap.limits(bootstrap.resampled_scores(values.T, rig, member))
+        return {
+            "score": number(values.mean()),
+            "ci95": [number(limit) for limit in ci95],
+            "values": [number(value) for value in means],
+        }
+
+    def _normalised(self, lungs: slice) -> Any:
+        """Normalised score of some lungs; None without a reference.
+
+        ``draws`` are those on rigs that nobody trained on, which rank; ``training`` is the score on
+        rigs of the training, and ``held_out_gap`` the difference.
+        """
+        values, reference, ranked = self.normalised, self.protocol.reference, self.ranked
+        if values is None or reference is None:
+            return None
+        by_draw = lung_score(values[lungs, 1:]).T
+        score, training = (
+            by_draw[some].mean() if some.any() else math.nan for some in (ranked, ~ranked)
+        )
+        return {
+            "nominal": number(np.mean(values[lungs, 0])),
+            "draws": self._mean(by_draw[ranked], lungs, ranked),
+            "training": number(training),
+            "held_out_gap": number(score - training),
+            "attainable_cmH2O": float(reference.attainable[lungs].mean()),
+            "pid_cmH2O": float(reference.pid[lungs].mean()),
         }
 
 

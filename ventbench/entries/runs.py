@@ -23,7 +23,6 @@ from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics.bootstrap import limits, resampled_scores
 from ventbench.task.stressors import (
-    CATEGORIES,
     WEIGHTS,
     Condition,
     conditions,
@@ -248,23 +247,8 @@ class Runs:
             "worst_condition": worst["condition"],
             "worst_error": worst["error_cmH2O"],
             "complete": self.complete,
-            "categories": self.by_category(),
             "conditions": list(self.by_condition),
         }
-
-    def by_category(self) -> dict[str, dict[str, float | None]]:
-        """Means of each category of stressors, and of the pairs."""
-        means = {}
-        for category in (*CATEGORIES, "pairs"):
-            at = [k for k, c in enumerate(self.conditions) if category_of(c) == category]
-            if at:
-                means[category] = {
-                    "error_cmH2O": number(np.mean(self.error[at])),
-                    "rise_cmH2O": number(np.mean(self.rise[at])),
-                    "survived": float(np.mean(self.survived[at])),
-                    "unsafe_runs": int(np.sum(~self.safe[at])),
-                }
-        return means
 
     @cached_property
     def by_condition(self) -> tuple[dict[str, Any], ...]:

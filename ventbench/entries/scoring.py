@@ -5,7 +5,6 @@ Scored is the airway pressure; controllers see readings of the sensor.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -29,13 +28,12 @@ from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.manifest import TRACKS
 from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
-from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure, Runs, number
+from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure, Runs
 from ventbench.plants.catalog import SimulatorLike
 from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.sandbox.child.cell import SubmissionError
-from ventbench.task import draws, protocol
+from ventbench.task import protocol
 from ventbench.task.draws import Draws
-from ventbench.task.environment import nominal_scenario
 from ventbench.task.interfaces import Task
 from ventbench.task.metrics.score import (
     InspirationSignals,
@@ -46,7 +44,6 @@ from ventbench.task.metrics.score import (
     steady_error,
     time_above_alarm,
 )
-from ventbench.task.stressors import Condition
 from ventbench.task.waveform import expiratory_command
 from ventbench.trajectories import end_to_end
 
@@ -178,7 +175,6 @@ def run_protocol(
     controllable = controllable_error(run.pressure[0], pip[..., None, None])
     for _, *cell in run.failures:
         controllable[tuple(cell)] = np.nan
-    requested = run.requested[0, :, 0]
     signals = (
         x[0, :, 0][:, :, protocol.SCORED_BREATHS, :]
         for x in (run.pressure, run.u_in, run.requested)
@@ -195,8 +191,6 @@ def run_protocol(
         stressed=under_stress,
         controllable=controllable,
         figures=figures(InspirationSignals(*signals, *levels)),
-        below=np.sum(requested < 0.0, axis=(1, 2, 3)),
-        above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3)),
         trajectories=end_to_end(
             submission.manifest.name, track, names, scoring_protocol.pips, *joined
         ),
@@ -257,9 +251,6 @@ def runs_of(
     for cell in run.failures:  # a controller that ended gave no command to be safe with
         error[cell], plateau[cell] = np.nan, np.nan
         safe[cell] = survived[cell] = False
-    volume = np.full(error.shape, np.nan)
-    if run.volume is not None:
-        volume = run.volume[..., protocol.SCORED_BREATHS, -1].mean(axis=-1)
     lungs = tuple(lung.id for lung in cells.lungs)
     count, (draws, pips) = len(lungs), cells.pips.shape[1:]
 
@@ -277,7 +268,7 @@ def runs_of(
         survived=flat(survived),
         alarm_s=flat(time_above_alarm(run.pressure, *by_breath).max(axis=-1)),
         peak=flat(run.pressure.max(axis=(-2, -1))),
-        volume=flat(volume),
+        volume=flat(run.volume[..., protocol.SCORED_BREATHS, -1].mean(axis=-1)),
         draw=np.repeat(cells.draw, pips),
         plateau_error=flat(plateau),
         requested=flat(run.requested),
@@ -294,73 +285,3 @@ def runs_of(
             if submission is not None
         ],
     )
-
-
-#: Where an entry is tried, in the order of the table.
-GROUPS = ("reference rig", "other members", "other rigs", "held-out rigs")
-
-
-def transfer(
-    submission: Submission,
-    rigs: Rigs,
-    *,
-    track: str | None = None,
-    runner: Runner | None = None,
-    progress: Progress | None = None,
-) -> Runs:
-    """Run an entry on all plants of all scored rigs, without noise; arguments as of `run_protocol`.
-
-    Returns:
-        Figures of all PIPs on all plants; where a lung has fewer than another, its reference runs
-        again in their place.
-
-    Raises:
-        SubmissionError: if the submission cannot be run, or does not enter the track.
-        InputError: if each lung has one rig only.
-    """
-    if rigs.sessions is None:
-        raise InputError("these simulators have one rig a lung: there is nothing to transfer to")
-    runner = runner or runner_of(submission, sandbox=True)
-    track, tasks = enter(submission, track, tuple(lung.id for lung in rigs.lungs), runner)
-    width = rigs.members - 1 + max(map(len, rigs.sessions))
-    plants_of_lungs = []
-    for sessions in rigs.sessions:
-        plants_of_lung = [(sessions[0], member) for member in range(rigs.members)]
-        plants_of_lung += [(rig, 0) for rig in sessions[1:]]
-        plants_of_lungs.append(plants_of_lung + [plants_of_lung[0]] * (width - len(plants_of_lung)))
-    rig, member = np.moveaxis(np.array(plants_of_lungs), -1, 0)
-    pips = np.broadcast_to(np.array(protocol.PIPS), (*rig.shape, len(protocol.PIPS)))
-    with compilation.float64():
-        plants = draws.plants_of(rigs.plants, rig, member)
-        scenario, draw = nominal_scenario(pips), np.zeros(width, np.int64)
-        cells = Cells(rigs.lungs, (Condition(),), plants, scenario, pips, draw, rig, member)
-        run = run_cells(cells, runner, submission, tasks, counted(progress, ROUNDS))
-    return dataclasses.replace(runs_of(run, cells, submission, tasks), requested=None)
-
-
-def by_group(runs: Runs, rigs: Rigs) -> dict[str, Any]:
-    """Errors of an entry by group and lung, of runs from :func:`transfer`, as JSON values.
-
-    For each of :data:`GROUPS` the mean over the lungs that have such plants, the number of plants,
-    and the mean of each lung over its plants and the PIPs; null where a lung has no such plant or
-    the controller failed. cmH2O.
-    """
-    table = runs.to_frame().drop_duplicates(["lung", "pip_cmH2O", "rig", "member"])
-    assert rigs.sessions is not None
-    reference = {
-        lung: sessions[0] for lung, sessions in zip(runs.lungs, rigs.sessions, strict=True)
-    }
-    held_out = {rig for rigs_of_lung in rigs.held_out for rig in rigs_of_lung}
-    on_reference = table.rig == table.lung.map(reference)
-    kinds = [on_reference & (table.member == 0), on_reference, ~table.rig.isin(held_out)]
-    table["group"] = np.select(kinds, GROUPS[:3], GROUPS[3])
-    groups = {}
-    for group in GROUPS:
-        errors = table[table.group == group].groupby("lung", sort=False).error_cmH2O
-        lungs = errors.agg(lambda values: values.mean(skipna=False))
-        groups[group] = {
-            "error_cmH2O": number(lungs.mean(skipna=False)),
-            "plants": int(errors.size().sum()) // len(protocol.PIPS),
-            "lungs": {lung: number(lungs.get(lung, np.nan)) for lung in runs.lungs},
-        }
-    return groups

@@ -30,7 +30,7 @@ import numpy as np
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.sandbox.child import wire
-from ventbench.sandbox.child.cell import SubmissionError
+from ventbench.sandbox.child.cell import Failure, SubmissionError
 from ventbench.sandbox.child.wire import Reply, WireError
 from ventbench.sandbox.child.zygote import (
     CLOCK,
@@ -149,14 +149,31 @@ Outcome = Reply | WireError | None
 
 
 class PolledControllers:
-    """Controllers that are asked each by itself; none waits for another."""
+    """Controllers of all cells of a submission, from start to close; none waits for another."""
+
+    #: what went wrong up to now, by index of the cell; a failed cell stays failed.
+    failures: dict[int, Failure]
 
     def ask(self, cells: Ints, observations: Floats) -> None:
-        """Give some controllers an observation each; see ``ControllerSession``."""
+        """Give some controllers, ``(n,)``, their next observations, ``(n, ROW)``.
+
+        Each is asked by itself, once for each step of each inspiration, in order, after its answer.
+        """
         raise NotImplementedError
 
     def answers(self) -> tuple[Ints, Floats]:
-        """Take what has been answered; see ``ControllerSession``."""
+        """Take the commands that have come, and wait for one if there is none.
+
+        Cells, shape ``(m,)``, and their ``u_in``, %: finite, 0 for a failed cell, not clipped.
+        """
+        raise NotImplementedError
+
+    def processor_time(self) -> float:
+        """Processor time that the controllers have had, s, as the system counts it."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """End all controllers; may be called more than once."""
         raise NotImplementedError
 
     def act(self, observations: Floats) -> Floats:

@@ -195,7 +195,7 @@ class SubmittedFolder(Protocol):
 class SandboxSession(PolledControllers):
     """Fresh, locked-down controllers, one process each, which must show some layers to be in force.
 
-    It is a :class:`ventbench.entries.cells.ControllerSession`, and begins with a task a cell.
+    It begins with a task a cell.
 
     Raises:
         SandboxError: if a cell does not lock itself down.
@@ -276,7 +276,7 @@ class SandboxSession(PolledControllers):
         self._give_up(late)
 
     def ask(self, cells: Ints, observations: Floats) -> None:
-        """Ask some controllers for their next commands, as of ``ControllerSession``."""
+        """Ask some controllers for their next commands, as of the base class."""
         for cell, outcome in self._pipes.early(self._pending).items():
             self._judge(cell, outcome)
         rows, frames = np.ascontiguousarray(observations, "<f8"), {}
@@ -289,7 +289,7 @@ class SandboxSession(PolledControllers):
         self._pipes.send(frames)
 
     def answers(self) -> tuple[Ints, Floats]:
-        """Take the commands that are there, as of ``ControllerSession``."""
+        """Take the commands that are there, as of the base class."""
         commands = dict.fromkeys(self._void, 0.0)
         if self._pending and not self._void:
             patience = self._allowance.patience_s

@@ -67,7 +67,7 @@ CASES = {
     "score pid_best --record r": "add --draws 20",
     "score pid_best --report": "--report needs --out DIR",
     "check file": "give the folder that holds controller.py",
-    "new Bad_Name": "how about bad_name?",
+    "new Bad_Name": "must be lower-case letters",
     "data check folder": "this is a folder. Name one file in it",
     "data check empty.csv": "the file is empty",
     "data check header.csv": "Write at least one breath",

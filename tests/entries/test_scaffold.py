@@ -113,22 +113,10 @@ def test_refuses_to_overwrite(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["demo", "link"]
 
 
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [
-        ("My PID!", "how about my_pid?"),
-        ("Rö-2", "how about ro_2?"),
-        ("9lives", None),
-        ("", None),
-        ("../x", "how about x?"),
-        ("a" * 41, "how about"),
-        ("x\n", "how about x?"),
-    ],
-)
-def test_says_what_a_name_may_be(name, hint, tmp_path):
-    with pytest.raises(InputError, match="must be lower-case letters") as caught:
+@pytest.mark.parametrize("name", ["My PID!", "Rö-2", "9lives", "", "../x", "a" * 41, "x\n"])
+def test_says_what_a_name_may_be(name, tmp_path):
+    with pytest.raises(InputError, match="must be lower-case letters"):
         create(name, "pid", tmp_path)
-    assert hint is None or hint in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ventbench.base.arrays import Floats
-from ventbench.entries.cells import ROUNDS, ControllerSession, Progress, Runner, counted
+from ventbench.entries.cells import ROUNDS, Progress, Runner, counted
 from ventbench.entries.folder import (
     CONTROLLER,
     SEEDS,
@@ -38,17 +38,18 @@ from ventbench.entries.manifest import GROUPS, Finding, Group
 from ventbench.entries.review import inspect_folder
 from ventbench.entries.runs import DRAWS
 from ventbench.sandbox.child.cell import ROW, Failure, SubmissionError, printable
+from ventbench.sandbox.pipes import PolledControllers
 from ventbench.task import draws, protocol
 from ventbench.task.interfaces import Task
 from ventbench.task.lungs import LUNG_IDS, LUNGS
 from ventbench.task.stressors import conditions
 
-#: Yields observations, receives commands in %.
-Script = Generator[list[float], float, None]
-
 #: Breaths and steps of one plain run.
 BREATHS = 2
 STEPS = BREATHS * protocol.INSPIRATION_STEPS
+
+# Columns of a row: of an :class:`~ventbench.task.interfaces.Observation`, targets side by side.
+_TIME, _DT, _PRESSURE, _TARGETS, _COMMAND = 0, 1, 2, slice(3, -1), -1
 
 _PIP = 25.0  # cmH2O
 _FULL, _TIME_CONSTANT = 60.0, 0.2  # of the stand-in for a lung, cmH2O at 100 % and s
@@ -58,7 +59,7 @@ class ContractRun(NamedTuple):
     """One cell: what the controller is told and shown, and what is unusual about it, in words."""
 
     task: Task
-    script: Script
+    inputs: Floats  #: ``(STEPS, ROW)``, see :func:`_inputs`; what was applied before is filled in.
     unusual: str = ""
 
 
@@ -67,74 +68,48 @@ def plain(tracks: Sequence[str]) -> list[ContractRun]:
     runs = []
     for track in tracks:
         lungs = LUNG_IDS if track == "performance" else (None,)
-        runs += [ContractRun(task(track, lung), breaths()) for lung in lungs]
+        runs += [
+            ContractRun(Task(track, lung, protocol.DT, protocol.INSPIRATION_STEPS), _inputs())
+            for lung in lungs
+        ]
     return runs
 
 
 def unusual(run_task: Task) -> list[ContractRun]:
-    """Short runs with inputs at and beyond the edge of what a bench gives."""
+    """Runs with inputs at and beyond the edge of what a bench gives."""
     random = np.random.default_rng(0)
     steps = protocol.INSPIRATION_STEPS
     wild = random.uniform(-20.0, 80.0, steps)
     uneven = random.uniform(0.005, 0.1, steps)
     inputs = {
-        "a control step of 10 ms": _open_loop(dt=0.01),
-        "a control step of 60 ms": _open_loop(dt=0.06),
-        "uneven control steps": _open_loop(dt=uneven),
-        "a pressure of -20 cmH2O": _open_loop(pressure=-20.0),
-        "a pressure of 120 cmH2O": _open_loop(pressure=120.0),
-        "a very noisy pressure": _open_loop(pressure=wild),
-        "a pressure and a target of 0 cmH2O": _open_loop(pressure=0.0, target=0.0),
-        "a target of 60 cmH2O": _open_loop(target=60.0),
+        "a control step of 10 ms": _inputs(dt=0.01),
+        "a control step of 60 ms": _inputs(dt=0.06),
+        "uneven control steps": _inputs(dt=uneven),
+        "a pressure of -20 cmH2O": _inputs(pressure=-20.0),
+        "a pressure of 120 cmH2O": _inputs(pressure=120.0),
+        "a very noisy pressure": _inputs(pressure=wild),
+        "a pressure and a target of 0 cmH2O": _inputs(pressure=0.0, target=0.0),
+        "a target of 60 cmH2O": _inputs(target=60.0),
     }
-    return [
-        ContractRun(run_task, script, f"with {description}")
-        for description, script in inputs.items()
-    ]
+    return [ContractRun(run_task, rows, f"with {what}") for what, rows in inputs.items()]
 
 
-def task(track: str, lung: str | None) -> Task:
-    """What a controller is told of a run."""
-    return Task(track, lung, protocol.DT, protocol.INSPIRATION_STEPS)
+def _inputs(
+    dt: float | Floats = protocol.DT, pressure: float | Floats = np.nan, target: float = _PIP
+) -> Floats:
+    """Observations of all steps of two breaths, ``(STEPS, ROW)``.
 
-
-def breaths() -> Script:
-    """Two breaths on a stand-in for a lung: pressure follows the valve with one time constant."""
-    for _ in range(BREATHS):
-        pressure, command = protocol.PEEP, 5.0
-        for step in range(protocol.INSPIRATION_STEPS):
-            elapsed = step * protocol.DT
-            answer = yield _row(elapsed, protocol.DT, pressure, _target(elapsed), command)
-            command = min(max(answer, 0.0), protocol.U_MAX)
-            equilibrium = protocol.PEEP + _FULL * command / protocol.U_MAX
-            pressure += (equilibrium - pressure) * protocol.DT / _TIME_CONSTANT
-
-
-def _open_loop(
-    dt: float | np.ndarray = protocol.DT,
-    pressure: float | np.ndarray = 20.0,
-    target: float = _PIP,
-) -> Script:
-    steps = protocol.INSPIRATION_STEPS
-    widths = np.broadcast_to(dt, steps)
-    starts, pressures = np.cumsum(widths) - widths, np.broadcast_to(pressure, steps)
-    command = 5.0
-    columns = (starts.tolist(), widths.tolist(), pressures.tolist())
-    for start, width, measured in zip(*columns, strict=True):
-        answer = yield _row(start, width, measured, target, command)
-        command = min(max(answer, 0.0), protocol.U_MAX)
-
-
-def _target(elapsed: float, pip: float = _PIP) -> float:
+    Where the pressure is NaN, a stand-in for a lung answers: it follows the valve with one time
+    constant.
+    """
+    widths = np.broadcast_to(dt, protocol.INSPIRATION_STEPS)
+    starts = np.cumsum(widths) - widths
+    rows = np.zeros((len(widths), ROW))
+    rows[:, _TIME], rows[:, _DT], rows[:, _PRESSURE] = starts, widths, pressure
+    ahead = starts[:, None] + np.arange(1 + protocol.TARGETS_AHEAD) * widths[:, None]
     falls = (protocol.FALL_START, protocol.FALL_END)
-    return float(np.interp(elapsed, falls, (pip, protocol.PEEP)))
-
-
-def _row(elapsed: float, dt: float, pressure: float, target: float, command: float) -> list[float]:
-    ahead = [_target(elapsed + k * dt, target) for k in range(1, protocol.TARGETS_AHEAD + 1)]
-    row = [elapsed, dt, pressure, target, *ahead, command]
-    assert len(row) == ROW
-    return row
+    rows[:, _TARGETS] = np.interp(ahead, falls, (target, protocol.PEEP))
+    return np.tile(rows, (BREATHS, 1))
 
 
 #: Rounds whose time does not count: first calls load and compile.
@@ -145,12 +120,12 @@ _WARM_UP = 3
 class Answers:
     """What came of the runs."""
 
-    commands: tuple[Floats, ...]  #: answers of each run, %, up to its end or failure.
+    commands: Floats  #: answers of each run, %, ``(runs, STEPS)``; NaN once it has failed.
     failures: dict[int, Failure]  #: what failed, by number of the run.
     act_seconds: Floats  #: processor time of one ``act`` in each round, s, without the first ones.
 
 
-def processor_time(session: ControllerSession) -> float:
+def processor_time(session: PolledControllers) -> float:
     """Time by the system's count, s: neither an entry nor a busy machine changes it."""
     return session.processor_time()
 
@@ -166,34 +141,31 @@ def run_all(
     Raises:
         SubmissionError: if the code cannot be imported.
     """
-    commands: list[list[float]] = [[] for _ in runs]
-    failures: dict[int, Failure] = {}
-    seconds = []
+    inputs = np.stack([run.inputs for run in runs])
+    commands, seconds = np.full(inputs.shape[:2], np.nan), []
     session = runner.start(submission, [run.task for run in runs])
     try:
-        rows = [next(run.script) for run in runs]  # of one that has ended, its last again
-        waiting = set(range(len(runs)))
-        while waiting:
-            batch = np.array(rows)
+        for k in range(STEPS):
+            if k % protocol.INSPIRATION_STEPS == 0:
+                pressure, applied = np.full(len(runs), protocol.PEEP), np.full(len(runs), 5.0)
+            rows = inputs[:, k]
+            rows[:, _COMMAND] = applied
+            rows[:, _PRESSURE] = np.where(
+                np.isnan(rows[:, _PRESSURE]), pressure, rows[:, _PRESSURE]
+            )
             live = max(1, len(runs) - len(session.failures))
             start = processor_time(session)
-            answers = session.act(batch)
+            answers = session.act(rows)
             seconds.append((processor_time(session) - start) / live)
             count()
-            for k in sorted(waiting):
-                if k in session.failures:
-                    failures[k] = session.failures[k]
-                    waiting.remove(k)
-                    continue
-                commands[k].append(float(answers[k]))
-                try:
-                    rows[k] = runs[k].script.send(float(answers[k]))
-                except StopIteration:
-                    waiting.remove(k)
+            working = [run for run in range(len(runs)) if run not in session.failures]
+            commands[working, k] = answers[working]
+            applied = np.clip(answers, 0.0, protocol.U_MAX)
+            equilibrium = protocol.PEEP + _FULL * applied / protocol.U_MAX
+            pressure = pressure + (equilibrium - pressure) * protocol.DT / _TIME_CONSTANT
+        return Answers(commands, dict(session.failures), np.array(seconds[_WARM_UP:]))
     finally:
         session.close()
-    arrays = tuple(np.array(values) for values in commands)
-    return Answers(arrays, failures, np.array(seconds[_WARM_UP:]))
 
 
 #: Calls of ``act`` in a run of all draws, in one under every condition, and the longest that those
@@ -333,20 +305,19 @@ def _ran(
     name, tracks = submission.label, submission.manifest.tracks
     plain_runs = plain(tracks)
     run_task = plain_runs[0].task
-    runs = [*plain_runs, ContractRun(run_task, breaths()), *unusual(run_task)]
+    runs = [*plain_runs, plain_runs[0], *unusual(run_task)]
     sandbox = None if runner.sandbox is None else dict(runner.sandbox)
     try:
         answers = run_all(submission, runs, runner, count)
         # By itself, so that the time does not depend on how many run beside it.
-        timed_run = plain_runs[0]._replace(script=breaths())
-        timed_answers = run_all(submission, [timed_run], runner, count)
+        timed_answers = run_all(submission, plain_runs[:1], runner, count)
     except SubmissionError as error:
         # Each begins with the label.
         for problem in str(error).split("\n"):
             advice = _IMPORT_ADVICE if "while it was imported" in problem else _CLASS_ADVICE
             findings.append(_placed("run", problem.removeprefix(f"{name}: "), advice))
         return _report(name, findings, skipped=_TO_RUN[1:], sandbox=sandbox)
-    findings += _failure_findings(runs, answers) or _failure_findings([timed_run], timed_answers)
+    findings += _failure_findings(runs, answers) or _failure_findings(plain_runs, timed_answers)
     findings += _clipping_notes(answers.commands[: len(plain_runs)])
     repeats = (0, len(plain_runs))
     if timed_answers.failures or set(repeats) & set(answers.failures):
@@ -372,9 +343,8 @@ def _seed_findings(
     for seed in seeds(submission.folder):
         with TemporaryDirectory() as folder:
             seeded = with_seed(submission, seed.name, Path(folder))
-            run = runs[0]._replace(script=breaths())
             try:
-                findings = _failure_findings([run], run_all(seeded, [run], runner))
+                findings = _failure_findings(runs, run_all(seeded, runs[:1], runner))
             except SubmissionError as error:
                 findings = [Finding("run", CONTROLLER, str(error), _IMPORT_ADVICE)]
         for finding in findings:
@@ -398,7 +368,8 @@ def _failure_findings(runs: Sequence[ContractRun], answers: Answers) -> list[Fin
 def _failure(run: ContractRun, answers: Answers, indices: list[int]) -> Finding:
     failure = answers.failures[indices[0]]
     detail = f": {failure.detail}" if failure.detail else ""
-    circumstances = _when(run, failure, len(answers.commands[indices[0]]))
+    answered = int(np.isfinite(answers.commands[indices[0]]).sum())
+    circumstances = _when(run, failure, answered)
     more = f" (and in {len(indices) - 1} other runs)" if len(indices) > 1 else ""
     message = f"{failure.what}{circumstances}{detail}{more}"
     return _placed("run", message, _ADVICE.get(failure.kind, _GENERAL_ADVICE))
@@ -419,16 +390,16 @@ def _placed(group: Group, text: str, advice: str) -> Finding:
     return Finding(group, place[1], text[place.end() :], advice, int(place[2]))
 
 
-def _clipping_notes(commands: Sequence[Floats]) -> Iterator[Finding]:
+def _clipping_notes(commands: Floats) -> Iterator[Finding]:
     """A note on commands beyond the valve, by the answers of the plain runs, %."""
-    values = np.concatenate(commands)
+    values = commands[np.isfinite(commands)]
     outside = np.sum((values < 0.0) | (values > protocol.U_MAX))
     if outside:
         message = (
             f"asked for {values.min():.4g} to {values.max():.4g} %, "
             f"outside of 0 to 100 % at {outside} of {values.size} steps"
         )
-        advice = "that is clipped, and the board says how often; harmless if it is meant"
+        advice = "that is clipped, and score.json says how often; harmless if it is meant"
         yield Finding("run", CONTROLLER, message, advice, problem=False)
 
 

@@ -391,9 +391,7 @@ def _required(folder: Path) -> Iterator[Finding]:
     for name, advice in _REQUIRED.items():
         path = folder / name
         if not path.is_file():
-            close = [p.name for p in folder.iterdir() if p.name.lower() == name.lower()]
-            hint = f"; {close[0]} is there: rename it" if close and close[0] != name else ""
-            yield _problem(name, f"is missing{hint}", advice)
+            yield _problem(name, "is missing", advice)
         elif path.stat().st_size == 0:
             yield _problem(name, "is empty", advice)
 

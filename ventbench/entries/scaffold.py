@@ -10,9 +10,6 @@ from __future__ import annotations
 import io
 import os
 import re
-import shutil
-import tempfile
-import unicodedata
 from collections.abc import Callable
 from importlib import resources
 from itertools import product
@@ -140,16 +137,10 @@ def create(
     folder = Path(out) / name
     if os.path.lexists(folder):
         raise InputError(f"{folder} exists; choose another name or --dir DIR; nothing was changed")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{name}."))
-    try:
-        for file, content in contents(name, family, network).items():
-            (draft / file).write_bytes(content)
-        draft.chmod(0o777 & ~_umask())
-        draft.rename(folder)  # all of it or nothing
-    except BaseException:
-        shutil.rmtree(draft, ignore_errors=True)
-        raise
+    written = contents(name, family, network)
+    folder.mkdir(parents=True)
+    for file, content in written.items():
+        (folder / file).write_bytes(content)
     return folder
 
 
@@ -344,10 +335,7 @@ def initial_weights(family: str) -> dict[str, NDArray[np.float32]]:
 
 def _check_name(name: str) -> None:
     if not NAME.fullmatch(name):
-        plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
-        better = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")[:40]
-        hint = f"; how about {better}?" if NAME.fullmatch(better) else ""
-        raise InputError(f"name {name!r} {NAME_RULE}{hint}")
+        raise InputError(f"name {name!r} {NAME_RULE}")
     if name in bundled():
         raise InputError(f"name {name!r} belongs to a submission of ventbench; choose another one")
 
@@ -360,9 +348,3 @@ def _npz(arrays: dict[str, NDArray[Any]]) -> bytes:
     file = io.BytesIO()
     np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
     return file.getvalue()
-
-
-def _umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask

@@ -27,9 +27,6 @@ from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
 from ventbench.task import environment
 
-#: Largest times for 1,000 records, s.
-BUILD_LIMIT_S, VERIFY_LIMIT_S = 10.0, 300.0
-
 SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
 FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
 
@@ -65,39 +62,28 @@ def fill(folder: Path, made: list[create.Draft], count: int) -> None:
     (folder / canonical.ATTESTATIONS).write_text(second_runs)
 
 
-def report(what: str, seconds: float, limit: float) -> None:
-    print(f"{what:44}{seconds:8.1f} s   limit {limit:5.0f} s   ratio {seconds / limit:.2f}")
-
-
 def main(records: int = 1000, verified: int = 100) -> None:
     """Time to build and to verify a leaderboard of many records."""
     plants = frozen.load()
     made = drafts(plants)
-    share = records / 1000
     print(f"{records} records on {os.cpu_count()} cores")
     sizes = [len(x.content) + sum(map(len, x.commands)) for x in made]
     print(f"largest record with its commands: {max(sizes) / 1e3:.0f} kB")
     with tempfile.TemporaryDirectory() as temporary:
-        folder, site = Path(temporary) / "large", Path(temporary) / "site"
+        folder, part = Path(temporary) / "large", Path(temporary) / "part"
         fill(folder, made, records)
-        begun = time.perf_counter()
-        done = build.build(folder, site)
-        report("first build", time.perf_counter() - begun, BUILD_LIMIT_S * share)
-        begun = time.perf_counter()
-        again = build.build(folder, site)
-        report("second build", time.perf_counter() - begun, BUILD_LIMIT_S * share)
-        if again.changed or len(done.changed) < done.files:
-            raise SystemExit("the second build changed something")
-        part = Path(temporary) / "part"
+        for what in ("first build", "second build"):
+            begun = time.perf_counter()
+            build.build(folder, Path(temporary) / "site")
+            print(f"{what:44}{time.perf_counter() - begun:8.1f} s")
         fill(part, made, min(verified, records))
         begun = time.perf_counter()
         found = verify(part, lambda: plants)
         seconds = time.perf_counter() - begun
         if found.problems:
             raise SystemExit("\n".join(found.problems[:5]))
-        scaled = seconds * records / found.records
         what = f"verify ({found.replayed} took {seconds:.1f} s)"
-        report(what, scaled, VERIFY_LIMIT_S * share)
+        print(f"{what:44}{seconds * records / found.records:8.1f} s")
 
 
 if __name__ == "__main__":

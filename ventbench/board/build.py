@@ -143,9 +143,6 @@ def _telling(lines: Sequence[Line]) -> list[Column]:
 
 
 def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
-    scores = [row.normalised.score for row in track.ranked if row.normalised is not None]
-    low = min((x.low for x in scores), default=1.0)
-    high = max((x.high for x in scores), default=1.0)
     rows = []
     for row in track.ranked:
         measured = pages.hardware_of(track.hardware, row.record.name)
@@ -154,7 +151,6 @@ def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
                 "cells": [column.cell(Line(track, "ranked", row)) for column in columns],
                 "path": pages.address(row.record),
                 "baseline": row.record.name == BASELINES[track.name],
-                "plot": pages.interval_plot(row, low, high),
                 "hardware": None if measured is None else pages.hardware_context(measured),
             }
         )

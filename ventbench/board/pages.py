@@ -26,7 +26,7 @@ from ventbench import palette
 from ventbench.base.arrays import Floats
 from ventbench.base.interval import Interval
 from ventbench.base.text import number, page_templates, plain
-from ventbench.board.ranking import HardwareRow, Row, StressRow
+from ventbench.board.ranking import HardwareRow, StressRow
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
@@ -266,9 +266,6 @@ def _float(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-#: Size of the small plot of an interval; the entry's dot never touches its edge.
-INTERVAL_WIDTH, MARGIN = 120, 6
-
 #: Limits between the shades of maps, cmH2O and points of the normalised score: the same for all
 #: entries, so that maps can be compared.
 ERROR_LIMITS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0)
@@ -284,22 +281,6 @@ VALVE_TOP, VALVE_HEIGHT = 400, 140
 
 RIGHT = LEFT + STEP * protocol.INSPIRATION_STEPS
 VALVE_BOTTOM = VALVE_TOP + VALVE_HEIGHT
-
-
-def interval_plot(row: Row, low: float, high: float) -> dict[str, str] | None:
-    """Positions of a score and its interval on an axis that all rows of a track share."""
-    if row.normalised is None:
-        return None
-    score = row.normalised.score
-    # A logarithm, so that one bad entry does not press all others together.
-    span = math.log(high / low) if high > low > 0.0 else 0.0
-
-    def x(value: float) -> float:
-        share = math.log(max(value, low) / low) / span if span else 0.5
-        return MARGIN + (INTERVAL_WIDTH - 2 * MARGIN) * share
-
-    left, dot, right = (x(v) for v in (score.low, score.value, score.high))
-    return {"x": f"{left:.1f}", "width": f"{max(right - left, 1.0):.1f}", "dot": f"{dot:.1f}"}
 
 
 def heat_map(values: Floats, limits: tuple[float, ...], digits: int = 2) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -74,8 +74,7 @@ class Round:
     @property
     def number(self) -> int:
         """Round of the beacon whose value it must take."""
-        delay = timedelta(seconds=self.frozen.delay_s)
-        return self.frozen.chain.first_at(self.frozen.frozen + delay)
+        return self.frozen.chain.first_at(self.frozen.frozen, self.frozen.delay_s)
 
     @property
     def seed(self) -> str:
@@ -156,7 +155,11 @@ def load(folder: Path) -> Round:
     frozen = schema.decoded(_FROZEN, path.read_bytes(), str(path))
     made = Round(folder, frozen, files.sha256(path))
     path = folder / BEACON
-    return _drawn(made, path.read_bytes(), str(path)) if path.is_file() else made
+    if not path.is_file():
+        return made
+    value = beacon.read(path.read_bytes(), str(path))
+    beacon.check(value, frozen.chain, made.number, str(path))
+    return replace(made, value=value)
 
 
 def draw(own: Round, content: bytes, *, now: datetime | None = None) -> Round:
@@ -165,17 +168,8 @@ def draw(own: Round, content: bytes, *, now: datetime | None = None) -> Round:
     Raises:
         InputError: if the time has not come, or the value is not the one that it must take.
     """
-    due = own.frozen.chain.time_of(own.number)
-    if (now or datetime.now(UTC)) < due:
-        raise InputError(f"value {own.number} of the beacon is published at {due:%F %T} UTC")
-    drawn = _drawn(own, content, "the value of the beacon")
-    files.write_json(own.folder / BEACON, msgspec.to_builtins(drawn.value))
-    return drawn
-
-
-def _drawn(own: Round, content: bytes, label: str) -> Round:
-    value = beacon.read(content, label)
-    beacon.check(value, own.frozen.chain, own.number, label)
+    value = beacon.take(content, own.frozen.chain, own.number, now)
+    files.write_json(own.folder / BEACON, msgspec.to_builtins(value))
     return replace(own, value=value)
 
 

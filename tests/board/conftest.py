@@ -286,7 +286,7 @@ def put(folder: Path, made: create.Draft, simulators: ReplayPlants | None = None
 
 def accept(folder: Path) -> None:
     """Vouch for all that says that it is official, as maintainers would, and close the round."""
-    listed = [record.load(path, strict=False) for path in store.record_paths(folder)]
+    listed = [record.load(path) for path in store.record_paths(folder)]
     lines = [
         f'[[second_runs]]\nrecord = "{one.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
         for one in listed

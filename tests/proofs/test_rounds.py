@@ -8,7 +8,6 @@ import json
 import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -148,8 +147,8 @@ def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert own.frozen.worlds == {"faults": 60, "stranger": 60}
     value.write_bytes(referee.value(SECRET, own.number))
     due = own.frozen.chain.time_of(own.number)
-    later = SimpleNamespace(now=lambda zone: due)
-    monkeypatch.setattr(rounds, "datetime", later)
+    take = rounds.beacon.take
+    monkeypatch.setattr(rounds.beacon, "take", lambda *given: take(*given[:3], due))
     played = []
     nobody = Board("", {})
     monkeypatch.setattr(rounds, "play", lambda own, **more: played.append(own) or nobody)

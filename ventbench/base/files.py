@@ -15,6 +15,7 @@ import io
 import json
 import math
 import os
+import stat
 import tempfile
 import tomllib
 from collections.abc import Callable
@@ -84,6 +85,21 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_text(path: Path, text: str) -> None:
     """Create or replace a UTF-8 text file in one step."""
     write_bytes(path, text.encode())
+
+
+def read_limited(path: Path, most: int) -> bytes:
+    """Read a file that anybody may have written, of at most so many bytes.
+
+    Raises:
+        InputError: if it is a link or no plain file, or larger.
+        OSError: if there is none, or it cannot be read.
+    """
+    status = path.lstat()
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path} is no plain file; give the file itself, and no link")
+    if status.st_size > most:
+        raise InputError(f"{path} has {status.st_size} bytes, and may have {most} at most")
+    return path.read_bytes()
 
 
 def as_json(value: Any) -> str:

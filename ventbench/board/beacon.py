@@ -52,9 +52,10 @@ class Chain(schema.Table, frozen=True):
     period: Annotated[int, msgspec.Meta(ge=1, le=10**6)]
     hash: schema.Sha256
 
-    def first_at(self, when: datetime) -> int:
-        """Number of the first round at or after a time."""
-        return max(1, math.ceil((when.timestamp() - self.genesis) / self.period) + 1)
+    def first_at(self, when: datetime, delay_s: int = 0) -> int:
+        """Number of the first round at or after a time and a delay."""
+        waited_s = when.timestamp() + delay_s - self.genesis
+        return max(1, math.ceil(waited_s / self.period) + 1)
 
     def time_of(self, number: int) -> datetime:
         """When a round is published."""
@@ -104,6 +105,20 @@ def read(content: bytes, label: str) -> Value:
 
 def _randomness(signature: str) -> str:
     return hashlib.sha256(bytes.fromhex(signature)).hexdigest()
+
+
+def take(content: bytes, chain: Chain, number: int, now: datetime | None = None) -> Value:
+    """Take the value of a round, as relays publish it; ``now`` is the clock's if not given.
+
+    Raises:
+        InputError: if its time has not come, or it is not that value.
+    """
+    due = chain.time_of(number)
+    if (now or datetime.now(UTC)) < due:
+        raise InputError(f"round {number} of the beacon is published at {due:%F %T} UTC")
+    value = read(content, "the value of the beacon")
+    check(value, chain, number, "the value of the beacon")
+    return value
 
 
 def fetch(chain: Chain, number: int) -> bytes:

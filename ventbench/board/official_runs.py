@@ -100,7 +100,7 @@ def rerun(
     scheduler: str | None = None,
     load: Load = frozen.load,
     runner: Callable[[], Runner] = sandboxed,
-    progress: Callable[[Outcome], None] | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> list[Outcome]:
     """Run the code of records again and compare commands.
 
@@ -112,7 +112,7 @@ def rerun(
         scheduler: address of a Dask scheduler instead, whose workers see the same files.
         load: gives the simulators; outside of this process, a function of a module.
         runner: gives the runner; outside of this process, a function of a module.
-        progress: called after each record.
+        progress: called with how many of how many were run again.
 
     Returns:
         One outcome a record, oldest first.
@@ -126,28 +126,25 @@ def rerun(
     chosen = {store.find_record(board, sha256, Record).sha256 for sha256 in records}
     scores = [score for score in board.scores if not chosen or score.sha256 in chosen]
     identity = canonical.through_json(load().about())
+    available = code_in([folder.parent / "submissions", *sources])
     outcomes: dict[str, Outcome] = {}
     todo: dict[str, tuple[Any, ...]] = {}
-
-    def note(outcome: Outcome) -> None:
-        outcomes[outcome.record] = outcome
-        if progress is not None:
-            progress(outcome)
-
-    available = code_in([folder.parent / "submissions", *sources])
     for score in scores:
-        code, why = available.get(score.header.submission.sha256), ""
+        code = available.get(score.header.submission.sha256)
         if score.header.simulators != identity:
             why = "it was scored on other simulators than those of this ventbench"
         elif code is None:
             why = "no folder at hand has the files that it names; give --source DIR"
-        if why:
-            note(Outcome(score.sha256, score.name, score.track, NOT_RERUN, why))
         else:
-            todo[score.sha256] = score.sha256, code, folder.resolve(), load, runner
+            round_ = board.evidence.rounds.get(score.header.draws.season)
+            todo[score.sha256] = score, round_, code, folder.resolve(), load, runner
+            continue
+        outcomes[score.sha256] = Outcome(score.sha256, score.name, score.track, NOT_RERUN, why)
     with executor(jobs if jobs > 1 and scheduler is None else 0, scheduler) as pool:
-        for _, outcome in results(pool, _run, todo):
-            note(outcome)
+        for done, (sha256, outcome) in enumerate(results(pool, _run, todo), 1):
+            outcomes[sha256] = outcome
+            if progress is not None:
+                progress(done, len(todo))
     return [outcomes[score.sha256] for score in scores]
 
 
@@ -171,49 +168,48 @@ def code_in(places: Iterable[Path]) -> dict[str, Path]:
 
 
 def _run(
-    sha256: str,
+    score: Record,
+    round_: Round | None,
     code: Path,
     folder: Path,
     load: Load,
     runner: Callable[[], Runner],
 ) -> Outcome:
-    """Run the code of one record, which is read again, and compare."""
-    score = store.find_record(store.load(folder), sha256, Record)
-    assert isinstance(score, Record)
-    simulators, apart = load(), runner()
+    """Run the code of one record, and compare."""
+    header, closest, simulators, apart = score.header, list[str](), load(), runner()
     try:
-        round_ = store.load(folder).evidence.rounds.get(score.header.draws.season)
-        protocol_ = protocol_of(score.header, simulators, round_)
+        protocol_ = protocol_of(header, simulators, round_)
         with TemporaryDirectory() as place:
             result = run_protocol(
-                frozen_copy(code, score.header.submission.sha256, Path(place)),
+                frozen_copy(code, header.submission.sha256, Path(place)),
                 protocol_.rigs,
                 track=score.track,
-                stress=0 if score.header.stress is None else DRAWS,
+                stress=0 if header.stress is None else DRAWS,
                 runner=apart,
                 drawn=protocol_.drawn,
             )
-        runs = [(result.requested, result.failures, score.header.failures)]
-        if (stress := score.header.stress) is not None and result.stressed is not None:
-            again = result.stressed
-            runs.append((np.asarray(again.requested), tuple(again.failures), stress.failures))
-        detail, closest = "", []
-        for commands, (requested, failures, named) in zip(score.commands, runs, strict=True):
+        runs: list[tuple[Any, ...]] = [
+            (header.commands, result.requested, result.failures, header.failures)
+        ]
+        if (stress := header.stress) is not None and (stressed := result.stressed) is not None:
+            again = np.asarray(stressed.requested), stressed.failures
+            runs.append((stress.commands, *again, stress.failures))
+        for commands, requested, *failures in runs:
             recorded = store.load_commands(commands, folder / RECORDS)
             again = environment.resolved(requested)
-            detail = detail or difference(recorded, again)
-            off = 0.0 if detail else np.abs(recorded - again).max()
+            failed, named = ({(x.condition, x.lung, x.pip, x.draw) for x in y} for y in failures)
+            detail = difference(recorded, again)
+            if not detail and failed != named:
+                detail = f"{len(failed)} cells failed, {len(named)} in the record"
+            if detail:
+                return Outcome(score.sha256, score.name, score.track, DIFFERENT, detail)
+            off = np.abs(recorded - again).max()
             closest.append(f"commands within {off:.1e} %" if off else "to the bit")
-            failed, before = (
-                {(x.condition, x.lung, x.pip, x.draw) for x in y} for y in (failures, named)
-            )
-            if not detail and failed != before:
-                detail = f"{len(failed)} cells failed, {len(before)} in the record"
-        closeness = ", under stress ".join(closest)
     except (InputError, FloatingPointError) as error:
-        detail, closeness = f"its code cannot be run: {error}", ""
-    state = DIFFERENT if detail else REPRODUCED
-    return Outcome(score.sha256, score.name, score.track, state, detail or closeness)
+        why = f"its code cannot be run: {error}"
+        return Outcome(score.sha256, score.name, score.track, DIFFERENT, why)
+    closeness = ", under stress ".join(closest)
+    return Outcome(score.sha256, score.name, score.track, REPRODUCED, closeness)
 
 
 def difference(recorded: Floats, again: Floats) -> str:
@@ -406,8 +402,6 @@ def _job(work: Path, entry: str) -> Path:
 
 def _job_result(path: Path, bounds: str) -> Result:
     """Read the result that the job of an entry has left; InputError if it is of other bounds."""
-    if path.is_symlink():
-        raise InputError(f"{path} is a link")
     result = schema.read_canonical(rounds.RESULT_DECODER, path)
     if result.bounds != bounds:
         raise InputError(f"{path} is of other draws or bounds; remove the folder")

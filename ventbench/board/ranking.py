@@ -238,10 +238,9 @@ def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:
     The earlier one is that whose code was frozen first, in an earlier round or before it in the
     same, baselines before all. What a record says of its date decides nothing.
     """
-    frozen = [x.frozen for x in leaderboard.evidence.rounds.values() if x.frozen]
     first: dict[str, int] = {}
-    for frozen_round in sorted(frozen, key=lambda x: x.frozen):
-        for entered in frozen_round.entries:
+    for round_ in reversed(leaderboard.rounds):
+        for entered in round_.entries:
             first.setdefault(entered.sha256, len(first))
 
     def place(entry: Entry) -> tuple[bool, int]:

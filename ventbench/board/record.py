@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
+from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
@@ -76,18 +77,14 @@ class Record(schema.Submitted):
         return (self.header.commands, *(() if stress is None else (stress.commands,)))
 
     @property
+    def run(self) -> tuple[str, str, str]:
+        """Name, track and hash of the code: what a round freezes."""
+        return self.name, self.track, self.header.submission.sha256
+
+    @property
     def key(self) -> tuple[str, str, str]:
         """Draws, track and name: what one entry of the board is known by."""
         return self.header.draws.season, self.track, self.name
-
-    @property
-    def basis(self) -> tuple[str, str]:
-        """Simulators and draws, which its figures depend on besides commands, as canonical text."""
-        simulators, draws = (
-            canonical.canonical(value).decode()
-            for value in (self.header.simulators, self.header.draws.to_json())
-        )
-        return simulators, draws
 
 
 class Device(schema.Table, frozen=True):
@@ -217,17 +214,14 @@ def created_of(entry: AnyRecord) -> str:
     return entry.created if isinstance(entry, Withdrawal) else entry.header.created
 
 
-def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
+def from_bytes(content: bytes, label: str) -> AnyRecord:
     """Read and check a record; ``label`` names the file in messages.
-
-    Where the hash is known to be right, it need not be ``strict``: the canonical form is as it was.
 
     Raises:
         InputError: if it is not a record.
     """
-    if strict:
-        canonical.parse(content, label)
     values = schema.read(content, label, _DECODER)
+    canonical.parse(content, label)
     sha256 = canonical.digest(content)
     if isinstance(values, schema.WithdrawalContent):
         return Withdrawal(sha256, values.withdraws, values.reason, values.created)
@@ -237,18 +231,14 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
     return Record(sha256, values)
 
 
-def load(path: Path, *, strict: bool = True) -> AnyRecord:
+def load(path: Path) -> AnyRecord:
     """Read a record's file, whatever it is called; see :func:`from_bytes`.
 
     Raises:
         InputError: if it is not a record.
         OSError: if it cannot be read.
     """
-    if path.is_symlink():
-        raise InputError(f"{path} is a symbolic link; give the record itself")
-    if path.stat().st_size > schema.MAX_BYTES:
-        raise InputError(f"{path} is larger than a record may be, {schema.MAX_BYTES / 1e6:.1f} MB")
-    return from_bytes(path.read_bytes(), str(path), strict=strict)
+    return from_bytes(files.read_limited(path, schema.MAX_BYTES), str(path))
 
 
 def withdrawal(withdraws: str, reason: str) -> bytes:

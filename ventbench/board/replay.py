@@ -33,7 +33,7 @@ from ventbench.board.rounds import Round
 from ventbench.board.schema import Commands, RecordedFailure, ScoreContent
 from ventbench.board.store import Store
 from ventbench.entries import cells as scored
-from ventbench.entries.cells import Cells, ProtocolRun, as_float64
+from ventbench.entries.cells import Cells, Index, ProtocolRun, as_float64, gather
 from ventbench.entries.reference import published, reference_of
 from ventbench.entries.runs import DRAWS, Runs
 from ventbench.entries.scoring import runs_of
@@ -105,36 +105,22 @@ def _breaths(plants: Sequence[Plant], scenario: Scenario, commands: Floats) -> A
 
 def run_of(cells: Cells, commands: Floats) -> ProtocolRun:
     """What commands, %, ``(S, L, n, P, BREATHS, INSPIRATION_STEPS)``, give on cells."""
-    lungs, conditions = len(cells.lungs), len(cells.conditions)
-    parts = []
+
+    def run(at: Index, plants: Sequence[Plant], scenario: Scenario) -> ProtocolRun:
+        own = commands[at].reshape(*np.shape(scenario.pip), *commands.shape[4:])
+        inspired, expired = _breaths(plants, scenario, own)
+        return ProtocolRun(
+            inspired.pressure,
+            inspired.requested,
+            inspired.u_in,
+            expired.pressure,
+            np.full(own.shape, np.nan) if inspired.volume is None else inspired.volume,
+            {},
+            np.zeros(0),
+        )
+
     with compilation.float64():
-        if conditions == 1:
-            plants = [as_float64(cells.plants, lungs)] * protocol.BREATHS
-            phases = _breaths(plants, cells.scenario, commands[0])
-            parts = [jax.tree.map(lambda x: x[None], phases)]
-        else:
-            for draw in range(len(cells.draw)):
-                plants, scenario = cells.stressed(draw)
-                breath_plants = [
-                    jax.tree.map(lambda x, k=k: x[:, k], plants) for k in range(protocol.BREATHS)
-                ]
-                draw_commands = commands[:, :, draw, 0].reshape(
-                    conditions * lungs, *commands.shape[4:]
-                )
-                phases = _breaths(breath_plants, scenario, draw_commands)
-                parts.append(
-                    jax.tree.map(lambda x: x.reshape(conditions, lungs, 1, 1, *x.shape[1:]), phases)
-                )
-    inspired, expired = jax.tree.map(lambda *x: np.concatenate(x, axis=2), *parts)
-    return ProtocolRun(
-        inspired.pressure,
-        inspired.requested,
-        inspired.u_in,
-        expired.pressure,
-        inspired.volume,
-        {},
-        np.zeros(0),
-    )
+        return gather(cells, run)
 
 
 def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
@@ -277,7 +263,7 @@ def protocol_of(
 
 def with_figures(
     leaderboard: Store,
-    load: Load,
+    simulators: ReplayPlants | None,
     problem: Callable[[str], object],
     *,
     note: Callable[[str], object] = lambda text: None,
@@ -289,7 +275,7 @@ def with_figures(
 
     Args:
         leaderboard: without them.
-        load: gives the simulators.
+        simulators: None derives nothing.
         problem: told why a record has none, and of a record whose lung was known.
         note: told whose stressed commands are not at hand.
         progress: called after each record.
@@ -298,9 +284,9 @@ def with_figures(
     """
     memo = {} if memo is None else memo
     replayed: dict[str, Record] = {}
-    simulators = loaded(load, problem) if leaderboard.scores else None
-    for at, record in enumerate(leaderboard.scores if simulators else ()):
-        assert simulators is not None
+    for at, record in enumerate(leaderboard.scores):
+        if simulators is None:
+            break
         path = store.path_of(leaderboard.folder, record.sha256)
         try:
             round_ = leaderboard.evidence.rounds.get(record.header.draws.season)
@@ -335,13 +321,9 @@ def load(folder: Path, simulators: Load | None = None) -> Store:
     def problem(text: str) -> None:
         raise InputError(text)
 
-    return with_figures(
-        store.load(folder),
-        simulators or frozen.load,
-        problem,
-        memo=_MEMO,
-        cached=simulators is None,
-    )
+    leaderboard, cached = store.load(folder), simulators is None
+    plants = loaded(simulators or frozen.load, problem) if leaderboard.scores else None
+    return with_figures(leaderboard, plants, problem, memo=_MEMO, cached=cached)
 
 
 #: Figures of this process.

@@ -18,9 +18,9 @@ fixed by the time of the freeze. A round whose chain is not the pinned public on
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -53,6 +53,7 @@ _MAX_BYTES = 5_000_000
 #: Characters of a name that is none which are shown.
 _MAX_NAME = 80
 
+_Time = Annotated[datetime, msgspec.Meta(tz=True)]
 _Name = Annotated[str, schema.matching(canonical.ROUND_NAME)]
 _Account = Annotated[str, schema.matching(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,62}[A-Za-z0-9])?")]
 
@@ -61,8 +62,8 @@ class Opened(schema.Table, frozen=True):
     """Content of ``round.toml``."""
 
     name: _Name  #: of the round.
-    opened: datetime  #: when, UTC.
-    closes: datetime  #: when entries are frozen at the earliest, UTC.
+    opened: _Time  #: when, UTC.
+    closes: _Time  #: when entries are frozen at the earliest, UTC.
     #: least time from the freeze to the beacon's value, s.
     delay_s: Annotated[int, msgspec.Meta(ge=1, le=10**7)]
     limit: Annotated[int, msgspec.Meta(ge=1, le=1000)]  #: most entries of an account.
@@ -98,7 +99,7 @@ class Frozen(schema.Table, frozen=True):
 
     round: schema.Sha256
     protocol: schema.Sha256
-    frozen: datetime
+    frozen: _Time
     entries: Annotated[list[Entered], msgspec.Meta(min_length=1)]
     left_out: dict[str, str] = msgspec.field(default_factory=dict)
 
@@ -141,6 +142,8 @@ class Round:
     frozen_sha256: str = ""  #: of ``frozen.toml``; empty before.
     #: files of commands of seeds, by entry and track.
     seeds: Mapping[str, Sequence[schema.Commands]] = field(default_factory=dict)
+    #: why an entry is where it is, by name; empty if nobody has said.
+    notes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -154,6 +157,20 @@ class Round:
         return ("open", "frozen", "drawn", "scored")[sum(step is not None for step in steps)]
 
     @property
+    def entries(self) -> Sequence[Entered]:
+        """Entries that were frozen."""
+        return self.frozen.entries if self.frozen else ()
+
+    @property
+    def runs(self) -> dict[str, tuple[str, str, str]]:
+        """Name, track and hash of the code, by the key of what is scored in a result."""
+        return {
+            f"{x.name} ({track})": (x.name, track, x.sha256)
+            for x in self.entries
+            for track in x.tracks
+        }
+
+    @property
     def seed(self) -> bytes:
         """Seed of the draws; InputError if the beacon's value is not there yet."""
         if self.value is None:
@@ -164,27 +181,16 @@ class Round:
     def number(self) -> int:
         """Round of the beacon whose value it must take."""
         assert self.frozen is not None
-        delay = timedelta(seconds=self.opened.delay_s)
-        return self.opened.chain.first_at(self.frozen.frozen + delay)
+        return self.opened.chain.first_at(self.frozen.frozen, self.opened.delay_s)
 
     @property
     def commitment(self) -> str:
         """Hash of the seed, as records state it."""
         return draw_tables.commitment(self.seed)
 
-    def entered(self, name: str, track: str, sha256: str) -> bool:
-        """Whether this very code was frozen for a track."""
-        entries = self.frozen.entries if self.frozen else []
-        return any(x.name == name and x.sha256 == sha256 and track in x.tracks for x in entries)
-
     def draws(self, rigs: Rigs) -> Draws:
         """Draws of the round."""
         return rigs.draws(draw_tables.COUNT, seed=self.seed, name=self.name)
-
-    def notes(self) -> dict[str, str]:
-        """Why an entry is where it is, by name; empty if nobody has said."""
-        path = self.folder / canonical.NOTES
-        return _toml(path, Notes).entries if path.exists() else {}
 
     def bounds(self) -> Reference:
         """Best attainable and best PID of the draws.
@@ -213,25 +219,28 @@ def load(leaderboard: Path, name: str) -> Round:
     opened = _toml(folder / OPENED, Opened)
     if opened.name != name or name == DEVELOPMENT:
         raise InputError(f"{folder / OPENED}, key name: {opened.name} is not the folder's name")
-    round_ = Round(folder, opened)
-    if not (folder / FROZEN).exists():
-        return round_
-    frozen = _toml(folder / FROZEN, Frozen)
-    for key, file in (("round", OPENED), ("protocol", PROTOCOL)):
-        if getattr(frozen, key) != files.sha256(folder / file):
-            raise InputError(f"{folder / file} has been changed since the round was frozen")
-    if frozen.frozen < opened.closes:
-        raise InputError(f"{folder / FROZEN}, key frozen: is before the round closed")
-    names = [entry.name for entry in frozen.entries]
-    if len(set(names)) < len(names):
-        raise InputError(f"{folder / FROZEN}, key entries: names one twice")
-    round_ = Round(folder, opened, frozen, frozen_sha256=files.sha256(folder / FROZEN))
-    if not (folder / BEACON).exists():
-        return round_
-    value = schema.read_canonical(beacon.DECODER, folder / BEACON)
-    beacon.check(value, opened.chain, round_.number, str(folder / BEACON))
-    result = schema.read_canonical(RESULT_DECODER, folder / RESULT) if RESULT in there else None
-    return Round(folder, opened, frozen, value, result, round_.frozen_sha256, seed_commands(folder))
+    notes_path = folder / canonical.NOTES
+    notes = _toml(notes_path, Notes).entries if notes_path.exists() else {}
+    round_ = Round(folder, opened, notes=notes)
+    if FROZEN in there:
+        frozen = _toml(folder / FROZEN, Frozen)
+        for key, file in (("round", OPENED), ("protocol", PROTOCOL)):
+            if getattr(frozen, key) != files.sha256(folder / file):
+                raise InputError(f"{folder / file} has been changed since the round was frozen")
+        if frozen.frozen < opened.closes:
+            raise InputError(f"{folder / FROZEN}, key frozen: is before the round closed")
+        if len({entry.name for entry in frozen.entries}) < len(frozen.entries):
+            raise InputError(f"{folder / FROZEN}, key entries: names one twice")
+        sha256 = files.sha256(folder / FROZEN)
+        round_ = replace(round_, frozen=frozen, frozen_sha256=sha256)
+    if BEACON in there:
+        value = schema.read_canonical(beacon.DECODER, folder / BEACON)
+        beacon.check(value, opened.chain, round_.number, str(folder / BEACON))
+        round_ = replace(round_, value=value, seeds=seed_commands(folder))
+    if RESULT in there:
+        result = schema.read_canonical(RESULT_DECODER, folder / RESULT)
+        round_ = replace(round_, result=result)
+    return round_
 
 
 def seed_commands(folder: Path) -> dict[str, list[schema.Commands]]:
@@ -247,8 +256,12 @@ def names(leaderboard: Path) -> list[str]:
 
 def load_all(leaderboard: Path) -> tuple[Round, ...]:
     """All rounds, the newest first; arguments and errors as of :func:`load`."""
-    all_rounds = [load(leaderboard, name) for name in names(leaderboard)]
-    return tuple(sorted(all_rounds, key=lambda x: (x.opened.closes, x.name), reverse=True))
+    return newest_first(load(leaderboard, name) for name in names(leaderboard))
+
+
+def newest_first(some: Iterable[Round]) -> tuple[Round, ...]:
+    """Rounds in the order of pages: that which closed last comes first."""
+    return tuple(sorted(some, key=lambda x: (x.opened.closes, x.name), reverse=True))
 
 
 def project_entries(leaderboard: Path) -> list[str]:
@@ -318,8 +331,8 @@ def freeze(
         raise InputError(f"round {name} is {round_.state} already")
     if at < round_.opened.closes:
         raise InputError(f"round {name} closes at {round_.opened.closes:%Y-%m-%d %H:%M:%S} UTC")
-    before = [r.frozen for r in load_all(leaderboard) if r.frozen]  # the earliest one last
-    owners = {x.name: x.account for frozen in before for x in frozen.entries}
+    # Of the earliest one last.
+    owners = {x.name: x.account for before in load_all(leaderboard) for x in before.entries}
     good, bad = _sorted_out(requests)
     requested: dict[str, Request] = {}
     for request in sorted(good, key=lambda x: (x.asked, x.name)):
@@ -400,11 +413,7 @@ def draw(leaderboard: Path, name: str, content: bytes, *, now: datetime | None =
     round_ = load(leaderboard, name)
     if round_.state != "frozen":
         raise InputError(f"round {name} is {round_.state}; it must be frozen")
-    due = round_.opened.chain.time_of(round_.number)
-    if _seconds(now) < due:
-        raise InputError(f"round {round_.number} of the beacon is published at {due:%F %T} UTC")
-    value = beacon.read(content, "the value of the beacon")
-    beacon.check(value, round_.opened.chain, round_.number, "the value of the beacon")
+    value = beacon.take(content, round_.opened.chain, round_.number, now)
     files.write_bytes(round_.folder / BEACON, canonical.canonical(msgspec.structs.asdict(value)))
     return load(leaderboard, name)
 
@@ -458,14 +467,9 @@ def _seconds(when: datetime | None) -> datetime:
 
 def _toml(path: Path, kind: type[schema.TableT]) -> schema.TableT:
     try:
-        table = schema.read_toml(path, kind, _MAX_BYTES)
+        return schema.read_toml(path, kind, _MAX_BYTES)
     except FileNotFoundError:
         raise InputError(f"{path} is not there: there is no such round") from None
-    for key in ("opened", "closes", "frozen"):
-        when = getattr(table, key, None)
-        if isinstance(when, datetime) and when.tzinfo is None:
-            raise InputError(f"{path}, key {key}: has no time zone; times are UTC")
-    return table
 
 
 _REQUESTS = msgspec.json.Decoder(list[Any])

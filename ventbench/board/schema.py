@@ -17,6 +17,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.text import deceptive, plain
 from ventbench.board import canonical
@@ -276,9 +277,7 @@ def read_canonical(decoder: msgspec.json.Decoder[T], path: Path) -> T:
         InputError: naming the first key that is wrong, or if it is not canonical.
         OSError: if it cannot be read.
     """
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(f"{path} has more than {MAX_BYTES} bytes")
-    content = path.read_bytes()
+    content = files.read_limited(path, MAX_BYTES)
     canonical.parse(content, str(path))
     return decoded(decoder, content, str(path))
 
@@ -290,10 +289,9 @@ def read_toml(path: Path, kind: type[TableT], most: int) -> TableT:
         InputError: if it is not such a file.
         FileNotFoundError: if there is none.
     """
-    if path.is_symlink() or path.stat().st_size > most:
-        raise InputError(f"{path} is a link, or larger than {most} bytes")
+    content = files.read_limited(path, most)
     try:
-        return msgspec.convert(tomllib.loads(path.read_text("utf-8")), kind)
+        return msgspec.convert(tomllib.loads(content.decode()), kind)
     except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or not of this form
         raise InputError(f"{path}: {error}") from None
 

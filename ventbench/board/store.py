@@ -100,42 +100,32 @@ def measured(records: Iterable[AnyRecord]) -> dict[str, str | None]:
 def in_order(records: Iterable[AnyRecord]) -> tuple[AnyRecord, ...]:
     """Sort records by their times, withdrawals after what they withdraw."""
     by_hash = {entry.sha256: entry for entry in records}
-    ordered: dict[str, AnyRecord] = {}
-    for entry in sorted(by_hash.values(), key=lambda x: (record.created_of(x), x.sha256)):
-        if isinstance(entry, Withdrawal) and (withdrawn := by_hash.get(entry.withdraws)):
-            ordered.setdefault(withdrawn.sha256, withdrawn)
-        ordered.setdefault(entry.sha256, entry)
-    return tuple(ordered.values())
+
+    def place(entry: AnyRecord) -> tuple[str, bool, str]:
+        takes_back = isinstance(entry, Withdrawal)
+        earlier = by_hash.get(entry.withdraws, entry) if takes_back else entry
+        created = max(record.created_of(entry), record.created_of(earlier))
+        return created, takes_back, entry.sha256
+
+    return tuple(sorted(by_hash.values(), key=place))
 
 
-def read_record(path: Path, *, strict: bool = False) -> AnyRecord:
-    """Read a record, named by its SHA-256; ``strict``: check its canonical form again.
+def read_record(path: Path) -> AnyRecord:
+    """Read a record, named by its SHA-256.
 
     Raises:
         InputError: if it was changed.
+        OSError: if it cannot be read.
     """
-    if not path.is_file() or path.is_symlink():
-        raise InputError(f"{path} is no plain file")
-    if path.stat().st_size > schema.MAX_BYTES:
-        raise InputError(f"{path} has been changed: no record has {path.stat().st_size} bytes")
-    content = path.read_bytes()
-    sha256 = canonical.digest(content)
-    if sha256 != path.stem:
-        raise InputError(
-            f"{path} has been changed: its SHA-256 is {sha256}{_content_problem(content)}"
-        )
-    # Its canonical form was checked when it was added, and no byte has changed since.
-    return record.from_bytes(content, str(path), strict=strict)
-
-
-def _content_problem(content: bytes) -> str:
-    """What is wrong inside a changed record, where that can be seen."""
-    for strict in (False, True):
-        try:
-            record.from_bytes(content, "the file", strict=strict)
-        except InputError as error:
-            return f"; {error}"
-    return ""
+    content = files.read_limited(path, schema.MAX_BYTES)
+    sha256, why = canonical.digest(content), ""
+    if sha256 == path.stem:
+        return record.from_bytes(content, str(path))
+    try:  # where it can be seen, say what is wrong inside
+        record.from_bytes(content, "the file")
+    except InputError as error:
+        why = f"; {error}"
+    raise InputError(f"{path} has been changed: its SHA-256 is {sha256}{why}")
 
 
 def find_record(
@@ -206,7 +196,7 @@ def add(
         for commands in (*added.commands, *seeds):
             content = commands_path(commands, path.parent).read_bytes()
             files.write_bytes(commands_path(commands, folder / RECORDS), content)
-    _write(folder, added, path.read_bytes())
+    files.write_bytes(path_of(folder, added.sha256), path.read_bytes())
     return added
 
 
@@ -226,12 +216,8 @@ def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
     content = record.withdrawal(withdrawn, reason)
     withdrawal = record.from_bytes(content, "the withdrawal")
     assert isinstance(withdrawal, Withdrawal)
-    _write(folder, withdrawal, content)
+    files.write_bytes(path_of(folder, withdrawal.sha256), content)
     return withdrawal
-
-
-def _write(folder: Path, added: AnyRecord, content: bytes) -> None:
-    files.write_bytes(path_of(folder, added.sha256), content)
 
 
 def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
@@ -241,7 +227,7 @@ def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
     sentence for each conflict, with the record's hash.
     """
     sentences: list[str] = []
-    by_hash: dict[str, Record | HardwareRecord] = {}
+    by_hash: dict[str, AnyRecord] = {}
     first: dict[str, Record] = {}  # on each draws, by their name
     counting: dict[tuple[str, str, str], Record] = {}  # of each entry, by draws, track and name
     # Whenever it was withdrawn: a record that was made before may be added after.
@@ -250,42 +236,35 @@ def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
     for index, entry in enumerate(records):
         name, problems = f"record {entry.sha256}", list[str]()
         if isinstance(entry, Withdrawal):
-            if entry.withdraws not in by_hash:
+            if not isinstance(by_hash.get(entry.withdraws), Record | HardwareRecord):
                 problems = [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
             elif entry.withdraws in withdrawn_before:
                 problems = [f"{name} withdraws {entry.withdraws[:12]} once more"]
             withdrawn_before.add(entry.withdraws)
-        else:
-            if entry.sha256 in by_hash:
-                problems = [f"{name} is on the leaderboard already"]
-            elif isinstance(entry, Record):
-                common = first.get(entry.header.draws.season)
-                incumbent = None if entry.sha256 in withdrawn else counting.get(entry.key)
-                problems = _conflicts(entry, common, incumbent)
-            by_hash[entry.sha256] = entry
-            if isinstance(entry, Record):
-                first.setdefault(entry.header.draws.season, entry)
-                if entry.sha256 not in withdrawn:
-                    counting.setdefault(entry.key, entry)
+        elif entry.sha256 in by_hash:
+            problems = [f"{name} is on the leaderboard already"]
+        elif isinstance(entry, Record):
+            incumbent = entry
+            if entry.sha256 not in withdrawn:
+                incumbent = counting.setdefault(entry.key, entry)
+            problems = _conflicts(entry, first.setdefault(entry.key[0], entry), incumbent)
+        by_hash[entry.sha256] = entry
         sentences += problems if index >= start else []
     return sentences
 
 
-def _conflicts(entry: Record, first: Record | None, incumbent: Record | None) -> list[str]:
+def _conflicts(entry: Record, first: Record, incumbent: Record) -> list[str]:
     """Conflicts of a score with the first on its draws, and with the one of its entry."""
-    name, sentences = f"record {entry.sha256}", list[str]()
-    if first is not None:
-        # Records can only be compared over the same simulators and draws.
-        keys = ("simulators", "draws")
-        sentences = [
-            f"{name} ({entry.name}), key {key}: differs from record {first.sha256[:12]} "
-            f"({first.name})"
-            for key, value, common in zip(keys, entry.basis, first.basis, strict=True)
-            if value != common
-        ]
-    if incumbent is not None:
+    name = f"record {entry.sha256} ({entry.name})"
+    # Records can only be compared over the same simulators and draws.
+    sentences = [
+        f"{name}, key {key}: differs from record {first.sha256[:12]} ({first.name})"
+        for key in ("simulators", "draws")
+        if getattr(entry.header, key) != getattr(first.header, key)
+    ]
+    if incumbent is not entry:
         sentences.append(
-            f"{name} ({entry.name}): the entry has record {incumbent.sha256[:12]}; withdraw that "
+            f"{name}: the entry has record {incumbent.sha256[:12]}; withdraw that "
             'first, ventbench board withdraw HASH --reason "why"'
         )
     return sentences
@@ -319,13 +298,11 @@ def load_commands(commands: Commands, folder: Path) -> Floats:
         InputError: if the file is missing, or not the one that is named.
     """
     path = commands_path(commands, folder)
-    if not path.is_file() or path.is_symlink():
-        raise InputError(f"{path} is missing: the commands of a record")
-    if path.stat().st_size > MAX_COMMANDS_BYTES:
-        raise InputError(f"{path} is larger than {MAX_COMMANDS_BYTES / 1e6:g} MB")
-    content = path.read_bytes()
-    sha256 = canonical.digest(content)
-    if sha256 != commands.sha256:
+    try:
+        content = files.read_limited(path, MAX_COMMANDS_BYTES)
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing: the commands of a record") from None
+    if (sha256 := canonical.digest(content)) != commands.sha256:
         raise InputError(f"{path} has been changed: its SHA-256 is {sha256}")
     if len(content) != commands.bytes:
         raise InputError(f"key commands.bytes: {path} has {len(content)}")

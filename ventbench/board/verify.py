@@ -13,10 +13,11 @@ that errors follow from commands; who computed them is for :mod:`ventbench.board
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, gate, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.official_runs import code_in, folders
-from ventbench.board.record import AnyRecord, Withdrawal
+from ventbench.board.record import Withdrawal
 from ventbench.board.replay import (
     Load,
     Memo,
@@ -54,6 +55,9 @@ SEED_TOLERANCE = 1e-6
 
 #: Cells of a round whose bound the second optimiser computes anew: about two minutes of one core.
 RECOMPUTED = 24
+
+T = TypeVar("T")
+U = TypeVar("U")
 
 #: Told how many records of how many have been replayed.
 Progress = Callable[[int, int], None]
@@ -103,48 +107,61 @@ def verify(
         OSError: if a file cannot be read.
     """
     report, memo = Report(), {} if memo is None else memo
+    problems = report.problems
     paths = store.record_paths(folder)
     if not paths:
         raise InputError(f"{folder} holds no leaderboard: there is no record in {RECORDS}/")
-    read: list[AnyRecord] = []
-    for path in paths:
-        try:
-            read.append(store.read_record(path, strict=True))
-        except (InputError, OSError) as error:
-            report.problems.append(str(error))
-    entries = store.in_order(read)
+    entries = store.in_order(_readable(store.read_record, paths, problems))
     report.records = len(entries)
+    names = rounds.names(folder)
+    read = rounds.newest_first(_readable(partial(rounds.load, folder), names, problems))
+    simulators = loaded(load, problems.append)
     plain, odd = canonical.walk(folder)
     if site is None and any(map(canonical.BUILT.fullmatch, plain)):
         site = folder
     inputs = {x for x in plain if site != folder or not canonical.BUILT.fullmatch(x)}
-    report.problems += [f"{folder / x} is no plain file or folder; remove it" for x in odd]
-    report.problems += store.conflicts(entries)
-    vouched, problems = gate.attested(folder, store.measured(entries))
-    report.problems += problems if len(entries) == len(paths) else []
-    leaderboard = Store(folder, entries, vouched, tuple(_rounds(folder, load, report, memo)))
-    report.problems += _strange_files(leaderboard, inputs, complete=len(entries) == len(paths))
-    report.problems += [] if problems else _unsigned(leaderboard)
-    for round_ in leaderboard.rounds:
-        report.problems += _unaccounted(round_, leaderboard)
+    problems += [f"{folder / x} is no plain file or folder; remove it" for x in odd]
+    problems += store.conflicts(entries)
+    complete = len(entries) == len(paths)
+    vouched, wrong_lists = gate.attested(folder, store.measured(entries))
+    problems += wrong_lists if complete else []
+    leaderboard = Store(folder, entries, vouched, read)
+    complete &= len(read) == len(names)
+    problems += _strange_files(leaderboard, inputs, complete=complete)
+    problems += [] if wrong_lists else _unsigned(leaderboard)
+    problems += _changed_since(leaderboard)
+    for round_ in read:
+        problems += _unaccounted(round_, leaderboard)
+        if simulators is not None:
+            problems += _other_protocol(round_, simulators, memo)
     leaderboard = with_figures(
         leaderboard,
-        load,
-        report.problems.append,
+        simulators,
+        problems.append,
         note=report.notes.append,
         progress=progress,
         memo=memo,
     )
     report.replayed = sum(score.derived is not None for score in leaderboard.scores)
-    report.problems += _below_bounds(leaderboard)
-    for round_ in leaderboard.rounds:
-        report.problems += _wrong_seeds(round_, leaderboard, load, memo)
-    if not report.problems:  # else whatever is wrong has been said, and moves ranks and pages
-        report.problems += _check_published(leaderboard, site, folder.parent / "README.md", memo)
-        for round_ in leaderboard.rounds:
-            _recompute(round_, load(), recomputed, report, memo)
-    report.problems = list(dict.fromkeys(report.problems))
+    problems += _below_bounds(leaderboard)
+    if simulators is not None:
+        for round_ in read:
+            problems += _wrong_seeds(round_, leaderboard, simulators, memo)
+    if simulators is not None and not problems:  # else what is wrong moves ranks and pages
+        problems += _check_published(leaderboard, site, folder.parent / "README.md", memo)
+        for round_ in read:
+            _recompute(round_, simulators, recomputed, report, memo)
+    report.problems = list(dict.fromkeys(problems))
     return report
+
+
+def _readable(read: Callable[[T], U], some: Iterable[T], problems: list[str]) -> Iterator[U]:
+    """What can be read; adds to the problems why the others cannot."""
+    for one in some:
+        try:
+            yield read(one)
+        except (InputError, OSError) as error:
+            problems.append(str(error))
 
 
 def _strange_files(leaderboard: Store, plain: set[str], *, complete: bool) -> list[str]:
@@ -152,27 +169,23 @@ def _strange_files(leaderboard: Store, plain: set[str], *, complete: bool) -> li
 
     If the entries are not complete, nobody knows which commands the missing ones name.
     """
-    problems, folder, entries = [], leaderboard.folder, leaderboard.records
-    complete &= len(leaderboard.rounds) == len(rounds.names(folder))
-    named = {entry.sha256 for entry in entries}
+    problems, folder = [], leaderboard.folder
     of_seeds = [x for round_ in leaderboard.rounds for x in round_.seeds.values()]
     used = [*(x.commands for x in leaderboard.scores), *of_seeds]
-    commands = {x.sha256 for own in used for x in own}
-    for name in sorted(plain - {ATTESTATIONS}):
-        path = Path(name)
-        if not canonical.named(name):
-            problems.append(f"{folder / name} is no part of a leaderboard; remove it")
-        elif complete and path.parts[0] == RECORDS and path.suffix != canonical.RECORD_SUFFIX:
-            of = commands if path.suffix == canonical.ACTIONS_SUFFIX else named
-            if path.stem not in of:
-                problems.append(f"{folder / name} belongs to no record; remove it")
+    named = {f"{x.sha256}{canonical.ACTIONS_SUFFIX}" for own in used for x in own}
+    for entry in leaderboard.records:
+        path = store.path_of(folder, entry.sha256)
+        named |= {path.name, gate.signature_path(path).name}
     signatures = {gate.signature_path(path) for path in gate.statements(folder)}
-    signature_files = (folder / x for x in sorted(plain) if x.endswith(canonical.SIGNATURE_SUFFIX))
-    return problems + [
-        f"{path} signs no file; remove it"
-        for path in signature_files
-        if path not in signatures and path.parent.name != RECORDS
-    ]
+    for path in (folder / name for name in sorted(plain)):
+        if not canonical.named(path.relative_to(folder).as_posix()):
+            problems.append(f"{path} is no part of a leaderboard; remove it")
+        elif path.parent.name == RECORDS:
+            if complete and path.name not in named:
+                problems.append(f"{path} belongs to no record; remove it")
+        elif path.suffix == canonical.SIGNATURE_SUFFIX and path not in signatures:
+            problems.append(f"{path} signs no file; remove it")
+    return problems
 
 
 def _unsigned(leaderboard: Store) -> list[str]:
@@ -197,53 +210,40 @@ def _unaccounted(round_: Round, leaderboard: Store) -> list[str]:
     Each frozen entry has one record or one failure on each of its tracks, its seeds have a score or
     a failure, and there is no other record of these draws; but a correction, once it is withdrawn.
     """
-    path, result = round_.folder / rounds.RESULT, round_.result
+    path, result, runs = round_.folder / rounds.RESULT, round_.result, round_.runs
     records = {x.sha256: x for x in leaderboard.scores if x.header.draws.season == round_.name}
     if result is None:
         return [f"{path} is missing: records are of the round's draws"] if records else []
-    runs = {
-        f"{entry.name} ({track})": (entry, track)
-        for entry in (round_.frozen.entries if round_.frozen else ())
-        for track in entry.tracks
-    }
     problems = [
         f"{path}: {key} has {'both a record and a failure' if key in result.failed else 'neither'}"
         for key in runs
         if (key in result.records) == (key in result.failed)
     ]
-    withdrawn, corrected = leaderboard.evidence.withdrawn, set[str]()
     for key, sha256 in result.records.items():
         record, at = records.pop(sha256, None), store.path_of(leaderboard.folder, sha256)
         if key not in runs:
             problems.append(f"{path}, key records: {key} was not frozen")
         elif record is None:
-            missing = f"{at} is missing: the record of {key} in round {round_.name}"
-            problems += [] if at.exists() else [missing]  # what cannot be read was named
-        elif (record.name, record.track, record.header.submission.sha256) != (
-            runs[key][0].name,
-            runs[key][1],
-            runs[key][0].sha256,
-        ):
+            if not at.exists():  # what cannot be read was named
+                missing = f"{at} is missing: the record of {key} in round {round_.name}"
+                problems.append(missing)
+        elif record.run != runs[key]:
             problems.append(f"{path}, key records: {at} is not of {key} as it was frozen")
         elif record.official and sha256 not in leaderboard.attested:
             problems.append(f"{at}, of round {round_.name}, is signed by no key of {ATTESTATIONS}")
-        if sha256 in withdrawn:
-            corrected.add(key)
+    withdrawn = leaderboard.evidence.withdrawn
+    corrected = {runs[k][:2] for k, sha in result.records.items() if k in runs and sha in withdrawn}
     problems += [
         f"{store.path_of(leaderboard.folder, x.sha256)} is not in {path}"
         for x in records.values()
-        if f"{x.name} ({x.track})" not in corrected
+        if x.run[:2] not in corrected
     ]
-    seeds = [key for key in (*result.failed, *result.seeds) if key not in runs]
+    stated = {key.partition(", seed ")[0] for key in (*result.failed, *result.seeds)}
     problems += [
-        f"{path}, keys failed and seeds: {key} was not frozen"
-        for key in seeds
-        if key.partition(", seed ")[0] not in runs
+        f"{path}, keys failed and seeds: {key} was not frozen" for key in sorted(stated - set(runs))
     ]
-    return problems + [
-        f"{path}, key seeds: {key} has no record"
-        for key in {*result.seeds, *round_.seeds} - set(result.records)
-    ]
+    unrecorded = {*result.seeds, *round_.seeds} - set(result.records)
+    return problems + [f"{path}, key seeds: {key} has no record" for key in sorted(unrecorded)]
 
 
 def _check_published(leaderboard: Store, site: Path | None, readme: Path, memo: Memo) -> list[str]:
@@ -272,52 +272,40 @@ def _check_published(leaderboard: Store, site: Path | None, readme: Path, memo: 
     return problems
 
 
-def _rounds(folder: Path, load: Load, report: Report, memo: Memo) -> Iterator[Round]:
-    """Read the rounds, newest first, and note what is wrong with them.
+def _changed_since(leaderboard: Store) -> Iterator[str]:
+    """Notes on what was not frozen, and entries that are not what the newest round has frozen.
 
     Entries stay as they were ranked until the next round is open.
     """
-    all_rounds: list[Round] = []
-    for name in rounds.names(folder):
-        try:
-            round_ = rounds.load(folder, name)
-            all_rounds.append(round_)
-            entered = {x.name for x in round_.frozen.entries} if round_.frozen else set[str]()
-            report.problems += [
-                f"{round_.folder / canonical.NOTES}, key entries: {x} was not frozen"
-                for x in set(round_.notes()) - entered
-            ]
-        except (InputError, OSError) as error:
-            report.problems.append(str(error))
-    all_rounds.sort(key=lambda x: x.opened.closes, reverse=True)
-    for at, round_ in enumerate(all_rounds):
-        yield round_
-        if round_.frozen is None:
-            continue
-        simulators = loaded(load, report.problems.append)
-        if simulators is None:
-            return
-        for key in rounds.protocol_differences(round_, simulators.about()):
-            report.problems.append(f"{round_.folder}: this ventbench has another protocol: {key}")
-        places = [folder.parent / "submissions"]
-        available, named = code_in(places), {x.name: x for x in folders(places)}
-        for entry in round_.frozen.entries if at == 0 else ():
-            if entry.name in named and entry.sha256 not in available:
-                report.problems.append(
-                    f"{named[entry.name]} is not what was frozen in round {round_.name}, "
+    places = [leaderboard.folder.parent / "submissions"]
+    available, by_name = code_in(places), {x.name: x for x in folders(places)}
+    for round_ in leaderboard.rounds:
+        for name in sorted(set(round_.notes) - {x.name for x in round_.entries}):
+            yield f"{round_.folder / canonical.NOTES}, key entries: {name} was not frozen"
+    for round_ in leaderboard.rounds[:1]:
+        for entry in round_.entries:
+            if entry.name in by_name and entry.sha256 not in available:
+                yield (
+                    f"{by_name[entry.name]} is not what was frozen in round {round_.name}, "
                     f"{entry.sha256[:12]}"
                 )
-        if round_.result is not None:
-            state = (
-                round_.commitment,
-                round_.result.bounds,
-                files.sha256(round_.folder / rounds.BOUNDS),
-            )
-            identity = canonical.canonical(simulators.about())
-            report.problems += once(memo, (state, identity), _wrong_bounds, round_, simulators)
 
 
-def _wrong_seeds(round_: Round, leaderboard: Store, load: Load, memo: Memo) -> list[str]:
+def _other_protocol(round_: Round, simulators: ReplayPlants, memo: Memo) -> Iterator[str]:
+    """Parts of the protocol of a round that this ventbench does not have, and wrong bounds."""
+    if round_.frozen is not None:
+        for key in rounds.protocol_differences(round_, simulators.about()):
+            yield f"{round_.folder}: this ventbench has another protocol: {key}"
+    if round_.result is not None:
+        file = files.sha256(round_.folder / rounds.BOUNDS)
+        state = round_.commitment, round_.result.bounds, file
+        identity = canonical.canonical(simulators.about())
+        yield from once(memo, (state, identity), _wrong_bounds, round_, simulators)
+
+
+def _wrong_seeds(
+    round_: Round, leaderboard: Store, simulators: ReplayPlants, memo: Memo
+) -> list[str]:
     """Scores of seeds that their commands do not give."""
     problems, path, result = [], round_.folder / canonical.SEEDS, round_.result
     if result is None:
@@ -329,7 +317,7 @@ def _wrong_seeds(round_: Round, leaderboard: Store, load: Load, memo: Memo) -> l
         stated, where = result.seeds.get(key, []), leaderboard.folder / RECORDS
         commands = round_.seeds.get(key, [])
         try:
-            given = seed_scores(replayed[sha256], commands, where, load(), round_, memo)
+            given = seed_scores(replayed[sha256], commands, where, simulators, round_, memo)
             same = len(given) == len(stated) and np.allclose(given, stated, 0.0, SEED_TOLERANCE)
             if not same:
                 raise InputError("its commands do not give the scores of the result")

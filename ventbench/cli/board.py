@@ -17,7 +17,6 @@ from ventbench.cli.options import (
     bar,
     console_of,
     emit,
-    notes,
     written_console,
 )
 
@@ -264,21 +263,16 @@ def _rerun(
     """Run code again; note in the report what came of it."""
     from ventbench.board import official_runs
 
-    with notes().status("running code again") as status:
-
-        def note(outcome: official_runs.Outcome) -> None:
-            if outcome.state == official_runs.REPRODUCED:
-                report.reproduced += 1
-            status.update(f"{report.reproduced} records reproduced")
-
+    with bar("running code again") as running:
         outcomes = official_runs.rerun(
             folder,
             records=records,
             sources=sources,
             jobs=jobs,
             scheduler=scheduler,
-            progress=note,
+            progress=running,
         )
+    report.reproduced = sum(x.state == official_runs.REPRODUCED for x in outcomes)
     report.second_runs = [str(x) for x in outcomes]
     report.problems += [str(x) for x in outcomes if x.state == official_runs.DIFFERENT]
     report.notes += [str(x) for x in outcomes if x.state == official_runs.NOT_RERUN]

@@ -107,7 +107,7 @@ def unseen_plants(recordings: RigRecordings, simulators: frozen.Frozen, chosen: 
     for turn in range(turns):
         left = [k for own in by_lung.values() if len(own) > 1 for k in own[turn::turns]]
         own = np.where(np.isin(session, [*left, *simulators.rejected]), 0.0, weight)
-        fitted, _ = fit(whole, jnp.asarray(own, jnp.float32), around)
+        fitted = fit(whole, jnp.asarray(own, jnp.float32), around)
         now = np.isin(chosen.session, left)
 
         def choose(new: Any, old: Any, now: Any = now) -> Any:

@@ -28,6 +28,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import tomli_w
 from jax import Array
 from scipy.stats import chi2
@@ -436,13 +437,10 @@ def _scatter(gain: Floats, group: Ints) -> tuple[Floats, float, float]:
     Returns:
         The deviations; the standard deviation; and the correlation between neighbours.
     """
-    deviations, squares, freedom, products = np.zeros(len(gain)), 0.0, 0, []
-    for name in np.unique(group):
-        gains_of_rig = gain[group == name]
-        deviations[group == name] = gains_of_rig - np.median(gains_of_rig)
-        deviation = gains_of_rig - gains_of_rig.mean()
-        squares, freedom = squares + float(deviation @ deviation), freedom + len(gains_of_rig) - 1
-        products += (deviation[1:] * deviation[:-1]).tolist()
-    sd = float(np.sqrt(squares / max(freedom, 1)))
-    lag = float(np.mean(products) / sd**2) if products and sd > 0 else 0.0
-    return deviations * (sd / max(float(np.std(deviations)), 1e-12)), sd, lag
+    of_rig = pd.Series(gain).groupby(group)
+    deviation = pd.Series(gain) - of_rig.transform("mean")
+    sd = float(np.sqrt((deviation**2).sum() / max(len(gain) - of_rig.ngroups, 1)))
+    products = deviation * deviation.groupby(group).shift()
+    lag = float(products.mean() / sd**2) if products.notna().any() and sd > 0 else 0.0
+    around = np.asarray(gain - of_rig.transform("median"))
+    return around * (sd / max(float(np.std(around)), 1e-12)), sd, lag

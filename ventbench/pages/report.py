@@ -336,19 +336,18 @@ def _row(figure: Any, axes: Any, name: str, gains: Floats, error: Floats) -> Non
 
 def _map(axis: Any, gains: Floats, error: Floats, d: float, limits: tuple[float, float]) -> Any:
     """One map; the values are not evenly spaced, so each is one cell wide."""
-    selected = gains[:, 2] == d
-    (P, row), (I, column) = (  # noqa: E741
-        np.unique(gains[selected, k], return_inverse=True) for k in (0, 1)
-    )
-    values = np.full((P.size, I.size), np.nan)
-    values[row, column] = error[selected]
+    import pandas as pd
+
+    table = pd.DataFrame(gains, columns=["P", "I", "D"]).assign(error=error)
+    values = table[table["D"] == d].pivot(index="P", columns="I", values="error")
+    low, high = limits
     image = axis.imshow(
-        values, origin="lower", cmap="viridis_r", vmin=limits[0], vmax=limits[1], aspect="auto"
+        values, origin="lower", cmap="viridis_r", vmin=low, vmax=high, aspect="auto"
     )
     y, x = np.unravel_index(int(np.nanargmin(values)), values.shape)
     axis.plot(x, y, marker="x", color="#e2603c", markersize=7, markeredgewidth=2)
     axis.set_xlabel("I", fontsize=8)
-    for ticks, mark in ((I, axis.set_xticks), (P, axis.set_yticks)):
+    for ticks, mark in ((values.columns, axis.set_xticks), (values.index, axis.set_yticks)):
         at = np.unique(np.linspace(0, ticks.size - 1, 5).round().astype(int))
         mark(at, [f"{ticks[k]:g}" for k in at], fontsize=7)
     return image

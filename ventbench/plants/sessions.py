@@ -18,9 +18,6 @@ from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
-#: Median intervals at which the rigs run, ms, from and to; others are not regular.
-CLUSTERS_MS = ((31.5, 32.1), (33.3, 34.45))
-
 #: Between fast and slow rigs, ms.
 _FAST_MS = 32.9
 # A sample is late if its interval exceeds the median by so much (ms); a rig with more than this
@@ -40,7 +37,6 @@ class SampleTiming:
     spiky: Bools  #: whether more than a few samples come late.
     inspiratory: Ints  #: number of inspiratory samples.
     known: Bools  #: False where times were blank, so that ``spiky`` says nothing.
-    regular: Bools  #: whether the interval is one at which the rigs run.
 
 
 def sample_timing(breaths: Breaths) -> SampleTiming:
@@ -48,9 +44,8 @@ def sample_timing(breaths: Breaths) -> SampleTiming:
     interval = np.where(breaths.valid[:, 1:], breaths.dt[:, :-1] * 1000.0, np.nan)
     median = np.nanmedian(interval, axis=1)
     late = np.nanmean(interval - median[:, None] > _LATE_MS, axis=1)
-    regular = np.any([(low <= median) & (median <= high) for low, high in CLUSTERS_MS], axis=0)
     inspiratory = np.count_nonzero(breaths.inspiratory, axis=1)
-    return SampleTiming(median, late > _SPIKY_SHARE, inspiratory, ~breaths.time_inferred, regular)
+    return SampleTiming(median, late > _SPIKY_SHARE, inspiratory, ~breaths.time_inferred)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ WEIGHT = np.append(1.0 * (np.arange(18) % 3 != 1), np.full(6, 0.4))
 def fitted_to(measured, reconstructed, sessions, around, progress=lambda share: None):
     with float64():
         data = inspirations(join([measured, reconstructed]), sessions, RECORDED_LUNGS)
-        return fit(data, jnp.asarray(WEIGHT), around, config=CONFIG, progress=progress)[0].pooled
+        return fit(data, jnp.asarray(WEIGHT), around, config=CONFIG, progress=progress).pooled
 
 
 @pytest.fixture(scope="module")

@@ -189,7 +189,7 @@ def judged(*parts: Breaths) -> list[LabelTest]:
     with float32():
         data = inspirations(breaths, table, labels)
         around = centre(labels, len(table))
-        fitted, _ = fit(data, jnp.ones(len(breaths)), around, config=FitConfig(iterations=160))
+        fitted = fit(data, jnp.ones(len(breaths)), around, config=FitConfig(iterations=160))
         rigs = plants(fitted.pooled, groups_of_sessions(table, labels))
     counts = np.full(len(table), len(breaths))
     errors = {index: [0.0] * len(labels) for index in range(len(table))}

@@ -52,7 +52,7 @@ def test_networks_of_one_lung_and_of_all_are_trained_apart(monkeypatch, tmp_path
         runs, zeros = len(seeds), np.zeros((len(seeds), 1), np.float32)
         error = np.arange(runs, 0, -1).astype(np.float32)
         numbers, seconds = np.arange(runs), np.zeros(1)
-        return TrainedPolicies(numbers, error, numbers[:1], zeros, zeros, seconds, 0.0)
+        return TrainedPolicies(numbers, error, numbers[:1], zeros, seconds, 0.0)
 
     monkeypatch.setattr(training, "train", train_none)
     monkeypatch.setattr(training, "_pid_errors", lambda lungs: [0.0] * len(lungs.weights))

@@ -408,18 +408,16 @@ def _advance(
     scales: Scales,
     noise: Noise,
     config: FitConfig,
-) -> tuple[tuple[Fitted, Any], Array]:
+) -> tuple[Fitted, Any]:
     optimiser = _optimiser(config)
 
-    def iterate(carry: tuple[Fitted, Any], _: None) -> tuple[tuple[Fitted, Any], Array]:
+    def iterate(carry: tuple[Fitted, Any], _: None) -> tuple[tuple[Fitted, Any], None]:
         fitted, state = carry
-        value, gradient = jax.value_and_grad(loss)(
-            fitted, data, weight, around, scales, noise, config
-        )
+        gradient = jax.grad(loss)(fitted, data, weight, around, scales, noise, config)
         updates, state = optimiser.update(gradient, state)
-        return (jax.tree.map(jnp.add, fitted, updates), state), value
+        return (jax.tree.map(jnp.add, fitted, updates), state), None
 
-    return jax.lax.scan(iterate, carry, None, length=CHUNK)
+    return jax.lax.scan(iterate, carry, None, length=CHUNK)[0]
 
 
 def fit(
@@ -429,7 +427,7 @@ def fit(
     config: FitConfig | None = None,
     start: Fitted | None = None,
     progress: Callable[[float], object] = lambda share: None,
-) -> tuple[Fitted, float]:
+) -> Fitted:
     """Fit all rigs at once, in the precision of the data.
 
     Args:
@@ -439,9 +437,6 @@ def fit(
         config: settings of the optimisation.
         start: where to start; the centre if not given.
         progress: called with the share that is done, 0..1.
-
-    Returns:
-        The fit, and its loss.
     """
     scales, noise, config = Scales(), Noise(), config or FitConfig()
     count, rigs = data.start.shape[0], around.pooled.session_gain.shape[0]
@@ -452,12 +447,11 @@ def fit(
         jnp.full(rigs, jnp.asarray(noise.unknown_start, float)),
     )
     carry: tuple[Fitted, Any] = (fitted, _optimiser(config).init(fitted))  # pyright: ignore[reportArgumentType]
-    value = float("inf")
     for iteration in range(0, config.iterations, CHUNK):
-        carry, values = _advance(carry, data, weight, around, scales, noise, config)
-        value = float(values[-1])
+        carry = _advance(carry, data, weight, around, scales, noise, config)
+        jax.block_until_ready(carry)  # so that Ctrl-C ends it, and progress is true
         progress((iteration + CHUNK) / config.iterations)
-    return carry[0], value
+    return carry[0]
 
 
 #: Parameters that the second stage fits, and the prior standard deviation of their logarithms.

@@ -233,7 +233,6 @@ class _Fits:
 
     scored: Fitted  #: fit to all breaths.
     members: list[Fitted]  #: fits without each fold.
-    resampled: list[Fitted]  #: fits to resampled breaths.
     excluding_rigs: list[Fitted]  #: fits without the sessions of each round.
     tests: list[LabelTest]  #: tests of the labels of all sessions.
 
@@ -271,7 +270,7 @@ def _fits(problem: _Problem, parts: WorkFolder, progress: Progress) -> _Fits:
         stored, finished = checkpoint.restore(template)
         if finished:
             return stored
-        fitted, _ = fit(
+        fitted = fit(
             problem.inspirations, jnp.asarray(weight), problem.centre, settings, start, tell
         )
         if expiration:
@@ -304,7 +303,7 @@ def _fits(problem: _Problem, parts: WorkFolder, progress: Progress) -> _Fits:
     doubtful = _worst(_label_tests(problem, scored, resampled, first))
     second = excluding_rigs("again", doubtful) if doubtful else first
     tests = _label_tests(problem, scored, resampled, second)
-    return _Fits(scored, members, resampled, second, tests)
+    return _Fits(scored, members, second, tests)
 
 
 def _worst(tests: Sequence[LabelTest]) -> list[int]:

@@ -106,8 +106,6 @@ class TrainedPolicies:
     validation: NDArray[np.float32]
     episodes: Ints  #: breaths that a run had seen at each point of its curve, ``(points,)``.
     curves: NDArray[np.float32]  #: nominal error of the policy then, cmH2O, ``(R, points)``.
-    #: error of the policy on the fresh cells, cmH2O, ``(R, points)``.
-    validation_curves: NDArray[np.float32]
     #: computing time of all runs together until each point, without compiling, ``(points,)``.
     seconds: Floats
     #: time of compiling, which comes first, with the chunk that is run for it, s.
@@ -138,7 +136,7 @@ def fresh_error(lungs: environment.Lungs, policy: Any) -> Array:
 def _advance(
     method: Method, runs: _Run, plants: environment.Lungs, count: int
 ) -> tuple[_Run, Array]:
-    """``count`` iterations of each run, then both errors, shape ``(R, 2)``."""
+    """``count`` iterations of each run, then the nominal errors, shape ``(R,)``."""
 
     def advance(run: _Run, plant: environment.Lungs) -> tuple[_Run, Array]:
         def iterate(state: Any, _: None) -> tuple[Any, None]:
@@ -149,8 +147,7 @@ def _advance(
         fresh = fresh_error(plant, policy)
         better = fresh < run.error
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), policy, run.best)
-        errors = jnp.stack([nominal_error(plant, policy), fresh])
-        return _Run(state, best, jnp.where(better, fresh, run.error)), errors
+        return _Run(state, best, jnp.where(better, fresh, run.error)), nominal_error(plant, policy)
 
     return jax.vmap(advance)(runs, plants)
 
@@ -199,8 +196,8 @@ def train(
         plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
         runs, first = _start(method, seeds, plants)
         points = -(-method.iterations // chunk)
-        curves = np.full((len(seeds), points + 1, 2), np.nan, np.float32)
-        curves[:, 0, 0] = first
+        curves = np.full((len(seeds), points + 1), np.nan, np.float32)
+        curves[:, 0] = first
         seconds, compiling = np.zeros(points + 1), np.zeros(())
         carry: Any = (runs, curves, seconds, compiling)
         settings = {
@@ -234,8 +231,7 @@ def train(
             policies=jax.tree.map(np.asarray, runs.best),
             validation=np.asarray(runs.error),
             episodes=np.arange(points + 1) * chunk * method.breaths,
-            curves=curves[..., 0],
-            validation_curves=curves[..., 1],
+            curves=curves,
             seconds=seconds,
             compile_seconds=float(compiling),
         )

@@ -7,7 +7,6 @@ and bags of ROS (rosbags). Nothing is resampled.
 from __future__ import annotations
 
 import json
-import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -22,12 +21,12 @@ from ventbench.base.errors import InputError, require
 from ventbench.base.text import few
 from ventbench.recordings.foreign import sizes
 from ventbench.recordings.foreign.tables import (
-    RATES,
     Table,
     clock_seconds,
     decoded,
     listed,
     named,
+    rate_of,
     read_spreadsheet,
     read_text,
     readable,
@@ -155,7 +154,9 @@ def _of_document(file: str, content: Any, kind: str) -> Table:
         table = table.noted(f"Columns of other lengths were left out ({few(omitted, 5)}).")
     stated = ((n, str(beside.get(key))) for n in table.columns for key in (n, f"{n}_unit"))
     units = {name: unit for name, unit in stated if is_unit(unit)}
-    return replace(table, rate=_stated_rate(beside), units=table.units | units)
+    rates = (rate_of(name, number) for name, number in beside.items())
+    rate = next((rate for rate in rates if rate is not None), None)
+    return replace(table, rate=rate, units=table.units | units)
 
 
 def _leaves(value: Any, path: str = "") -> dict[str, Any]:
@@ -191,13 +192,6 @@ def _by_name(content: dict[str, Any]) -> dict[str, Any]:
             rest = {n: x for n, x in content.items() if n not in (name, title)}
             return rest | {name: dict(zip(map(str, lists[title]), values, strict=True))}
     return content
-
-
-def _stated_rate(beside: Mapping[str, Any]) -> float | None:
-    """Sampling rate, Hz, among the values that stand beside columns."""
-    plain = {re.sub(r"[^a-z]|hz$", "", name.lower()): value for name, value in beside.items()}
-    rates = (plain[name] for name in RATES if isinstance(plain.get(name), int | float))
-    return next((float(rate) for rate in rates if rate > 0.0), None)
 
 
 def _channels(

@@ -14,7 +14,7 @@ import numpy as np
 
 from ventbench.base.arrays import Floats, Pieces
 from ventbench.base.errors import InputError
-from ventbench.recordings.foreign.tables import FREQUENCIES, INTERVALS, Table, named
+from ventbench.recordings.foreign.tables import Table, named, rate_of
 from ventbench.recordings.headers import Conversion, conversion, is_unit
 
 #: Names of the values of a long table, and most things that it measures.
@@ -114,13 +114,12 @@ def _pivoted(table: Table, mapped: Mapping[str, str]) -> Table:
     row = places.ngroup().to_numpy()
     first = np.unique(row, return_index=True)[1]
     unit_column = next((name for name, x in words.items() if _units(x)), None)
-    headers, columns, units = named(kinds[kind]), {}, {}
-    for name, written in headers.items():
-        of_kind = table.columns[kind] == written
-        columns[name] = np.full(len(first), np.nan)
-        columns[name][row[of_kind]] = table.columns[values][of_kind]
-        if unit_column is not None:
-            units[name] = str(table.columns[unit_column][of_kind][0])
+    headers, units = named(kinds[kind]), dict[str, str]()
+    wide = pd.Series(table.columns[values], [row, table.columns[kind]]).unstack()
+    columns = {name: wide[written].to_numpy() for name, written in headers.items()}
+    if unit_column is not None:
+        of_kind = dict(zip(table.columns[kind], table.columns[unit_column], strict=True))
+        units = {name: str(of_kind[written]) for name, written in headers.items()}
     for name, x in table.columns.items():
         kept = name not in (kind, values, unit_column) and len(pd.unique(x)) > 1
         if kept and name not in columns and (x == x[first][row]).all():
@@ -184,15 +183,10 @@ def _unpacked(
 
 def _interval(table: Table, starts: Floats | None, lengths: Floats) -> Floats | None:
     """Time between samples in each row, s: as a column says, the file, or the starts of rows."""
-    for name, x in table.columns.items():
-        key = re.sub(r"[^a-z]", "", table.headers.get(name, name).lower())
-        if not table.is_numeric(name) or not (x > 0).all():
-            continue
-        if key.replace("hz", "") in FREQUENCIES or (key.endswith("hz") and "rate" in key):
-            return 1.0 / np.asarray(x, float)
-        for unit, size in (("ms", 1e-3), ("us", 1e-6), ("s", 1.0), ("", 1.0)):
-            if key.endswith(unit) and key.removesuffix(unit) in INTERVALS:
-                return size * np.asarray(x, float)
+    for name in filter(table.is_numeric, table.columns):
+        header, x = table.headers.get(name, name), np.asarray(table.columns[name], float)
+        if (rate := rate_of(header, x, "s", certain=True)) is not None:
+            return 1.0 / rate
     if table.rate:
         return np.full(len(lengths), 1.0 / table.rate)
     if starts is None or len(starts) < 3:

@@ -74,8 +74,10 @@ _CLOCK = re.compile(
 )
 
 #: Names of a sampling rate, Hz, and of an interval, s, above a table or beside it.
-FREQUENCIES, _OTHERS, INTERVALS = _TEXTS["rates"].values()
-RATES = (*FREQUENCIES, *_OTHERS)
+_FREQUENCIES, _OTHERS, _INTERVALS = _TEXTS["rates"].values()
+
+#: A number above a table, and the unit behind it.
+_STATED = re.compile(r"(?<![^\s,;:=|])(\d+\.?\d*)(?![^\s,;:=|a-z])[\s,;:=|]*([a-z]*)(/sample)?")
 
 #: First cells of lines that hold names, and units, of the columns right of them.
 _TITLES, _UNIT_TITLES = _TEXTS["titles"].values()
@@ -515,14 +517,29 @@ def _rate(above: list[list[str]], mark: str) -> float | None:
     """Sampling rate, Hz, that a line above the table states."""
     for cells in above:
         text = " ".join(cells).replace(mark, ".").lower()
-        for number in re.finditer(r"(?<![^\s,;:=|])(\d+\.?\d*)[\s,;:=|]*([a-z/]*)", text):
-            value, unit = float(number[1]), number[2]
-            name = re.sub(r"[^a-z]|hz", "", text[: number.start()])
-            if name in RATES and value > 0.0:
-                return value * (1000.0 if unit == "khz" else 1.0)
-            of_sample = unit in ("s/sample", "sec/sample", "ms/sample", "msec/sample")
-            if (of_sample or (name in INTERVALS and unit in ("s", "ms"))) and value > 0.0:
-                return (1000.0 if unit.startswith("m") else 1.0) / value
+        for number in _STATED.finditer(text):
+            name = "interval" if number[3] else text[: number.start()]
+            unit = number[2].replace("ec", "")
+            if (rate := rate_of(name, float(number[1]), unit)) is not None:
+                return rate
+    return None
+
+
+def rate_of(name: str, number: Any, unit: str = "", certain: bool = False) -> Any:
+    """Sampling rate, Hz, that positive numbers state by their name; None if they state none.
+
+    The name is that of a rate or, with a unit in it or beside it, of an interval. A rate that is
+    ``certain`` cannot be that of breaths.
+    """
+    if not isinstance(number, int | float | np.ndarray) or not np.all(number > 0):
+        return None
+    key = re.sub(r"[^a-z]", "", name.lower())
+    rate = key.removesuffix("hz")
+    if rate in _FREQUENCIES or (rate in _OTHERS and (rate != key or not certain)):
+        return number * (1000.0 if unit == "khz" else 1.0)
+    for time, size in UNITS["time"].items():
+        if {key, key + unit} & {interval + time for interval in _INTERVALS}:
+            return 1.0 / (float(size) * number)
     return None
 
 

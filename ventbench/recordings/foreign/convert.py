@@ -178,7 +178,7 @@ def import_recording(
     layout = layout or recognise(table.columns)
     spec = _layout(layout, table)
     roles = _roles(table, mapped, spec, rate)
-    spoken = spec.words | dict(words or {})
+    spoken = {x.casefold(): number for x, number in (spec.words | dict(words or {})).items()}
     table, roles = _states(table, roles, spoken)
     by_role = {role: name for name, role in roles.items() if role not in ("group", "unused")}
     changes = _conversions(table, by_role, units, spec)
@@ -323,7 +323,11 @@ def _selected(table: Table, select: dict[str, str]) -> Table:
             raise InputError(
                 f"--select {name}={value}: {table.file} has no column {name}; it has {table.names}"
             )
-        keep &= np.array([_same(cell, value) for cell in table.columns[name].tolist()])
+        values = table.columns[name]
+        if table.is_numeric(name):
+            keep &= values == _number(value)
+        else:
+            keep &= values == value
     if not keep.any():
         conditions = ", ".join(f"{n}={v}" for n, v in select.items())
         raise InputError(f"{table.file}: no row has {conditions}")
@@ -332,13 +336,12 @@ def _selected(table: Table, select: dict[str, str]) -> Table:
     return table.rows(keep).noted(f"{int(keep.sum())} of {len(keep)} rows were selected.")
 
 
-def _same(cell: Any, value: str) -> bool:
-    if str(cell) == value:
-        return True
+def _number(word: str) -> float | None:
+    """The number that a word is, NaN of a blank one; None if it is none."""
     try:
-        return float(cell) == float(value)
+        return float(word or "nan")
     except ValueError:
-        return False
+        return None
 
 
 def _layout(name: str | None, table: Table) -> Layout:
@@ -500,19 +503,16 @@ def _states(
     """
     columns, units, roles, sentences = dict(table.columns), dict(table.units), dict(roles), []
     for name, values in table.columns.items():
-        role = roles.get(name)
-        if values.dtype.kind != "U" or role not in (None, "u_in", "u_out"):
+        if values.dtype.kind != "U" or roles.get(name, "u_out") not in ("u_in", "u_out"):
             continue
         words = {word.casefold(): word for word in np.unique(values).tolist() if word}
         state = STATES.get(frozenset(words))
-        if state is None or words.keys() <= {word.casefold() for word in spoken}:
+        if state is None or words.keys() <= spoken.keys():
             continue
-        if role is None:
-            if not state.phase or "u_out" in roles.values():
-                continue
-            roles[name] = "u_out"
-        one, zero = (words[word] for word in (state.one, state.zero))
-        if role == "u_in":
+        if name not in roles and not (state.phase and "u_out" not in roles.values()):
+            continue
+        one, zero = words[state.one], words[state.zero]
+        if roles.setdefault(name, "u_out") == "u_in":
             one, zero = (zero, one) if state.phase else (one, zero)
             units[name] = "1"
         columns[name] = np.where(values == "", np.nan, np.where(values == one, 1.0, 0.0))
@@ -520,32 +520,22 @@ def _states(
     return replace(table, columns=columns, units=units).noted(*sentences), roles
 
 
-def _numbers(table: Table, name: str, words: Mapping[str, float]) -> Floats:
+def _numbers(table: Table, name: str, spoken: Mapping[str, float]) -> Floats:
     """Numbers of a column, in which words may stand for some."""
     values = table.columns[name]
     if table.is_numeric(name):
         return np.asarray(values, float)
-    spoken = {word.casefold(): number for word, number in words.items()}
-    kinds, which = np.unique(np.char.lower(values.astype(str)), return_inverse=True)
-    numbers = np.full(len(kinds), np.nan)
-    for k, word in enumerate(kinds.tolist()):
-        if word.casefold() in spoken:
-            numbers[k] = spoken[word.casefold()]
-        elif word:
-            try:
-                numbers[k] = float(word)
-            except ValueError:
-                examples = [str(x) for x in dict.fromkeys(values.tolist()) if x][:2]
-                examples.sort(
-                    key=lambda x: not re.match("open|on|true|yes|high|1", x, re.IGNORECASE)
-                )
-                option = ",".join(f"{x}={1 - n}" for n, x in enumerate(examples))
-                raise InputError(
-                    f"{table.file}, column {name}: its cells are no numbers, such as "
-                    f"{examples[0]!r}; say what they stand for, such as "
-                    f"--map-values {quote(option)}"
-                ) from None
-    return numbers[which.reshape(-1)]
+    kinds, which = np.unique(values.astype(str), return_inverse=True)
+    numbers = [spoken.get(word.casefold(), _number(word)) for word in kinds.tolist()]
+    if None in numbers:
+        examples = [str(x) for x in dict.fromkeys(values.tolist()) if x][:2]
+        examples.sort(key=lambda x: not re.match("open|on|true|yes|high|1", x, re.IGNORECASE))
+        option = ",".join(f"{x}={1 - n}" for n, x in enumerate(examples))
+        raise InputError(
+            f"{table.file}, column {name}: its cells are no numbers, such as {examples[0]!r}; say "
+            f"what they stand for, such as --map-values {quote(option)}"
+        )
+    return np.array(numbers, float)[which.reshape(-1)]
 
 
 def _repeats(raw: Mapping[str, Floats]) -> tuple[Bools, str]:
@@ -649,14 +639,13 @@ def _time(
     keys: list[Ints],
 ) -> tuple[Floats, str]:
     """Time of each row, s; NaN where the file leaves it blank."""
-    if rate is not None and rate <= 0:
-        raise InputError(f"--rate {rate:g}: a positive rate in Hz is needed")
-    if rate is not None:
-        return np.arange(len(table)) / rate, f"Sampling rate {rate:g} Hz, as given."
-    if time is None:
+    if rate is not None or time is None:
         stated = next(filter(None, (table.header(n).interval for n in by_role.values())), None)
-        rate = table.rate or 1.0 / (stated or np.nan)
-        return np.arange(len(table)) / rate, f"Sampling rate {rate:g} Hz, of the file."
+        hertz = rate if rate is not None else table.rate or 1.0 / (stated or np.nan)
+        if hertz <= 0:
+            raise InputError(f"--rate {hertz:g}: a positive rate in Hz is needed")
+        whence = "of the file" if rate is None else "as given"
+        return np.arange(len(table)) / hertz, f"Sampling rate {hertz:g} Hz, {whence}."
     steps = np.diff(time)
     inside = np.isfinite(steps)
     for key in keys:

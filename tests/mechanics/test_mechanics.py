@@ -224,7 +224,6 @@ def test_a_late_sensor_is_told_beside_the_circuit_that_would_do_the_same():
     (term,) = only(late_by(recording(20.0, 20.0, n=20, seed=5), 0.03)).terms
     assert term.name == "circuit_compliance"
     assert term.alternatives == ("sensor_lag",)
-    near(term.parameters["equivalent_lag"], 0.03, 0.1)
 
 
 @pytest.mark.parametrize(("R", "quadratic", "lag"), [(20.0, 30.0, 0.03), (10.0, 0.0, 0.08)])
@@ -315,7 +314,7 @@ def test_gaps_partial_breaths_and_clipped_sensors():
         found = only(replace(whole, pressure=pressure, flow=flow, volume=volume))
         near(found.R, 20.0, 0.03)
         near(found.C, 20.0, 0.03)
-        assert "end of the sensor's range" in " ".join(found.notes)
+        assert "pressure saturate at 24 cmH2O" in " ".join(found.notes)
     # Parts of breaths only: the first second of some, nothing of others.
     valid = whole.valid.copy()
     valid[:4, 130:] = False

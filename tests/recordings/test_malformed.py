@@ -300,13 +300,6 @@ def test_many_problems_are_counted_and_the_first_twenty_shown(rows, write_csv):
     assert (again.problems, again.total, str(again)) == (error.problems, error.total, str(error))
 
 
-def test_ids_that_do_not_increase_are_a_warning(rows, write_csv):
-    rows[5][ID] = rows[4][ID]
-    report = check(write_csv(rows))
-    assert report.ok
-    assert (report.warnings[0].line, report.warnings[0].column) == (7, "id")
-
-
 def test_milliseconds_are_refused(rows, write_csv):
     for row in rows:
         row[TIME] = str(1000 * float(row[TIME]))

@@ -28,6 +28,7 @@ from ventbench.mechanics.labels import (
 from ventbench.mechanics.regression import (
     BASE,
     COLUMNS,
+    PARABOLIC,
     TIMES,
     CrossProducts,
     RegressionFit,
@@ -38,9 +39,8 @@ from ventbench.mechanics.regression import (
     cross_products,
     effect_size,
     fit,
-    parabolic,
 )
-from ventbench.mechanics.segments import Segment, clipped_share, segments
+from ventbench.mechanics.segments import Segment, segments
 from ventbench.mechanics.term_selection import (
     FEWEST_BREATHS,
     SelectedTerm,
@@ -48,9 +48,9 @@ from ventbench.mechanics.term_selection import (
     delay,
     select_terms,
 )
-from ventbench.recordings.bad_samples import MEASURED, clean, isolated, notable
+from ventbench.recordings.bad_samples import MEASURED, clean, notable
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.roles import check_roles, find_saturation
+from ventbench.recordings.roles import check_roles, find_saturation, opposite_sign
 from ventbench.system_id.fit import t_quantile
 from ventbench.task.lungs import Lung
 
@@ -63,9 +63,6 @@ _WIDEST = 10.0
 
 #: Least share of the inspired volume that must be seen to leave, and most.
 _CLOSES = (0.6, 1.6)
-
-#: Correlation of pressure and volume below which they do not belong to one lung.
-_TOGETHER = 0.2
 
 #: Largest flow of a breath, mL/s, beyond which another unit is likely, and least.
 _FLOWS = (20.0, 4000.0)
@@ -95,19 +92,15 @@ def _symptom(breaths: Breaths) -> str:
     values = breaths.flow if breaths.flow is not None else breaths.volume
     assert values is not None
     known = breaths.valid & np.isfinite(breaths.pressure) & np.isfinite(values)
-    use = np.flatnonzero(known.sum(axis=1) >= 3)
-    if not len(use):
-        return f"{signal} and pressure are hardly ever known together"
     if breaths.flow is not None:
         steps = np.where(known, values * breaths.dt, 0.0)
         volume = np.cumsum(steps, axis=1)
     else:
         steps = np.where(known[:, 1:] & known[:, :-1], np.diff(values, axis=1), 0.0)
         volume = values
-    into, out = (np.maximum(sign * steps[use], 0.0).sum(axis=1) for sign in (1.0, -1.0))
-    inspired, expired = float(np.median(into)), float(np.median(out))
-    pairs = ((breaths.pressure[i, known[i]], volume[i, known[i]]) for i in use)
-    together = [np.corrcoef(p, v)[0, 1] for p, v in pairs if np.ptp(p) > 0 and np.ptp(v) > 0]
+    inspired, expired = (
+        float(np.median(np.maximum(sign * steps, 0.0).sum(axis=1))) for sign in (1.0, -1.0)
+    )
     if expired < _CLOSES[0] * inspired:
         return (
             f"of {inspired:.0f} mL that flow in, {expired:.0f} mL are seen to leave (median of the "
@@ -119,7 +112,7 @@ def _symptom(breaths: Breaths) -> str:
             f"{inspired:.0f} mL flow in and {expired:.0f} mL are seen to leave (median of the "
             f"breaths); the {signal} misses part of the inspirations, or its zero is off"
         )
-    if together and float(np.median(together)) < -_TOGETHER:
+    if opposite_sign(breaths.pressure[known], volume[known]):
         return f"volume falls while pressure rises; the sign of the {signal} is reversed"
     if breaths.flow is not None:
         peak = float(np.nanmedian(np.nanmax(np.where(breaths.valid, breaths.flow, np.nan), axis=1)))
@@ -128,8 +121,8 @@ def _symptom(breaths: Breaths) -> str:
     return f"pressure and {signal} do not move together as those of one lung do"
 
 
-#: Share of clipped pressures, and residual, cmH2O, above which a note warns the reader.
-_NOTED_CLIPPING, _NOTED_NOISE = 0.02, 1.0
+#: Residual, cmH2O, above which a note warns the reader.
+_NOTED_NOISE = 1.0
 
 #: Peak flow, L/s, below which a note says that R is known at small flow only.
 _SMALL_FLOW = 0.2
@@ -246,7 +239,6 @@ def _doubted(lung: Mechanics, counts: dict[str, int], count: int) -> Mechanics:
 
 
 def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
-    breaths, unlikely = _drop_isolated(breaths)
     measured = segments(breaths)
     if not measured:
         raise InputError(
@@ -258,18 +250,17 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     table = bounded(cross_products(at_lung))
     lag = None if delayed_by is None else delayed_by.parameters.get("tau")
     selected = select_terms(table, 0.0 if lag is None else 0.5 * float(np.ptp(lag.ci95)))
-    full = _fit_lung(table, selected, at_lung, breaths)
+    full = _fit_lung(table, [term.column for term in selected], at_lung, breaths)
     plain = _fit_lung(table, _quadratic_resistance(table), at_lung, breaths)
     label = Lung(float(breaths.R[0]), float(breaths.C[0]))
     best = _best_for_label(full, plain, label)
     source = "pressure and flow" if breaths.flow is not None else "pressure and volume"
     noise = float(np.sqrt(full.fitted.variance))
-    notes = (*unlikely, *_notes(breaths, at_lung, table, noise))
+    notes = _notes(breaths, at_lung, table, noise)
     R, C = best.resistance(0.0), best.compliance()
     problem = problem_with(breaths, R, C)
     terms = (
-        *(() if leaks is None else (leaks,)),
-        *_with_equivalent_lag(delayed_by, best),
+        *(term for term in (leaks, delayed_by) if term is not None),
         *(full.term(term) for term in selected),
     )
     shows = {fault: term in [t.name for t in terms] for fault, term in _FITTED.items()}
@@ -288,43 +279,13 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     return Mechanics(name, R, C, offset, terms, match, noise, count, samples, notes, faults)
 
 
-def _drop_isolated(breaths: Breaths) -> tuple[Breaths, list[str]]:
-    """Breaths without single samples that no lung explains, and a note on them.
-
-    What R and C leave of the pressure is smooth up to noise, whatever else the lung does: a sample
-    that stands out of what its neighbours leave is a wrong pressure or a wrong flow. That of the
-    two is left out which stands out of its own neighbours by more.
-    """
-    if breaths.flow is None or not (measured := segments(breaths)):
-        return breaths, []
-    r, elastance = parabolic(measured).coefficients[:2] / 1000.0
-    flow = np.where(breaths.valid, breaths.flow, np.nan)
-    volume = np.cumsum(np.nan_to_num(flow) * breaths.dt, axis=1)
-    residual = (breaths.pressure - r * flow - elastance * volume)[breaths.valid]
-    out = np.zeros(breaths.valid.shape, bool)
-    out[breaths.valid] = isolated(residual)
-    count = int(out.sum())
-    if not count:
-        return breaths, []
-
-    def stands_out(values: Floats) -> Floats:
-        padded = np.pad(values, ((0, 0), (1, 1)), mode="edge")
-        return np.abs(values - 0.5 * (padded[:, 2:] + padded[:, :-2]))
-
-    of_flow = out & (r * stands_out(flow) > stands_out(breaths.pressure))
-    note = f"{count} samples that neither their neighbours nor the lung explain were left out."
-    pressure = np.where(out & ~of_flow, np.nan, breaths.pressure)
-    return replace(breaths, pressure=pressure, flow=np.where(of_flow, np.nan, breaths.flow)), [note]
-
-
 def _fit_lung(
     table: CrossProducts,
-    selected: tuple[SelectedTerm, ...],
+    further: Sequence[int],
     segments: tuple[Segment, ...],
     breaths: Breaths,
 ) -> LungFit:
-    columns = (*range(len(BASE)), *(term.column for term in selected))
-    fitted = fit(table, np.ones(len(table), bool), columns)
+    fitted = fit(table, np.ones(len(table), bool), (*range(len(BASE)), *further))
     # A flow may jump between two samples, which a measured volume shows.
     blur, jump = 0.0, 0.0
     if breaths.volume is None and breaths.flow is not None:
@@ -335,13 +296,10 @@ def _fit_lung(
     return LungFit(fitted, covariance(table, fitted), table, segments, blur, jump)
 
 
-def _quadratic_resistance(table: CrossProducts) -> tuple[SelectedTerm, ...]:
-    """The quadratic part of the resistance, which a label leaves open, unless it is negative."""
-    (column,) = columns_of("turbulent_resistance")
-    fitted = fit(table, np.ones(len(table), bool), (*range(len(BASE)), column))
-    if fitted.coefficients[-1] <= 0.0:
-        return ()
-    return (SelectedTerm("turbulent_resistance", column, 0.0, ()),)
+def _quadratic_resistance(table: CrossProducts) -> tuple[int, ...]:
+    """Column of the quadratic resistance, which a label leaves open, unless it is negative."""
+    fitted = fit(table, np.ones(len(table), bool), PARABOLIC)
+    return PARABOLIC[len(BASE) :] if fitted.coefficients[-1] > 0.0 else ()
 
 
 def _best_for_label(full: LungFit, plain: LungFit, label: Lung) -> LungFit:
@@ -359,22 +317,9 @@ def _best_for_label(full: LungFit, plain: LungFit, label: Lung) -> LungFit:
     return plain
 
 
-def _with_equivalent_lag(delayed_by: Term | None, lung: LungFit) -> tuple[Term, ...]:
-    """The delay; for a circuit also the lag of a pressure sensor that would do the same."""
-    if delayed_by is None:
-        return ()
-    if delayed_by.name != "circuit_compliance":
-        return (delayed_by,)
-    value = delayed_by.parameters["compliance"]
-    shared = lung.resistance(0.0).value / (1.0 + value.value / lung.compliance().value)
-    low, high = (1e-3 * shared * end for end in value.ci95)
-    lag = Estimate(1e-3 * shared * value.value, "s", (low, high))
-    return (replace(delayed_by, parameters={"compliance": value, "equivalent_lag": lag}),)
-
-
 def _notes(
     breaths: Breaths, segments: tuple[Segment, ...], table: CrossProducts, noise: float
-) -> list[str]:
+) -> tuple[str, ...]:
     issues, first = check_roles(breaths), notable(breaths)
     notes = [] if first is None else [f"{first}."]
     notes += [str(finding) for finding in issues]
@@ -384,12 +329,6 @@ def _notes(
         )
     if lost := len(breaths) - len(table):
         notes.append(f"{lost} of {len(breaths)} breaths have no piece long enough to be used.")
-    share = clipped_share(breaths)
-    if share > _NOTED_CLIPPING:
-        notes.append(
-            f"{100 * share:.0f} % of the pressures stand at the end of the sensor's range and are "
-            "left out."
-        )
     peak = max(float(segment.flow.max()) for segment in segments)
     if peak < _SMALL_FLOW and not any(finding.column == "flow" for finding in issues):
         notes.append(f"The flow stays below {1000 * peak:.0f} mL/s: R is known at small flow only.")
@@ -398,7 +337,7 @@ def _notes(
             f"{noise:.1f} cmH2O are left unexplained, such as a valve that chatters: R and C are "
             "rough."
         )
-    return notes
+    return tuple(notes)
 
 
 @dataclass(frozen=True, eq=False)

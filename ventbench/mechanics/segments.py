@@ -122,12 +122,6 @@ def _bridged(time: Floats, flow: Floats) -> tuple[Floats, Bools]:
     return np.where(finite | bridged, np.where(finite, flow, filled), np.nan), bridged
 
 
-def clipped_share(breaths: Breaths) -> float:
-    """Share of the pressures that are clipped at an end of the sensor's range, 0..1."""
-    finite = np.isfinite(breaths.pressure) & breaths.valid
-    return float(np.sum(_clipped(breaths.pressure) & finite) / max(finite.sum(), 1))
-
-
 def _smoothed(
     time: Floats, pressure: Floats, flow: Floats | None, volume: Floats | None
 ) -> tuple[Ints, Bools, *_Signals] | None:

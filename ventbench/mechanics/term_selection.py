@@ -61,21 +61,14 @@ FEWEST_BREATHS, MOST_TERMS = 4, 5
 
 @dataclass(frozen=True)
 class SelectedTerm:
-    """A term of the model."""
+    """A term of the model, or one that is tried."""
 
     name: str  #: name of the effect.
     column: int  #: index of its column.
     nats: float  #: log-likelihood ratio on held-out breaths.
-    alternatives: tuple[str, ...]  #: other terms that would have gained nearly as much.
-
-
-@dataclass(frozen=True)
-class _Trial:
-    name: str
-    column: int
-    nats: float
-    gain: float
-    passes: bool
+    gain: float  #: what it adds to the log-likelihood of held-out breaths.
+    passes: bool  #: whether the breaths need it.
+    alternatives: tuple[str, ...] = ()  #: other terms that would have gained nearly as much.
 
 
 def select_terms(table: CrossProducts, timing: float = 0.0) -> tuple[SelectedTerm, ...]:
@@ -89,8 +82,8 @@ def select_terms(table: CrossProducts, timing: float = 0.0) -> tuple[SelectedTer
     """
     if len(table) < FEWEST_BREATHS:
         return ()
-    parabolic = SelectedTerm(_STANDING, PARABOLIC[-1], 0.0, ())
-    selected = [parabolic] if _trial(table, timing, _columns([]), _STANDING).gain > 0.0 else []
+    standing = _trial(table, timing, _columns([]), _STANDING)
+    selected = [standing] if standing.gain > 0.0 else []
     dropped: set[str] = set()
     while len(selected) < MOST_TERMS:
         columns = _columns(selected)
@@ -105,20 +98,17 @@ def select_terms(table: CrossProducts, timing: float = 0.0) -> tuple[SelectedTer
         ]
         best = contenders[0]  # TERMS are in the order of how common they are
         alternatives = tuple(trial.name for trial in contenders[1:])
-        selected.append(SelectedTerm(best.name, best.column, best.nats, alternatives))
+        selected.append(replace(best, alternatives=alternatives))
         # The new term may make an earlier one superfluous.
         for term in selected[:-1]:
-            rest = [term_left for term_left in selected if term_left is not term]
-            if (
-                term is not parabolic
-                and not _trial(table, timing, _columns(rest), term.name).passes
-            ):
+            rest = [other for other in selected if other is not term]
+            if term is not standing and not _trial(table, timing, _columns(rest), term.name).passes:
                 selected = rest
                 dropped.add(term.name)
-    rest = [term for term in selected if term is not parabolic]
+    rest = [term for term in selected if term is not standing]
     trial = _trial(table, timing, _columns(rest), _STANDING)
     if trial.passes and len(rest) < len(selected):
-        return (replace(parabolic, nats=trial.nats), *rest)
+        return (trial, *rest)
     return tuple(rest)
 
 
@@ -166,7 +156,9 @@ def _held_out(models: Sequence[_Model], null: _Model) -> tuple[float, Floats]:
     return float(np.logaddexp.reduce(ratios) - np.log(len(ratios))), np.nanmean(gains, axis=0)
 
 
-def _trial(table: CrossProducts, timing: float, columns: tuple[int, ...], name: str) -> _Trial:
+def _trial(
+    table: CrossProducts, timing: float, columns: tuple[int, ...], name: str
+) -> SelectedTerm:
     """Try one more term: its best column on all breaths, and its gain on held-out breaths."""
     every = np.ones(len(table), bool)
     models = [_Model(table, (*columns, c), name in POSITIVE) for c in columns_of(name)]
@@ -187,7 +179,7 @@ def _trial(table: CrossProducts, timing: float, columns: tuple[int, ...], name: 
         and abs(fitted.coefficients[-1]) >= least
         and _plausible(table, fitted)
     )
-    return _Trial(name, column, nats, float(by_breath.sum()), passes)
+    return SelectedTerm(name, column, nats, float(by_breath.sum()), passes)
 
 
 def _plausible(table: CrossProducts, fitted: RegressionFit) -> bool:

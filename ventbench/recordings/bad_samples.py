@@ -247,13 +247,6 @@ class _Signal:
         return usual if same.mean() >= _REGULAR else None
 
 
-def isolated(values: Floats) -> Bools:
-    """Which values are supported by no neighbour, ``(m,)``."""
-    if np.isfinite(values).sum() < _READINGS:
-        return np.zeros(len(values), bool)
-    return _Signal.of(values).isolated(np.zeros(len(values), bool))
-
-
 def _repeats(values: Floats) -> Bools:
     """Whether a value is exactly the one before, ``(m,)``."""
     return np.append(False, values[1:] == values[:-1])

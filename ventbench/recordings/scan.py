@@ -258,16 +258,6 @@ def check_single(rows: Rows, log: ProblemLog) -> None:
     log.add(rows.breaths.starts[rows.breaths.lengths == 1], "breath_id", message, advice)
 
 
-def check_row_ids(rows: Rows, log: ProblemLog, last: int) -> int:
-    """Warn where the column id, which is not used otherwise, does not increase; return the last."""
-    ids = rows.columns["id"]
-    same = np.append(rows.first > 0 and ids[0] <= last, ids[1:] <= ids[:-1])
-    message = "id {value} is not greater than the one before"
-    advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
-    log.add(same, "id", message, advice, level="warning")
-    return int(ids[-1])
-
-
 _REPEAT = ("the row repeats {other}", "Remove one of the two.")
 _TWICE = "two rows of the breath have the time {value} s, the other is {other}"
 _SORT = "Sort the rows of the breath by time_step, and remove rows that are there twice."
@@ -435,7 +425,7 @@ def scan(
             if progress is not None:
                 progress(source.done, source.size)
 
-    parts, first_rows, last = [], dict[int, int](), 0
+    parts, first_rows = [], dict[int, int]()
     marks = set(missing)
     for rows in blocks_of(batches()):
         log.rows = rows
@@ -445,7 +435,6 @@ def scan(
         check_ids(rows, log, first_rows)
         for check in (check_single, check_lung, check_times):
             check(rows, log)
-        last = check_row_ids(rows, log, last)
         columns = check_values(rows, log, clip=clip)
         with np.errstate(all="ignore"):  # infinite values are problems already
             parts.append(_scanned(rows, columns, bad, keep))

@@ -102,7 +102,8 @@ def test_it_is_refused_before_it_is_unpacked(
     monkeypatch.setattr(sizes, "LARGEST", LARGEST)
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match=r"more than the 0\.004 GB that are read"):
+        said = r"cannot be read as EDF" if make is edf else r"more than the 0\.004 GB that are read"
+        with pytest.raises(InputError, match=said):
             read_table(path)
         spent = tracemalloc.get_traced_memory()[1]
     finally:
@@ -112,7 +113,7 @@ def test_it_is_refused_before_it_is_unpacked(
 
 def test_a_header_must_not_claim_what_is_not_there(tmp_path: Path) -> None:
     pytest.importorskip("pyedflib", reason="pyedflib has no wheel for this Python")
-    with pytest.raises(InputError, match="claims 1000 samples that are not in it"):
+    with pytest.raises(InputError, match=r"cannot be read as EDF .*Filesize"):
         read_table(edf(tmp_path, "10", 100))
 
 

@@ -7,12 +7,11 @@ would take more than :data:`LARGEST` bytes.
 
 from __future__ import annotations
 
+import gzip
 import math
-import os
 import struct
 import zipfile
 import zlib
-from pathlib import Path
 from typing import Any
 
 from ventbench.base.errors import InputError
@@ -120,25 +119,6 @@ def check_matlab(file: str) -> None:
     refuse(file, total, "its variables")
 
 
-def check_edf(file: str) -> None:
-    """Check the records that the header of an EDF or BDF file claims against the file's length."""
-    with open(file, "rb") as stream:
-        head = stream.read(256)
-        try:
-            records, signals = int(head[236:244]), int(head[252:256])
-            stream.seek(256 + 216 * signals)
-            counts = [int(stream.read(8)) for _ in range(signals)]
-        except ValueError:
-            raise InputError(f"{file} cannot be read as EDF: its header is damaged") from None
-    width = 3 if head.startswith(b"\xff") else 2
-    samples = max(records, 0) * sum(counts)
-    check_samples(file, samples)
-    if 256 * (1 + signals) + width * samples > os.path.getsize(file):
-        raise InputError(
-            f"{file} cannot be read as EDF: its header claims {samples} samples that are not in it"
-        )
-
-
 def check_wfdb(file: str) -> None:
     """Check the samples that the header of a WFDB record claims."""
     import wfdb
@@ -153,17 +133,15 @@ def gunzipped(file: str) -> bytes:
     Raises:
         InputError: if it unpacks to more, or cannot be unpacked.
     """
-    packed, parts, size = Path(file).read_bytes(), [], 0
+    parts, size = [], 0
     try:
-        while packed:
-            reader = zlib.decompressobj(wbits=31)
-            part = reader.decompress(packed, LARGEST + 1 - size)
-            size += len(part)
-            refuse(file, size, "its unpacked contents")
-            if not reader.eof:
-                raise InputError(f"{file} cannot be unpacked: it ends early; copy it again")
-            parts.append(part)
-            packed = reader.unused_data.lstrip(b"\0")
-    except zlib.error as error:
+        with gzip.open(file) as stream:
+            while part := stream.read(1 << 20):
+                parts.append(part)
+                size += len(part)
+                refuse(file, size, "its unpacked contents")
+    except EOFError:
+        raise InputError(f"{file} cannot be unpacked: it ends early; copy it again") from None
+    except (zlib.error, gzip.BadGzipFile) as error:
         raise InputError(f"{file} cannot be unpacked ({error})") from None
     return b"".join(parts)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from ventbench.base.arrays import Floats
@@ -186,9 +187,7 @@ class RecordingReport:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values."""
-        plain = asdict(self) | {"ok": self.ok}
-        plain["time_inferred"] = {str(key): dt for key, dt in self.time_inferred.items()}
-        return {k: list(x) if isinstance(x, tuple) else x for k, x in plain.items()}
+        return msgspec.to_builtins(self, str_keys=True) | {"ok": self.ok}
 
     def notes(self) -> tuple[str, ...]:
         """What was inferred, changed or ignored, a sentence each."""

@@ -328,36 +328,20 @@ def leading_zeros(u_out: NDArray[np.int8], breaths: Pieces) -> Ints:
     return np.minimum(np.minimum.reduceat(switched, breaths.starts), breaths.lengths)
 
 
-@dataclass(frozen=True)
-class KnownTimes:
-    """Times of breaths, with what follows from each breath alone."""
-
-    #: s from the breath's first sample, NaN in all of a breath without times, (m,).
-    time: Floats
-    blank: Bools  #: breaths with fewer than two times, which have none then, (k,) bool.
-    interpolated: Ints  #: number of single times that are interpolated, (k,).
-    shifted: Bools  #: breaths that do not start at 0 in the file, (k,) bool.
-
-
-def complete_times(time: Floats, breaths: Pieces) -> KnownTimes:
+def complete_times(time: Floats, breaths: Pieces) -> Floats:
     """Interpolate single blank times and shift each breath to start at 0.
 
     Blank times between two known ones are linear in the sample number; those before the first or
     after the last known one are extrapolated at the breath's mean interval. Times are as in the
-    file, s, NaN where blank, (m,).
+    file, s, NaN where blank, (m,); they stay NaN in a breath with fewer than two.
     """
-    starts, n_missing = breaths.starts, breaths.sums(np.isnan(time))
-    blank = breaths.lengths - n_missing < 2
-    partial = (n_missing > 0) & ~blank
-    if partial.any():
-        time = time.copy()
-        for breath in np.flatnonzero(partial):
-            span = slice(starts[breath], starts[breath] + breaths.lengths[breath])
-            time[span] = _interpolate(time[span])
-    first = time[starts]
-    shifted = np.isfinite(first) & (first != 0.0) & ~blank
-    time = time - np.where(blank, np.nan, first)[breaths.owner]
-    return KnownTimes(time, blank, np.where(partial, n_missing, 0), shifted)
+    missing = breaths.sums(np.isnan(time))
+    blank = breaths.lengths - missing < 2
+    time = time.copy()
+    for breath in np.flatnonzero((missing > 0) & ~blank):
+        span = slice(breaths.starts[breath], breaths.starts[breath] + breaths.lengths[breath])
+        time[span] = _interpolate(time[span])
+    return time - np.where(blank, np.nan, time[breaths.starts])[breaths.owner]
 
 
 def _interpolate(time: Floats) -> Floats:
@@ -449,11 +433,13 @@ def _scanned(
     rows: Rows, columns: dict[str, NDArray[Any]], bad: Sequence[BadSamples], keep: bool
 ) -> Scanned:
     starts, lengths = rows.breaths.starts, rows.breaths.lengths
-    times = complete_times(columns["time_step"], rows.breaths)
+    given = columns["time_step"]
+    time = complete_times(given, rows.breaths)
+    blank = np.isnan(time[starts])
     names = ("u_in", "pressure", *OPTIONAL)
     samples = {name: columns[name] for name in names if name in columns}
     samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
-    inside = np.diff(times.time, append=np.nan)
+    inside = np.diff(time, append=np.nan)
     inside[starts[1:] - 1] = np.nan
     inside[~np.isfinite(inside)] = np.nan
     return Scanned(
@@ -463,14 +449,14 @@ def _scanned(
         starts=starts + rows.first,
         lengths=lengths,
         n_inspiratory=leading_zeros(samples["u_out"], rows.breaths),
-        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
-        time_blank=times.blank,
-        time_interpolated=times.interpolated,
-        time_shifted=times.shifted,
+        interval=time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
+        time_blank=blank,
+        time_interpolated=np.where(blank, 0, rows.breaths.sums(np.isnan(given))),
+        time_shifted=~blank & np.isfinite(given[starts]) & (given[starts] != 0.0),
         steps=np.stack([x.reduceat(inside, starts) for x in (np.fmin, np.fmax)], axis=1),
-        figures=breath_figures(times.time, samples, rows.breaths),
+        figures=breath_figures(time, samples, rows.breaths),
         bad=tuple(replace(bad_samples, rows=bad_samples.rows + rows.first) for bad_samples in bad),
-        samples={"time": times.time, **samples} if keep else {},
+        samples={"time": time, **samples} if keep else {},
     )
 
 

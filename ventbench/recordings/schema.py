@@ -8,9 +8,9 @@ have columns of the same names.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -45,10 +45,6 @@ class RecordingProblem:
         if self.column is not None:
             where += f", column {self.column}"
         return f"{where}: {self.what}. {self.advice}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        return asdict(self)
 
 
 class RecordingError(InputError):

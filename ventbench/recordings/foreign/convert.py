@@ -264,7 +264,7 @@ def import_recording(
     rows, parts = np.concatenate(pieces), Pieces.of(list(map(len, pieces)))
     breaths = arranged(
         parts.lengths,
-        complete_times(time[rows], parts).time,
+        complete_times(time[rows], parts),
         {name: x[rows] for name, x in samples.items()},
         breath_id=np.arange(1, len(pieces) + 1),
         R=R[rows[parts.starts]],

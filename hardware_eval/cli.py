@@ -32,7 +32,6 @@ from hardware_eval.commands import (
     trial,
 )
 from ventbench.base import files
-from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
@@ -335,6 +334,10 @@ def compare(
     )
 
 
+#: Pressure above which `collect` closes the valve, cmH2O.
+_EASE = 45.0
+
+
 @app.command()
 def collect(
     port: Port,
@@ -344,9 +347,6 @@ def collect(
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Log and recording; a collection continues.")
     ] = Path("runs/exploration"),
-    ease: Annotated[
-        float, typer.Option(help="Pressure above which the valve closes, cmH2O.")
-    ] = 45.0,
     yes: Yes = False,
     json: JsonFile = None,
 ) -> None:
@@ -357,15 +357,9 @@ def collect(
     from hardware_eval.bench.drive import collect as run_collection
     from hardware_eval.results import evaluate as ev
     from ventbench.cli.options import bar
-    from ventbench.task import protocol
     from ventbench.task.lungs import scored_lung
 
     label = scored_lung(lung).id
-    highest = protocol.SAFETY_PRESSURE
-    if not protocol.PEEP < ease <= highest:
-        raise InputError(
-            f"--ease {ease:g} cmH2O: give more than {protocol.PEEP:g} and at most {highest:g}"
-        )
     files.claim_folder(out)
     with bench_on(port, yes=yes, kept=out) as (line, bench, person):
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
@@ -377,7 +371,7 @@ def collect(
                 breaths,
                 out,
                 seed=seed,
-                ease=ease,
+                ease=_EASE,
                 about={"device": ev.device_about(line)},
                 progress=lambda number: exploring(number, breaths),
             )

@@ -1,9 +1,10 @@
 """The loop closed: a lung that conceals physics, found, corrected for, and controlled better.
 
-An emulated lung conceals physics that the simulators lack, drawn from the library and sealed. A
+An emulated lung conceals physics that the simulators lack, drawn from the library by words. A
 controller that was planned on a simulator runs on it and does worse than there. The comparison of a
 recording with the simulator names what is missing; the controller is planned again on the corrected
-simulator and runs on the same lung. Only then the seal is opened. Nothing in between reads it.
+simulator and runs on the same lung. Only then it is told what was concealed; nothing in between
+reads it.
 
 A simulator says which commands bring the pressure to its target and keep it there, and which
 pressures they give. The controller sends these commands, and a PI controller answers the difference
@@ -44,7 +45,6 @@ from hardware_eval.emulation.simulated import (
     SimulatedHal,
     breath_begun,
     conceal,
-    reveal,
 )
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results.evaluate import Line
@@ -231,7 +231,6 @@ class Demo:
 
     words: str  #: what the lung was drawn from.
     lung: str  #: its label.
-    commitment: str  #: hash of the sealed answer, published first.
     #: error of the entry on the emulator of the plain simulator, by PIP.
     simulated: dict[float, float]
     measured: dict[float, float]  #: its error on the lung that conceals something, by PIP.
@@ -241,7 +240,7 @@ class Demo:
     open_loop_mae: dict[str, float]
     predicted: float  #: error of the replanned entry on the corrected simulator, mean over PIPs.
     retuned: dict[float, float]  #: error of the replanned entry on the lung, by PIP.
-    truth: dict[str, Any]  #: what the seal held.
+    truth: dict[str, Any]  #: what was concealed.
     steps: tuple[str, ...]  #: what was done, with its figures, a sentence each.
     seconds: float  #: duration.
 
@@ -297,7 +296,7 @@ def demo(
     """Run the demo, in this process on a virtual clock.
 
     Args:
-        words: any words; they determine lung and concealed physics, and open the seal.
+        words: any words; they determine lung and concealed physics.
         out: an empty folder for everything.
         breaths: breaths to collect for the diagnosis.
         simulator: name of the simulators, which the concealed physics is added to.
@@ -317,12 +316,10 @@ def demo(
         steps.append(f"{title}: {figures}")
         tell(f"{len(steps)}. {steps[-1]}")
 
-    # The public half of the concealed lung: its label and the seal. The plant stays in there.
+    # Its label is public; of the rest only the bench knows.
     hidden = conceal(words, simulator)
-    lung, seal = hidden.lung.id, out / "seal.json"
-    hidden.write(seal)
-    commitment = str(hidden.seal["commitment"])
-    step("A lung is sealed", f"{lung}; commitment {commitment[:16]}...")
+    lung, effect = hidden.lung.id, hidden.effect
+    step("A lung conceals physics", lung)
     tested = scored_plants(simulator, [lung])
     plain = tested.plant(lung)
     planned = plan_controller(plain, PIPS)
@@ -361,14 +358,12 @@ def demo(
     retuned = evaluated(line, second, "second")
     against = _against(measured, retuned, "the first")
     step("The replanned controller on the lung", f"{_said(retuned)}{against}")
-    _, effect = reveal(seal, words)
     truth = _mechanism(effect.name, effect.parameters)
     found = "named" if effect.name in named else "not named"
-    step("The seal is opened", f"{truth}, {effect.strength}: {found}")
+    step("What it conceals", f"{truth}, {effect.strength}: {found}")
     done = Demo(
         words,
         lung,
-        commitment,
         simulated,
         measured,
         diagnosis.verdict,

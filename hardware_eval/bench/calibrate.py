@@ -1,7 +1,7 @@
 """Calibration of a bench: measured series, a weighted line through each, one dated file.
 
-Every part is a series of readings against a reference, some of them reached from below and some
-from above, and gets the same analysis (:func:`fit`). What the wire measures is read from it; what
+Every part is a series of readings against a reference, those of a valve reached from below and from
+above, and gets the same analysis (:func:`fit`). What the wire measures is read from it; what
 it does not, a person reads from an instrument. The file names the device and is refused when it is
 of another one, was changed, or is stale.
 """
@@ -76,11 +76,10 @@ class Fit:
 
     intercept: Interval  #: reading where the reference is 0.
     slope: Interval  #: reading per reference; NaN if the reference is the same throughout.
-    hysteresis: Interval  #: mean reading from above less that from below; NaN if only one is there.
     residual: float  #: standard deviation of the readings about the line.
 
 
-def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit:
+def fit(reference: Floats, reading: Floats, error: Floats) -> Fit:
     """Fit a line by least squares, weighted by the readings' errors.
 
     The errors count if the readings scatter no more than they say; else the scatter does.
@@ -89,7 +88,6 @@ def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit
         reference: shape ``(n,)``.
         reading: shape ``(n,)``.
         error: standard error of each reading, shape ``(n,)``, above 0.
-        above: 1 where the reference was approached from above, else 0, shape ``(n,)``.
     """
     level = int(np.ptp(reference) == 0.0)
     line, covariance = np.polyfit(reference, reading, 1 - level, w=1.0 / error, cov="unscaled")
@@ -100,21 +98,8 @@ def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit
         interval(x, math.sqrt(scatter * v), freedom)
         for x, v in zip(line, np.diag(covariance), strict=True)
     )
-    unknown = Interval(math.nan)
-    both = [x for x in np.unique(reference) if len(set(above[reference == x])) == 2]
-    apart = np.array(
-        [
-            reading[(reference == x) & (above == 1)].mean()
-            - reading[(reference == x) & (above == 0)].mean()
-            for x in both
-        ]
-    )
-    hysteresis = unknown
-    if len(apart) > 1:
-        each = float(apart.std(ddof=1)) / math.sqrt(len(apart))
-        hysteresis = interval(float(apart.mean()), each, len(apart) - 1)
     spread = math.sqrt(float(residual @ residual) / max(freedom, 1))
-    return Fit(intercept, slope[0] if slope else unknown, hysteresis, spread)
+    return Fit(intercept, slope[0] if slope else Interval(math.nan), spread)
 
 
 @dataclass(frozen=True)
@@ -124,7 +109,7 @@ class Part:
     Attributes:
         kind: a key of :data:`PARTS`.
         date: when, UTC, ISO 8601.
-        reference, reading, error, above: the series, see :func:`fit`; units in :data:`PARTS`.
+        reference, reading, error: the series, see :func:`fit`; units in :data:`PARTS`.
         by_hand: whether a person read the values.
         lung: label of the mounted lung; the series of ``lung`` is the logarithms of R and 1/C.
         note: what the lung is by them, in words.
@@ -135,7 +120,6 @@ class Part:
     reference: tuple[float, ...]
     reading: tuple[float, ...]
     error: tuple[float, ...]
-    above: tuple[int, ...]
     by_hand: bool
     lung: str = ""
     note: str = ""
@@ -143,9 +127,7 @@ class Part:
     @property
     def fit(self) -> Fit:
         """The line through it."""
-        return fit(
-            *(np.array(x, float) for x in (self.reference, self.reading, self.error, self.above))
-        )
+        return fit(*(np.array(x, float) for x in (self.reference, self.reading, self.error)))
 
     def problem(self) -> str:
         """Why no bench reads so, as a sentence; empty if one may."""
@@ -174,8 +156,6 @@ class Part:
         parts = [f"{self.kind}: {own.intercept} {y} at 0 {x}"]
         if math.isfinite(own.slope.value):
             parts.append(f"{own.slope} {y} per {x}")
-        if math.isfinite(own.hysteresis.value):
-            parts.append(f"from above {own.hysteresis} {y} more")
         return f"{'; '.join(parts)}; residual {own.residual:.2g} {y}"
 
 
@@ -188,10 +168,6 @@ def _mean(values: Floats, least: float) -> tuple[float, float]:
         raise InputError("the device gives no reading here; see `ventbench-hardware selftest`")
     scatter = float(values.std(ddof=1)) / math.sqrt(len(values))
     return float(values.mean()), max(scatter, least)
-
-
-def _above(reference: Sequence[float]) -> tuple[int, ...]:
-    return tuple(int(k > 0 and x < reference[k - 1]) for k, x in enumerate(reference))
 
 
 def measure(
@@ -239,9 +215,8 @@ def measure(
     columns = zip(*points, strict=True)
     xs, ys, errors = (tuple(round(float(x), 6) for x in column) for column in columns)
     date = (now or dated.today()).isoformat(timespec="seconds")
-    above = _above(xs) if kind in ("span", "flow", "valve") else (0,) * len(xs)
     label = lung if kind in ("lung", "leak") else ""
-    part = Part(kind, date, xs, ys, errors, above, by_hand, label, note)
+    part = Part(kind, date, xs, ys, errors, by_hand, label, note)
     if wrong := part.problem():
         raise InputError(f"{kind}: {wrong}. Nothing was kept")
     return part
@@ -284,12 +259,13 @@ def _valve_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[P
         raise InputError("valve: give two openings at least, within 0 to 100 %")
     assert bench.client.welcome is not None
     points = []
-    for opening, above in zip(openings, _above(openings), strict=True):
+    for before, opening in zip([0.0, *openings], openings, strict=False):
+        above = before > opening
         if bench.client.welcome.capabilities & Capability.FLOW:
-            flows = _puffed(bench, lung, opening, bool(above)).flow[-_COUNT:]
+            flows = _puffed(bench, lung, opening, above).flow[-_COUNT:]
             points.append((opening, *_mean(flows, _FLOW_ERROR)))
         else:
-            _held_open(bench, lung, opening, bool(above))
+            _held_open(bench, lung, opening, above)
             flow = bench.operator.number(f"the meter's steady flow at {opening:g} %, mL/s: ")
             points.append((opening, flow, max(0.02 * abs(flow), 1.0)))  # as meters state it
     return points
@@ -375,9 +351,7 @@ class Calibration:
         parts = {}
         for kind, part in self.parts.items():
             line = part.fit
-            found = {
-                name: vars(getattr(line, name)) for name in ("intercept", "slope", "hysteresis")
-            }
+            found = {"intercept": vars(line.intercept), "slope": vars(line.slope)}
             parts[kind] = {**vars(part), "units": PARTS[kind], **found, "residual": line.residual}
         content = {"format": FORMAT, "device": self.device, "parts": parts}
         return replace(self, sha256=dated.save(path, content))

@@ -9,7 +9,7 @@ import os
 import re
 import select
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -259,49 +259,39 @@ class RerunView:
         self._stream.log("/runs", rr.TextLog(_told(run)))
 
 
-class McapView:
-    """Writes breaths to an MCAP file, for Foxglove and its kin: JSON, one message a step.
+#: Samples of a breath in an MCAP file.
+_SAMPLES = ("pressure", "flow", "target", "requested", "u_in", "u_out", "late")
+
+
+def write_mcap(path: Path, breaths: Iterable[tuple[PlannedRun, BreathLog]]) -> None:
+    """Write breaths to an MCAP file, for Foxglove and its kin: JSON, one message a step.
 
     The topic ``/breath`` has the samples in the log's units, null where there is none, and what
     runs; times are those of the bench, from 0.
-
-    Args:
-        path: of the file.
 
     Raises:
         InputError: if mcap is not installed.
         OSError: if the file cannot be written.
     """
+    require("mcap", extra="mcap", what="MCAP files")
+    from mcap.writer import Writer
 
-    _SAMPLES = ("pressure", "flow", "target", "requested", "u_in", "u_out", "late")
-
-    def __init__(self, path: Path) -> None:
-        require("mcap", extra="mcap", what="MCAP files")
-        from mcap.writer import Writer
-
-        number = {"type": ["number", "null"]}
-        properties = {"run": {"type": "string"}, **dict.fromkeys(self._SAMPLES, number)}
-        schema = json.dumps({"type": "object", "properties": properties}).encode()
-        self._writer = Writer(str(path))
-        self._writer.start(library="ventbench")
-        known = self._writer.register_schema("ventbench.breath", "jsonschema", schema)
-        self._channel = self._writer.register_channel("/breath", "json", known)
-        self._elapsed = 0.0
-
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Write a breath, after those before it."""
-        start = self._elapsed - breath.time[0]
-        self._elapsed += breath.time[-1] - breath.time[0] + protocol.DT
-        columns = [getattr(breath, name) for name in self._SAMPLES]
+    number = {"type": ["number", "null"]}
+    properties = {"run": {"type": "string"}, **dict.fromkeys(_SAMPLES, number)}
+    schema = json.dumps({"type": "object", "properties": properties}).encode()
+    writer, start = Writer(str(path)), 0.0
+    writer.start(library="ventbench")
+    known = writer.register_schema("ventbench.breath", "jsonschema", schema)
+    channel = writer.register_channel("/breath", "json", known)
+    for run, breath in breaths:
+        columns = [getattr(breath, name) for name in _SAMPLES]
         for time, *row in zip(breath.time, *columns, strict=True):
             numbers = [value if math.isfinite(value) else None for value in row]
-            values = {"run": _told(run), **dict(zip(self._SAMPLES, numbers, strict=True))}
-            at = round(1e9 * (start + time))
-            self._writer.add_message(self._channel, at, json.dumps(values).encode(), at)
-
-    def close(self) -> None:
-        """Write the index, and close the file."""
-        self._writer.finish()
+            values = {"run": _told(run), **dict(zip(_SAMPLES, numbers, strict=True))}
+            at = round(1e9 * (start + time - breath.time[0]))
+            writer.add_message(channel, at, json.dumps(values).encode(), at)
+        start += breath.time[-1] - breath.time[0] + protocol.DT
+    writer.finish()
 
 
 def _told(run: PlannedRun) -> str:

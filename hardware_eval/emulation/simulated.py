@@ -4,17 +4,14 @@ The plant advances from one change of the command to the next, as in scoring; a 
 is what the plant shows by then. A loop of 30 ms so reads what a scored run reads.
 
 A lung may have *concealed* physics, which any words determine: one strong effect of the library,
-its strength and its lung, added to a simulator. The answer is published encrypted, with its hash,
-when the lung is made; the words open it.
+its strength and its lung, added to a simulator.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import math
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -26,23 +23,19 @@ from hardware_eval.device.program import Identity, Sample
 from hardware_eval.emulation.cases import (
     LIBRARY,
     Effect,
-    commitment,
     draw_case,
     draw_effect,
     draw_grid,
-    encrypt,
     random_generator,
-    unseal,
 )
 from hardware_eval.wire.messages import Capability
-from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.physics.model import PhysicsState, physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.corrected import Corrected
 from ventbench.task import protocol
 from ventbench.task.interfaces import Plant
-from ventbench.task.lungs import Lung, lung
+from ventbench.task.lungs import Lung
 
 #: A command that does not change is taken into the plant's state after this time, s; above the
 #: control step, so that a loop decides when, and within the dead times that plants remember.
@@ -54,8 +47,6 @@ SHORTEST_HOLD = 1e-4
 #: What a disturbed tube does: a leak as if the expiratory valve stood open by so much, and a factor
 #: of the airway's resistance.
 TUBES = {"": (0.0, 1.0), "leak": (0.05, 1.0), "pinch": (0.0, 3.0)}
-
-_SEAL = "ventbench-concealed-1"
 
 #: Never concealed: a test lung has no patient, the drift of a sensor over a recording needs to know
 #: how long that will be, and the other two hardly matter to a controller.
@@ -208,15 +199,11 @@ def simulated_lung(lung_id: str, simulator: Any = "frozen", **settings: Any) -> 
 
 @dataclass(frozen=True, eq=False)
 class ConcealedLung:
-    """A lung whose physics nobody has been told."""
+    """A lung with physics that its label does not tell."""
 
-    lung: Lung  #: its label, which is public.
+    lung: Lung  #: its label.
     plant: Plant  #: simulator with the concealed physics.
-    seal: dict[str, str]  #: JSON values to publish: lung, commitment, and the encrypted answer.
-
-    def write(self, path: Path) -> None:
-        """Write the seal to a JSON file."""
-        files.write_json(path, self.seal)
+    effect: Effect  #: the concealed physics.
 
 
 def conceal(words: str, simulator: Any = "frozen") -> ConcealedLung:
@@ -228,45 +215,11 @@ def conceal(words: str, simulator: Any = "frozen") -> ConcealedLung:
         InputError: if there are no words.
     """
     if not words.strip():
-        raise InputError("--conceal: give some words; they determine the lung and open the seal")
+        raise InputError("--conceal: give some words; they determine the lung")
     effect, label = _draw(words)
-    without = physics(label)
-    named = {effect.name: effect.parameters}
+    without, named = physics(label), {effect.name: effect.parameters}
     plant = Corrected(load_simulators(simulator).plant(label.id), physics(label, named), without)
-    answer = {
-        "format": _SEAL,
-        "lung": label.id,
-        "effect": asdict(effect),
-        "nonce": random_generator(words, "emulator", "nonce").bytes(32).hex(),
-    }
-    text = json.dumps(answer, indent=1).encode()
-    public = label.id.encode()
-    seal = {
-        "format": _SEAL,
-        "lung": label.id,
-        "commitment": commitment(text),
-        "sealed": encrypt(text, words, public).hex(),
-    }
-    return ConcealedLung(label, plant, seal)
-
-
-def reveal(path: Path, words: str) -> tuple[Lung, Effect]:
-    """Open a seal that :meth:`ConcealedLung.write` wrote: the lung's label and what it concealed.
-
-    Raises:
-        InputError: if the file is no seal, or the words are others.
-    """
-    try:
-        seal = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
-    if not isinstance(seal, dict) or seal.get("format") != _SEAL:
-        raise InputError(f"{path} is no seal of a concealed lung")
-    text = unseal(
-        bytes.fromhex(seal["sealed"]), words, str(seal["lung"]).encode(), seal["commitment"]
-    )
-    answer = json.loads(text)
-    return lung(answer["lung"]), Effect(**answer["effect"])
+    return ConcealedLung(label, plant, effect)
 
 
 def _draw(words: str) -> tuple[Effect, Lung]:

@@ -296,16 +296,14 @@ def replay(
 
 
 def _show(everything: list[LoggedBreath], rerun: str | None, mcap: Path | None, total: int) -> None:
-    from hardware_eval.bench.console import McapView, RerunView
+    from hardware_eval.bench.console import RerunView, write_mcap
 
-    written = McapView(mcap) if mcap else None
-    shows = [RerunView(rerun).breath] if rerun else []
-    shows += [written.breath] if written else []
-    for breath in everything if shows else ():
-        for show in shows:
-            show(breath.run, breath.log, breath.run.number, total)
-    if written:
-        written.close()
+    if rerun:
+        view = RerunView(rerun)
+        for breath in everything:
+            view.breath(breath.run, breath.log, breath.run.number, total)
+    if mcap:
+        write_mcap(mcap, [(breath.run, breath.log) for breath in everything])
 
 
 def _differences(path: Path, session: Session) -> list[str]:

@@ -17,7 +17,7 @@ from hardware_eval.demo import (
     errors_on,
     plan_controller,
 )
-from hardware_eval.emulation.simulated import reveal
+from hardware_eval.emulation.simulated import conceal
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.folder import open_submission
@@ -84,8 +84,9 @@ def test_the_loop_closes(tmp_path: Path) -> None:
     words = "monday"  # the words that the command has if none are given
     out = tmp_path / "demo"
     done = demo(words, out, sandbox=False, tell=print)
-    label, effect = reveal(out / "seal.json", words)
-    assert (label.id, effect.name) == (done.lung, "leak")
+    hidden = conceal(words, "physics")
+    effect = hidden.effect
+    assert (hidden.lung.id, effect.name) == (done.lung, "leak")
     figures = json.loads((out / "demo.json").read_text())
     assert figures["truth"]["name"] == effect.name
     assert figures["steps"] == list(done.steps)

@@ -148,7 +148,11 @@ def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     value.write_bytes(referee.value(SECRET, own.number))
     due = own.frozen.chain.time_of(own.number)
     take = rounds.beacon.take
-    monkeypatch.setattr(rounds.beacon, "take", lambda *given: take(*given[:3], due))
+    monkeypatch.setattr(
+        rounds.beacon,
+        "take",
+        lambda content, chain, number, now=None: take(content, chain, number, due),
+    )
     played = []
     nobody = Board("", {})
     monkeypatch.setattr(rounds, "play", lambda own, **more: played.append(own) or nobody)

@@ -47,6 +47,11 @@ class TrainingPlants:
         """Ids of the lungs."""
         return tuple(lung.id for lung in self.lungs)
 
+    @property
+    def nominal(self) -> Plant:
+        """The nominal plant of each lung, leaves ``(L, ...)``."""
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.plants)
+
 
 def plants_to_train_on(simulator: SimulatorLike = "frozen") -> TrainingPlants:
     """Load plants to train a controller on.

@@ -102,7 +102,8 @@ def test_physics_that_cannot_be_is_left_out(monkeypatch) -> None:
         if broken.size:
             raise PlantError(int(broken[0]))
         failed, none = {(6,): Failure("act", "x")}, zero[..., :0]
-        return ProtocolRun(pressure, zero, zero, none, None, failed, np.ones(1))
+        unknown = np.full_like(zero, np.nan)
+        return ProtocolRun(pressure, zero, zero, none, unknown, failed, np.ones(1))
 
     monkeypatch.setattr("proofs.studies.adversary.step_through", run)
     excess = bench._batch(points, pip).ravel()

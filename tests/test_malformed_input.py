@@ -96,7 +96,7 @@ CASES = {
     "board show --folder board": "attestations.toml",
     "view nosuch": "nosuch: there is no such folder",
     "board show --folder nosuch": "nosuch: there is no such folder; the published leaderboard",
-    "board add noise.json --folder folder": "noise.json is not JSON: it is no text",
+    "board add noise.json --folder folder": "noise.json is not JSON of a record",
     "board add other.json --folder folder": "other.json",
     "board withdraw 123 --reason x --folder folder": "holds no single record",
     "board headroom --check noise.json": "not a file of reference errors: it is no .npz archive",

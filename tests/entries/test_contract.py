@@ -14,13 +14,13 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries import contract
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, InProcessSession
 from ventbench.entries.contract import STEPS
 from ventbench.entries.folder import check_files, open_submission
 from ventbench.entries.review import check_sources
 from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.sandbox.pipes import Allowance
-from ventbench.sandbox.runner import SandboxRunner
+from ventbench.sandbox.runner import SandboxRunner, SandboxSession
 
 from .conftest import MANIFEST
 
@@ -38,6 +38,12 @@ def ticking(act_s=1e-4):
     return lambda session: next(ticks)
 
 
+def set_clock(monkeypatch, act_s=1e-4):
+    """Let sessions, apart or in this process, count time by such a clock."""
+    for kind in (SandboxSession, InProcessSession):
+        monkeypatch.setattr(kind, "processor_time", ticking(act_s))
+
+
 @pytest.fixture
 def check(make, monkeypatch):
     """Check a submission of this source, or of this body of act; apart or in this process."""
@@ -46,7 +52,7 @@ def check(make, monkeypatch):
         folder = make(source, **options)
         (folder / "README.md").write_text("A test.")
         runner = SandboxRunner(allowance=PATIENT) if apart else InProcessRunner()
-        monkeypatch.setattr(contract, "processor_time", ticking(act_s))
+        set_clock(monkeypatch, act_s)
         return contract.check(str(folder), runner)
 
     return run
@@ -69,7 +75,7 @@ def test_a_good_one(check):
 
 @pytest.mark.parametrize("name", ["pid_best", "pid_robust"])
 def test_our_own_are_ready(name, monkeypatch):
-    monkeypatch.setattr(contract, "processor_time", ticking())
+    set_clock(monkeypatch)
     report = contract.check(name, SandboxRunner(allowance=PATIENT))
     assert report.ok, "\n".join(report.lines())
     contract.assert_ready(name, InProcessRunner())

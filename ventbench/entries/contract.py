@@ -38,7 +38,6 @@ from ventbench.entries.manifest import GROUPS, Finding, Group
 from ventbench.entries.review import inspect_folder
 from ventbench.entries.runs import DRAWS
 from ventbench.sandbox.child.cell import ROW, Failure, SubmissionError, printable
-from ventbench.sandbox.pipes import PolledControllers
 from ventbench.task import draws, protocol
 from ventbench.task.interfaces import Task
 from ventbench.task.lungs import LUNG_IDS, LUNGS
@@ -125,11 +124,6 @@ class Answers:
     act_seconds: Floats  #: processor time of one ``act`` in each round, s, without the first ones.
 
 
-def processor_time(session: PolledControllers) -> float:
-    """Time by the system's count, s: neither an entry nor a busy machine changes it."""
-    return session.processor_time()
-
-
 def run_all(
     submission: Submission,
     runs: Sequence[ContractRun],
@@ -154,9 +148,9 @@ def run_all(
                 np.isnan(rows[:, _PRESSURE]), pressure, rows[:, _PRESSURE]
             )
             live = max(1, len(runs) - len(session.failures))
-            start = processor_time(session)
+            start = session.processor_time()
             answers = session.act(rows)
-            seconds.append((processor_time(session) - start) / live)
+            seconds.append((session.processor_time() - start) / live)
             count()
             working = [run for run in range(len(runs)) if run not in session.failures]
             commands[working, k] = answers[working]

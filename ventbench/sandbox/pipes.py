@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,33 +149,33 @@ GATHERED_S = 0.05
 Outcome = Reply | WireError | None
 
 
-class PolledControllers:
+class PolledControllers(ABC):
     """Controllers of all cells of a submission, from start to close; none waits for another."""
 
     #: what went wrong up to now, by index of the cell; a failed cell stays failed.
     failures: dict[int, Failure]
 
+    @abstractmethod
     def ask(self, cells: Ints, observations: Floats) -> None:
         """Give some controllers, ``(n,)``, their next observations, ``(n, ROW)``.
 
         Each is asked by itself, once for each step of each inspiration, in order, after its answer.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def answers(self) -> tuple[Ints, Floats]:
         """Take the commands that have come, and wait for one if there is none.
 
         Cells, shape ``(m,)``, and their ``u_in``, %: finite, 0 for a failed cell, not clipped.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def processor_time(self) -> float:
         """Processor time that the controllers have had, s, as the system counts it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
         """End all controllers; may be called more than once."""
-        raise NotImplementedError
 
     def act(self, observations: Floats) -> Floats:
         """Ask every controller for its next command, and wait for all of them.

@@ -7,7 +7,7 @@ a valve that nobody has looked at. The steps are those that a laboratory would t
 2. take the simulator that one would have without recordings: an R-C lung at its label;
 3. diagnose it (``ventbench diagnose``), which gives ``corrected.json``;
 4. learn a simulator from the recordings alone (``ventbench train simulator``);
-5. train the same controllers on each (``ventbench tune pid``, ``submissions/residual_mlp``),
+5. train the same controllers on each (``ventbench train pid``, ``submissions/residual_mlp``),
    and run all of them on the rig, under noise and deviations that are the same for all.
 
 Usage: ``python benchmarks/own_rig.py [--out DIR] [--rig NAME]``.

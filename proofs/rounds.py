@@ -176,14 +176,14 @@ def draw(own: Round, content: bytes, *, now: datetime | None = None) -> Round:
 def play(
     own: Round,
     *,
-    jobs: int = 1,
+    workers: int = 0,
     tell: Callable[[str, int, int], object] = lambda what, done, total: None,
 ) -> Board:
     """Make the cases, let all answer, judge, and write the board; what is finished is kept.
 
     Args:
         own: round that is drawn.
-        jobs: number of cases at once.
+        workers: number of processes; 0 for this one alone.
         tell: called with what is done, how much of it, and of how much.
 
     Raises:
@@ -206,13 +206,13 @@ def play(
                 folder.path,
                 own.frozen.kind,
                 count,
-                jobs=jobs,
+                workers=workers,
                 source=world,
                 progress=partial(tell, f"make {world}"),
             )
         for name in own.frozen.diagnosers:
             tell_this = partial(tell, f"{name}, {world}")
-            answer(folder, own.diagnoser(name), limits=limits, jobs=jobs, progress=tell_this)
+            answer(folder, own.diagnoser(name), limits=limits, workers=workers, progress=tell_this)
     ours = "ventbench" if "ventbench" in own.frozen.diagnosers else min(own.frozen.diagnosers)
     result = board(folders, [own.seed] * len(folders), ours)
     files.write_json(own.folder / f"{BOARD}.json", result.as_dict())

@@ -2,13 +2,16 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from hardware_eval import cli as hardware
@@ -119,8 +122,8 @@ def test_doctor_names_what_is_missing(monkeypatch):
     ("program", "words", "wanted"),
     [
         ("ventbench", "score pid_r", "pid_robust"),
-        ("ventbench", "tune pid --lung R5C1", "R5C10"),
-        ("ventbench", "tune pid --lung R20C1", "R20C10"),
+        ("ventbench", "train pid --lung R5C1", "R5C10"),
+        ("ventbench", "train pid --lung R20C1", "R20C10"),
         ("ventbench", "data open-loop --plant two", "two_balloon"),
         ("ventbench-hardware", "run ppo", "ppo"),
         ("ventbench-hardware", "compare --plant phy", "physics"),
@@ -135,6 +138,21 @@ def test_names_are_completed(program, words, wanted):
     }
     ended = CliRunner().invoke(apps[program], prog_name=program, env=variables)
     assert wanted in ended.stdout.split()
+
+
+@pytest.mark.parametrize("former", cli._MOVED)
+def test_a_command_that_moved_says_where_it_is(former):
+    ended = CliRunner().invoke(cli.app, [former, "anything"])
+    assert isinstance(ended.exception, InputError)
+    now = cli._MOVED[former]
+    assert f"`ventbench {former}` is now `ventbench {now}`" == str(ended.exception)
+    words = [word for word in now.split() if re.fullmatch("[a-z]+(-[a-z]+)*", word)]
+    assert CliRunner().invoke(cli.app, [*words, "--help"]).exit_code == 0
+
+
+def test_about_twelve_commands_stand_at_the_top():
+    top: Any = typer.main.get_command(cli.app)
+    assert len(top.commands) <= 13
 
 
 def test_completion_is_offered():

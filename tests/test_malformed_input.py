@@ -91,7 +91,7 @@ CASES = {
     f"diagnose {SOUND} --out file": "--out file is a file",
     f"diagnose {SOUND} --out out --drive maybe": "choose auto, valve or flow",
     "view folder": "contains no scored run; make one with",
-    "report run": "it is no .npz archive; score the submission again",
+    "view run --out x.html": "it is no .npz archive; score the submission again",
     "board show --folder folder": "holds no record; add one with",
     "board show --folder board": "attestations.toml",
     "view nosuch": "nosuch: there is no such folder",
@@ -100,7 +100,7 @@ CASES = {
     "board add other.json --folder folder": "other.json",
     "board withdraw 123 --reason x --folder folder": "holds no single record",
     "board headroom --check noise.json": "not a file of reference errors: it is no .npz archive",
-    "tune pid --lung R1": "R1",
+    "train pid --lung R1": "R1",
 }
 
 

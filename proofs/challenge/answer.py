@@ -25,7 +25,7 @@ def answer(
     diagnoser: Diagnoser,
     *,
     limits: Limits | None = None,
-    jobs: int = 1,
+    workers: int = 0,
     only: tuple[str, ...] = (),
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> dict[str, str]:
@@ -37,7 +37,7 @@ def answer(
         folder: folder of the challenge.
         diagnoser: who answers.
         limits: what it may use on a case; the usual ones if None.
-        jobs: number of cases at once.
+        workers: number of processes; 0 for this one alone.
         only: names of cases; all if empty.
         progress: called with the number of answered cases and the number of all cases.
 
@@ -55,7 +55,7 @@ def answer(
     done, lost = len(names) - len(waiting), {}
     progress(done, len(names))
     work = {name: (folder, name, diagnoser, limits or Limits()) for name in waiting}
-    with executor(jobs if jobs > 1 else 0) as pool:
+    with executor(workers) as pool:
         for name, problem in results(pool, answer_case, work):
             done += 1
             progress(done, len(names))

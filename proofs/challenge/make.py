@@ -43,7 +43,7 @@ def make(
     kind: Kind | Literal["all"],
     count: int,
     *,
-    jobs: int = 1,
+    workers: int = 0,
     source: str = "first",
     record: Record = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
@@ -57,7 +57,7 @@ def make(
         out: folder, which must not hold a challenge yet.
         kind: kind of the cases.
         count: number of cases.
-        jobs: number of processes.
+        workers: number of processes; 0 for this one alone.
         source: name of the generator, one of :data:`~proofs.challenge.generators.GENERATORS`.
         record: see :data:`Record`; a function of a module if there are processes.
         progress: called with the numbers of finished and of all recordings.
@@ -79,7 +79,7 @@ def make(
     ]
     names = [question.case.name for question in drawn]
     nats: dict[str, list[float]] = {}
-    with executor(jobs if jobs > 1 else 0) as pool:
+    with executor(workers) as pool:
         work = {question.case.name: (secret, folder, question, record) for question in drawn}
         for name, of_effects in results(pool, _make_case, work):
             nats[name] = of_effects

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from proofs.cli import ResultsPage
-from ventbench.cli.options import JsonFile, bar, bars, claim_out, emit
+from ventbench.cli.options import JsonFile, Workers, bar, bars, claim_out, emit
 
 app = typer.Typer(
     name="challenge",
@@ -36,7 +36,7 @@ def make(
             "all of these kinds."
         ),
     ] = "all",
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    workers: Workers = 0,
     generator: Annotated[
         Literal["first", "stranger", "faults"],
         typer.Option(
@@ -57,7 +57,7 @@ def make(
     from proofs.challenge.make import make as work
 
     with bar("recording") as recording:
-        hashed = work(seed, out, kind, cases, jobs=jobs, source=generator, progress=recording)
+        hashed = work(seed, out, kind, cases, workers=workers, source=generator, progress=recording)
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
 
 
@@ -76,7 +76,7 @@ def answer(
     diagnoser: Diagnoser = "ventbench",
     seconds: Annotated[float, typer.Option(min=1, help="Processor seconds a case.")] = 300.0,
     memory: Annotated[float, typer.Option(min=0.5, help="Address space a case, GiB.")] = 16.0,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of cases at once.")] = 1,
+    workers: Workers = 0,
     case: Annotated[list[str], typer.Option(help="Only this case; may be repeated.")] = [],  # noqa: B006
 ) -> None:
     """Let a diagnoser answer every case, each in a process of its own.
@@ -95,7 +95,7 @@ def answer(
             ChallengeFolder(folder),
             who,
             limits=Limits(seconds, memory),
-            jobs=jobs,
+            workers=workers,
             only=tuple(case),
             progress=progress,
         )
@@ -207,7 +207,7 @@ def round_(
         Path | None,
         typer.Option(metavar="FILE", help="Value of the beacon; default: ask a public relay."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of cases at once.")] = 1,
+    workers: Workers = 0,
     json: JsonFile = None,
     page: ResultsPage = None,
 ) -> None:
@@ -225,7 +225,7 @@ def round_(
         content = beacon.read_bytes() if beacon else beacons.fetch(chain, own.number)
         own = rounds.draw(own, content)
     with bars() as tell:
-        result = rounds.play(own, jobs=jobs, tell=tell)
+        result = rounds.play(own, workers=workers, tell=tell)
     _told(result, board_section(result), json, page)
 
 

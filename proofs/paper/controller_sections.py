@@ -44,7 +44,7 @@ EXAMPLE, EXAMPLE_PIP = "R20C20", 20.0
 
 
 def best_gains(grid: pid_search.PIDGrid) -> Section:
-    """The grid of PIDs (the paper's table 2); ``ventbench tune pid`` draws it."""
+    """The grid of PIDs (the paper's table 2); ``ventbench train pid`` draws it."""
     rows: list[tuple[Cell, ...]] = []
     without = grid.gains[:, 2] == 0.0
     excess = []

@@ -139,7 +139,7 @@ def main() -> None:
 
     author.pull()
     if given.newcomer:
-        author.ventbench("new", given.newcomer, "--dir", "submissions")
+        author.ventbench("new", given.newcomer, "--out", "submissions")
         author.share("An entry")
     requests = out / "requests.json"  # what the platform would say
     asked = [{"name": given.newcomer, "account": "author", "asked": closes.isoformat()}]

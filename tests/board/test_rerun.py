@@ -162,5 +162,5 @@ def test_published_records_are_reproduced_in_two_processes(
     scores = [score for score in store.load(folder).scores if score.track == "performance"]
     newest = {s.name: s.sha256 for s in scores if s.name in ("pid_best", "pid_robust")}
     assert len(newest) == 2
-    outcomes = official_runs.rerun(folder, records=[*newest.values()], jobs=2)
+    outcomes = official_runs.rerun(folder, records=[*newest.values()], workers=2)
     assert [(x.state, x.detail) for x in outcomes if x.state != official_runs.REPRODUCED] == []

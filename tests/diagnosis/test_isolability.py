@@ -115,7 +115,7 @@ def test_a_plan_is_read_breath_by_breath(tmp_path: Path) -> None:
 
 def test_the_command_tells_and_ends_with_1_where_something_is_open(tmp_path: Path) -> None:
     path = write(tmp_path / "plan.csv", plan(10.0, 20.0))
-    words = ["isolability", "--lung", "R20C50", "--controls", str(path), "--names"]
+    words = ["diagnose", str(path), "--isolability", "--lung", "R20C50", "--names"]
     done = CliRunner().invoke(app, [*words, "valve_lag,valve_delay,leak", "--json", "-"])
     value = json.loads(done.stdout)
     assert value["lung"] == "R20C50"

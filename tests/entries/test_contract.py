@@ -365,7 +365,7 @@ def test_command_line(make, tmp_path):
 
 
 def test_command_new(tmp_path):
-    made = command("new", "demo", "--family", "dqn", "--dir", tmp_path)
+    made = command("new", "demo", "--family", "dqn", "--out", tmp_path)
     assert made.exit_code == 0, made.output
     assert "network.py, submission.toml, weights.npz" in made.output
     refused = command("new", "demo", "--family", "nothing")

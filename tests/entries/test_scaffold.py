@@ -103,7 +103,7 @@ def test_files_have_no_blanks_left(family):
 def test_refuses_to_overwrite(tmp_path):
     folder = create("demo", "pid", tmp_path)
     (folder / "README.md").write_text("mine")
-    with pytest.raises(InputError, match="exists; choose another name or --dir"):
+    with pytest.raises(InputError, match="exists; choose another name or --out"):
         create("demo", "dqn", tmp_path)
     assert (folder / "README.md").read_text() == "mine"
     assert not (folder / "network.py").exists()

@@ -74,7 +74,7 @@ def small(monkeypatch):
 
 def test_the_command_writes_table_plot_and_result(small, tmp_path):
     """Without draws; the result against the mean over all training rigs by hand."""
-    command = ["tune", "pid", "--all", "--draws", "0", "--out", str(tmp_path), "--json", "-"]
+    command = ["train", "pid", "--all", "--draws", "0", "--out", str(tmp_path), "--json", "-"]
     run = CliRunner().invoke(app, command)
     assert run.exit_code == 0, run.output
     names = sorted(path.name for path in tmp_path.iterdir())
@@ -96,18 +96,18 @@ def test_the_command_writes_table_plot_and_result(small, tmp_path):
 
 
 def test_the_command_for_one_lung(small, tmp_path):
-    arguments = ["tune", "pid", "--lung", "R20C50", "--draws", "0", "--out", str(tmp_path)]
+    arguments = ["train", "pid", "--lung", "R20C50", "--draws", "0", "--out", str(tmp_path)]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     result = json.loads((tmp_path / "best.json").read_text())
     assert tuple(result["lungs"]) == ("R20C50",)
     assert "single" not in result
-    run = CliRunner().invoke(app, ["tune", "pid", "--lung", "all", "--out", str(tmp_path)])
+    run = CliRunner().invoke(app, ["train", "pid", "--lung", "all", "--out", str(tmp_path)])
     assert isinstance(run.exception, InputError)
 
 
 @pytest.mark.parametrize("which", [[], ["--all", "--robust"], ["--lung", "R5C10", "--all"]])
 def test_the_command_wants_to_know_which_lungs(which, tmp_path):
-    run = CliRunner().invoke(app, ["tune", "pid", *which, "--out", str(tmp_path)])
+    run = CliRunner().invoke(app, ["train", "pid", *which, "--out", str(tmp_path)])
     assert isinstance(run.exception, InputError)
     assert "exactly one of" in str(run.exception)
 

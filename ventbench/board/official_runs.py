@@ -96,7 +96,7 @@ def rerun(
     *,
     records: Sequence[str] = (),
     sources: Sequence[Path] = (),
-    jobs: int = 1,
+    workers: int = 0,
     scheduler: str | None = None,
     load: Load = frozen.load,
     runner: Callable[[], Runner] = sandboxed,
@@ -108,7 +108,7 @@ def rerun(
         folder: of the leaderboard.
         records: hashes of the records, or the beginnings of them; all scores if empty.
         sources: folders with the code: of one submission, or of several.
-        jobs: number of processes; 1 for this one alone.
+        workers: number of processes; 0 for this one alone.
         scheduler: address of a Dask scheduler instead, whose workers see the same files.
         load: gives the simulators; outside of this process, a function of a module.
         runner: gives the runner; outside of this process, a function of a module.
@@ -140,7 +140,7 @@ def rerun(
             todo[score.sha256] = score, round_, code, folder.resolve(), load, runner
             continue
         outcomes[score.sha256] = Outcome(score.sha256, score.name, score.track, NOT_RERUN, why)
-    with executor(jobs if jobs > 1 and scheduler is None else 0, scheduler) as pool:
+    with executor(workers, scheduler) as pool:
         for done, (sha256, outcome) in enumerate(results(pool, _run, todo), 1):
             outcomes[sha256] = outcome
             if progress is not None:

@@ -6,8 +6,12 @@ Heavy packages are imported inside the commands, so that ``ventbench --help`` an
 
 from __future__ import annotations
 
-import typer
+from typing import Any
 
+import typer
+from typer.core import TyperGroup
+
+from ventbench.base.errors import InputError
 from ventbench.cli import (
     board,
     data,
@@ -20,7 +24,28 @@ from ventbench.cli import (
     train,
 )
 
+#: Commands by their former names.
+_MOVED = {
+    "coverage": "board coverage",
+    "headroom": "board headroom",
+    "isolability": "diagnose PLAN --isolability",
+    "lungs": "list lungs",
+    "open-loop": "data open-loop",
+    "report": "view RUN --out report.html",
+    "stressors": "list stressors",
+    "tune": "train",
+}
+
+
+class _Commands(TyperGroup):
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] in _MOVED:
+            raise InputError(f"`ventbench {args[0]}` is now `ventbench {_MOVED[args[0]]}`")
+        return super().resolve_command(ctx, args)
+
+
 app = options.program("ventbench", "A benchmark for the control of mechanical ventilators.")
+app.info.cls = _Commands
 listing = typer.Typer(
     name="list",
     help="List the lungs, stressors, submissions and examples.",
@@ -29,10 +54,11 @@ listing = typer.Typer(
 
 #: Groups of `ventbench --help`, the commands of each, and where the commands of the groups belong.
 _PANELS = {
-    "Controllers": (score.score, score.new, score.check),
-    "Recordings": (diagnose.diagnose, diagnose.mechanics, diagnose.isolability),
-    "Simulators and pictures": (simulators.simulate, simulators.view, simulators.report),
+    "Controllers": (score.score, score.new, score.check, train.app),
+    "Recordings": (diagnose.diagnose, diagnose.mechanics, data.app),
+    "Simulators and pictures": (simulators.simulate, simulators.view, listing),
     "This machine": (doctor.doctor,),
+    "Leaderboard": (board.app, round.app),
 }
 _GROUPS = {
     listing: (simulators.lungs, score.stressors, score.entries, data.examples),
@@ -41,16 +67,13 @@ _GROUPS = {
 }
 for _panel, _commands in _PANELS.items():
     for _command in _commands:
-        app.command(rich_help_panel=_panel)(_command)
+        if isinstance(_command, typer.Typer):
+            app.add_typer(_command, rich_help_panel=_panel)
+        else:
+            app.command(rich_help_panel=_panel)(_command)
 for _group, _commands in _GROUPS.items():
     for _command in _commands:
         _group.command()(_command)
-app.add_typer(train.tune, rich_help_panel="Controllers")
-app.add_typer(train.app, rich_help_panel="Controllers")
-app.add_typer(data.app, rich_help_panel="Recordings")
-app.add_typer(listing, rich_help_panel="Simulators and pictures")
-app.add_typer(board.app, rich_help_panel="Leaderboard")
-app.add_typer(round.app, rich_help_panel="Leaderboard")
 
 
 def main() -> None:

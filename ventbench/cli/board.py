@@ -14,6 +14,7 @@ from ventbench.cli.options import (
     JsonFile,
     Scheduler,
     Sources,
+    Workers,
     bar,
     console_of,
     emit,
@@ -191,7 +192,7 @@ def verify(
         typer.Option("--rerun", help="Also run the code of records again, in the sandbox."),
     ] = False,
     source: Sources = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes of --rerun.")] = 1,
+    workers: Workers = 0,
     scheduler: Scheduler = None,
     site: Annotated[
         Path | None,
@@ -221,10 +222,11 @@ def verify(
 
     The exit code is 1 if there is any problem. Each problem names its file.
 
-    Example: `ventbench board verify --rerun --jobs 2`
+    Example: `ventbench board verify --rerun --workers 2`
     """
     import dataclasses
 
+    from ventbench.board import official_runs
     from ventbench.board import verify as verifier
     from ventbench.plants import frozen
 
@@ -239,7 +241,19 @@ def verify(
             progress=replaying,
         )
     if rerun and not report.problems:  # else the records are not what they were
-        _rerun(report, folder, records or [], source or [], jobs, scheduler)
+        with bar("running code again") as running:
+            outcomes = official_runs.rerun(
+                folder,
+                records=records or (),
+                sources=source or (),
+                workers=workers,
+                scheduler=scheduler,
+                progress=running,
+            )
+        report.reproduced = sum(x.state == official_runs.REPRODUCED for x in outcomes)
+        report.second_runs = [str(x) for x in outcomes]
+        report.problems += [str(x) for x in outcomes if x.state == official_runs.DIFFERENT]
+        report.notes += [str(x) for x in outcomes if x.state == official_runs.NOT_RERUN]
     console = written_console(dataclasses.asdict(report), json)
     for note in report.notes:
         console.print(f"note: {plain(note)}")
@@ -250,32 +264,6 @@ def verify(
     _summary(console, report)
     if report.problems:
         raise typer.Exit(1)
-
-
-def _rerun(
-    report: Report,
-    folder: Path,
-    records: list[str],
-    sources: list[Path],
-    jobs: int,
-    scheduler: str | None,
-) -> None:
-    """Run code again; note in the report what came of it."""
-    from ventbench.board import official_runs
-
-    with bar("running code again") as running:
-        outcomes = official_runs.rerun(
-            folder,
-            records=records,
-            sources=sources,
-            jobs=jobs,
-            scheduler=scheduler,
-            progress=running,
-        )
-    report.reproduced = sum(x.state == official_runs.REPRODUCED for x in outcomes)
-    report.second_runs = [str(x) for x in outcomes]
-    report.problems += [str(x) for x in outcomes if x.state == official_runs.DIFFERENT]
-    report.notes += [str(x) for x in outcomes if x.state == official_runs.NOT_RERUN]
 
 
 def _summary(console: Console, report: Report) -> None:

@@ -25,8 +25,13 @@ from ventbench.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from ventbench.diagnosis.result import Diagnosis
     from ventbench.mechanics import Mechanics
     from ventbench.mechanics.identify import Term
+    from ventbench.recordings.breaths import Breaths
+
+#: Heading of the options of ``--isolability``.
+_PLANNED = "With --isolability"
 
 
 def mechanics(
@@ -161,22 +166,23 @@ def _table(lungs: dict[str, Mechanics]) -> Any:
     )
 
 
-if TYPE_CHECKING:
-    from ventbench.diagnosis.result import Diagnosis
-    from ventbench.recordings.breaths import Breaths
-
-
 def diagnose(
     recordings: Annotated[
         Path,
         typer.Argument(
             help="CSV, CSV.GZ or Parquet file in the public schema, or the folder of a session, "
-            "whose recordings are diagnosed as one."
+            "whose recordings are diagnosed as one. With --isolability a CSV file of planned "
+            "breaths: u_in, u_out, time_step, breath_id."
         ),
     ],
     out: Annotated[
-        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
-    ],
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            callback=claim_out,
+            help="Folder for the results; always needed but with --isolability.",
+        ),
+    ] = None,
     plant: PlantName = "physics",
     drive: Annotated[
         str,
@@ -189,7 +195,9 @@ def diagnose(
     lung: Annotated[
         str | None,
         typer.Option(
-            metavar="R20C50", help="Only the breaths of this lung.", autocompletion=complete_lungs
+            metavar="R20C50",
+            help="Only the breaths of this lung; that of planned breaths, R20C50 by default.",
+            autocompletion=complete_lungs,
         ),
     ] = None,
     patient: Annotated[
@@ -203,6 +211,30 @@ def diagnose(
     clip: Clip = False,
     pad: Pad = False,
     missing: Missing = None,
+    isolability: Annotated[
+        bool,
+        typer.Option(
+            "--isolability",
+            help="Tell which mechanisms planned breaths could tell apart, before anything is "
+            "recorded.",
+        ),
+    ] = False,
+    sensors: Annotated[
+        str,
+        typer.Option(metavar="pressure,flow", help="What is measured.", rich_help_panel=_PLANNED),
+    ] = "pressure",
+    noise: Annotated[
+        float,
+        typer.Option(help="Of pressure, standard deviation, cmH2O.", rich_help_panel=_PLANNED),
+    ] = 0.25,
+    names: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B",
+            help="Only these mechanisms; the library if empty.",
+            rich_help_panel=_PLANNED,
+        ),
+    ] = "",
     json: JsonFile = None,
 ) -> None:
     """Find the physics that a simulator lacks when it differs from a recording.
@@ -217,8 +249,18 @@ def diagnose(
     `--plant module:function`; one in another program writes `--plant answers.csv`, with breath_id,
     a column simulated (cmH2O) and perhaps time_step (s): perhaps the recording with that column.
 
+    With --isolability, pairs of mechanisms that planned breaths would not tell apart are listed
+    with the breath or the sensor that would; strengths are mild. The exit code is 1 if there are
+    such pairs.
+
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
+
+    Example: `ventbench diagnose plan.csv --isolability --sensors pressure,flow`
     """
+    if isolability:
+        return _isolability(recordings, lung or "R20C50", sensors, noise, names, json)
+    if out is None:
+        raise InputError("--out DIR is needed: the folder for the results")
     if drive not in ("auto", "valve", "flow"):
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
     require("jinja2", "rerun")
@@ -268,37 +310,15 @@ def expected_time(breaths: int, lungs: int, warm: bool) -> str:
     return f"{text}. Ctrl-C stops it; nothing is written before the end."
 
 
-def isolability(
-    controls: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE", help="CSV file of planned breaths: u_in, u_out, time_step, breath_id."
-        ),
-    ],
-    lung: Annotated[
-        str, typer.Option(metavar="R20C50", help="Its label.", autocompletion=complete_lungs)
-    ] = "R20C50",
-    sensors: Annotated[
-        str, typer.Option(metavar="pressure,flow", help="What is measured.")
-    ] = "pressure",
-    noise: Annotated[float, typer.Option(help="Of pressure, standard deviation, cmH2O.")] = 0.25,
-    names: Annotated[
-        str, typer.Option(metavar="A,B", help="Only these mechanisms; the library if empty.")
-    ] = "",
-    json: JsonFile = None,
+def _isolability(
+    controls: Path, lung: str, sensors: str, noise: float, names: str, json: Path | None
 ) -> None:
-    """Tell which mechanisms planned breaths could tell apart, before anything is recorded.
-
-    Strengths are mild. Pairs that cannot be told apart are listed with the breath or the sensor
-    that would separate them. The exit code is 1 if there are such pairs.
-
-    Example: `ventbench isolability --lung R20C50 --controls plan.csv --sensors pressure,flow`
-    """
+    """Print what planned breaths could tell apart; see :func:`diagnose`."""
     from ventbench.base import compilation
-    from ventbench.diagnosis.isolability import isolability as compute
+    from ventbench.diagnosis.isolability import isolability
 
     compilation.keep()
-    result = compute(
+    result = isolability(
         controls,
         lung=lung,
         sensors=[sensor.strip() for sensor in sensors.split(",")],

@@ -234,8 +234,8 @@ def new(
         ),
     ],
     family: Annotated[str, typer.Option(help="Kind: pid, residual, ppo, dqn or other.")] = "pid",
-    folder: Annotated[
-        Path, typer.Option("--dir", metavar="DIR", help="Folder in which NAME/ is written.")
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder in which NAME/ is written.")
     ] = Path("."),
     network: Annotated[
         Path | None,
@@ -254,7 +254,7 @@ def new(
     """
     from ventbench.entries import scaffold
 
-    path = scaffold.create(name, family, folder, network)
+    path = scaffold.create(name, family, out, network)
     typer.echo(f"wrote {path}: " + ", ".join(sorted(entry.name for entry in path.iterdir())))
     typer.echo(f"next: ventbench check {path} && ventbench score {path}")
 

@@ -246,35 +246,25 @@ def view(
     runs: Runs,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="File to write; default: scores.rrd in the first RUN."),
+        typer.Option(
+            metavar="FILE",
+            help="File to write: a rerun file, or a report if it ends with .html; default: "
+            "scores.rrd in the first RUN.",
+        ),
     ] = None,
-    show: Annotated[bool, typer.Option("--open/--no-open", help="Open the viewer.")] = True,
+    show: Annotated[bool, typer.Option("--open/--no-open", help="Open a rerun file.")] = True,
 ) -> None:
-    """Write a rerun file of scored runs and open it.
+    """Write a rerun file of scored runs and open it, or write a self-contained HTML report.
 
-    Example: `ventbench view runs/demo/pid_best runs/demo/pid_robust`
+    Example: `ventbench view runs/demo/pid_best runs/demo/pid_robust --out report.html`
     """
     from ventbench import pages
 
-    path = out or runs[0] / "scores.rrd"
-    pages.write_rerun(path, _read(runs)[0])
+    path, (loaded, scores) = out or runs[0] / "scores.rrd", _read(runs)
+    if path.suffix == ".html":
+        pages.write_report(path, loaded, scores)
+    else:
+        pages.write_rerun(path, loaded)
     typer.echo(f"wrote {path}")
-    if show:
+    if show and path.suffix != ".html":
         pages.open_viewer(path)
-
-
-def report(
-    runs: Runs,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="File to write; default: report.html in the first RUN."),
-    ] = None,
-) -> None:
-    """Write a self-contained HTML report of scored runs.
-
-    Example: `ventbench report runs/demo/pid_best runs/demo/pid_robust`
-    """
-    from ventbench import pages
-
-    loaded, scores = _read(runs)
-    typer.echo(f"wrote {pages.write_report(out or runs[0] / 'report.html', loaded, scores)}")

@@ -1,4 +1,4 @@
-"""``ventbench train`` and ``tune``: simulators of rigs, and gains of PIDs."""
+"""``ventbench train``: simulators of rigs, and gains of PIDs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from ventbench.cli.options import (
     written_console,
 )
 
-app = typer.Typer(name="train", help="Train simulators.", no_args_is_help=True)
-tune = typer.Typer(name="tune", help="Search for the gains of a controller.", no_args_is_help=True)
+app = typer.Typer(
+    name="train", help="Learn simulators; search for gains of PIDs.", no_args_is_help=True
+)
 
 
 @app.command()
@@ -73,12 +74,7 @@ def simulator(
 PLOT = "grid.png"
 
 
-@tune.callback()
-def _group() -> None:
-    pass
-
-
-@tune.command()
+@app.command()
 def pid(
     lung: Annotated[
         str | None,
@@ -121,7 +117,7 @@ def pid(
     simulators a lung has all its rigs but the held-out one. The 100 best without noise also run on
     draws that are for tuning alone, and the best there win.
 
-    Example: `ventbench tune pid --all --out runs/pid`
+    Example: `ventbench train pid --all --out runs/pid`
     """
     from ventbench.train.pid_search import RESULT, TABLE, tune_beyond, tune_pid
 

@@ -136,7 +136,7 @@ def create(
         raise InputError(f"family {family!r} is not one of {', '.join(FAMILIES)}{hint}")
     folder = Path(out) / name
     if os.path.lexists(folder):
-        raise InputError(f"{folder} exists; choose another name or --dir DIR; nothing was changed")
+        raise InputError(f"{folder} exists; choose another name or --out DIR; nothing was changed")
     written = contents(name, family, network)
     folder.mkdir(parents=True)
     for file, content in written.items():

@@ -290,7 +290,8 @@ def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:
 {compared}- **green bar** at the bottom: scored part
 
 **All lungs**: breath {last}. **A lung's tab**: the whole run; the expiratory valve, `u_out`, is the
-same for all. Time is in seconds since the run began. `ventbench report` has the scores.
+same for all. Time is in seconds since the run began. `ventbench view RUN --out report.html` has the
+scores.
 
 ventbench {ventbench.__version__}
 """

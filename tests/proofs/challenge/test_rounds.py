@@ -79,8 +79,8 @@ def test_a_challenge_is_not_overwritten(made):
 @pytest.mark.slow
 def test_two_processes_make_and_answer_the_same(made, tmp_path):
     folder = ChallengeFolder(tmp_path / "c")
-    assert make(SECRET, folder.path, "masked", 2, jobs=2, record=coarsely) == made[1]
-    assert answer(folder, who("sees_nothing"), limits=QUICK, jobs=2) == {}
+    assert make(SECRET, folder.path, "masked", 2, workers=2, record=coarsely) == made[1]
+    assert answer(folder, who("sees_nothing"), limits=QUICK, workers=2) == {}
     assert sorted(folder.answers("sees_nothing")) == sorted(folder.cases())
 
 

@@ -7,7 +7,7 @@ ordinary priority.
 
 Usage:
 
-    python benchmarks/hardware_loop.py [--minutes 30] [--lung R20C50] [--plant frozen]
+    python benchmarks/hardware_loop.py [--minutes 30] [--lung R20C50] [--simulator frozen]
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def breathing(step: int, pressure: float) -> tuple[float, int]:
     return max(GAIN * (float(waveform.target(step, PIP)) - pressure), 0.0), 0
 
 
-def main(minutes: float = 0.1, lung: str = "R20C50", plant: str = "frozen") -> None:
+def main(minutes: float = 0.1, lung: str = "R20C50", simulator: str = "frozen") -> None:
     """Timing of a 30 ms loop on an emulated device: lateness of steps, round trips, losses."""
-    command = f"-m hardware_eval emulate --lung {lung} --plant {plant}".split()
+    command = f"-m hardware_eval emulate --lung {lung} --simulator {simulator}".split()
     emulator = subprocess.Popen(
         [sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -169,7 +169,7 @@ def emulate(
     lung: Annotated[
         str, typer.Option(help="Lung on it.", autocompletion=options.complete_lungs)
     ] = "R20C50",
-    plant: options.PlantName = "frozen",
+    simulator: options.SimulatorName = "frozen",
     link: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Symbolic link to make to the terminal.")
     ] = None,
@@ -193,7 +193,7 @@ def emulate(
 
     emulator.check_link(link)
     runs_image = None if firmware is None else command_of(firmware)
-    lung_plant = load_simulators(plant).plant(lung)
+    lung_plant = load_simulators(simulator).plant(lung)
     print("compiling the lung; the terminal appears when it answers", file=sys.stderr, flush=True)
     hal = simulated.SimulatedHal(lung_plant, name=f"emulated {lung}", sensor=simulated.PVP_SENSOR)
     begun = time.monotonic()
@@ -223,7 +223,7 @@ def emulate(
 def selftest(
     port: Port,
     lung: Lung,
-    plant: options.PlantName = "frozen",
+    simulator: options.SimulatorName = "frozen",
     skip: Skip = None,
     calibration: Calibrated = None,
     json: JsonFile = None,
@@ -237,7 +237,7 @@ def selftest(
     from ventbench.plants.catalog import load_simulators
     from ventbench.task.lungs import scored_lung
 
-    label, simulators = scored_lung(lung).id, load_simulators(plant)
+    label, simulators = scored_lung(lung).id, load_simulators(simulator)
     left_out = chosen_parts(skip or ())
     with bench_on(port, yes=True) as (line, bench, _):
         baseline = calibration_of(line, calibration).baseline()
@@ -291,7 +291,7 @@ def compare(
             "a recording in the public schema.",
         ),
     ],
-    plant: options.PlantName = "frozen",
+    simulator: options.SimulatorName = "frozen",
     out: Annotated[
         Path | None,
         typer.Option(
@@ -312,7 +312,7 @@ def compare(
     from ventbench.simulation import error_summary, mean_errors
 
     breaths = recorded_breaths(recorded)
-    tested = scored_plants(plant, list(breaths.by_lung_index))
+    tested = scored_plants(simulator, list(breaths.by_lung_index))
     error = mean_errors(tested.pressures(breaths), breaths)
     lungs = {lung: error_summary("", error[index]) for lung, index in breaths.by_lung_index.items()}
     diagnoses = {}
@@ -395,13 +395,7 @@ def demo(
         "runs/demo"
     ),
     breaths: Annotated[int, typer.Option(min=12, help="Breaths to explore.")] = 36,
-    plant: Annotated[
-        str,
-        typer.Option(
-            help="Simulators that lack the concealed physics: physics or frozen.",
-            autocompletion=options.complete_plants,
-        ),
-    ] = "physics",
+    simulator: options.SimulatorName = "physics",
     in_process: options.InProcess = False,
     json: JsonFile = None,
 ) -> None:
@@ -416,7 +410,7 @@ def demo(
         conceal,
         out,
         breaths=breaths,
-        simulator=plant,
+        simulator=simulator,
         sandbox=not in_process,
         tell=lambda text: print(text, file=to, flush=True),
     )

@@ -124,9 +124,9 @@ def test_doctor_names_what_is_missing(monkeypatch):
         ("ventbench", "score pid_r", "pid_robust"),
         ("ventbench", "train pid --lung R5C1", "R5C10"),
         ("ventbench", "train pid --lung R20C1", "R20C10"),
-        ("ventbench", "data open-loop --plant two", "two_balloon"),
+        ("ventbench", "data open-loop --simulator two", "two_balloon"),
         ("ventbench-hardware", "run ppo", "ppo"),
-        ("ventbench-hardware", "compare --plant phy", "physics"),
+        ("ventbench-hardware", "compare --simulator phy", "physics"),
     ],
 )
 def test_names_are_completed(program, words, wanted):

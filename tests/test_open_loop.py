@@ -143,7 +143,7 @@ def test_the_command_writes_what_the_function_finds(breaths, tmp_path):
 @pytest.mark.parametrize("kind", ["frozen", "hybrid", "physics"])
 def test_the_command_knows_all_kinds(breaths, tmp_path, kind):
     write(breaths, tmp_path / "lab.csv")
-    text = run("data", "open-loop", tmp_path / "lab.csv", "--plant", kind, "--json", "-")
+    text = run("data", "open-loop", tmp_path / "lab.csv", "--simulator", kind, "--json", "-")
     result = json.loads(text[text.index("{") : text.rindex("\n}") + 2])
     assert result["plant"] == kind
     assert f"of the {kind} simulators" in text
@@ -163,8 +163,10 @@ def test_bad_recordings_are_refused_in_one_line(breaths, tmp_path):
     message = run("data", "open-loop", tmp_path / "lab.csv", code=2)
     assert "line 89, column u_in: 104.2 is outside 0..100" in message
     assert "R5C20" in run("data", "open-loop", tmp_path / "lab.csv", "--clip")
-    message = run("data", "open-loop", tmp_path / "lab.csv", "--clip", "--plant", "magic", code=2)
-    assert "--plant 'magic': there is no such file" in message
+    message = run(
+        "data", "open-loop", tmp_path / "lab.csv", "--clip", "--simulator", "magic", code=2
+    )
+    assert "--simulator 'magic': there is no such file" in message
 
 
 def test_the_public_recordings_give_the_held_out_errors_of_the_manifest(

@@ -93,7 +93,7 @@ def test_many_breaths_are_each_simulated_alone(tmp_path):
             for k, u in enumerate(commands[number])
         ]
     path.write_text("\n".join(rows) + "\n")
-    run("simulate", "--controls", path, "--plant", "physics", "--out", out)
+    run("simulate", "--controls", path, "--simulator", "physics", "--out", out)
     breaths = ventbench.load_recording(out, pad=True)
     assert breaths.breath_id.tolist() == list(lengths)
     for index, (number, (R, C, length)) in enumerate(lengths.items()):
@@ -101,7 +101,7 @@ def test_many_breaths_are_each_simulated_alone(tmp_path):
         alone = Controls(np.linspace(0.0, 0.03 * (length - 1), length), commands[number], u_out)
         wanted = simulate(alone, lung=f"R{R}C{C}", simulator="physics").pressure
         np.testing.assert_allclose(breaths.pressure[index, :length], wanted, atol=2e-3)
-    printed = run("simulate", "--controls", path, "--plant", "physics")
+    printed = run("simulate", "--controls", path, "--simulator", "physics")
     assert printed.splitlines()[0] == out.read_text().splitlines()[0]
     recording = ventbench.load_recording(out, pad=True)
     with pytest.raises(InputError, match="is the recording itself; it has no column simulated"):

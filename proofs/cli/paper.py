@@ -13,8 +13,8 @@ from ventbench.base.errors import InputError, require
 from ventbench.cli.options import (
     InProcess,
     JsonFile,
-    PlantName,
     RecordingsDir,
+    SimulatorName,
     Workers,
     bar,
     bars,
@@ -224,7 +224,7 @@ def adversary(
         list[str] | None,
         typer.Option(help="Stressor that may act; may be repeated. Default: all, and the rig."),
     ] = None,
-    plant: PlantName = "frozen",
+    simulator: SimulatorName = "frozen",
     in_process: InProcess = False,
     json: JsonFile = None,
 ) -> None:
@@ -241,7 +241,7 @@ def adversary(
     with bar(f"searching for what makes {name} unsafe"):
         unsafe = work.adversary(
             name,
-            simulator=plant,
+            simulator=simulator,
             lungs=lung or (),
             stressors=stressor or (),
             sandbox=not in_process,

@@ -54,7 +54,7 @@ def test_linear_algebra_takes_one_thread_where_it_is_asked_to():
 
 def test_a_score_keeps_what_it_compiles(monkeypatch, tmp_path, setting):
     monkeypatch.setenv("VENTBENCH_CACHE", str(tmp_path / "kept"))
-    words = ["score", "pid_best", "--plant", "physics", "--in-process"]
+    words = ["score", "pid_best", "--simulator", "physics", "--in-process"]
     assert CliRunner().invoke(app, words).exit_code == 0
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "kept")  # type: ignore[attr-defined]
 

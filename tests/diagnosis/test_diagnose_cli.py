@@ -1,4 +1,4 @@
-"""``ventbench diagnose`` around a diagnosis that is made up, and ``--plant FILE`` everywhere."""
+"""``ventbench diagnose`` around a diagnosis that is made up; ``--simulator FILE`` elsewhere."""
 
 from __future__ import annotations
 
@@ -114,11 +114,11 @@ def test_json_to_stdout_is_nothing_else(recording, tmp_path, calls):
 def test_bad_input(recording, tmp_path, calls):
     out = tmp_path / "out"
     assert "no such file" in run(tmp_path / "none.csv", "--out", out, code=2).lower()
-    message = run(recording, "--plant", "phisics", "--out", out, code=2)
-    assert "--plant 'phisics': there is no such file" in message
+    message = run(recording, "--simulator", "phisics", "--out", out, code=2)
+    assert "--simulator 'phisics': there is no such file" in message
     other = tmp_path / "other.json"
     other.write_text("{}")
-    assert "is not a file of plants" in run(recording, "--plant", other, "--out", out, code=2)
+    assert "is not a file of plants" in run(recording, "--simulator", other, "--out", out, code=2)
     assert calls == []
     assert not out.exists()
     assert "--out DIR is needed" in run(recording, code=2)
@@ -130,7 +130,7 @@ def test_the_corrected_plant_can_be_diagnosed_itself(recording, tmp_path, calls)
     corrected = out / "corrected.json"
     found, _ = load_plants(corrected)
     assert list(found) == ["R20C50"]
-    run(recording, "--lung", "R20C50", "--plant", corrected, "--out", tmp_path / "again")
+    run(recording, "--lung", "R20C50", "--simulator", corrected, "--out", tmp_path / "again")
     given = calls[-1]["simulator"]
     assert given.name == "corrected.json"
     assert [lung.id for lung in given.lungs] == ["R20C50"]
@@ -147,7 +147,7 @@ def test_simulated_pressures_and_drive(recording, tmp_path, calls):
     both = tmp_path / "both.csv"
     table.to_csv(both, index=False)
     out = tmp_path / "out"
-    run(both, "--plant", both, "--drive", "valve", "--out", out)
+    run(both, "--simulator", both, "--drive", "valve", "--out", out)
     given = calls[0]["simulator"]
     assert (type(given), given.name) == (SimulatedPressures, "both.csv")
     assert calls[0]["drive"] == "valve"
@@ -166,7 +166,7 @@ def test_a_simulator_in_plain_python(recording, tmp_path, calls, monkeypatch):
         "        self.p += 0.1 * u_in * dt\n"
         "        return self.p\n"
     )
-    run(recording, "--plant", "plain_lungs:Lung", "--out", tmp_path / "out")
+    run(recording, "--simulator", "plain_lungs:Lung", "--out", tmp_path / "out")
     given = calls[0]["simulator"]
     assert (type(given), given.name) == (PythonSimulators, "plain_lungs:Lung")
     assert np.isfinite(given.pressures(calls[0]["breaths"])).all()

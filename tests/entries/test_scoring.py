@@ -493,7 +493,7 @@ def test_one_command_scores_every_track_that_an_entry_enters(make, tmp_path):
     out = tmp_path / "runs"
 
     def scored(track, *options):
-        words = ["score", str(folder), "--plant", "physics", "--in-process", "--json", "-"]
+        words = ["score", str(folder), "--simulator", "physics", "--in-process", "--json", "-"]
         ended = CliRunner().invoke(app, [*words, "--track", track, *options])
         assert ended.exit_code == 0, ended.output
         return json.loads(ended.stdout)
@@ -560,7 +560,7 @@ def test_entries_on_a_cluster_have_the_scores_that_they_have_here(tmp_path):
 
     def scores(*options: object) -> dict[str, Any]:
         file = tmp_path / "scores.json"
-        words = ("score", "pid_robust", "pid_best", "--plant", "physics", "--in-process")
+        words = ("score", "pid_robust", "pid_best", "--simulator", "physics", "--in-process")
         ended = CliRunner().invoke(app, [*words, "--json", str(file), *map(str, options)])
         assert ended.exit_code == 0, ended.output
         return {

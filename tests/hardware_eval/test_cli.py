@@ -231,7 +231,7 @@ def test_a_wrong_plan_is_refused_with_its_key(text: str, said: str, tmp_path: Pa
     [
         ("run pid_best --lung R5C20 --out {file}", "is a file, not a folder"),
         ("calibrate zero --out {file}/calibration.json", "is a file, not a folder"),
-        ("selftest --lung R5C20 --plant nothing", "--plant 'nothing'"),
+        ("selftest --lung R5C20 --simulator nothing", "--simulator 'nothing'"),
         ("selftest --lung R5C20 --skip nothing", "no part 'nothing'"),
         ("collect --lung R5C20 --out {file}", "is a file, not a folder"),
         ("bringup --operator ''", "--operator: give the name"),
@@ -273,7 +273,7 @@ def test_a_demo_without_words_leaves_nothing(tmp_path: Path) -> None:
     ("line", "said"),
     [
         ("--lung R7", "R7"),
-        ("--plant nothing", "nothing"),
+        ("--simulator nothing", "nothing"),
         ("--link {file}", "{file}: there is a file of that name"),
         ("--link {file}/lung", "is no folder; make it first"),
         ("--firmware {new}", "make it with `make`"),

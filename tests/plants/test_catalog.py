@@ -235,7 +235,9 @@ def test_what_stands_for_nothing_is_refused(given):
 
 def test_machine_code_of_others_is_refused_with_the_way_to_run_it(tmp_path):
     (path := tmp_path / "lung.FMU").write_bytes(b"PK")
-    with pytest.raises(InputError, match=r"lung\.FMU is an FMU.*--plant module:name.*own_rig\.md"):
+    with pytest.raises(
+        InputError, match=r"lung\.FMU is an FMU.*--simulator module:name.*own_rig\.md"
+    ):
         load_simulators(path)
 
 

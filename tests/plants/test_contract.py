@@ -331,7 +331,7 @@ def test_a_new_family_is_one_file_and_one_line(make_recording, tmp_path, monkeyp
         test_stacked_plants_are_each_their_own(name)
         test_expiration_returns_to_peep(name, 12.0)
         test_nominal_variation_changes_nothing(name)
-    # It has a name for `--plant`, and its plants go into files.
+    # It has a name for `--simulator`, and its plants go into files.
     simulators = load_simulators("first_order")
     recording = make_recording(["R5C10", "R20C50"])
     answers = simulators.pressures(recording)

@@ -195,7 +195,7 @@ def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     plants = {name: single_compartment(lung(name)) for name in ("R20C20", "R5C10")}
     path = tmp_path / "corrected.json"
     save_plants(path, plants)
-    options = ("score", "pid_best", "--plant", path, "--in-process")
+    options = ("score", "pid_best", "--simulator", path, "--in-process")
     code, text = run(*options, "--json", "-")
     plain = json.loads(text)
     assert code == 0
@@ -214,5 +214,5 @@ def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     assert "R5C20" not in text
     code, text = run(*options, "--draws", 20, "--record", tmp_path / "records")
     assert code == 2
-    assert "leave out --plant" in text
-    assert run("score", "pid_best", "--plant", "nothing")[0] == 2
+    assert "leave out --simulator" in text
+    assert run("score", "pid_best", "--simulator", "nothing")[0] == 2

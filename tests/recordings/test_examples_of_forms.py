@@ -103,7 +103,7 @@ def test_the_lung_comes_out(name: str) -> None:
 
 
 def test_a_submission_is_sent_to_its_recording() -> None:
-    with pytest.raises(InputError, match=r"diagnose the recording with --plant .*submission"):
+    with pytest.raises(InputError, match=r"diagnose the recording with --simulator .*submission"):
         import_recording(FORMS / "submission.csv.gz", lung="R20C50")
     recorded = load(FORMS / "kaggle.csv.gz")
     table = read_table(FORMS / "submission.csv.gz").columns

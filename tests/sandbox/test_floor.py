@@ -90,7 +90,7 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
             lambda words=words: CliRunner().invoke(app, words.split(), catch_exceptions=False)
             for words in (
                 "score pid_best",
-                "score pid_best --plant physics",
+                "score pid_best --simulator physics",
                 "score pid_robust --stress 1",
             )
         ),

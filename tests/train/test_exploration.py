@@ -179,7 +179,7 @@ def test_unknown_lungs_and_no_breaths_are_errors():
 @pytest.mark.parametrize("plant", ["frozen", "physics"])
 def test_the_command_line_explores_a_simulator(tmp_path, plant):
     out = tmp_path / "explored.csv"
-    given = ["data", "explore", str(out), "--plant", plant, "--lung", "R5C20", "--noise", "0.2"]
+    given = ["data", "explore", str(out), "--simulator", plant, "--lung", "R5C20", "--noise", "0.2"]
     said = CliRunner().invoke(app, [*given, "--breaths", "7"])
     assert said.exit_code == 0, said.output
     found = load(out)

@@ -14,7 +14,7 @@ from ventbench.cli.options import (
     JsonFile,
     Missing,
     Pad,
-    PlantName,
+    SimulatorName,
     bar,
     complete_lungs,
     emit,
@@ -260,7 +260,7 @@ def explore(
     lung: Annotated[
         str, typer.Option(help="Lung setting, such as R20C50.", autocompletion=complete_lungs)
     ] = "R20C50",
-    plant: PlantName = "frozen",
+    simulator: SimulatorName = "frozen",
     breaths: Annotated[
         int, typer.Option(min=1, help="Number of breaths; the PIPs alternate.")
     ] = 60,
@@ -280,7 +280,7 @@ def explore(
     from ventbench.plants.catalog import load_simulators
     from ventbench.train import exploration
 
-    chosen = load_simulators(plant).plant(lung)
+    chosen = load_simulators(simulator).plant(lung)
     ventilator = exploration.SimulatedVentilator(
         chosen, min(breaths, _TOGETHER), noise=noise, seed=seed
     )

@@ -14,7 +14,7 @@ from ventbench.cli.options import (
     JsonFile,
     Missing,
     Pad,
-    PlantName,
+    SimulatorName,
     bar,
     claim_out,
     complete_lungs,
@@ -183,7 +183,7 @@ def diagnose(
             help="Folder for the results; always needed but with --isolability.",
         ),
     ] = None,
-    plant: PlantName = "physics",
+    simulator: SimulatorName = "physics",
     drive: Annotated[
         str,
         typer.Option(
@@ -243,11 +243,12 @@ def diagnose(
     the model an effect outside the library acts), and how much the corrected simulator gains on
     held-out breaths. R, C, the expiratory resistance and PEEP are always refitted. Writes
     diagnosis.json, report.html, diagnosis.rrd and, if the simulator has plants, corrected.json,
-    which every `--plant` option accepts.
+    which every `--simulator` option accepts.
 
     Sampling rates from 20 to 1000 Hz are taken as they are. A simulator in plain Python is
-    `--plant module:function`; one in another program writes `--plant answers.csv`, with breath_id,
-    a column simulated (cmH2O) and perhaps time_step (s): perhaps the recording with that column.
+    `--simulator module:function`; one in another program writes `--simulator answers.csv`, with
+    breath_id, a column simulated (cmH2O) and perhaps time_step (s): perhaps the recording with that
+    column.
 
     With --isolability, pairs of mechanisms that planned breaths would not tell apart are listed
     with the breath or the sensor that would; strengths are mild. The exit code is 1 if there are
@@ -265,7 +266,7 @@ def diagnose(
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
     require("jinja2", "rerun")
     breaths = read_recording(recordings, clip=clip, pad=pad, missing=missing)
-    diagnosis = _diagnose(breaths, plant, lung, patient, drive)
+    diagnosis = _diagnose(breaths, simulator, lung, patient, drive)
     written = diagnosis.save(out)
     console = written_console(diagnosis.as_dict(), json)
     verdict, *sentences = str(diagnosis).splitlines()
@@ -277,7 +278,7 @@ def diagnose(
 
 
 def _diagnose(
-    breaths: Breaths, plant: str, lung: str | None, patient: bool, drive: str
+    breaths: Breaths, simulator: str, lung: str | None, patient: bool, drive: str
 ) -> Diagnosis:
     """Diagnose with a progress bar that says what is done and how long it will take."""
     from ventbench.base import compilation
@@ -285,7 +286,7 @@ def _diagnose(
     from ventbench.plants.catalog import load_simulators
 
     compilation.keep()
-    simulators = load_simulators(plant)
+    simulators = load_simulators(simulator)
     lungs = 1 if lung is not None else len(breaths.by_lung_index)
     notes().print(expected_time(len(breaths), lungs, compilation.is_warm()))
     with bar("diagnosing") as diagnosing:

@@ -118,12 +118,10 @@ InProcess = Annotated[
     bool,
     typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
 ]
-PlantName = Annotated[
+SimulatorName = Annotated[
     str,
     typer.Option(
-        "--plant",
-        "--simulator",
-        metavar="PLANT",
+        metavar="SIMULATOR",
         autocompletion=complete_plants,
         help="Simulators: frozen (the official ones), physics, two_balloon, a file of plants such "
         "as corrected.json, a CSV or Parquet file of simulated pressures, or module:function.",

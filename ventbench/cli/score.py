@@ -16,8 +16,8 @@ from ventbench.cli.options import (
     Entries,
     InProcess,
     JsonFile,
-    PlantName,
     Scheduler,
+    SimulatorName,
     Workers,
     bar,
     claim_out,
@@ -79,7 +79,7 @@ def score(
             "the robustness track hold the score under missing physics too.",
         ),
     ] = None,
-    plant: PlantName = "frozen",
+    simulator: SimulatorName = "frozen",
     stress: Annotated[
         int | None,
         typer.Option(
@@ -100,7 +100,7 @@ def score(
     on the reference rig of each lung; lower is better. With `--draws 20` the ranked score stands
     beside it: normalised, on all rigs of each lung, and the score under missing physics. Each
     controller runs in sandboxed processes that have no access to the simulators. With another
-    `--plant` the lungs are those of that plant, and the score is not official. Several controllers
+    `--simulator` the lungs are its own, and the score is not official. Several controllers
     are scored in turn, or at the same time with `--workers` or `--scheduler`.
 
     Example: `ventbench score submissions/pid_best --json score.json`
@@ -123,15 +123,15 @@ def score(
     entries = [entry.manifest.name for entry in opened]
     if len(set(entries)) < len(entries):
         raise InputError(f"two submissions have the same name: {', '.join(sorted(entries))}")
-    if record is not None and plant != "frozen":
-        raise InputError("--record needs the official simulators: leave out --plant")
-    load_simulators(plant)  # whatever is wrong with it is told before anything runs
+    if record is not None and simulator != "frozen":
+        raise InputError("--record needs the official simulators: leave out --simulator")
+    load_simulators(simulator)  # whatever is wrong with it is told before anything runs
     if stress and track is None:
         track = "robustness"
     if stress is None:
         stress = DRAWS if draws >= 20 else 0
     jobs = [job for entry in opened for job in _jobs(entry, track, stress)]
-    work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process)
+    work = partial(_run, simulator=simulator, draws=draws, sandbox=not in_process)
     scores = map_entries("scoring", work, jobs, workers, scheduler)
     results = [result.to_json() for result in scores]
     console = written_console(results[0] if len(results) == 1 else {"submissions": results}, json)

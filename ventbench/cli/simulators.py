@@ -14,7 +14,7 @@ from ventbench.cli.options import (
     Clip,
     JsonFile,
     Pad,
-    PlantName,
+    SimulatorName,
     bar,
     complete_lungs,
     read_recording,
@@ -128,7 +128,7 @@ def simulate(
             help="Write to this file instead of stdout; of many breaths also .csv.gz or .parquet.",
         ),
     ] = None,
-    plant: PlantName = "frozen",
+    simulator: SimulatorName = "frozen",
 ) -> None:
     """Simulate the pressures for a file of valve commands, as CSV.
 
@@ -142,7 +142,9 @@ def simulate(
     with open(controls, encoding="utf-8-sig", errors="replace") as file:
         many = "breath_id" in file.readline().replace('"', "").strip().split(",")
     if many:
-        simulated = simulation.simulate_breaths(controls, lung=lung, simulator=plant, start=start)
+        simulated = simulation.simulate_breaths(
+            controls, lung=lung, simulator=simulator, start=start
+        )
         if out is None:
             typer.echo(simulated.to_frame().to_csv(index=False), nl=False)
         else:
@@ -150,7 +152,7 @@ def simulate(
         return
     if lung is None:
         raise InputError("--lung is needed: the file names no lung; give one such as R20C50")
-    text = simulation.simulate(controls, lung=lung, simulator=plant, start=start).to_csv()
+    text = simulation.simulate(controls, lung=lung, simulator=simulator, start=start).to_csv()
     if out is None:
         typer.echo(text, nl=False)
     else:
@@ -161,7 +163,7 @@ def open_loop(
     recordings: Annotated[
         Path, typer.Argument(help="CSV, CSV.GZ or Parquet file in the public schema.")
     ],
-    plant: PlantName = "frozen",
+    simulator: SimulatorName = "frozen",
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
@@ -185,7 +187,7 @@ def open_loop(
             "simulator with"
         )
     with bar(f"simulating {len(breaths)} breaths") as simulating:
-        result = simulation.open_loop(breaths, plant, progress=simulating)
+        result = simulation.open_loop(breaths, simulator, progress=simulating)
     console = written_console(result.as_dict(), json)
     console.print(_open_loop_table(result.as_dict()))
     for line in result.remarks():

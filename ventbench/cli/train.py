@@ -11,8 +11,8 @@ from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.cli.options import (
     JsonFile,
-    PlantName,
     RecordingsDir,
+    SimulatorName,
     bar,
     claim_out,
     complete_lungs,
@@ -51,8 +51,8 @@ def simulator(
 ) -> None:
     """Learn simulators from a folder of recordings in the public schema, with any R and C.
 
-    Every CSV or Parquet file in the folder is read. The result is a folder for `--plant`. Ctrl-C
-    keeps the finished work; the same command continues.
+    Every CSV or Parquet file in the folder is read. The result is a folder for `--simulator`.
+    Ctrl-C keeps the finished work; the same command continues.
 
     Example: `ventbench train simulator --recordings my-recordings --out runs/my-rig`
     """
@@ -95,7 +95,7 @@ def pid(
         Path,
         typer.Option(metavar="DIR", callback=claim_out, help="Folder for table, plot and result."),
     ] = Path("runs/pid"),
-    plant: PlantName = "frozen",
+    simulator: SimulatorName = "frozen",
     draws: Annotated[
         int,
         typer.Option(
@@ -127,13 +127,13 @@ def pid(
     with bar("PIDs") as progress:
         if beyond:
             result = tune_beyond(
-                names, draws=draws, each=not robust, simulator=plant, progress=progress
+                names, draws=draws, each=not robust, simulator=simulator, progress=progress
             )
             files.write_json(out / RESULT, result)
             written = [RESULT]
         else:
             grid, result = tune_pid(
-                names, out, draws=draws, each=not robust, simulator=plant, progress=progress
+                names, out, draws=draws, each=not robust, simulator=simulator, progress=progress
             )
             written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
     console = written_console(result, json)

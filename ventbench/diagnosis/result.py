@@ -107,7 +107,7 @@ class Diagnosis(Findings):
         """Write the diagnosis as JSON, a page and a rerun file, and what follows from it.
 
         ``diagnosis.json``, ``report.html`` and ``diagnosis.rrd``. ``corrected.json`` holds the
-        corrected plants, which every ``--plant`` takes; it is left out if the simulator has no
+        corrected plants, which every ``--simulator`` takes; it is left out if the simulator has no
         plants. ``record_next.csv`` holds the commands of the breaths to record next, for an
         operator or ``ventbench simulate``; it is left out if nothing is open.
 

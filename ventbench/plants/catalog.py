@@ -1,4 +1,4 @@
-"""The simulators behind every ``--plant``: one resolver for names, files, functions and arrays.
+"""The simulators behind every ``--simulator``: one resolver for names, files, functions and arrays.
 
 ====================================  ============================================================
 What is given                         What it stands for
@@ -175,15 +175,15 @@ def _by_text(text: str) -> Simulators:
             return _of_table(read_table(path).columns, path.name, str(path), files.sha256(path))
         if name.endswith(".fmu"):
             raise InputError(
-                f"{path} is an FMU, whose machine code nothing here runs; give --plant module:name "
-                "of an object that steps it with fmpy, as docs/own_rig.md shows"
+                f"{path} is an FMU, whose machine code nothing here runs; give --simulator "
+                "module:name of an object that steps it with fmpy, as docs/own_rig.md shows"
             )
         return _plant_file(path)
     module, colon, attribute = text.partition(":")
     if colon and all(part.isidentifier() for part in (*module.split("."), attribute)):
         return _imported(module, attribute)
     raise InputError(
-        f"--plant {text!r}: there is no such file, nor a simulator of that name; choose "
+        f"--simulator {text!r}: there is no such file, nor a simulator of that name; choose "
         f"{', '.join(names())}, a file of plants (.json), a CSV or Parquet file of simulated "
         "pressures, or module:function"
     )
@@ -228,7 +228,7 @@ def _of_value(value: Any, text: str | None = None, sha256: str | None = None) ->
 
     Args:
         value: any.
-        text: how ``--plant`` names it, if it does.
+        text: how ``--simulator`` names it, if it does.
         sha256: of the module that it is from; by default that of the parameters of plants.
     """
     if isinstance(value, Mapping):
@@ -301,7 +301,7 @@ def _imported(module: str, attribute: str) -> Simulators:
         value = getattr(loaded, attribute)
     except Exception as error:
         raise InputError(
-            f"--plant {text}: it cannot be imported: {type(error).__name__}: {error}"
+            f"--simulator {text}: it cannot be imported: {type(error).__name__}: {error}"
         ) from error
     finally:
         sys.path.remove(str(Path.cwd()))
@@ -310,8 +310,8 @@ def _imported(module: str, attribute: str) -> Simulators:
     if (found := _of_value(value, text, digest)) is not None:
         return found
     raise InputError(
-        f"--plant {text}: a {type(value).__name__} is neither a function, a plant nor plants by "
-        "lung id"
+        f"--simulator {text}: a {type(value).__name__} is neither a function, a plant nor plants "
+        "by lung id"
     )
 
 

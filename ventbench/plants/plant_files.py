@@ -1,8 +1,8 @@
 """Families of plants, one line each; plants by lung as JSON, a stack of them as ``.npz``.
 
-A family is known to files, ``--plant`` and the contract tests. Never pickle: a file can only name
-the plant types of :data:`FAMILIES`, by their class names. Numbers have full precision: what is read
-is to the bit what was written, and equal plants give equal bytes.
+A family is known to files, ``--simulator`` and the contract tests. Never pickle: a file can only
+name the plant types of :data:`FAMILIES`, by their class names. Numbers have full precision: what is
+read is to the bit what was written, and equal plants give equal bytes.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class PlantFamily:
 
     plant: type  #: class of the plants; files name it by the class's name.
     #: makes the plant of a lung at its label, if labels are all it needs. The family then has a
-    #: name for ``--plant`` and goes through the contract tests of physics plants.
+    #: name for ``--simulator`` and goes through the contract tests of physics plants.
     for_lung: Callable[[Lung], Plant] | None = None
 
 
-#: By the name that ``--plant`` takes. ``physics`` and ``frozen`` are more than one line, see
+#: By the name that ``--simulator`` takes. ``physics`` and ``frozen`` are more than one line, see
 #: :mod:`ventbench.plants.catalog`.
 FAMILIES: dict[str, PlantFamily] = {
     "single_compartment": PlantFamily(SingleCompartment, single_compartment),

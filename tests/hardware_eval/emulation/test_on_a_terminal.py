@@ -169,7 +169,7 @@ def test_an_emulator_of_its_own_vents_when_its_host_falls_silent(tmp_path: Path)
     link = tmp_path / "lung"
     command = [sys.executable, "-m", "hardware_eval", "emulate", "--link", str(link)]
     emulator = subprocess.Popen(
-        [*command, "--lung", LUNG, "--plant", "single_compartment"],
+        [*command, "--lung", LUNG, "--simulator", "single_compartment"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

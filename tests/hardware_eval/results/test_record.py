@@ -173,7 +173,7 @@ def test_the_board_shows_it_beside_the_simulated_score(path: Path, tmp_path: Pat
 def test_the_recording_is_compared_with_simulators(path: Path) -> None:
     figures = []
     for plant in ("physics", "frozen"):
-        words = ["compare", str(path), "--plant", plant, "--no-diagnose", "--json", "-"]
+        words = ["compare", str(path), "--simulator", plant, "--no-diagnose", "--json", "-"]
         done = CliRunner().invoke(cli.app, words)
         assert done.exit_code == 0, done.output
         figures.append(json.loads(done.stdout)["lungs"][LUNG])

@@ -34,7 +34,16 @@ def test_a_held_valve_is_unsafe_at_the_supply_that_algebra_says(make, monkeypatc
     flow = (LIMIT - 5.0) / (R / 1e3 + 31 * 0.03 / C)
     u_in = flow / stressor("supply_high").strong ** SEVERITY / VALVE_GAIN
     entry = make(act=f"return {u_in!r}")
-    arguments = ["study", "adversary", str(entry), "--lung", "R20C50", "--lung", "R5C50", "--plant"]
+    arguments = [
+        "study",
+        "adversary",
+        str(entry),
+        "--lung",
+        "R20C50",
+        "--lung",
+        "R5C50",
+        "--simulator",
+    ]
     arguments += ["physics", "--stressor", "supply_high", "--in-process", "--json", "-"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 1, result.output

@@ -1,4 +1,4 @@
-"""From any folder of recordings to simulators that every ``--plant`` takes."""
+"""From any folder of recordings to simulators that every ``--simulator`` takes."""
 
 from __future__ import annotations
 

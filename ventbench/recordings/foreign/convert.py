@@ -426,7 +426,7 @@ def _check_needed(
     if set(table.columns) == {"id", "pressure"}:  # as the competition's submissions
         raise InputError(
             f"{table.file} holds pressures by row alone, as a submission does; diagnose the "
-            f"recording with --plant {table.file}"
+            f"recording with --simulator {table.file}"
         )
     has = set(roles.values())
     timed = rate or table.rate or any(table.header(name).interval for name in table.columns)

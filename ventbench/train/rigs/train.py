@@ -154,7 +154,7 @@ def train_rigs(
 ) -> frozen.Frozen:
     """Learn simulators from any folder of recordings in the public schema.
 
-    The result is a folder that every ``--plant`` takes. Finished fits are kept in ``out/parts``
+    The result is a folder that every ``--simulator`` takes. Finished fits are kept in ``out/parts``
     until all is done, so that an interrupted training goes on. On one machine with the same
     packages the files are the same byte for byte.
 

@@ -390,7 +390,9 @@ def options(description: str, out: Path) -> argparse.ArgumentParser:
     which.add_argument("--all", action="store_true", help="only one network for all lungs")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first training")
     parser.add_argument("--seeds", type=int, default=1, help="trainings; the best is kept")
-    parser.add_argument("--plant", default="frozen", help="simulators to train on")
+    parser.add_argument(
+        "--simulator", dest="plant", default="frozen", help="simulators to train on"
+    )
     parser.add_argument("--out", type=Path, default=out, help="folder for the results")
     return parser
 

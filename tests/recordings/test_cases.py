@@ -42,7 +42,7 @@ READ = {
 #: Files after public forms: breaths, interval and what is said.
 PUBLIC = {
     "clock_reset": (10, 0.02, "The clock begins anew in line 902"),
-    "flow_every_second_row": (9, 0.02, "1500 rows were left out in which only some"),
+    "flow_every_second_row": (9, 0.02, "1500 rows in which only some of the measured columns"),
     "flow_mL_s": (9, 0.01, "flow_mL_s"),
     "held_values": (11, 0.01, "119 of 3600 readings of flow_lpm (3.3 %) only repeat"),
     "missing_marks_flow": (11, 0.01, "such as -99): lines 3218"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -94,9 +95,9 @@ def check(
 
     with bar(f"reading {file}") as reading:
         report = recordings.check(file, clip=clip, pad=pad, missing=missing or (), progress=reading)
-    emit(report.to_dict(), json)
+    console = written_console(report.to_dict(), json)
     for line in report.lines():
-        typer.echo(line, err=str(json) == "-")
+        console.print(line, soft_wrap=True)
     if not report.ok:
         raise typer.Exit(2)
     if report.suspicious:
@@ -146,10 +147,14 @@ def import_(
             "--split-breaths", help="Split at inspirations, even if a column numbers the breaths."
         ),
     ] = False,
-    pressure_unit: Annotated[str | None, typer.Option(help="cmH2O, mbar, hPa, kPa, mmHg.")] = None,
-    flow_unit: Annotated[str | None, typer.Option(help="mL/s, L/s, L/min, mL/min, L/h.")] = None,
+    pressure_unit: Annotated[
+        str | None, typer.Option(help="cmH2O, mbar, hPa, kPa, bar, mmHg.")
+    ] = None,
+    flow_unit: Annotated[
+        str | None, typer.Option(help="mL/s, L/s, L/min, mL/min, L/h, cfm.")
+    ] = None,
     volume_unit: Annotated[str | None, typer.Option(help="mL or L.")] = None,
-    time_unit: Annotated[str | None, typer.Option(help="s, ms, us or min.")] = None,
+    time_unit: Annotated[str | None, typer.Option(help="s, ms, us, ns, min or day.")] = None,
     u_in_unit: Annotated[str | None, typer.Option(help="% or 1 (0 to 1).")] = None,
     invert: Annotated[
         list[str] | None,
@@ -215,23 +220,23 @@ def import_(
             decimal=decimal,
         )
     emit(imported.as_dict(), json)
-    to_stderr = str(json) == "-"
+    say = partial(typer.echo, err=str(json) == "-")
     for name, role in imported.columns.items():
         change = imported.conversions.get(role)
         unit = f" ({change})" if change is not None else ""
-        typer.echo(f"{name}: {role}{unit}", err=to_stderr)
+        say(f"{name}: {role}{unit}")
     for note in imported.understood:
-        typer.echo(note, err=to_stderr)
+        say(note)
     for warning in imported.warnings:
         typer.echo(f"warning: {warning}", err=True)
-    typer.echo(imported.preview, err=to_stderr)
+    say(imported.preview)
     if out is None:
-        typer.echo("Nothing was written; give --out recording.csv to write it.", err=to_stderr)
+        say("Nothing was written; give --out recording.csv to write it.")
         return
     recordings.write(imported.breaths, out)
     lengths = imported.breaths.valid.sum(axis=1)
     pad = " (breaths of unequal length: read it with --pad)" if len(set(lengths)) > 1 else ""
-    typer.echo(f"wrote {len(imported.breaths)} breaths to {out}{pad}", err=to_stderr)
+    say(f"wrote {len(imported.breaths)} breaths to {out}{pad}")
 
 
 def _pairs(arguments: list[str] | None, option: str) -> dict[str, str]:

@@ -49,7 +49,7 @@ from ventbench.mechanics.term_selection import (
     select_terms,
 )
 from ventbench.recordings.bad_samples import MEASURED, clean, notable
-from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.breaths import Breaths, arranged
 from ventbench.recordings.roles import check_roles, find_saturation, opposite_sign
 from ventbench.system_id.fit import t_quantile
 from ventbench.task.lungs import Lung
@@ -173,6 +173,23 @@ class Mechanics:
     faults: tuple[str, ...] = ()  #: what may be wrong with the sensors, of :data:`FAULTS`.
 
 
+def _at_the_slowest(breaths: Breaths) -> Breaths:
+    """Breaths at the samples at which all is known, where a column comes evenly more slowly.
+
+    Between its readings it would be invented, and would lag behind the others where it jumps.
+    """
+    names = [name for name in MEASURED if getattr(breaths, name) is not None]
+    known = breaths.valid & np.isfinite(sum(getattr(breaths, name) for name in names))
+    lengths, apart = known.sum(axis=1), np.diff(np.flatnonzero(known))
+    if min(lengths) < 2 or np.median(apart) < 2 or apart.max() > 2.0 * np.median(apart):
+        return breaths
+    first = breaths.time[np.arange(len(breaths)), known.argmax(axis=1)]
+    samples = {name: getattr(breaths, name)[known] for name in (*names, "u_in", "u_out")}
+    kept = ("breath_id", "R", "C", "source", "notes", "left_out")
+    rest = {name: getattr(breaths, name) for name in kept}
+    return arranged(lengths, (breaths.time - first[:, None])[known], samples, **rest)
+
+
 def identify(
     breaths: Breaths,
     progress: Callable[[int, int], object] | None = None,
@@ -189,7 +206,7 @@ def identify(
         InputError: if neither is recorded, or too little of a lung to tell R from C, or more than
             a fifth of the readings are none.
     """
-    breaths, lungs, completed = clean(breaths, readings=readings), [], 0
+    breaths, lungs, completed = _at_the_slowest(clean(breaths, readings=readings)), [], 0
     notable(breaths)
     for name, part in breaths.by_lung().items():
         lungs.append(_identify_lung(name, part))

@@ -59,6 +59,7 @@ class Conversion:
     unit: str  #: unit in the file.
     to: str  #: unit of the schema.
     factor: Fraction  #: one ``unit`` in ``to``; its reciprocal is the exact way back.
+    stated: bool = True  #: whether anybody said the unit; else it is taken for the schema's.
 
     def apply(self, values: Floats) -> Floats:
         """Convert; one rounding to the nearest number at most for each of two integers."""
@@ -88,7 +89,7 @@ def conversion(quantity: str, unit: str | None) -> Conversion:
         raise InputError(
             f"{unit!r} is no unit of {quantity} that is known; choose one of {', '.join(spellings)}"
         )
-    return Conversion(name, to, spellings[name])
+    return Conversion(name, to, spellings[name], unit is not None)
 
 
 def in_file_unit(change: Conversion, pascal: float) -> float:

@@ -8,7 +8,7 @@ resampled or smoothed.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -37,7 +37,7 @@ from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, Layout, recogni
 from ventbench.recordings.foreign.shapes import epoch_unit, one_row_a_sample
 from ventbench.recordings.foreign.tables import Table
 from ventbench.recordings.headers import STATES, Conversion, conversion, in_file_unit, read_header
-from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
+from ventbench.recordings.roles import SLOW, Finding, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.scan import complete_times
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung
@@ -57,9 +57,8 @@ _STANDS_STILL, _PRECISE = 0.2, 0.005
 _WRAPS = (2.0**16, 2.0**24, 2.0**31, 2.0**32, *(10.0**k for k in range(2, 10)), 60.0, 3600.0)
 _WRAPS += (43_200.0, 86_400.0, 3_600_000.0, 86_400_000.0)
 
-#: Share of the rows from which blanks of a column are those of a slower rate, longest of them that
-#: is bridged, s, and share of the column's range that is a jump.
-_SPARSE, _BRIDGED, _JUMP = 0.05, 0.25, 0.1
+#: Share of the rows from which blanks of a column are those of a slower rate.
+_SPARSE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,32 +183,29 @@ def import_recording(
     changes = _conversions(table, by_role, units, spec)
     if spec.about:
         table = table.noted(f"Layout {layout}: {spec.about}.")
-    clock = by_role.get("time")
-    if clock is not None and (unit := epoch_unit(table.columns[clock])) not in (None, "s"):
-        table = table.noted(f"{clock} counts {unit} since 1970, by the size of its values.")
+    table = _in_order(table, by_role.get("time"))
     raw = {
         role: _numbers(table, name, spoken)
         for role, name in by_role.items()
         if role != "breath" and not (role == "time" and rate is not None)
     }
-    for reason in (_repeats, _knows_little):
-        omitted, why = reason(raw)
-        if omitted.any():
-            first = table.place(int(np.argmax(omitted)))
-            raw = {role: x[~omitted] for role, x in raw.items()}
-            sentence = f"{int(omitted.sum())} rows {why}, the first in {first}."
-            table = table.rows(~omitted).noted(sentence)
-    notes = list(table.notes)
+    table, raw = _without(table, raw, repeated_rows(raw), "that repeat the row before")
+    if "time" not in raw:
+        raw["time"], changes["time"], how = _even(table, by_role, rate)
+        table = table.noted(how)
+    table, raw = _without(table, raw, _knows_little(raw), _PARTIAL)
     measured = {role: raw[role] for role in (*MEASURED, "u_in") if role in raw}
     bad = find_bad_samples(measured, tuple(missing))
     raw |= blanked(measured, bad)
     warnings = [_of_file(bad_samples, table, by_role) for bad_samples in bad]
+    slow = "slow" in [bad_samples.kind for bad_samples in bad]
+    table, raw = _without(table, raw, _knows_little(raw) & slow, _PARTIAL)
+    notes = list(table.notes)
     added = dict(offsets or {})
     if unknown := set(added) - set(raw):
         raise InputError(f"--offset {min(unknown)}: no column is {min(unknown)}")
-    if "time" in raw:
-        raw["time"], sentences = _continued(table, raw["time"])
-        notes += sentences
+    raw["time"], sentences = _continued(table, raw["time"])
+    notes += sentences
     values = raw | {
         role: changes[role].apply(raw[role] + added[role] if role in added else raw[role])
         for role in changes.keys() & raw.keys()
@@ -230,9 +226,11 @@ def import_recording(
     keys = groups = [_labels(table.columns[n]) for n, role in roles.items() if role == "group"]
     if "breath" in by_role and not split_breaths:
         keys = [*groups, _labels(table.columns[by_role["breath"]])]
-    time, how = _time(table, by_role, values.get("time"), rate, keys)
-    notes.append(how)
-    notes += _bridge(values, time, by_role)
+    time = values["time"]
+    notes += _checked_clock(table, time, keys)
+    if "u_in" in values:
+        values["u_in"], sentences = _held(values["u_in"], by_role["u_in"])
+        notes += sentences
     unused = [name for name in table.columns if roles.get(name, "unused") == "unused"]
     unused += [by_role["time"]] if rate is not None and "time" in by_role else []
     if unused:
@@ -260,7 +258,6 @@ def import_recording(
     labelled = {**samples, "R": R, "C": C}
     pieces, dropped = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
     notes += dropped
-    warnings += _suspicious(samples, changes)
     rows, parts = np.concatenate(pieces), Pieces.of(list(map(len, pieces)))
     breaths = arranged(
         parts.lengths,
@@ -274,11 +271,19 @@ def import_recording(
         left_out=left_out(bad),
     )
     notable(breaths)
-    issues = check_roles(breaths)
-    if issues and issues[0].level == "refused":
-        column = by_role.get(issues[0].column, issues[0].column)
-        raise InputError(f"{table.file}, column {column}: {issues[0]}")
-    warnings += [str(finding) for finding in issues]
+    doubts = [*_small(samples), *check_roles(breaths)]
+    for doubt in doubts:
+        column = f"{table.file}, column {by_role.get(doubt.column, doubt.column)}"
+        if doubt.level == "refused":
+            raise InputError(f"{column}: {doubt}")
+        change = changes.get(doubt.column) if layout is None else None
+        of_unit = f"--{doubt.column}-unit" in doubt.advice
+        if of_unit and change is not None and not change.stated:
+            raise InputError(
+                f"{column}: {doubt} Nothing states its unit; give --{doubt.column}-unit, also if "
+                f"it is {change.to}."
+            )
+    warnings += map(str, doubts)
     notes += few_breaths(len(breaths))
     used = {name: role for name, role in roles.items() if role != "unused"}
     return Imported(breaths, changes, used, tuple(notes), tuple(warnings), bad)
@@ -538,23 +543,45 @@ def _numbers(table: Table, name: str, spoken: Mapping[str, float]) -> Floats:
     return np.array(numbers, float)[which.reshape(-1)]
 
 
-def _repeats(raw: Mapping[str, Floats]) -> tuple[Bools, str]:
-    """Rows that are there twice, and what they are in words."""
-    return repeated_rows(raw), "that repeat the row before were left out"
+def _in_order(table: Table, clock: str | None) -> Table:
+    """Rows from the oldest to the newest; notes what a clock counts by its size."""
+    if clock is None or not table.is_numeric(clock):
+        return table
+    if (unit := epoch_unit(table.columns[clock])) not in (None, "s"):
+        since = {"day": 1899}.get(unit, 1970)
+        table = table.noted(f"{clock} counts {unit} since {since}, by the size of its values.")
+    if np.nansum(np.sign(np.diff(table.columns[clock]))) >= 0:
+        return table
+    backwards = table.rows(np.arange(len(table))[::-1])
+    return backwards.noted("The newest row comes first: rows were put in the order of time.")
 
 
-def _knows_little(raw: Mapping[str, Floats]) -> tuple[Bools, str]:
+def _without(
+    table: Table, raw: dict[str, Floats], omitted: Bools, why: str
+) -> tuple[Table, dict[str, Floats]]:
+    """Leave out rows, and say which."""
+    if not omitted.any():
+        return table, raw
+    first = table.place(int(np.argmax(omitted)))
+    sentence = f"{int(omitted.sum())} rows {why} were left out, the first in {first}."
+    return table.rows(~omitted).noted(sentence), {role: x[~omitted] for role, x in raw.items()}
+
+
+#: What rows are of which :func:`_knows_little` tells.
+_PARTIAL = "in which only some of the measured columns are known"
+
+
+def _knows_little(raw: Mapping[str, Floats]) -> Bools:
     """Rows without the slowest measured column, where it comes more slowly than the others.
 
     Between, it would be invented, and would lag behind the others where it jumps. Commands are not
-    thinned, and without a clock no rows can be missed.
+    thinned.
     """
     finite = [np.isfinite(raw[role]) for role in MEASURED if role in raw]
     finite = [x for x in finite if x.any()] or [np.ones(1, bool)]
     least, both = min(x.mean() for x in finite), np.logical_and.reduce(finite)
     slow = least <= 1.0 - _SPARSE and both.mean() >= 0.9 * least
-    omitted = ~both & (slow and "u_in" not in raw and "time" in raw)
-    return omitted, "were left out in which only some of the measured columns are known"
+    return ~both & (slow and "u_in" not in raw)
 
 
 def _of_file(bad: BadSamples, table: Table, by_role: Mapping[str, str]) -> str:
@@ -597,33 +624,15 @@ def _continued(table: Table, time: Floats) -> tuple[Floats, list[str]]:
     return time, sentences
 
 
-def _bridge(values: dict[str, Floats], time: Floats, by_role: Mapping[str, str]) -> list[str]:
-    """Interpolate the blanks of columns that come at a slower rate than the rows, but no jumps."""
-    sentences = []
-    for role in (role for role in (*MEASURED, "u_in") if role in values):
-        finite = np.isfinite(values[role])
-        if finite.mean() > 1.0 - _SPARSE or finite.sum() < 2:
-            continue
-        at = np.flatnonzero(finite)
-        if (every := float(np.median(np.diff(at)))) < 2:
-            continue
-        samples, rows = values[role][at], np.arange(at[0], at[-1] + 1)
-        before = np.searchsorted(at, rows, side="right") - 1
-        after = np.minimum(before + 1, len(at) - 1)
-        bridgeable = at[after] - at[before] <= 2.0 * every
-        bridgeable &= ~(time[at[after]] - time[at[before]] > _BRIDGED)
-        if role == "u_in":  # a command stays until the next
-            bridged = samples[before]
-        else:
-            bridged = np.interp(rows, at, samples)
-            bridgeable &= np.abs(samples[after] - samples[before]) <= _JUMP * np.ptp(samples)
-        values[role] = values[role].copy()
-        values[role][rows] = np.where(finite[rows] | bridgeable, bridged, np.nan)
-        how = "held" if role == "u_in" else "interpolated except where it jumps"
-        sentences.append(
-            f"{by_role.get(role, role)} is known in one of {every:g} rows; it was {how}."
-        )
-    return sentences
+def _held(u_in: Floats, name: str) -> tuple[Floats, list[str]]:
+    """Commands, each held until the next one where they come more slowly than the rows; a note."""
+    rows, at = np.arange(len(u_in)), np.flatnonzero(np.isfinite(u_in))
+    if len(at) < 2 or len(at) == len(rows):
+        return u_in, []
+    last, every = at[np.searchsorted(at, rows, side="right") - 1], float(np.median(np.diff(at)))
+    held = (rows >= last) & (rows - last < 2.0 * every)
+    sentence = f"{name} is known in one of {every:g} rows; it was held."
+    return np.where(held, u_in[last], np.nan), [sentence] if every > 1.0 else []
 
 
 def _labels(values: NDArray[Any]) -> Ints:
@@ -631,27 +640,26 @@ def _labels(values: NDArray[Any]) -> Ints:
     return np.unique(values, return_inverse=True)[1].reshape(-1)
 
 
-def _time(
-    table: Table,
-    by_role: Mapping[str, str],
-    time: Floats | None,
-    rate: float | None,
-    keys: list[Ints],
-) -> tuple[Floats, str]:
-    """Time of each row, s; NaN where the file leaves it blank."""
-    if rate is not None or time is None:
-        stated = next(filter(None, (table.header(n).interval for n in by_role.values())), None)
-        hertz = rate if rate is not None else table.rate or 1.0 / (stated or np.nan)
-        if hertz <= 0:
-            raise InputError(f"--rate {hertz:g}: a positive rate in Hz is needed")
-        whence = "of the file" if rate is None else "as given"
-        return np.arange(len(table)) / hertz, f"Sampling rate {hertz:g} Hz, {whence}."
+def _even(
+    table: Table, by_role: Mapping[str, str], rate: float | None
+) -> tuple[Floats, Conversion, str]:
+    """Times of rows at an even rate, s, and what they are, where no clock is used."""
+    stated = next(filter(None, (table.header(n).interval for n in by_role.values())), None)
+    hertz = rate if rate is not None else table.rate or 1.0 / (stated or np.nan)
+    if hertz <= 0:
+        raise InputError(f"--rate {hertz:g}: a positive rate in Hz is needed")
+    how = f"Sampling rate {hertz:g} Hz, {'of the file' if rate is None else 'as given'}."
+    return np.arange(len(table)) / hertz, conversion("time", None), how
+
+
+def _checked_clock(table: Table, time: Floats, keys: list[Ints]) -> list[str]:
+    """Refuse a clock, s, that is too coarse or of another unit; what it is in words."""
     steps = np.diff(time)
     inside = np.isfinite(steps)
     for key in keys:
         inside &= np.diff(key) == 0
     if not inside.any():
-        return time, "Times are blank in part."
+        return ["Times are blank in part."]
     onwards = steps[inside & (steps > 0)]
     if len(onwards) == 0:
         raise InputError(f"{table.file}: the time does not increase; give --rate in its place")
@@ -671,7 +679,7 @@ def _time(
             f"{table.file}: the median sampling interval is {median:.4g} s, and rates are 20 to "
             "1000 Hz; give --time-unit ms, or the sampling rate with --rate 100"
         )
-    return time, f"Sampling interval {1e3 * median:.4g} ms (median), {1 / median:.4g} Hz."
+    return [f"Sampling interval {1e3 * median:.4g} ms (median), {1 / median:.4g} Hz."]
 
 
 def _plain(rate: float, precision: float) -> str:
@@ -780,20 +788,14 @@ def _sound(
     return intact, [sentence] if reasons else []
 
 
-def _suspicious(
-    samples: Mapping[str, NDArray[Any]], changes: Mapping[str, Conversion]
-) -> list[str]:
+def _small(samples: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
     """Sizes that look like a forgotten unit."""
-    warnings = []
-    for role, small, advice in (
-        ("flow", _SMALL_FLOW, "--flow-unit L/min or L/s"),
-        ("volume", _SMALL_VOLUME, "--volume-unit L"),
+    for role, small, unit, other in (
+        ("flow", _SMALL_FLOW, "mL/s", "L/min or L/s"),
+        ("volume", _SMALL_VOLUME, "mL", "L"),
     ):
         if role in samples and np.isfinite(samples[role]).any():
             size = float(np.nanquantile(np.abs(samples[role]), 0.99))
             if size < small:
-                warnings.append(
-                    f"{role} is {size:.3g} {changes[role].to} at most (99 %), which is little; is "
-                    f"the unit right ({advice})?"
-                )
-    return warnings
+                message = f"{role} is {size:.3g} {unit} at most (99 %), which is little"
+                yield Finding(role, message, f"Is it in {other} (--{role}-unit)?")

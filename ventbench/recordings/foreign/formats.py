@@ -87,6 +87,8 @@ def _parquet(file: str) -> Table:
     with readable(file, "Parquet"):
         sizes.check_parquet(file)
         frame = parquet.read_table(file).to_pandas()
+    if frame.index.dtype.kind in "Mf":
+        frame = frame.rename_axis(index=frame.index.name or "time").reset_index()
     if frame.empty:
         raise InputError(f"{file} holds no rows")
     return _of_values(file, {str(header): frame[header] for header in frame}, "Parquet")
@@ -170,6 +172,9 @@ def _leaves(value: Any, path: str = "") -> dict[str, Any]:
         return {f"{path}.{key}".lstrip("."): frame[key].to_numpy() for key in frame}
     if not isinstance(value, dict):
         return {path: value}
+    unit, lists = value.get("unit"), [x for x in value.values() if isinstance(x, list)]
+    if path and is_unit(str(unit)) and len(lists) == 1:
+        return {f"{path} [{unit}]": lists[0]}
     leaves: dict[str, Any] = {}
     for name, inner in _by_name(value).items():
         leaves |= _leaves(inner, f"{path}.{name}".lstrip("."))
@@ -178,7 +183,10 @@ def _leaves(value: Any, path: str = "") -> dict[str, Any]:
 
 def _by_name(content: dict[str, Any]) -> dict[str, Any]:
     """A record with lists by name where it holds rows beside their names, or columns by row."""
-    inner = [tuple(x) if isinstance(x, dict) else () for x in content.values()]
+    inner = [
+        tuple(x) if isinstance(x, dict) and not any(isinstance(y, list) for y in x.values()) else ()
+        for x in content.values()
+    ]
     if len(inner) > 1 and len(inner[0]) > 1 and len(set(inner)) == 1:  # as pandas writes them
         if len(inner[0]) < len(content):
             return {"": list(content.values())}

@@ -23,6 +23,10 @@ _VALUES, _MOST = ("value", "values", "reading", "measurement", "val", "amplitude
 #: Seconds since 1970 that a recording may be of: 2001 to 2100.
 _RECORDED = (1e9, 4.1e9)
 
+#: Days since 1899 of 2000 to 2100, as spreadsheets count, and the step that tells days, which would
+#: be 9 s, from other times, of which it is a rate of 10 kHz.
+_SERIAL, _DAYS_STEP = (36526, 73050), 1e-4
+
 #: Share of the steps between starts that must agree, and how well, to tell an interval.
 _AGREEING, _ALIKE = 0.8, 0.02
 
@@ -45,8 +49,12 @@ def one_row_a_sample(
 
 
 def epoch_unit(values: Floats) -> str | None:
-    """Unit in which a clock counts since 1970, by its size; None if it does not."""
+    """Unit in which a clock counts since 1970, or days since 1899, by its size; None if neither."""
     finite = np.asarray(values)[np.isfinite(values)]
+    steps = np.abs(np.diff(finite))
+    fine = np.any(steps > 0) and np.median(steps[steps > 0]) < _DAYS_STEP
+    if fine and _SERIAL[0] <= finite.min() <= finite.max() <= _SERIAL[1]:
+        return "day"
     for unit in ("s", "ms", "us", "ns"):
         seconds = conversion("time", unit).apply(finite)
         if len(finite) and _RECORDED[0] <= seconds.min() <= seconds.max() <= _RECORDED[1]:

@@ -610,7 +610,9 @@ def _values(cells: Any, mark: str) -> tuple[Floats, int]:
     between = rf"[{',' if mark == '.' else '.'} '’\u00a0\u202f]"
     apart = cells.str.contains(between) & cells.str.fullmatch(_NUMBER[mark].pattern)
     if mark == "," and not cells.str.contains(",", regex=False).any():
-        apart &= False  # a column of a file with decimal commas that has points itself
+        # In a file with decimal commas: points of thousands, if some numbers are too small for one.
+        thousands = cells.str.fullmatch(r"(?:0|[1-9]\d{0,2}(?:\.\d{3})*)?").all()
+        apart &= thousands and cells.str.fullmatch(r"\d+").any()
     if apart.any():
         cells = cells.mask(apart, cells.str.replace(between, "", regex=True))
     plain = cells.str.replace(",", ".", regex=False) if mark == "," else cells

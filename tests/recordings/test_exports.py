@@ -1,0 +1,147 @@
+"""Exports in the shapes of devices: R and C are those of the lung, or the option is named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ventbench.base.errors import InputError
+from ventbench.mechanics import identify
+from ventbench.recordings.foreign import import_recording
+
+R, C, RATE = 12.0, 45.0, 100.0
+
+
+def lung(cycles: int = 8) -> pd.DataFrame:
+    """Time, s, pressure, cmH2O, flow, L/s, and volume, L, under two pressures in turn."""
+    time = np.arange(int(3.0 * cycles * RATE)) / RATE
+    pressure, volume = np.zeros_like(time), np.zeros(len(time) + 1)
+    target, fine = 5.0, 50
+    for k, phase in enumerate(time % 3.0):
+        volume[k + 1], pressure[k] = volume[k], target
+        for _ in range(fine):
+            target += ((20.0 if phase < 0.995 else 5.0) - target) / (0.05 * RATE * fine)
+            flow = (target - 5.0 - 1000.0 / C * volume[k + 1]) / R
+            volume[k + 1] += flow / (RATE * fine)
+    flow = (pressure - 5.0 - 1000.0 / C * volume[:-1]) / R
+    noise = np.random.default_rng(0).normal(size=(2, len(time)))
+    columns = {"time": time, "paw": pressure + 0.05 * noise[0], "flow": flow + 0.003 * noise[1]}
+    return pd.DataFrame(columns | {"volume": volume[:-1]})
+
+
+MADE = lung()
+
+
+def csv(path: Path, columns: Mapping[str, object], **options: object) -> Path:
+    pd.DataFrame(columns).to_csv(path, index=False, **options)  # type: ignore[call-overload]
+    return path
+
+
+def check(path: Path, tolerance: float = 0.04, **options: object) -> None:
+    imported = import_recording(path, lung="R20C50", **options)  # type: ignore[arg-type]
+    match = identify(imported.breaths)[0].match
+    assert match.fitted_R == pytest.approx(R, rel=tolerance), imported.understood
+    assert match.fitted_C == pytest.approx(C, rel=tolerance)
+
+
+SLOW = np.repeat(60.0 * MADE.flow[::4].to_numpy(), 4)
+VALVE = {"u_in": np.where(MADE.time % 3.0 < 1.0, 50.0, 0.0), "u_out": MADE.time % 3.0 >= 1.0}
+
+
+@pytest.mark.parametrize("clock", [True, False], ids=["clock", "rate"])
+@pytest.mark.parametrize("valve", [{}, VALVE], ids=["", "valve"])
+@pytest.mark.parametrize("cells", ["held", "blank"])
+def test_a_flow_sensor_that_is_slower_than_the_rows(tmp_path, clock, valve, cells):
+    flow = SLOW if cells == "held" else np.where(MADE.index % 4 == 0, SLOW, np.nan)
+    columns = {"time_s": MADE.time} if clock else {}
+    columns |= {"paw_cmH2O": MADE.paw, "flow_lpm": flow} | valve
+    check(csv(tmp_path / "lab.csv", columns), rate=None if clock else RATE)
+
+
+@pytest.mark.parametrize("options", [{}, {"rate": RATE}], ids=["clock", "rate"])
+def test_the_newest_row_first(tmp_path, options):
+    back = MADE[::-1]
+    columns = {"time_s": back.time, "paw_cmH2O": back.paw, "flow_lpm": 60.0 * back.flow}
+    check(csv(tmp_path / "lab.csv", columns), **options)
+
+
+@pytest.mark.parametrize(
+    "stamp",
+    [
+        lambda time: (1_714_550_400_000_000_000 + np.round(1e9 * time)).astype(np.int64),
+        lambda time: [f"{45234.5 + x / 86400.0:.10f}" for x in time],
+    ],
+    ids=["ns since 1970", "days of a spreadsheet"],
+)
+def test_clocks_by_their_size(tmp_path, stamp: Callable):
+    columns = {"ts": stamp(MADE.time), "paw_cmH2O": MADE.paw, "flow_lpm": 60.0 * MADE.flow}
+    check(csv(tmp_path / "lab.csv", columns))
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [("bar", 0.000980665), ("cmH2O", 1.0)],
+)
+@pytest.mark.parametrize(
+    ("flow_unit", "flow_factor"), [("cfm", 2.11888), ("sccm", 6e4), ("dL/min", 600.0)]
+)
+def test_units_of_industry(tmp_path, unit, factor, flow_unit, flow_factor):
+    columns = {"Time (s)": MADE.time, f"Paw ({unit})": factor * MADE.paw}
+    check(csv(tmp_path / "lab.csv", columns | {f"Flow ({flow_unit})": flow_factor * MADE.flow}))
+
+
+@pytest.mark.parametrize(
+    ("columns", "options"),
+    [
+        ({"flow": 60.0 * MADE.flow}, {"flow": "L/min"}),
+        ({"flow": MADE.flow}, {"flow": "L/s"}),
+        ({"flow": 60.0 * MADE.flow, "volume": MADE.volume}, {"flow": "L/min", "volume": "L"}),
+        ({"volume": MADE.volume}, {"volume": "L"}),
+        ({"flow": 1000.0 * MADE.flow, "paw": 0.0980665 * MADE.paw}, {"pressure": "kPa"}),
+    ],
+    ids=["L/min", "L/s", "L/min and L", "L", "kPa"],
+)
+def test_a_unit_that_nothing_states_is_asked_for(tmp_path, columns, options):
+    path = csv(tmp_path / "lab.csv", {"time": MADE.time, "paw": MADE.paw} | columns)
+    given: dict[str, str] = {}
+    for role, unit in options.items():
+        with pytest.raises(InputError, match=rf"column \w+: .* give --{role}-unit, also if it is"):
+            import_recording(path, lung="R20C50", units=given)
+        given |= {role: unit}
+    check(path, units=given)
+
+
+def test_a_unit_that_is_stated_is_believed(tmp_path):
+    columns = {"time": MADE.time, "paw": MADE.paw, "flow (mL/s)": 60.0 * MADE.flow}
+    imported = import_recording(csv(tmp_path / "lab.csv", columns), lung="R20C50")
+    assert any("which is little" in text for text in imported.warnings)
+
+
+def test_points_of_thousands_beside_decimal_commas(tmp_path):
+    columns = {
+        "Zeit (ms)": [f"{1000 * x:,.0f}".replace(",", ".") for x in MADE.time],
+        "Druck (cmH2O)": [f"{x:.2f}".replace(".", ",") for x in MADE.paw],
+        "Volumen (ml)": [f"{1000 * x:.1f}".replace(".", ",") for x in MADE.volume],
+    }
+    check(csv(tmp_path / "lab.csv", columns, sep=";"))
+
+
+def test_times_in_the_index_of_a_table(tmp_path):
+    index = pd.Timestamp("2024-05-01 10:00") + pd.to_timedelta(MADE.time, unit="s")
+    frame = pd.DataFrame({"paw_cmH2O": MADE.paw, "flow_lpm": 60.0 * MADE.flow})
+    frame.set_index(pd.Index(index)).to_parquet(tmp_path / "lab.parquet")
+    check(tmp_path / "lab.parquet")
+
+
+def test_signals_with_their_units_in_json(tmp_path):
+    signals = {
+        "paw": {"unit": "cmH2O", "data": MADE.paw.tolist()},
+        "flow": {"unit": "L/min", "data": (60.0 * MADE.flow).tolist()},
+    }
+    (tmp_path / "lab.json").write_text(json.dumps({"fs": RATE, "signals": signals}))
+    check(tmp_path / "lab.json")

@@ -9,7 +9,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -148,18 +147,6 @@ def test_lungs_tells_which_sessions_are_not_scored():
 
 def test_lungs_as_json():
     assert json.loads(run("list", "lungs", "--json", "-")) == frozen.load().lungs()
-
-
-def test_coverage_of_a_published_entry(monkeypatch):
-    record = min(RECORDS.glob("*.json"))
-    # Nothing was recorded at and above 50 %, and plenty below.
-    counts = {name: {"recorded_commands": [100] * 5 + [0] * 5} for name in LUNG_IDS}
-    simulators = SimpleNamespace(lungs=lambda: counts)
-    monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
-    shares = json.loads(run("board", "coverage", record, "--json", "-"))
-    assert set(shares) == set(LUNG_IDS)
-    assert all(0.0 <= share["wide_open"] <= share["sparse"] <= 1.0 for share in shares.values())
-    assert max(share["sparse"] for share in shares.values()) > 0.0
 
 
 @pytest.mark.parametrize("name", ["R5C10", "R20C50"])

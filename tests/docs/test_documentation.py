@@ -60,7 +60,6 @@ EXAMPLES = (
     "ventbench doctor",
     "ventbench simulate",
     "ventbench data open-loop",
-    "ventbench board coverage",
     "ventbench list entries",
     "ventbench list examples",
     "ventbench data import",

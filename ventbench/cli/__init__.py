@@ -26,7 +26,6 @@ from ventbench.cli import (
 
 #: Commands by their former names.
 _MOVED = {
-    "coverage": "board coverage",
     "headroom": "board headroom",
     "isolability": "diagnose PLAN --isolability",
     "lungs": "list lungs",
@@ -63,7 +62,7 @@ _PANELS = {
 _GROUPS = {
     listing: (simulators.lungs, score.stressors, score.entries, data.examples),
     data.app: (simulators.open_loop,),
-    board.app: (simulators.coverage, score.headroom),
+    board.app: (score.headroom,),
 }
 for _panel, _commands in _PANELS.items():
     for _command in _commands:

@@ -17,7 +17,6 @@ from ventbench.cli.options import (
     Workers,
     bar,
     console_of,
-    emit,
     written_console,
 )
 
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ventbench.board.ranking import Track
-    from ventbench.board.verify import Report
 
 app = typer.Typer(
     name="board", help="The leaderboard: add records, build and verify pages.", no_args_is_help=True
@@ -169,10 +167,10 @@ def build(
     from ventbench.board import build as builder
 
     built = builder.build(folder, out)
-    emit({"records": built.records, "files": built.files, "changed": list(built.changed)}, json)
-    typer.echo(
+    figures = {"records": built.records, "files": built.files, "changed": list(built.changed)}
+    written_console(figures, json).print(
         f"{out}: {built.records} records, {built.files} pages, {len(built.changed)} files changed",
-        err=str(json) == "-",
+        soft_wrap=True,
     )
 
 
@@ -261,12 +259,6 @@ def verify(
         console.print(line, soft_wrap=True)
     for problem in report.problems:
         console.print(plain(problem), style="red", soft_wrap=True)
-    _summary(console, report)
-    if report.problems:
-        raise typer.Exit(1)
-
-
-def _summary(console: Console, report: Report) -> None:
     count = len(report.problems)
     state = f"{count} problem{'s' if count > 1 else ''}" if count else "no problems"
     reproduced = f", {report.reproduced} reproduced by their code" if report.reproduced else ""
@@ -274,6 +266,8 @@ def _summary(console: Console, report: Report) -> None:
         f"{state}: {report.records} records, {report.replayed} replayed{reproduced}",
         soft_wrap=True,
     )
+    if report.problems:
+        raise typer.Exit(1)
 
 
 @app.command()

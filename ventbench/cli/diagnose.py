@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,7 +27,6 @@ from ventbench.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from ventbench.diagnosis.result import Diagnosis
     from ventbench.mechanics import Mechanics
     from ventbench.mechanics.identify import Term
     from ventbench.recordings.breaths import Breaths
@@ -55,7 +56,8 @@ def mechanics(
 
     Example: `ventbench mechanics lab.csv`
     """
-    named = _of_runs(recordings) or _of_session(recordings, clip=clip, pad=pad, missing=missing)
+    read = partial(read_recording, clip=clip, pad=pad, missing=missing)
+    named = _of_runs(recordings) or _of_session(recordings, read)
     console = written_console([{"name": name} | _lung(lung) for name, lung in named.items()], json)
     console.print(_table(named))
     for name, lung in named.items():
@@ -92,9 +94,7 @@ def _of_runs(path: Path) -> dict[str, Mechanics]:
     return {f"{name}: {lung.label}": lung for name, lung in by_run.items()}
 
 
-def _of_session(
-    path: Path, *, clip: bool, pad: bool, missing: list[float] | None
-) -> dict[str, Mechanics]:
+def _of_session(path: Path, read: Callable[[Path], Breaths]) -> dict[str, Mechanics]:
     """Lungs of a file by label; of a folder by file and label."""
     from ventbench.mechanics import share_faults
     from ventbench.recordings.read import session_files
@@ -103,17 +103,14 @@ def _of_session(
     by_lung = {
         f"{file.stem}: {lung.label}" if len(paths) > 1 else lung.label: lung
         for file in paths
-        for lung in _identify(file, clip=clip, pad=pad, missing=missing)
+        for lung in _identify(file, read(file))
     }
     return dict(zip(by_lung, share_faults(list(by_lung.values())), strict=True))
 
 
-def _identify(
-    path: Path, *, clip: bool, pad: bool, missing: list[float] | None
-) -> tuple[Mechanics, ...]:
+def _identify(path: Path, breaths: Breaths) -> tuple[Mechanics, ...]:
     from ventbench.mechanics import identify
 
-    breaths = read_recording(path, clip=clip, pad=pad, missing=missing)
     if breaths.flow is None and breaths.volume is None:
         raise InputError(
             f"{path}: there is neither a column flow (mL/s) nor volume (mL); record one of them, "
@@ -130,8 +127,7 @@ def _lung(mechanics: Mechanics) -> dict[str, Any]:
     """Return JSON values; numbers that are not finite become null."""
     import dataclasses
 
-    plain = dataclasses.asdict(mechanics) | {"settings": mechanics.match.settings}
-    return files.json_values(plain)
+    return files.json_values(dataclasses.asdict(mechanics) | {"settings": mechanics.match.settings})
 
 
 def _term(term: Term) -> str:
@@ -258,6 +254,10 @@ def diagnose(
 
     Example: `ventbench diagnose plan.csv --isolability --sensors pressure,flow`
     """
+    from ventbench.base import compilation
+    from ventbench.diagnosis.diagnose import diagnose as find
+    from ventbench.plants.catalog import load_simulators
+
     if isolability:
         return _isolability(recordings, lung or "R20C50", sensors, noise, names, json)
     if out is None:
@@ -266,7 +266,19 @@ def diagnose(
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
     require("jinja2", "rerun")
     breaths = read_recording(recordings, clip=clip, pad=pad, missing=missing)
-    diagnosis = _diagnose(breaths, simulator, lung, patient, drive)
+    compilation.keep()
+    simulators = load_simulators(simulator)
+    lungs = 1 if lung is not None else len(breaths.by_lung_index)
+    notes().print(expected_time(len(breaths), lungs, compilation.is_warm()))
+    with bar("diagnosing") as diagnosing:
+        diagnosis = find(
+            breaths,
+            simulator=simulators,
+            lung=lung,
+            patient=patient,
+            drive=drive,  # type: ignore[arg-type]
+            progress=lambda stage, share: diagnosing(share, text=stage),
+        )
     written = diagnosis.save(out)
     console = written_console(diagnosis.as_dict(), json)
     verdict, *sentences = str(diagnosis).splitlines()
@@ -275,29 +287,6 @@ def diagnose(
         console.print(text)
     for path in written:
         console.print(f"wrote {path}", soft_wrap=True)
-
-
-def _diagnose(
-    breaths: Breaths, simulator: str, lung: str | None, patient: bool, drive: str
-) -> Diagnosis:
-    """Diagnose with a progress bar that says what is done and how long it will take."""
-    from ventbench.base import compilation
-    from ventbench.diagnosis.diagnose import diagnose as find
-    from ventbench.plants.catalog import load_simulators
-
-    compilation.keep()
-    simulators = load_simulators(simulator)
-    lungs = 1 if lung is not None else len(breaths.by_lung_index)
-    notes().print(expected_time(len(breaths), lungs, compilation.is_warm()))
-    with bar("diagnosing") as diagnosing:
-        return find(
-            breaths,
-            simulator=simulators,
-            lung=lung,
-            patient=patient,
-            drive=drive,  # type: ignore[arg-type]
-            progress=lambda stage, share: diagnosing(share, text=stage),
-        )
 
 
 def expected_time(breaths: int, lungs: int, warm: bool) -> str:

@@ -123,7 +123,7 @@ SimulatorName = Annotated[
     typer.Option(
         metavar="SIMULATOR",
         autocompletion=complete_plants,
-        help="Simulators: frozen (the official ones), physics, two_balloon, a file of plants such "
+        help="Simulators: frozen (those that rank), physics, two_balloon, a file of plants such "
         "as corrected.json, a CSV or Parquet file of simulated pressures, or module:function.",
     ),
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,15 @@ import typer
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.cli.board import FOLDER, Folder, at_hand, tables_of
-from ventbench.cli.options import JsonFile, Scheduler, Sources, Workers, bar, bars, emit
+from ventbench.cli.options import (
+    JsonFile,
+    Scheduler,
+    Sources,
+    Workers,
+    bar,
+    bars,
+    written_console,
+)
 
 if TYPE_CHECKING:
     from ventbench.board.rounds import Round
@@ -196,11 +205,10 @@ def score(
     if plan:
         runs = official_runs.plan(round_)
         seconds = sum(official_runs.SECONDS[track] for _, track in runs)
-        emit({"runs": runs, "processor_s": seconds}, json)
-        typer.echo(
+        written_console({"runs": runs, "processor_s": seconds}, json).print(
             f"{len(runs)} runs of {len({x for x, _ in runs})} entries: about "
             f"{seconds / 3600:.1f} h of processor time, and the bounds of the draws",
-            err=str(json) == "-",
+            soft_wrap=True,
         )
         return
     with bars() as tell, executor(workers, scheduler) as pool:
@@ -234,9 +242,9 @@ def show(
     folder = at_hand(folder)
     if name is None:
         every_round = rounds.load_all(folder)
-        emit({"rounds": [_summary(round_) for round_ in every_round]}, json)
+        console = written_console({"rounds": [_summary(x) for x in every_round]}, json)
         for round_ in every_round:
-            typer.echo(f"{round_.name}: {round_.state}", err=str(json) == "-")
+            console.print(f"{round_.name}: {round_.state}")
         return
     round_ = rounds.load(folder, name)
     _print_round(round_, json)
@@ -263,19 +271,18 @@ def _summary(round_: Round) -> dict[str, object]:
 
 def _print_round(round_: Round, json: Path | None) -> None:
     """Say how far a round is, and what comes next."""
-    summary, err = _summary(round_), str(json) == "-"
-    emit(summary, json)
+    summary = _summary(round_)
+    say = partial(written_console(summary, json).print, soft_wrap=True)
     kind = "rehearsal" if round_.opened.rehearsal else "round"
-    typer.echo(f"{kind} {round_.name} is {round_.state}", err=err)
+    say(f"{kind} {round_.name} is {round_.state}")
     if round_.frozen is not None:
-        typer.echo(
+        say(
             f"{len(round_.frozen.entries)} entries, {round_.frozen_sha256}; value "
-            f"{round_.number} of the beacon, at {summary['beacon_time']}",
-            err=err,
+            f"{round_.number} of the beacon, at {summary['beacon_time']}"
         )
         reasons = {**round_.frozen.left_out, **(round_.result.failed if round_.result else {})}
         for entry, why in reasons.items():
-            typer.echo(f"{entry}: {plain(why)}", err=err)
+            say(f"{entry}: {plain(why)}")
     following = {"open": "freeze", "frozen": "draw", "drawn": "score"}.get(round_.state)
     next_ = f"ventbench round {following} {round_.name}" if following else "ventbench board build"
-    typer.echo(f"next: {next_}", err=err)
+    say(f"next: {next_}")

@@ -22,7 +22,6 @@ from ventbench.cli.options import (
     bar,
     claim_out,
     complete_entries,
-    emit,
     map_entries,
     notes,
     table_of,
@@ -114,7 +113,7 @@ def score(
     from ventbench.plants.catalog import load_simulators
 
     if record is not None and (draws < 20 or stress not in (None, 0, DRAWS)):
-        raise InputError(f"--record needs all published draws: add --draws 20 --stress {DRAWS}")
+        raise InputError("--record needs all published draws: give --draws 20, without --stress")
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
     if report:
@@ -124,7 +123,7 @@ def score(
     if len(set(entries)) < len(entries):
         raise InputError(f"two submissions have the same name: {', '.join(sorted(entries))}")
     if record is not None and simulator != "frozen":
-        raise InputError("--record needs the official simulators: leave out --simulator")
+        raise InputError("--record needs the frozen simulators: leave out --simulator")
     load_simulators(simulator)  # whatever is wrong with it is told before anything runs
     if stress and track is None:
         track = "robustness"
@@ -283,9 +282,9 @@ def check(
     runner = InProcessRunner() if in_process else None
     with bar(f"running {submission}") as running:
         report = contract.check(submission, runner, progress=running)
-    emit(report.to_json(), json)
+    console = written_console(report.to_json(), json)
     for line in report.lines():
-        typer.echo(line, err=str(json) == "-")
+        console.print(line, soft_wrap=True)
     if not report.ok:
         raise typer.Exit(1)
 

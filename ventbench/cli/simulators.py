@@ -24,7 +24,7 @@ from ventbench.cli.options import (
 from ventbench.task import protocol
 
 if TYPE_CHECKING:
-    from ventbench.trajectories import Trajectories
+    pass
 
 
 def lungs(json: JsonFile = None) -> None:
@@ -38,15 +38,15 @@ def lungs(json: JsonFile = None) -> None:
     """
     from ventbench.plants import frozen
 
-    official = frozen.load()
-    summaries = official.lungs()
+    published = frozen.load()
+    summaries = published.lungs()
     kinds = {"own_rig": "own rig", "unseen_rig": "unseen rig", "held_out": "by clock"}
 
     def shown(summary: dict[str, Any], kind: str) -> str:
         return f"{summary[f'{kind}_mae']:.2f} / {summary[f'{kind}_median_mae']:.2f}"
 
     rows = []
-    for rigs, (lung_id, summary) in zip(official.rigs, summaries.items(), strict=True):
+    for rigs, (lung_id, summary) in zip(published.rigs, summaries.items(), strict=True):
         setting = (f"{summary['R']:g}", f"{summary['C']:g}", str(len(rigs)))
         figures = (shown(summary, kind) for kind in kinds)
         rows.append((lung_id, *setting, *figures, str(summary["held_out_breaths"])))
@@ -59,51 +59,11 @@ def lungs(json: JsonFile = None) -> None:
     )
     console = written_console(summaries, json)
     console.print(table)
-    for session, reason in official.rejected.items():
-        label = official.sessions.table[session].lung
+    for session, reason in published.rejected.items():
+        label = published.sessions.table[session].lung
         if label in summaries:
             text = f"not scored: session {session} of {label}: {reason}"
             console.print(text, soft_wrap=True)
-
-
-def coverage(
-    record: Annotated[
-        Path, typer.Argument(help="A record of the leaderboard; its commands lie beside it.")
-    ],
-    json: JsonFile = None,
-) -> None:
-    """Tell how much of an entry's commands lies beyond what was recorded of each lung.
-
-    Where there are few recorded samples a simulator follows its prior, and a score is worth less.
-
-    Example: `ventbench board coverage leaderboard/records/RECORD.json`
-    """
-    from dataclasses import asdict
-
-    from ventbench.board import record as records
-    from ventbench.board import store
-    from ventbench.plants import frozen
-    from ventbench.task.lungs import LUNG_IDS
-    from ventbench.task.metrics import open_loop
-
-    entry = records.load(record)
-    if not isinstance(entry, records.Record):
-        raise InputError(f"{record} is no record of a score that lies open")
-    lungs = frozen.load().lungs()
-    commands = store.load_commands(entry.header.commands, record.parent)
-    by_lung = open_loop.by_lung(dict(zip(LUNG_IDS, commands, strict=True)), lungs)
-    columns = ("lung", "70 % and above", "ranges hardly recorded", "recorded at 70 % and above")
-    rows = (
-        (
-            name,
-            f"{100 * share.wide_open:.1f}",
-            f"{100 * share.sparse:.1f}",
-            f"{share.recorded_wide_open} of {share.recorded}",
-        )
-        for name, share in by_lung.items()
-    )
-    table = table_of("Commands beyond the recordings, % of all", columns, rows)
-    written_console({name: asdict(share) for name, share in by_lung.items()}, json).print(table)
 
 
 def simulate(
@@ -221,29 +181,6 @@ Runs = Annotated[
 ]
 
 
-def _read(folders: list[Path]) -> tuple[list[Trajectories], list[dict[str, Any]]]:
-    import json
-
-    from ventbench import trajectories
-
-    runs, scores = [], []
-    for folder in folders:
-        saved = folder / "trajectories.npz"
-        if not folder.is_dir():
-            raise InputError(f"{folder}: there is no such folder")
-        if not saved.is_file():
-            raise InputError(
-                f"{folder} contains no scored run; make one with "
-                "`ventbench score SUBMISSION --out DIR` and give DIR/SUBMISSION"
-            )
-        runs.append(trajectories.load(saved))
-        try:
-            scores.append(json.loads((folder / "score.json").read_text("utf-8")))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{folder / 'score.json'}: {error}; score the run again") from error
-    return runs, scores
-
-
 def view(
     runs: Runs,
     out: Annotated[
@@ -260,13 +197,28 @@ def view(
 
     Example: `ventbench view runs/demo/pid_best runs/demo/pid_robust --out report.html`
     """
-    from ventbench import pages
+    import json
 
-    path, (loaded, scores) = out or runs[0] / "scores.rrd", _read(runs)
-    if path.suffix == ".html":
+    from ventbench import pages, trajectories
+
+    loaded, scores = [], []
+    for folder in runs:
+        saved = folder / "trajectories.npz"
+        if not saved.is_file():
+            raise InputError(
+                f"{folder} contains no scored run; make one with "
+                "`ventbench score SUBMISSION --out DIR` and give DIR/SUBMISSION"
+            )
+        loaded.append(trajectories.load(saved))
+        try:
+            scores.append(json.loads((folder / "score.json").read_text("utf-8")))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{folder / 'score.json'}: {error}; score the run again") from error
+    path = out or runs[0] / "scores.rrd"
+    if is_report := path.suffix == ".html":
         pages.write_report(path, loaded, scores)
     else:
         pages.write_rerun(path, loaded)
     typer.echo(f"wrote {path}")
-    if show and path.suffix != ".html":
+    if show and not is_report:
         pages.open_viewer(path)

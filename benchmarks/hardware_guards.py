@@ -26,6 +26,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -35,13 +36,12 @@ import numpy as np
 import typer
 from scipy import stats
 
-from hardware_eval.bench import fallback, safety, selftest
+from hardware_eval.bench import calibrate, fallback, safety, selftest
 from hardware_eval.bench.controllers import Count, Lateness, PIDController
 from hardware_eval.bench.drive import Commands, Driven
-from hardware_eval.bench.identity import Baseline, KnownLung, measured_lung, white_noise
+from hardware_eval.bench.identity import Baseline, KnownLung, Valve, measured_lung, white_noise
 from hardware_eval.bench.loop import LATE_SHARE
 from hardware_eval.bench.plan import CONTROL_GAINS
-from hardware_eval.bench.safety import VALVE_GAIN
 from hardware_eval.bench.session import MAX_HELD_UP
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Effect
 from hardware_eval.emulation.simulated import breath_begun
@@ -71,6 +71,9 @@ FINE = round(protocol.DT / STEP)
 #: Converter's step, cmH2O; noise of the flow, mL/s, and relative error of its gain.
 QUANTUM, FLOW_NOISE, FLOW_GAIN = 0.0703, 5.0, 0.01
 
+#: Relative error of a meter; steps until a flow is steady.
+METER, STEADY = 0.02, 6
+
 #: A leak of so much at 20 cmH2O, mL/s.
 LEAK = 5.0
 
@@ -90,9 +93,7 @@ CREEP, CREEP_TIME = (0.04, 0.08), (0.5, 1.8)
 FORMS = {"viscoelasticity": "library", "turbulent_resistance": "quadratic", "leak": "orifice"}
 
 #: Parts of the self-test that could find it; all if not here.
-ALL = selftest.PARTS
 PARTS_OF = {CREEPS: ("sensor", "leak"), LEAKS: ("sensor", "leak")}
-_OF_LUNG = ("sensor", "lung")
 
 #: Families of lungs.
 FAMILIES = ("frozen", "population", "independent")
@@ -226,14 +227,19 @@ class Mounted:
 
 
 def mount(
-    family: str, settings: Sequence[str], kind: str, seed: int, rng: np.random.Generator
+    family: str,
+    settings: Sequence[str],
+    kind: str,
+    seed: int,
+    rng: np.random.Generator,
+    blind: bool,
 ) -> Mounted:
-    """Draw a lung of a family about each setting, and sensors."""
+    """Draw a lung of a family about each setting, and sensors, without one of flow if blind."""
     n = len(settings)
     make, arrays = drawn(family, settings, seed.to_bytes(32, "big"), rng, kind)
     flow, noise = 1.0 + FLOW_GAIN * rng.standard_normal(n), rng.uniform(0.1, 0.3, n)
     sensor, opens = SENSORS.get(kind, 1.0), float(kind != STUCK)
-    return Mounted(partial(make, arrays), noise, sensor, flow, opens)
+    return Mounted(partial(make, arrays), noise, sensor, None if blind else flow, opens)
 
 
 class Watched:
@@ -281,6 +287,12 @@ class Watched:
         self.u_in, self._u_out, self._steps = u_in, u_out, self._steps + 1
 
 
+def rest(lungs: Lungs, label: str, n: int) -> None:
+    """Vent n lungs as long as the self-test does before a program."""
+    for _ in range(round(selftest.rest_before(label) / protocol.DT)):
+        lungs.hold(np.zeros(n), np.ones(n))
+
+
 #: What the programs of each part brought.
 Parts = dict[str, list[Driven]]
 
@@ -297,8 +309,7 @@ def driven(
         each = [selftest.programs(label, noise)[part] for noise in noises]
         for k, (make, _, pip) in enumerate(each[0]):
             lengths = [programs[k][1] for programs in each]
-            for _ in range(round(selftest.rest_before(label) / protocol.DT)):
-                lungs.hold(np.zeros(n), np.ones(n))
+            rest(lungs, label, n)
             watched = Watched(mounted, lungs, [label] * n, np.full(n, pip), rng)
             columns = _program(watched, [make() for _ in range(n)], max(lengths))
             for i, steps in enumerate(lengths):
@@ -324,31 +335,18 @@ def _program(watched: Watched, programs: Sequence[Commands], steps: int) -> Floa
     return np.moveaxis(np.array(rows), 0, 1)
 
 
-#: Flow of a calibrated valve, and its range, mL/s per %.
-Valve = tuple[float, float, float]
-
-
-def blinded(done: Parts, label: str) -> tuple[Parts, Valve]:
-    """The same without a flow sensor, and the valve that it had calibrated."""
-    gain = VALVE_GAIN * measured_lung(done["lung"], label, NOISE)[3]
-    blind = {
-        part: [replace(x, flow=np.full_like(x.flow, np.nan)) for x in each]
-        for part, each in done.items()
-    }
-    return blind, (gain, 0.98 * gain, 1.02 * gain)
-
-
-def judged(
-    done: Parts, label: str, valve: Valve | None = None, known: KnownLung | None = None
-) -> dict[str, Any]:
-    """Judge a lung by what calibration has told."""
-    simulator = "frozen" if parse_lung(label) in LUNGS else None  # else they have no say
-    baseline = Baseline(valve, known)
-    sheet = selftest.judge(label, done, simulator=simulator, baseline=baseline)
-    trips = [text for each in done.values() for x in each for text in x.trips]
-    bad = [x.name for x in sheet.findings if not x.ok] + ["safety"] * bool(trips)
-    told = "; ".join(x.text for x in sheet.findings if x.name in ("identity", "lung"))
-    return {"bad": bad, "told": told}
+def metered(mounted: Mounted, label: str, rng: np.random.Generator) -> list[Valve | None]:
+    """Curves of valves as a person calibrates them, who reads a meter; one result a lung."""
+    lungs, n, reads = mounted.begin(), len(mounted.noise), []
+    meter = 1.0 + METER * rng.standard_normal(n)
+    for first, opening in product((1.0, 1.5), calibrate.OPENINGS):  # as it is, and from above
+        rest(lungs, label, n)
+        for larger in (first, first, *[1.0] * STEADY):
+            lungs.hold(np.full(n, larger * opening), np.zeros(n))
+        reads.append(meter * lungs.flow())
+    about = "valve", "", calibrate.OPENINGS * 2
+    parts = [calibrate.Part(*about, tuple(x), tuple(METER * x), True) for x in np.array(reads).T]
+    return [calibrate.Calibration({}, {"valve": part}).valve for part in parts]
 
 
 def of_label(
@@ -361,17 +359,22 @@ def of_label(
     if kind == "another lung":
         others = [x for x in labels_of(family) if x != label]
         settings = [others[k % len(others)] for k in range(lungs)]
-    mounted = mount(family, settings, kind, seed, rng)
+    mounted = mount(family, settings, kind, seed, rng, blind)
     known: list[KnownLung | None] = [None] * lungs
     if kind in ("right", *SENSORS):  # its calibration, when the sensor was right
-        for k, own in enumerate(driven(replace(mounted, sensor=1.0), label, rng, _OF_LUNG)):
-            probes = blinded(own, label)[0] if blind else own
-            noise = white_noise(probes["sensor"][0].pressure)
-            known[k] = measured_lung(probes["lung"], label, noise)[0]
-    results = []
-    for k, own in enumerate(driven(mounted, label, rng, PARTS_OF.get(kind, ALL))):
-        parts, valve = blinded(own, label) if blind and "lung" in own else (own, None)
-        results.append({"lung": settings[k], **judged(parts, label, valve, known[k])})
+        known = [
+            measured_lung(own["lung"], label, white_noise(own["sensor"][0].pressure))[0]
+            for own in driven(replace(mounted, sensor=1.0), label, rng, ("sensor", "lung"))
+        ]
+    results, valves = [], metered(mounted, label, rng) if blind else [None] * lungs
+    done = driven(mounted, label, rng, PARTS_OF.get(kind, selftest.PARTS))
+    for setting, own, *told in zip(settings, done, valves, known, strict=True):
+        baseline = Baseline(*told)  # type: ignore[arg-type]
+        sheet = selftest.judge(label, own, simulator=None, baseline=baseline)
+        tripped = any(x.trips for each in own.values() for x in each)
+        bad = [x.name for x in sheet.findings if not x.ok] + ["safety"] * tripped
+        text = "; ".join(x.text for x in sheet.findings if x.name == "identity")
+        results.append({"lung": setting, "bad": bad, "told": text})
     return results
 
 

@@ -21,10 +21,11 @@ import numpy as np
 
 from hardware_eval.bench import dated
 from hardware_eval.bench.bringup import at_open_tube, vented
-from hardware_eval.bench.drive import Commands, Driven, drive
+from hardware_eval.bench.drive import Driven, drive
 from hardware_eval.bench.identity import (
     Baseline,
     KnownLung,
+    Valve,
     identified,
     interval,
     measured_lung,
@@ -66,8 +67,8 @@ _MEANS, _READINGS = 10, 30
 _PRESSURE_ERROR, _FLOW_ERROR = 0.003, 0.3
 
 #: Steps of a puff: at rest, at a larger opening if it comes from above, at its own; steps that
-#: count. Factor of the larger opening. Time for which an opening is held for a person to read, s.
-_LEAD, _ABOVE, _OWN, _COUNT, _LARGER, _HOLD_S = 3, 2, 3, 2, 1.5, 3.0
+#: count. Factor of the larger opening. Steps for which one is held for a person to read.
+_LEAD, _ABOVE, _OWN, _COUNT, _LARGER, _HELD = 3, 2, 3, 2, 1.5, 100
 
 
 @dataclass(frozen=True)
@@ -262,10 +263,10 @@ def _valve_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[P
     for before, opening in zip([0.0, *openings], openings, strict=False):
         above = before > opening
         if bench.client.welcome.capabilities & Capability.FLOW:
-            flows = _puffed(bench, lung, opening, above).flow[-_COUNT:]
-            points.append((opening, *_mean(flows, _FLOW_ERROR)))
+            puff = _opened(bench, lung, opening, above, _LEAD, _LEAD + _ABOVE + _OWN + 1, 0)
+            points.append((opening, *_mean(puff.flow[-_COUNT:], _FLOW_ERROR)))
         else:
-            _held_open(bench, lung, opening, above)
+            _opened(at_open_tube(bench), lung, opening, above, 0, _HELD, 1)
             flow = bench.operator.number(f"the meter's steady flow at {opening:g} %, mL/s: ")
             points.append((opening, flow, max(0.02 * abs(flow), 1.0)))  # as meters state it
     return points
@@ -283,19 +284,16 @@ def _leak_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Po
 
 def _lung_points(bench: Bench, lung: str) -> tuple[list[Point], str]:
     """Logarithms of R and 1/C, and what the lung is by them."""
-    done = {
-        part: [
-            _watched(drive(bench, lung, make(), steps, pip=pip), "lung")
-            for make, steps, pip in programs(lung)[part]
-        ]
+    rest, *probes = (
+        _watched(drive(bench, lung, make(), steps, pip=pip), "lung")
         for part in ("sensor", "lung")
-    }
-    noise = white_noise(done["sensor"][0].pressure)
-    own = measured_lung(done["lung"], lung, max(noise, 1e-3))[0]
-    points = [(float(k), own.logarithms[k], own.errors[k]) for k in range(2)]
+        for make, steps, pip in programs(lung)[part]
+    )
+    own = measured_lung(probes, lung, max(white_noise(rest.pressure), 1e-3))[0]
+    points = list(zip((0.0, 1.0), own.logarithms, own.errors, strict=True))
     if not np.isfinite(points).all():
         raise InputError("lung: neither R nor C can be measured here; see the self-test")
-    holds, _, told = identified(done["lung"], lung, None)
+    holds, told = identified(probes, lung, None)
     if holds is False:
         raise InputError(f"lung: {told}. Nothing was kept")
     return points, told
@@ -317,24 +315,18 @@ def _watched(done: Driven, kind: str) -> Driven:
     return done
 
 
-def _puffed(bench: Bench, lung: str, opening: float, above: bool) -> Driven:
-    """A puff into the lung; its last steps have the opening's steady flow."""
+def _opened(
+    bench: Bench, lung: str, opening: float, above: bool, lead: int, steps: int, u_out: int
+) -> Driven:
+    """Open the valve after some steps, from a larger opening or none, and hold it."""
     larger = min(_LARGER * opening, protocol.U_MAX)
 
     def commands(step: int, pressure: float) -> tuple[float, int]:
-        if step < _LEAD:
+        if step < lead:
             return 0.0, 1
-        return (larger if above and step < _LEAD + _ABOVE else opening), 0
+        return (larger if above and step < lead + _ABOVE else opening), u_out
 
-    steps = _LEAD + _ABOVE + _OWN + 1
     return _watched(drive(bench, lung, commands, steps, pip=45.0), "valve")
-
-
-def _held_open(bench: Bench, lung: str, opening: float, above: bool) -> None:
-    """Hold an opening for a person to read, tube and expiratory valve open."""
-    steps, larger = round(_HOLD_S / protocol.DT), min(_LARGER * opening, protocol.U_MAX)
-    held: Commands = lambda step, pressure: (larger if above and step < 10 else opening, 1)  # noqa: E731
-    _watched(drive(at_open_tube(bench), lung, held, steps, pip=30.0), "valve")
 
 
 @dataclass(frozen=True)
@@ -357,19 +349,21 @@ class Calibration:
         return replace(self, sha256=dated.save(path, content))
 
     @property
-    def valve(self) -> tuple[float, float, float] | None:
-        """Flow of the valve, mL/s per %, mean and range; None if it was not calibrated.
+    def valve(self) -> Valve | None:
+        """Curve of the valve, through the means of both directions; None if not calibrated.
 
-        The range is over openings, directions and two standard errors of each: a valve that is not
-        linear has a wide one.
+        Its error is that of the readings and their scatter about the curve, none of which is taken
+        to average out: a meter is off by the same share everywhere.
         """
-        if "valve" not in self.parts:
+        if (part := self.parts.get("valve")) is None:
             return None
-        part = self.parts["valve"]
-        opening, flow, error = map(np.array, (part.reference, part.reading, part.error))
-        flow, error, opening = flow[opening > 0], error[opening > 0], opening[opening > 0]
-        low, high = (flow - 2.0 * error) / opening, (flow + 2.0 * error) / opening
-        return float(np.mean(flow / opening)), float(low.min()), float(high.max())
+        series = np.array([part.reference, part.reading, part.error])
+        opening, flow, error = series[:, series[0] > 0.0]
+        openings = np.unique(opening)
+        means = np.array([flow[opening == x].mean() for x in openings])
+        near = np.interp(opening, openings, means)
+        share = float(np.sqrt(np.mean((error**2 + (flow - near) ** 2) / near**2)))
+        return Valve(tuple(openings.tolist()), tuple(means.tolist()), share)
 
     def correction(self) -> Correction:
         """What corrects the readings of the device."""

@@ -317,10 +317,10 @@ def judge(
         return Sheet(lung, tuple(findings), skipped=skipped)
     errors = {} if simulator is None else _errors(probes, simulator)
     found, R, C, gain = measured_lung(probes, lung, noise)
-    holds, alone, told = identified(probes, lung, baseline.valve)
+    holds, told = identified(probes, lung, baseline.valve)
     label = math.nan if holds is None else float(holds)
     findings.append(Finding("identity", label, holds is not False, told))
-    findings += _lung(lung, errors, R, C, gain, alone)
+    findings += _lung(lung, errors, R, C, gain, holds is None and lung in errors)
     findings.append(span_finding(found, baseline.lung))
     return Sheet(lung, tuple(findings), errors, R, C, skipped)
 
@@ -387,11 +387,11 @@ def _closed(held: Driven, lung: str, calibrated: float = 0.0) -> Finding:
     if len(held.pressure) < closed + 10:
         return unknown("leak", "the lung could not be filled")
     allowed = LIMITS["leak"].high + calibrated
-    found = leak(held, closed, parse_lung(lung).C, allowed)
-    told = f"loses {found.flow:.1f} mL/s at {found.pressure:.1f} cmH2O when closed"
-    if beyond := found.sigmas > _SIGMAS:
-        told += f": {found.sigmas:.1f} standard errors beyond {allowed:g} mL/s and creep"
-    return Finding("leak", found.flow, not beyond, told)
+    flow, sigmas = leak(held, closed, parse_lung(lung).C, allowed)
+    told = f"loses {flow:.1f} mL/s at {held.pressure[closed:].mean():.1f} cmH2O when closed"
+    if beyond := sigmas > _SIGMAS:
+        told += f": {sigmas:.1f} standard errors beyond {allowed:g} mL/s and creep"
+    return Finding("leak", flow, not beyond, told)
 
 
 def _puff(u_in: float, steps: int) -> Commands:
@@ -491,7 +491,7 @@ def span_finding(found: KnownLung, known: KnownLung | None) -> Finding:
 
 
 def _lung(
-    lung: str, errors: dict[str, float], R: float, C: float, gain: float, alone: bool
+    lung: str, errors: dict[str, float], R: float, C: float, gain: float, asked: bool
 ) -> list[Finding]:
     label, ratio, told = parse_lung(lung), math.nan, f"no simulator of {lung} was asked"
     if lung in errors:
@@ -501,9 +501,8 @@ def _lung(
         told = f"{errors[lung]:.2f} cmH2O as {lung}"
         if nearest != lung:
             told += f", {errors[nearest]:.2f} as {nearest}: is the lung set to {nearest}?"
-    decided = Finding("lung", ratio, True, told + "; R and C are the label's")
     return [
-        decided if alone else judged("lung", ratio, told),
+        judged("lung", ratio, told) if asked else Finding("lung", ratio, True, told),
         judged("resistance", max(R, 0.0) / label.R, f"R {R:.1f}, C {C:.1f} by least squares"),
         judged("valve_gain", gain, f"the valve gives {gain:.2f} of 22.8 mL/s per %"),
     ]

@@ -8,7 +8,7 @@ sensor does not see, a reversed sign, another unit, a volume that drifts.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -193,20 +193,18 @@ def _at_the_slowest(breaths: Breaths) -> Breaths:
 def identify(
     breaths: Breaths,
     progress: Callable[[int, int], object] | None = None,
-    readings: Collection[str] = MEASURED,
 ) -> tuple[Mechanics, ...]:
     """Identify each lung of a recording with flow or volume; they are one session.
 
     Args:
         breaths: the recording.
         progress: called after each lung with how many breaths are done, and of how many.
-        readings: columns that a sensor read: a flow that commands give has no bad samples.
 
     Raises:
         InputError: if neither is recorded, or too little of a lung to tell R from C, or more than
             a fifth of the readings are none.
     """
-    breaths, lungs, completed = _at_the_slowest(clean(breaths, readings=readings)), [], 0
+    breaths, lungs, completed = _at_the_slowest(clean(breaths)), [], 0
     notable(breaths)
     for name, part in breaths.by_lung().items():
         lungs.append(_identify_lung(name, part))

@@ -165,17 +165,14 @@ def notable(breaths: Breaths) -> str | None:
     return text if share > _NOTABLE else None
 
 
-def clean(
-    breaths: Breaths, missing: Collection[float] = (), readings: Collection[str] = MEASURED
-) -> Breaths:
+def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
     """Breaths without bad samples, which its notes list first; the same object if there is none.
 
     Args:
         breaths: the recording.
         missing: see :func:`find_bad_samples`.
-        readings: columns that a sensor read; what was computed holds no bad sample.
     """
-    names = [name for name in (*readings, "u_in") if getattr(breaths, name) is not None]
+    names = [name for name in (*MEASURED, "u_in") if getattr(breaths, name) is not None]
     columns = {name: getattr(breaths, name)[breaths.valid] for name in names}
     bad = find_bad_samples(columns, missing)
     if not bad:

@@ -31,7 +31,7 @@ def test_a_good_bench_goes(bench: Bench) -> None:
     own = {name for name in LIMITS if " " not in name}  # else of calibration
     assert {finding.name for finding in sheet.findings} == own - elsewhere
     # The emulated lung reports its flow, so that R and C are those of the label.
-    assert pytest.approx(5.0, rel=0.15) == sheet.R
+    assert pytest.approx(5.0, rel=0.2) == sheet.R
     assert pytest.approx(20.0, rel=0.05) == sheet.C
 
 
@@ -88,7 +88,7 @@ def test_a_line_that_stays_silent_is_a_no_go_that_says_so(
 def test_a_wrongly_set_lung_is_a_no_go_that_names_it(bench: Bench) -> None:
     sheet = selftest(bench, "R20C50", simulator="physics")
     assert not sheet.go
-    assert any(f"is the lung set to {LUNG}?" in problem for problem in sheet.problems())
+    assert any(f"it is {LUNG}, not R20C50" in problem for problem in sheet.problems())
 
 
 #: Settings of a QuickLung, by analysis: no simulator of the library has seen them.

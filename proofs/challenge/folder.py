@@ -18,7 +18,7 @@ from proofs.challenge.questions import DrawnCase
 from ventbench.base import files
 from ventbench.base.errors import InputError
 
-_FORMAT = "ventbench-challenge-1"
+_FORMAT = "ventbench-challenge-2"
 
 
 class Withheld(msgspec.Struct, frozen=True):
@@ -29,37 +29,38 @@ class Withheld(msgspec.Struct, frozen=True):
     #: where an effect acts that acts in part of the recording only: intervals of time, s, by id of
     #: the breath; None if there is no such effect.
     active: dict[int, tuple[tuple[float, float], ...]] | None = None
+    #: log-likelihood that is lost without each effect of the case, nats, from
+    #: :func:`~proofs.challenge.detectability.log_likelihood_loss`. Machines differ in its digits,
+    #: so that no answer holds it, whose hash is published.
+    nats: tuple[float, ...] = ()
 
 
-#: Cases, each with the nats of its effects.
-Truth = list[tuple[DrawnCase, list[float]]]
+#: Cases, each with the nats of its effects if they are among the answers, as they once were.
+Truth = list[tuple[DrawnCase, tuple[float, ...]]]
 
 
-def encode_answers(secret: str, drawn: list[DrawnCase], nats: list[list[float]]) -> bytes:
+def encode_answers(secret: str, drawn: list[DrawnCase]) -> bytes:
     """Return the plain text of the answers; a random nonce keeps their hash from being guessed.
+
+    It is of what is drawn alone, and so the same on every machine.
 
     Args:
         secret: secret of the challenge.
         drawn: cases of the challenge.
-        nats: log-likelihood that is lost without each effect of each case, nats, from
-            :func:`~proofs.challenge.detectability.log_likelihood_loss`.
     """
-    cases = [
-        {"kind": question.kind, "nats": of_effects, "case": asdict(question.case)}
-        for question, of_effects in zip(drawn, nats, strict=True)
-    ]
+    cases = [{"kind": question.kind, "case": asdict(question.case)} for question in drawn]
     nonce = random_generator(secret, "nonce").bytes(32).hex()
     value = {"format": _FORMAT, "nonce": nonce, "cases": cases}
     return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
 
 
 def decode_answers(text: bytes) -> Truth:
-    """Return the cases and the nats of their effects from the plain text of the answers."""
+    """Return what the plain text of the answers holds."""
     truth = []
     for entry in json.loads(text)["cases"]:
         generator = GENERATORS[entry["case"].get("generator", "first")]
         case = msgspec.convert(entry["case"], generator.case)
-        truth.append((DrawnCase(entry["kind"], case), [float(nats) for nats in entry["nats"]]))
+        truth.append((DrawnCase(entry["kind"], case), tuple(entry.get("nats", ()))))
     return truth
 
 
@@ -158,7 +159,7 @@ class ChallengeFolder:
             raise InputError(f"{path} is damaged, or sealed with another seed") from None
 
     def truth(self, secret: str) -> Truth:
-        """Open the seal; returns the cases with the nats of their effects.
+        """Open the seal; returns what it holds.
 
         Raises:
             InputError: if the secret is not that of the challenge, or files are missing.

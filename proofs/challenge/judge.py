@@ -130,7 +130,7 @@ class JudgedCase:
 
 def judge(
     drawn: DrawnCase,
-    nats: list[float],
+    nats: tuple[float, ...],
     breaths: Breaths,
     withheld: Withheld,
     given: dict[str, Any],

@@ -77,14 +77,11 @@ def make(
             generator(source).draw(kind, count, random_generator(secret, "plan")), start=1
         )
     ]
-    names = [question.case.name for question in drawn]
-    nats: dict[str, list[float]] = {}
     with executor(workers) as pool:
         work = {question.case.name: (secret, folder, question, record) for question in drawn}
-        for name, of_effects in results(pool, _make_case, work):
-            nats[name] = of_effects
-            progress(len(nats), count)
-    text = encode_answers(secret, drawn, [nats[name] for name in names])
+        for done, _ in enumerate(results(pool, _make_case, work), start=1):
+            progress(done, count)
+    text = encode_answers(secret, drawn)
     files.write_text(folder.commitment, commitment(text) + "\n")
     entries = [
         {
@@ -101,10 +98,8 @@ def make(
     return commitment(text)
 
 
-def _make_case(
-    secret: str, folder: ChallengeFolder, drawn: DrawnCase, record: Record
-) -> list[float]:
-    """Record one case; returns the nats of each of its effects."""
+def _make_case(secret: str, folder: ChallengeFolder, drawn: DrawnCase, record: Record) -> None:
+    """Record one case."""
     case = drawn.case
     breaths = record_within_limits(secret, drawn, record=record)
     apart = np.isin(breaths.breath_id, withheld_breaths(secret, case))
@@ -118,11 +113,11 @@ def _make_case(
                 for k in np.flatnonzero(apart).tolist()
             },
             None if active is None else _intervals(breaths, active),
+            tuple(log_likelihood_loss(case, breaths, k) for k in range(len(case.effects))),
         ),
     )
     blank = np.where(apart[:, None], np.nan, breaths.pressure)
     write(replace(breaths, pressure=blank), folder.recording(case.name))
-    return [round(log_likelihood_loss(case, breaths, k), 1) for k in range(len(case.effects))]
 
 
 def withheld_breaths(secret: str, case: Case) -> list[int]:

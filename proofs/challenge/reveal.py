@@ -129,7 +129,7 @@ def _judge_all(folder: ChallengeFolder, secret: str, diagnoser: str) -> dict[str
                 contract.decode(msgspec.json.encode(given["answer"]), samples)
             except contract.AnswerError as error:
                 given = given | {"problem": str(error)}
-        found[name] = judge(drawn, nats, breaths, withheld, given)
+        found[name] = judge(drawn, nats or withheld.nats, breaths, withheld, given)
     return found
 
 

@@ -159,7 +159,7 @@ def test_names_and_parameters_are_those_of_the_vocabulary():
         values = true_values(d.case)
         assert values
         assert set(values) <= PARAMETERS
-    text = encode_answers("s", drawn, [[30.0] * len(d.case.effects) for d in drawn])
+    text = encode_answers("s", drawn)
     assert [d for d, _ in decode_answers(text)] == drawn
     with pytest.raises(InputError, match="no kind outside"):
         GENERATOR.draw("outside", 3, np.random.default_rng(0))

@@ -247,7 +247,7 @@ def test_another_order_of_hypotheses_is_the_same_answer():
     there = answer((0.5, "leak"), (0.5, "cough"))
     back = answer((0.5, "cough"), (0.5, "leak"))
     first, second = (
-        judge(drawn("single", LEAK), [99.0], recording(), withheld(), answered(a))
+        judge(drawn("single", LEAK), (99.0,), recording(), withheld(), answered(a))
         for a in (there, back)
     )
     assert first == second

@@ -263,10 +263,11 @@ def test_a_challenge_of_strangers_keeps_its_seal(tmp_path, monkeypatch):
     monkeypatch.setattr(generators, "GENERATORS", listed)
     hashed = make("words", tmp_path / "a", "all", 2, source="stranger")
     assert hashed == make("words", tmp_path / "b", "all", 2, source="stranger")
-    truth = ChallengeFolder(tmp_path / "a").truth("words")
-    assert [type(drawn.case) for drawn, _ in truth] == [StrangerCase] * 2
-    ((_, losses),) = [(drawn, loss) for drawn, loss in truth if drawn.case.effects == (lag,)]
-    assert losses[0] > 100.0, "a strong lag is detectable"
+    folder = ChallengeFolder(tmp_path / "a")
+    cases = [drawn.case for drawn, _ in folder.truth("words")]
+    assert [type(case) for case in cases] == [StrangerCase] * 2
+    (lagging,) = [case for case in cases if case.effects == (lag,)]
+    assert folder.open(lagging.name, "words").nats[0] > 100.0, "a strong lag is detectable"
     with pytest.raises(InputError, match="published"):
         ChallengeFolder(tmp_path / "a").truth("other words")
     public = json.loads((tmp_path / "a" / "cases.json").read_text())

@@ -74,7 +74,7 @@ def judged(
     kept: Withheld | None = None,
     **changed: Any,
 ) -> JudgedCase:
-    nats = [worth] * len(effects)
+    nats = (worth,) * len(effects)
     file = answered(given, **changed)
     return judge(drawn(kind, *effects), nats, recording(), kept or withheld(), file)
 

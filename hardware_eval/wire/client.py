@@ -223,7 +223,8 @@ class Link:
             port.open()
             os.set_blocking(port.fileno(), False)
         except ValueError as error:
-            raise LinkError(f"port {self.url!r}: {error}; {_PORTS}") from error
+            why = {"fileno": "no device is behind it"}.get(str(error), error)
+            raise LinkError(f"port {self.url!r}: {why}; {_PORTS}") from error
         except (OSError, serial.SerialException) as error:
             raise self._not_opened(error) from error
         return cast(serial.Serial, port)  # others, such as sockets, have the same methods
@@ -285,18 +286,18 @@ class ClockWatch:
 
     A sample was taken between its question, less what a sample may be old, and its answer: that
     bounds the clocks' offset. All bounds since the session began must agree, but for the drift of
-    crystals.
+    crystals. Bounds that one old sample contradicts begin anew, until the rate is beyond its error.
     """
 
     def __init__(self) -> None:
         """Begin with a session."""
         self._low, self._high = -math.inf, math.inf
-        self._seen, self._first = -math.inf, (math.nan, math.nan)
-        self._still = self._first
+        self._seen, self._first = 0.0, (math.nan, math.nan)
+        self._still, self._age = self._first, 0.0
 
     def see(self, device: float, asked: float, answered: float) -> str:
         """Look at a reading's device time and the host's times, s; returns what is wrong."""
-        elapsed = answered - self._seen if math.isfinite(self._seen) else 0.0
+        elapsed = answered - self._seen
         if math.isnan(self._first[0]):
             self._first = device, asked
         if device != self._still[0]:
@@ -309,13 +310,15 @@ class ClockWatch:
         self._seen = answered
         if apart <= 0.0:
             return ""
-        if asked - self._still[1] > _SAMPLE_AGE:
-            for_s = asked - self._still[1]
-            return f"the device's clock, or its sensor, has stood still for {for_s:.2g} s"
+        if (still := asked - self._still[1]) > _SAMPLE_AGE:
+            return f"the device's clock, or its sensor, has stood still for {still:.2g} s"
         if apart > _JUMP:
             return f"the device's clock jumped by {apart:.2g} s against this computer's"
-        passed = asked - self._first[1]
-        rate, error = (device - self._first[0]) / passed - 1.0, 2.0 * _SAMPLE_AGE / passed
+        passed, self._age = asked - self._first[1], max(self._age, 2.0 * _SAMPLE_AGE + apart)
+        rate, error = (device - self._first[0]) / passed - 1.0, self._age / passed
+        if abs(rate) <= error:  # a sample may be so old, where host and device are one computer
+            self._low, self._high = low, high
+            return ""
         speed = "fast" if rate > 0.0 else "slow"
         return f"the device's clock is {100 * abs(rate):.1f} (+-{100 * error:.1f}) % too {speed}"
 

@@ -249,11 +249,13 @@ def test_what_would_be_lost_at_the_end_is_refused_before_the_port_is_opened(
     assert list(tmp_path.iterdir()) == [file]
 
 
-@pytest.mark.parametrize("port", ["socket://localhost", "socket://localhost:ten", "foo://bar"])
+@pytest.mark.parametrize(
+    "port", ["socket://localhost", "socket://localhost:ten", "foo://bar", "loop://"]
+)
 def test_a_port_that_is_none_is_told_what_one_is(port: str) -> None:
     done = invoke("conformance", "--port", port)
     assert isinstance(done.exception, InputError)
-    assert re.fullmatch(f"port '{port}': .*; write a device such as .*", str(done.exception))
+    assert re.fullmatch(f"port '{port}': .* .*; write a device such as .*", str(done.exception))
 
 
 @pytest.mark.parametrize("line", ["replay", "compare", "trial", "report"])

@@ -148,6 +148,18 @@ def test_a_clock_that_jumps_or_stands_still_is_named(seed: int, by: float, sign:
     assert "stood still" in Steps(seed).until(3.0, lambda t: 7.0, worst=0.02)
 
 
+def test_a_clock_is_not_blamed_for_a_sample_that_is_old() -> None:
+    """A computer that is busy holds up an emulated device: of 0.03 s nothing tells a rate."""
+    for old, off in ((0.0, 0.13), (0.13, 0.0)):  # the first sample, or the second
+        steps = Steps(0)
+        assert steps.watch.see(-off, 0.0, 0.004) == ""
+        assert steps.watch.see(0.03 - old, 0.03, 0.034) == ""
+        steps.now = 0.06
+        assert steps.until(30.0, lambda t: t) == ""
+        steps.now = 30.0
+        assert "too fast" in steps.until(60.0, lambda t: 30.0 + 1.02 * (t - 30.0), worst=0.02)
+
+
 def test_a_terminal_without_blocks_shows_bars_of_letters(monkeypatch: pytest.MonkeyPatch) -> None:
     raw = io.BytesIO()
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(raw, "ascii"))

@@ -6,7 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from ventbench.diagnosis import evidence
 from ventbench.diagnosis.estimates import nonparametric_term, split_form
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.in_time import ALVEOLUS, SUPPLY
@@ -151,3 +153,23 @@ def test_a_mechanism_or_nothing_is_enough_among_all_terms():
     nothing = small.concluded(small.made(seed=1), small.ALL_TERMS)
     assert nothing.names == ()
     assert nothing.unnamed is None
+
+
+def test_what_no_sensor_leaves_is_searched_again_from_all_of_a_ventilator(monkeypatch):
+    searched, search = [], evidence.search
+
+    def spy(evaluator, also=()):
+        searched.append((evaluator.white, tuple(also)))
+        return search(evaluator, also)
+
+    monkeypatch.setattr(evidence, "search", spy)
+    breaths = small.made(seed=1)
+    small.concluded(breaths)
+    assert searched == [(False, ())]
+    # An error that lasts for twenty readings: nothing of a ventilator, so the first answer stands.
+    shocks = np.random.default_rng(2).normal(0.0, 0.3, breaths.pressure.shape)
+    slow = lfilter([1.0], [1.0, -0.95], shocks, axis=1)
+    found = small.concluded(dataclasses.replace(breaths, pressure=breaths.pressure + slow))
+    assert searched[1:] == [(False, ()), (True, small.SETTINGS.search.ventilator)]
+    assert found.names == ()
+    assert not found.white

@@ -12,7 +12,6 @@ from ventbench.diagnosis.evaluator import (
     Evaluator,
     cross_validated_gain,
     delay_restarts,
-    estimate_noise,
     fit_with_noise,
     make_evaluator,
 )
@@ -271,7 +270,7 @@ def test_a_dead_time_on_the_wrong_side_of_a_sample_is_moved(exhaling_late):
     assert there == pytest.approx(0.1, abs=0.025)
     fitted = fit_with_noise(exhaling_late, late_by, stuck)
     assert fitted.column(PATH)[0] == pytest.approx(0.1, abs=0.02)
-    assert estimate_noise(fitted).sigma[0] == pytest.approx(0.1, rel=0.3)
+    assert exhaling_late.estimate_noise(fitted).sigma[0] == pytest.approx(0.1, rel=0.3)
 
 
 def test_a_dead_time_at_the_optimum_stays(exhaling_late):

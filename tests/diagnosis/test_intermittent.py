@@ -14,7 +14,7 @@ from proofs.challenge.faults.effects import FaultsCase
 from proofs.challenge.faults.laboratory import record
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, make_evaluator
-from ventbench.diagnosis.evidence import COMMANDS, EVENTS, search
+from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior, search
 from ventbench.diagnosis.hypothesis import Hypothesis, all_parameter_paths
 from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.in_time import Paths, ask_for_little
@@ -73,7 +73,7 @@ def found(breaths: Breaths, **changed: Any) -> Intermittent | None:
     evaluator: Evaluator = make_evaluator(data, held, paths(intermittent()), settings=settings)
     evaluator = dataclasses.replace(evaluator, **changed)
     base = fit_with_noise(evaluator, Hypothesis())
-    every = {frozenset((*EVENTS, *COMMANDS)): 1.0}
+    every = Posterior((), {frozenset((*EVENTS, *COMMANDS)): 1.0})
     conclusion = Conclusion(base, base, base, None, base.noise, {}, {}, posterior=every)
     model = IdentifiedModel(evaluator, conclusion, None, evaluator.training)  # type: ignore[arg-type]
     return find(model, data, breaths.breath_id)

@@ -7,7 +7,7 @@ ask for is dropped, the least needed first. Alternatives are the other sets of t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
 
@@ -18,10 +18,9 @@ from ventbench.diagnosis import evidence
 from ventbench.diagnosis.evaluator import (
     Evaluator,
     cross_validated_gain,
-    estimate_noise,
     fit_with_noise,
 )
-from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior, Scored
+from ventbench.diagnosis.evidence import IN_TIME, WARMTH, Posterior, Scored
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
 from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
 from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
@@ -41,9 +40,6 @@ Progress: TypeAlias = Callable[[str], None]
 
 #: Least posterior odds of a name that is listed as an alternative, and most that are.
 _MIN_ODDS, _LISTED = 0.05, 2
-
-#: Least posterior probability of an effect of some breaths that is looked for.
-_LOOKED_FOR = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,24 +94,19 @@ class Conclusion:
     #: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths have the
     #: same gain.
     gain_sd: float = 0.0
+    white: bool = False  #: whether the noise of the fits is white.
     #: whether much is missing, and neither mechanism nor unnamed effect is accepted.
     unresolved: bool = False
     #: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without each
     #: mechanism, by name.
     worths: dict[str, float] = field(default_factory=dict)
-    #: posterior probability of each set of terms, by their names.
-    posterior: Mapping[frozenset[str], float] = field(default_factory=dict)
+    #: over the sets of terms.
+    posterior: Posterior = field(default_factory=lambda: Posterior((), {}))
 
     @property
     def names(self) -> tuple[str, ...]:
         """The selected mechanisms."""
         return self.named.names
-
-    @property
-    def likely_events(self) -> tuple[str, ...]:
-        """Effects of some breaths that may act."""
-        posterior = Posterior((), self.posterior)
-        return tuple(n for n in (*EVENTS, *COMMANDS) if posterior.marginal(n) > _LOOKED_FOR)
 
 
 def component_of(term: str) -> str:
@@ -125,7 +116,7 @@ def component_of(term: str) -> str:
 
 
 def conclude(
-    evaluator: Evaluator, every: Partition, tell: Progress, earlier: FittedModel | None = None
+    evaluator: Evaluator, every: Partition, tell: Progress, also: Sequence[str] = ()
 ) -> Conclusion:
     """Find what a recording needs beyond the base model.
 
@@ -134,17 +125,23 @@ def conclude(
         every: the breaths that are searched: its training breaths, and perhaps others that judge no
             corrected simulator.
         tell: called with a description of each step before it runs.
-        earlier: a model whose mechanisms are tried in any case.
+        also: names of mechanisms that are tried in any case.
     """
     tell("searching")
-    posterior = evidence.search(
-        replace(evaluator, training=every), () if earlier is None else earlier.names
-    )
+    posterior = evidence.search(replace(evaluator, training=every), also)
     tell("comparing with held-out breaths")
     base = fit_with_noise(evaluator, Hypothesis())
-    judged = _judge(
-        evaluator, posterior, posterior.undecided(evaluator.settings.held_out_test.threshold)
-    )
+    judged = _judge(evaluator, posterior)
+    settings = evaluator.settings.search
+    slow = judged.accepted.noise.autocorrelation_time > 1.0 / WARMTH
+    if slow and not posterior.likely_events:  # an effect of some breaths is set aside before
+        tell("searching from all of a ventilator")
+        white = replace(evaluator, white=True, excluded=(*evaluator.excluded, *IN_TIME))
+        of_ventilator = evidence.search(replace(white, training=every), settings.ventilator)
+        rival = _judge(white, of_ventilator)
+        errors = [_square(each.evaluator, each.accepted) for each in (rival, judged)]
+        if errors[0] < settings.error_ratio**2 * errors[1]:
+            posterior, judged = of_ventilator, rival
     best, evaluator, candidate, full, gains, worths = judged
     names = names_of(best.terms)
     unknown = [name for name in full.names if name in basis_terms()]
@@ -193,9 +190,10 @@ def conclude(
         {name: gains[name] for name in named.names},
         {name: _alternatives(evaluator, posterior, names, named, name) for name in named.names},
         evaluator.gain_sd,
+        evaluator.white,
         unnamed is None and not named.names and _is_unresolved(evaluator, candidate),
         {name: worths[name] for name in named.names},
-        posterior.weights,
+        posterior,
     )
 
 
@@ -210,12 +208,13 @@ class _Judgement(NamedTuple):
     worths: dict[str, float]  #: of each of these, root-mean-square error, cmH2O.
 
 
-def _judge(evaluator: Evaluator, posterior: Posterior, chosen: Scored) -> _Judgement:
-    """Let held-out breaths judge a set, and what is likelier than the rest of it.
+def _judge(evaluator: Evaluator, posterior: Posterior) -> _Judgement:
+    """Let held-out breaths judge the likeliest set, and what is likelier than the rest of it.
 
     Of these, the one is taken whose open-loop error on held-out breaths is least: coloured noise
     makes up for much of what a likelihood sees.
     """
+    chosen = posterior.undecided(evaluator.settings.held_out_test.threshold)
     rejected: set[str] = set()
     judgements: list[tuple[float, _Judgement]] = []
     while True:
@@ -224,7 +223,7 @@ def _judge(evaluator: Evaluator, posterior: Posterior, chosen: Scored) -> _Judge
         if gain_sd:
             now = replace(evaluator, gain_sd=gain_sd)
             candidate = fit_with_noise(now, candidate.hypothesis, candidate)
-        judged = _Judgement(chosen, now, candidate, *_supported(now, candidate))
+        judged = _Judgement(chosen, now, candidate, *eliminate(now, candidate))
         judgements.append((_square(now, judged.accepted), judged))
         dropped = frozenset(candidate.names) - frozenset(judged.accepted.names)
         rejected |= dropped
@@ -247,12 +246,17 @@ def _fitted(evaluator: Evaluator, best: Scored) -> FittedModel:
     return fit_with_noise(evaluator, hypothesis, first)
 
 
-def _supported(
-    evaluator: Evaluator, model: FittedModel
+def eliminate(
+    evaluator: Evaluator, model: FittedModel, judged: Collection[str] | None = None
 ) -> tuple[FittedModel, dict[str, float], dict[str, float]]:
     """Drop terms that training and held-out breaths do not both ask for, the least needed first.
 
     Of a recording with few breaths, each is held out once (cross-validation).
+
+    Args:
+        evaluator: evaluator of the recording.
+        model: fitted to the training breaths.
+        judged: the terms to judge; all if None.
 
     Returns:
         The rest, and what each of its terms gains on held-out breaths: log-likelihood, nats, and
@@ -265,6 +269,10 @@ def _supported(
         gains = evaluator.held_out_gain(model, reduced)
         before, after = _square(evaluator, reduced), _square(evaluator, model)
         worth = float(np.sqrt(before) - np.sqrt(after))
+        if evaluator.white:  # its likelihood counts a slow error once for each sample
+            least = settings.held_out_test.threshold / WARMTH
+            helps = worth > 0.0 and float(gains.sum()) > least
+            return gains, worth, helps and not is_negligible(evaluator, model, reduced, name)
         if not is_needed(evaluator, model, reduced):
             return gains, worth, False
         if name in basis_terms():
@@ -278,7 +286,7 @@ def _supported(
         return gains, worth, True
 
     while True:
-        results = {name: compared(name) for name in model.names}
+        results = {n: compared(n) for n in model.names if judged is None or n in judged}
         weak = [name for name, (_, _, supported) in results.items() if not supported]
         if not weak:
             nats = {name: float(gains.sum()) for name, (gains, _, _) in results.items()}
@@ -349,7 +357,7 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
         change = at(frequency, beside, training)[2][:, None]
         remainder = Partition(replace(data, measured=data.measured - change), training.predictor)
         refit = evaluator.fit(fitted.hypothesis, beside.noise, beside, partition=remainder)
-        noise = estimate_noise(refit)
+        noise = evaluator.estimate_noise(refit)
         beside = replace(refit, problem=replace(refit.problem, data=data, noise=noise))
     step = 0.02 * frequency
     frequencies = frequency + step * np.arange(-4, 5)
@@ -439,9 +447,3 @@ def drop_mechanism(conclusion: Conclusion, name: str, evaluator: Evaluator) -> C
         held_out_gains={k: v for k, v in conclusion.held_out_gains.items() if k != name},
         alternatives={k: v for k, v in conclusion.alternatives.items() if k != name},
     )
-
-
-def drop_nonparametric_term(conclusion: Conclusion) -> Conclusion:
-    """The conclusion with its mechanisms alone, without a nonparametric term beside them."""
-    named = conclusion.named
-    return replace(conclusion, full=named, unnamed=None, noise=named.noise)

@@ -251,11 +251,12 @@ def _base_model(
     after, notes = recording_model.pressures(final, data, first), []
     model = final
     if not final.hypothesis.breath_terms:
-        again = fit_open_loop(evaluator, final, recording_model.final, settings)
-        pressure = recording_model.pressures(again, data, first)
-        if error(pressure) < settings.drift_ratio * error(after):
-            model, after = again, pressure
-            notes.append(_NOTE_ON_DRIFT)
+        if not conclusion.white:
+            again = fit_open_loop(evaluator, final, recording_model.final, settings)
+            pressure = recording_model.pressures(again, data, first)
+            if error(pressure) < settings.drift_ratio * error(after):
+                model, after = again, pressure
+                notes.append(_NOTE_ON_DRIFT)
         named = conclusion.named
         if conclusion.unnamed is not None and named.names and error(after) > error(refit):
             pressure = recording_model.pressures(named, data, first)
@@ -362,7 +363,7 @@ def _any_model(
     conclusion, evaluator = recording_model.conclusion, recording_model.evaluator
     # The simulator's own model, and the same with the recording's R, C, R_ex and PEEP.
     simulator_fit = simulator_model.conclusion.full
-    noise = replace(conclusion.noise, ar=(0.0, 0.0))
+    noise = conclusion.noise.white
     refitted = refit_base_parameters(simulator_model, evaluator.training.data, noise)
     identified = simulator_model.pressures(simulator_fit, data, first)
     after = before + recording_model.pressures(conclusion.full, data, first) - identified
@@ -428,7 +429,7 @@ def fit_open_loop(
         label: also start from the labels' R and C, and from other lungs around them.
     """
     evaluator = replace(evaluator, gain_sd=0.0)  # a breath to come has the usual gain
-    noise = replace(fitted.noise, ar=(0.0,) * len(fitted.noise.ar), tail=settings.tail)
+    noise = replace(fitted.noise.white, tail=settings.tail)
     values, names = evaluator.transferred_values(fitted, partition), partition.predictor.names
     estimates_of_fit = {p: values[:, names.index(p)] for p in fitted.hypothesis.paths if p in names}
     starts = [estimates_of_fit]

@@ -34,7 +34,7 @@ from ventbench.diagnosis.findings import (
     Traces,
     Verdict,
 )
-from ventbench.diagnosis.hypothesis import FittedModel, varies_by_breath
+from ventbench.diagnosis.hypothesis import varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, identify, place_of_change
 from ventbench.diagnosis.intermittent import find
 from ventbench.diagnosis.residual_analysis import flow_and_volume, locate, quiet_samples
@@ -60,7 +60,7 @@ from ventbench.recordings.bad_samples import notable
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 from ventbench.recordings.roles import require_roles
-from ventbench.system_id import Data, Fit, Noise
+from ventbench.system_id import Data, Fit
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import lung as parse_lung
 
@@ -176,7 +176,7 @@ def diagnose(
     return replace(
         diagnosis,
         verdict="named" if intermittent else diagnosis.verdict,
-        posterior=likeliest_sets(posterior),
+        posterior=likeliest_sets(posterior.weights),
         mechanisms=(*intermittent, *diagnosis.mechanisms),
         simulator=_name(simulator, simulators),
         seconds=time.perf_counter() - began,
@@ -194,7 +194,7 @@ def _identify(
     tell: Progress,
     settings: SelectionConfig,
     low: float = _STARTED,
-    earlier: FittedModel | None = None,
+    also: tuple[str, ...] = (),
 ) -> IdentifiedModel:
     """Identify the recording alone, from the breaths that do not judge.
 
@@ -204,11 +204,11 @@ def _identify(
         tell: receives the current step.
         settings: every threshold.
         low: share of the diagnosis that is done before.
-        earlier: mechanisms to start from too.
+        also: names of mechanisms that are tried in any case.
     """
     uses = experiment.uses
     identifying = uses.identifying
-    high = 1.0 if earlier is not None else _halfway(experiment)
+    high = 1.0 if also else _halfway(experiment)
     return identify(
         experiment.identification_data,
         uses.testing[identifying],
@@ -216,7 +216,7 @@ def _identify(
         steps_between(tell, low, high),
         settings,
         uses.fitted[identifying],
-        earlier,
+        also,
     )
 
 
@@ -319,7 +319,7 @@ def _conclude(
     ):
         tell("describing the recording by what the simulator has", _IDENTIFIED)
         in_its_terms = _identify(
-            experiment, excluded, tell, settings, _IDENTIFIED, simulator_model.conclusion.named
+            experiment, excluded, tell, settings, _IDENTIFIED, simulator_model.conclusion.names
         )
         comparison = min(
             comparison,
@@ -431,7 +431,7 @@ def _conclude(
         saturated=experiment.saturated,
         left_out=notable(breaths),
         gain_scatter=conclusion.gain_sd,
-        posterior=likeliest_sets(conclusion.posterior),
+        posterior=likeliest_sets(conclusion.posterior.weights),
         detection_limits=limits,
         plants=correction.plants,
         simulator=simulators.name,
@@ -710,5 +710,4 @@ def _missing_mechanism(
 
 def _request(conclusion: Conclusion) -> BreathRequest | None:
     rivals = [rival for listed in conclusion.alternatives.values() for rival in listed.models]
-    noise = Noise((conclusion.noise.sigma[0],), (0.0,))
-    return request_breaths(conclusion.named, rivals, noise)
+    return request_breaths(conclusion.named, rivals, conclusion.noise.white)

@@ -107,6 +107,8 @@ class Evaluator:
     #: further splits of the same breaths, training and held-out, such that every breath is held out
     #: exactly once in all splits together.
     folds: tuple[tuple[Partition, Partition], ...] = ()
+    #: whether noise is white: a slow discrepancy takes what physics would explain.
+    white: bool = False
     settings: SelectionConfig = DEFAULT  #: every threshold.
     _held_out: WeakKeyDictionary[FittedModel, Floats] = field(
         init=False, repr=False, default_factory=WeakKeyDictionary
@@ -116,6 +118,14 @@ class Evaluator:
     def allowed_mechanisms(self) -> tuple[str, ...]:
         """Mechanisms of the library that may act."""
         return tuple(name for name in library() if name not in self.excluded)
+
+    def estimate_noise(self, fitted: FittedModel) -> Noise:
+        """Noise that a model leaves in the breaths that it was fitted to."""
+        return self.colour(robust_noise(fitted.residual, fitted.problem.data.weight))
+
+    def colour(self, noise: Noise) -> Noise:
+        """The noise as this evaluator has it."""
+        return noise.white if self.white else noise
 
     def partition(self, data: Data) -> Partition:
         """Combine breaths with a predictor that has the parameters of this evaluator."""
@@ -417,7 +427,7 @@ def fit_with_noise(
     noise = warm_start.problem.noise if warm_start else Noise()
     fitted = evaluator.fit(hypothesis, noise, warm_start)
     for _ in range(settings.noise_rounds):
-        noise = estimate_noise(fitted)
+        noise = evaluator.estimate_noise(fitted)
         again = evaluator.fit(hypothesis, noise, fitted, restart=True)
         before = noise.log_likelihood(fitted.residual, fitted.problem.data.weight)
         gained = again.log_likelihood.sum() - before.sum()
@@ -425,17 +435,3 @@ def fit_with_noise(
         if gained < settings.noise_gain:
             break
     return fitted
-
-
-def fit_with_white_noise(evaluator: Evaluator, current: FittedModel) -> FittedModel:
-    """Refit a model at white noise.
-
-    Coloured noise excuses slow errors, so that R, C and PEEP may drift anywhere to reduce it.
-    """
-    white = replace(current.noise, ar=(0.0, 0.0))
-    return evaluator.fit(current.hypothesis, white, current if current.names else None)
-
-
-def estimate_noise(fitted: FittedModel) -> Noise:
-    """Noise that a model leaves in the breaths that it was fitted to."""
-    return robust_noise(fitted.residual, fitted.problem.data.weight)

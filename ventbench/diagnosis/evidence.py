@@ -19,7 +19,7 @@ from scipy import linalg
 
 from ventbench.base.arrays import Floats
 from ventbench.base.linear import cholesky
-from ventbench.diagnosis.evaluator import Evaluator, estimate_noise
+from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
 from ventbench.diagnosis.in_time import SWINGS, in_time, of_some_breaths, swings, with_course
 from ventbench.diagnosis.linearised import (
@@ -53,6 +53,9 @@ MUSCLES = ("cough", "unknown:muscles")
 #: likelihood: no model has what neighbouring samples share.
 _ODDS, _PLACE, WARMTH = 0.7, 0.1, 0.2
 
+#: Least posterior probability of an effect of some breaths that is looked for.
+_LOOKED_FOR = 0.5
+
 #: Standard deviations of the logarithm of the breaths' gains that are compared.
 _SCATTERS = (0.003, SCATTER, 0.03, 0.06, 0.1, 0.17, 0.3)
 
@@ -82,6 +85,11 @@ class Posterior:
     def marginal(self, name: str) -> float:
         """Posterior probability that a term acts, over all sets."""
         return float(sum(weight for names, weight in self.weights.items() if name in names))
+
+    @property
+    def likely_events(self) -> tuple[str, ...]:
+        """Effects of some breaths that may act."""
+        return tuple(n for n in (*EVENTS, *COMMANDS) if self.marginal(n) > _LOOKED_FOR)
 
     def swaps(self, names: frozenset[str], name: str) -> dict[str, float]:
         """Posterior odds of others in the place of one term of a set, the likeliest first.
@@ -280,7 +288,7 @@ class _Search:
         """Search."""
         data, first = self.evaluator.training.data, self.fit(())
         data = mask_spikes(first, data)
-        noise = estimate_noise(self.fit((), data))
+        noise = self.evaluator.estimate_noise(self.fit((), data))
         self.data, self.base = data, self.fit((), data, noise)
         views = [self.view(self.base, noise)]
         if self.deviates_from_label(self.base):
@@ -327,9 +335,8 @@ class _Search:
     def extend(self, chosen: Scored, noise: Noise) -> tuple[CandidateEffects, Noise]:
         """Fit sets with one term more, less or other, and return what they were chosen by."""
         around, names = self.around(chosen.fitted), names_of(chosen.terms)
-        noise = self.linear_model(
-            around, chosen.fitted, noise, chosen.terms, loose=True
-        ).residual_noise
+        model = self.linear_model(around, chosen.fitted, noise, chosen.terms, loose=True)
+        noise = self.evaluator.colour(model.residual_noise)
         if len(names) < self.settings.most_terms:
             model = self.linear_model(around, chosen.fitted, noise, chosen.terms)
             more = enumerate_sets(model, self.events(model), 1, self.settings.beam)
@@ -423,7 +430,8 @@ class _Search:
         likeliest = self.linear_model(around, base, noise, loose=True).scatter
         self.scatters = tuple(sorted({min(SCATTER, likeliest), likeliest}))
         for _ in range(2):
-            noise = self.linear_model(around, base, noise, loose=True).residual_noise
+            loose = self.linear_model(around, base, noise, loose=True)
+            noise = self.evaluator.colour(loose.residual_noise)
         model = self.linear_model(around, base, noise)
         latent = in_time(
             model,

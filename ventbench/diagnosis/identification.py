@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,12 +10,7 @@ import numpy as np
 from ventbench.base.arrays import Bools, Floats
 from ventbench.base.interval import Interval
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.conclusion import (
-    Conclusion,
-    conclude,
-    drop_mechanism,
-    drop_nonparametric_term,
-)
+from ventbench.diagnosis.conclusion import Conclusion, conclude, drop_mechanism
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
@@ -80,7 +75,7 @@ def identify(
     tell: Callable[[str], None],
     settings: SelectionConfig = DEFAULT,
     fitted: Bools | None = None,
-    earlier: FittedModel | None = None,
+    also: Sequence[str] = (),
 ) -> IdentifiedModel:
     """Find the mechanisms that breaths need, and fit them.
 
@@ -91,16 +86,16 @@ def identify(
         tell: receives the current step, in words.
         settings: every threshold.
         fitted: which breaths the final fit may use, ``(n,)``; all but the testing ones if None.
-        earlier: mechanisms to start from too, fitted to the same lungs.
+        also: names of mechanisms that are tried in any case.
     """
     names = all_parameter_paths(settings, excluded)
     evaluator = make_evaluator(data, held, names, excluded, settings)
     # Breaths that judge are in no search, though they test: few breaths have both uses.
     chosen = ~held if fitted is None else fitted
     searched = evaluator.partition(data.select(chosen))
-    conclusion = conclude(evaluator, searched, tell, earlier)
+    conclusion = conclude(evaluator, searched, tell, also)
     # Gains that differ between breaths are parameters of each breath, unknown of held-out ones.
-    evaluator = replace(evaluator, gain_sd=conclusion.gain_sd)
+    evaluator = replace(evaluator, gain_sd=conclusion.gain_sd, white=conclusion.white)
     while True:
         has_term = conclusion.unnamed is not None and conclusion.unnamed.term is not None
         # A nonparametric term is fitted to the training breaths alone, to save time.
@@ -116,7 +111,8 @@ def identify(
         # The least needed one first: the intervals of others may shrink once it has gone.
         name = min(vague, key=lambda name: conclusion.held_out_gains.get(name, 0.0))
         if _is_idle_form(conclusion, name, settings):
-            conclusion = drop_nonparametric_term(conclusion)
+            named = conclusion.named
+            conclusion = replace(conclusion, full=named, unnamed=None, noise=named.noise)
         else:
             conclusion = drop_mechanism(conclusion, name, evaluator)
 

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Floats
-from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, fit_with_white_noise
+from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise
 from ventbench.diagnosis.evidence import COMMANDS
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, linearise
@@ -113,7 +113,7 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         ids: their ids, ``(n,)``.
     """
     evaluator, conclusion = model.evaluator, model.conclusion
-    hypothesis, likely = conclusion.named.hypothesis, conclusion.likely_events
+    hypothesis, likely = conclusion.named.hypothesis, conclusion.posterior.likely_events
     if not likely:
         return None
     alone = fit_with_noise(evaluator, hypothesis.minus(*hypothesis.breath_terms))
@@ -189,7 +189,8 @@ def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _EventFit | Non
     breaths are affected, the model is one of these, and the others show the opposite effect.
     """
     training = evaluator.training
-    fitted, affected = fit_with_white_noise(evaluator, alone), np.zeros(len(training.data), bool)
+    fitted = evaluator.fit(alone.hypothesis, alone.noise.white, alone if alone.names else None)
+    affected = np.zeros(len(training.data), bool)
     for k in range(_ROUNDS):
         evidence = _Evidence.of(evaluator, fitted, training, name)
         strength, share, nats = evidence.likeliest()

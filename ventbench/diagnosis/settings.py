@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "evidence-2"
+VERSION = "evidence-3"
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,21 @@ class SearchSettings:
     #: root mean square, cmH2O, of the error that a nonparametric term beside mechanisms explains,
     #: to be kept: less may be their form, or what every rig has.
     least_change: float = 0.1
+    #: what every ventilator has: edges of its outlet, valve, supply, and tubes. Where what a search
+    #: leaves is no noise of a sensor, it is repeated from these.
+    ventilator: tuple[str, ...] = (
+        "exhalation_valve_delay",
+        "exhalation_valve_closing",
+        "valve_curve",
+        "valve_dead_band",
+        "valve_delay",
+        "supply_droop",
+        "turbulent_resistance",
+        "circuit_compliance",
+    )
+    #: open-loop error on held-out breaths over that of the first search, below which the second
+    #: stands.
+    error_ratio: float = 0.9
     much: float = 100.0  #: criterion from which a set that is not accepted leaves much missing.
 
 

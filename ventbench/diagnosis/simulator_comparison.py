@@ -14,15 +14,12 @@ from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Bools, Floats
 from ventbench.diagnosis import estimates
+from ventbench.diagnosis.conclusion import eliminate
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, identify
 from ventbench.diagnosis.settings import DEFAULT
-from ventbench.diagnosis.validation import (
-    drop_redundant_terms,
-    is_weak,
-    passes_heldout_test,
-)
+from ventbench.diagnosis.validation import is_needed, is_weak, passes_heldout_test
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id import fit
 from ventbench.system_id.data import Data, Noise
@@ -136,14 +133,9 @@ def with_mechanisms_of(
         return simulator_model
     joint = simulator_fit.hypothesis.plus(recording_fit.hypothesis.minus(*simulator_fit.names))
     # From the values of the base model: those of a poor description lie in a minimum of their own.
-    fitted = fit_with_noise(evaluator, joint)
-    fitted = drop_redundant_terms(evaluator, fitted, added)
-    full = fit_with_noise(evaluator, fitted.hypothesis, fitted)
+    full = eliminate(evaluator, fit_with_noise(evaluator, joint), added)[0]
     against = evaluator.fit(simulator_fit.hypothesis, full.noise, simulator_fit)
-    gains = evaluator.held_out_gain(full, against)
-    if evaluator.criterion(full) >= evaluator.criterion(against) or not passes_heldout_test(
-        gains, evaluator.settings.held_out_test
-    ):
+    if not is_needed(evaluator, full, against):
         return simulator_model
     named, unnamed = full, conclusion.unnamed
     if unnamed is not None and unnamed.term is not None:
@@ -162,11 +154,9 @@ def describe_otherwise(recording_model: IdentifiedModel, simulator_model: Identi
     all of those names seem to be missing. The recording should be described by the simulator's
     names too; held-out breaths tell which description corrects the simulator.
     """
-    recorded, simulated = (
-        set(recording_model.conclusion.names),
-        set(simulator_model.conclusion.names),
-    )
-    return bool(recorded - simulated) and bool(simulated - recorded)
+    models = (recording_model, simulator_model)
+    recorded, simulated = (set(model.conclusion.names) for model in models)
+    return not recorded <= simulated and not simulated <= recorded
 
 
 def mean_error(data: Data, pressure: Floats) -> float:
@@ -297,14 +287,13 @@ def refit_at_simulator_parameters(
         return None
     place = recording_model.conclusion.unnamed
     term = (place.term,) if place is not None and place.term else ()
-    evaluator = _wider(recording_model.evaluator, simulator_model.evaluator)
     # What the simulator's model does not describe is in the corrected simulator: here as well.
     reduced = less_unmodelled(data, response, simulator_model)
-    training, held_out = evaluator.training.predictor, evaluator.held_out.predictor
+    evaluator = recording_model.evaluator
     evaluator = replace(
         evaluator,
-        training=Partition(reduced.select(~held), training),
-        held_out=Partition(reduced.select(held), held_out),
+        training=evaluator.partition(reduced.select(~held)),
+        held_out=evaluator.partition(reduced.select(held)),
     )
     test = evaluator.settings.held_out_test
 
@@ -328,7 +317,9 @@ def refit_at_simulator_parameters(
         least = int(np.argmin([nats.sum() for nats in lost]))
         name = names[least]
         total = float((score(fitted) - nothing).sum())
-        negligible = is_faint(fitted, simulator_fit, name, test.negligible_strength)
+        path = strength_path(name)
+        beyond = fitted.column(path) - simulator_fit.column(path)[0]
+        negligible = is_weak(name, beyond, test.negligible_strength)
         negligible &= bool(lost[least].sum() < test.negligible_share * total)
         if passes_heldout_test(lost[least], test) and not negligible:
             break
@@ -336,12 +327,6 @@ def refit_at_simulator_parameters(
         names = tuple(candidate for candidate in names if candidate != name)
     conclusion = replace(recording_model.conclusion, full=fitted)
     return IdentifiedModel(evaluator, conclusion, fitted, evaluator.training), names
-
-
-def is_faint(fitted: FittedModel, simulator_fit: FittedModel, name: str, share: float) -> bool:
-    """Whether a mechanism differs from the simulator's by less than a share of a mild strength."""
-    path = strength_path(name)
-    return is_weak(name, fitted.column(path) - simulator_fit.column(path)[0], share)
 
 
 def _noiseless_fit(
@@ -407,14 +392,3 @@ def _fit_beside(
         predictor=partition.predictor,
     )
     return FittedModel(hypothesis.names, solution.problem, solution.minimum, hypothesis)
-
-
-def _wider(recording: Evaluator, simulator: Evaluator) -> Evaluator:
-    """Evaluator of the recording whose simulator has the parameters of both."""
-    if len(recording.training.predictor.names) >= len(simulator.training.predictor.names):
-        return recording
-    return replace(
-        recording,
-        training=Partition(recording.training.data, simulator.training.predictor),
-        held_out=Partition(recording.held_out.data, simulator.held_out.predictor),
-    )

@@ -30,7 +30,6 @@ testing breaths are expected to gain twice what they must.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -226,24 +225,6 @@ def is_negligible(evaluator: Evaluator, full: FittedModel, reduced: FittedModel,
     criterion = evaluator.criterion(full)
     base = evaluator.criterion(evaluator.fit(Hypothesis(), full.noise, full))
     return evaluator.criterion(reduced) - criterion < settings.negligible_share * (base - criterion)
-
-
-def drop_redundant_terms(
-    evaluator: Evaluator, current: FittedModel, names: Sequence[str]
-) -> FittedModel:
-    """Drop terms that are not needed, or negligible.
-
-    Args:
-        evaluator: evaluator of the recording.
-        current: the model.
-        names: the terms to judge.
-    """
-    for name in names:
-        reduced = evaluator.fit(current.hypothesis.minus(name), current.noise, current)
-        needed = is_needed(evaluator, current, reduced)
-        if not needed or is_negligible(evaluator, current, reduced, name):
-            current = reduced
-    return current
 
 
 def detection_limits(evaluator: Evaluator, fitted: FittedModel) -> dict[str, float]:

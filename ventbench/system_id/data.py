@@ -117,6 +117,16 @@ class Noise:
     #: shares of the variance that are the discrepancy's, one for each channel.
     slow: tuple[float, ...] = (1.0, 1.0)
 
+    @property
+    def white(self) -> Noise:
+        """The same without correlation, so that no slow error is excused."""
+        return replace(self, ar=(0.0,) * len(self.ar))
+
+    @property
+    def autocorrelation_time(self) -> float:
+        """Readings of the pressure that count as one (integrated autocorrelation time)."""
+        return 1.0 + 2.0 * self.slow[0] * self.ar[0] / (1.0 - self.ar[0])
+
     def whiten(self, residual: Floats, weight: Floats) -> Floats:
         """Transform residuals to independent ones of unit variance; 0 where ``weight`` is 0.
 

@@ -82,8 +82,9 @@ def fitted(probes: Sequence[Driven], valve: Valve = NOMINAL, terms: int = 3) -> 
     for the time d by which it is late, which a stiff lung confuses with R: ``V(t - d) / C`` is
     ``V / C - d Q / C``. So all times are fitted, and each keeps its likelihood. Only the
     inspiration has that flow, and of it not the steps in which the expiratory valve closes. Where a
-    flow is measured the expiration helps, with a resistance of its own. ``n`` residuals of
-    correlation rho count as ``n (1 - rho) / (1 + rho)``.
+    flow is measured, it runs straight between samples or is held before each: half a step of time.
+    The expiration helps there, with a resistance of its own. ``n`` residuals of correlation rho
+    count as ``n (1 - rho) / (1 + rho)``.
 
     Args:
         probes: of the part ``lung``.
@@ -93,12 +94,12 @@ def fitted(probes: Sequence[Driven], valve: Valve = NOMINAL, terms: int = 3) -> 
     steps, measured, fits = protocol.INSPIRATION_STEPS, is_measured(probes), []
     parts = [slice(0 if measured or terms < 3 else _CLOSING, steps)]
     parts += [slice(steps, None)] * measured
-    for late in (0.0,) if measured else _LATE:
+    for late in (0.0, 0.5 * protocol.DT) if measured else _LATE:
         rows = []
         for probe in probes:
             if measured:
                 flow = 1e-3 * probe.flow
-                volume = cumulative_trapezoid(flow, dx=protocol.DT, initial=0.0)
+                volume = cumulative_trapezoid(flow, dx=protocol.DT, initial=0.0) + late * flow
             else:
                 given = np.append(0.0, 1e-3 * np.cumsum(valve.flow(probe.u_in)) * protocol.DT)
                 time = protocol.DT * np.arange(len(given))

@@ -16,6 +16,7 @@ import secrets
 import time
 from collections import deque
 from dataclasses import dataclass, replace
+from io import UnsupportedOperation
 from typing import Protocol, TypeVar, cast
 from urllib.parse import urlsplit
 
@@ -223,7 +224,7 @@ class Link:
             port.open()
             os.set_blocking(port.fileno(), False)
         except ValueError as error:
-            why = {"fileno": "no device is behind it"}.get(str(error), error)
+            why = "no device is behind it" if isinstance(error, UnsupportedOperation) else error
             raise LinkError(f"port {self.url!r}: {why}; {_PORTS}") from error
         except (OSError, serial.SerialException) as error:
             raise self._not_opened(error) from error

@@ -185,7 +185,7 @@ def emulate(
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """
-    from hardware_eval.device.program import DeviceService, DeviceSettings
+    from hardware_eval.device.program import DeviceService
     from hardware_eval.emulation import emulator, simulated
     from hardware_eval.emulation.firmware import Firmware, command_of
     from hardware_eval.realtime import prefer, told_to_end
@@ -200,7 +200,7 @@ def emulate(
     image = None if runs_image is None else Firmware(runs_image, hal, begun)
     try:
         device = emulator.Emulator(
-            image or DeviceService(hal, DeviceSettings(), 0.0),
+            image or DeviceService(hal, 0.0),
             link=link,
             begun=begun,
         )

@@ -17,7 +17,7 @@ from ventbench.base.errors import InputError
 try:
     from hardware_eval.device import deadman
     from hardware_eval.device.guard import Guard
-    from hardware_eval.device.program import DeviceService, DeviceSettings
+    from hardware_eval.device.program import DeviceService
     from hardware_eval.wire.client import BAUD_RATE
     from hardware_eval.wire.port import Port
 except InputError as missing:  # an extra that brings the wire
@@ -71,7 +71,6 @@ def _run(given: argparse.Namespace) -> int:
     if given.vent:
         return 0
     sensor = PvpSensor(given.config)
-    settings = DeviceSettings(sensor.pressure_limit)
     process, orders = deadman.start(
         f"{PvpValves.__module__}:{PvpValves.__name__}", str(given.config)
     )
@@ -79,7 +78,7 @@ def _run(given: argparse.Namespace) -> int:
     try:
         if reason := realtime.prefer():
             print(f"no real-time scheduling: {reason}", file=sys.stderr)
-        _serve_until_signal(hal, settings, serial_line(given.port))
+        _serve_until_signal(hal, sensor.pressure_limit, serial_line(given.port))
     finally:
         hal.close()
         process.wait()
@@ -91,13 +90,13 @@ def _run(given: argparse.Namespace) -> int:
 
 
 def _serve_until_signal(
-    hal: deadman.SupervisedHal, settings: DeviceSettings, open_line: Callable[[], int | None]
+    hal: deadman.SupervisedHal, limit: float, open_line: Callable[[], int | None]
 ) -> None:
     ended = realtime.told_to_end()
     port = Port(open_line, os.close)
     awake = notifier()
     try:
-        Guard(DeviceService(hal, settings, time.monotonic()), port).run(
+        Guard(DeviceService(hal, time.monotonic(), limit), port).run(
             lambda: ended() or hal.lost or awake()
         )
     finally:

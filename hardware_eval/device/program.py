@@ -44,7 +44,6 @@ from hardware_eval.wire.messages import (
     feed_bytes,
     microseconds,
 )
-from ventbench.base.errors import InputError
 from ventbench.task import protocol
 
 #: Version of this program: what a device tells as its firmware.
@@ -129,22 +128,6 @@ class Hal(Sensor, Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceSettings:
-    """What is fixed when a device's program starts."""
-
-    pressure_limit: float = protocol.SAFETY_PRESSURE  #: above which the device vents, cmH2O.
-
-    def __post_init__(self) -> None:
-        """Check the limit.
-
-        Raises:
-            InputError: if it is outside what is safe.
-        """
-        if not 0.0 < self.pressure_limit <= 100.0:
-            raise InputError(f"pressure limit {self.pressure_limit} cmH2O is outside 0..100")
-
-
-@dataclass(frozen=True, slots=True)
 class DeviceState:
     """State between two steps."""
 
@@ -165,14 +148,14 @@ class DeviceState:
     counters: Counters = field(default_factory=Counters)  #: counts since the program started.
 
 
-def init(settings: DeviceSettings, now: float) -> DeviceState:
-    """Vented, no session, at ``now``, s."""
+def init(own_limit: float, now: float) -> DeviceState:
+    """Vented, no session, at ``now``, s; vents above a limit of its own, cmH2O."""
     begun = microseconds(now)
-    return DeviceState(settings.pressure_limit, valid=begun, changed=begun, stepped=begun)
+    return DeviceState(own_limit, valid=begun, changed=begun, stepped=begun)
 
 
 def step(
-    settings: DeviceSettings,
+    own_limit: float,
     identity: Identity,
     state: DeviceState,
     now: float,
@@ -185,7 +168,7 @@ def step(
     long the device itself was held up.
 
     Args:
-        settings: limits of the device.
+        own_limit: pressure above which the device vents, whatever a host asks, cmH2O.
         identity: what the device tells about itself.
         state: state from ``init`` or ``step``.
         now: time, s; never less than in the step before.
@@ -218,14 +201,14 @@ def step(
                 state = _counted(state, Fault.MALFORMED.value)
                 continue
             state, answer = _received(
-                settings, identity, _counted(state, "frames"), event, event.message, sample
+                own_limit, identity, _counted(state, "frames"), event, event.message, sample
             )
             answers.append(encode(Packet(event.session, event.sequence, answer)))
     return state, b"".join(answers)
 
 
 def _received(
-    settings: DeviceSettings,
+    own_limit: float,
     identity: Identity,
     state: DeviceState,
     packet: Packet,
@@ -240,9 +223,9 @@ def _received(
     if isinstance(message, Vent):  # from whomever, and whenever: it is always safe
         state = replace(state, sequence=sequence) if ours and fresh else state
         state = _vented(state, Flag.HOST_VENTED)
-        answer = _reading(state, sequence, sample)
+        answer = _reading(state, sample)
     elif isinstance(message, Hello):
-        state, answer = _opened(settings, identity, state, packet, message, fresh or not ours)
+        state, answer = _opened(own_limit, identity, state, packet, message, fresh or not ours)
     elif not ours:
         state, answer = _counted(state, "session"), Reason.SESSION
     elif not fresh:
@@ -252,15 +235,14 @@ def _received(
         if isinstance(message, Statistics):
             return state, state.counters
         state, reason = _obeyed(identity, state, message, sample)
-        answer = reason or _reading(state, sequence, sample)
+        answer = reason or _reading(state, sample)
     if isinstance(answer, Reason):
-        return state, Refusal(sequence, answer, state.mode, _flags(state, sample))
+        return state, Refusal(answer, state.mode, _flags(state, sample))
     return state, answer
 
 
-def _reading(state: DeviceState, sequence: int, sample: Sample) -> Reading:
+def _reading(state: DeviceState, sample: Sample) -> Reading:
     return Reading(
-        sequence,
         sample.time,
         sample.pressure,
         sample.flow,
@@ -272,7 +254,7 @@ def _reading(state: DeviceState, sequence: int, sample: Sample) -> Reading:
 
 
 def _opened(
-    settings: DeviceSettings,
+    own_limit: float,
     identity: Identity,
     state: DeviceState,
     packet: Packet,
@@ -285,7 +267,7 @@ def _opened(
     if not acceptable:
         return _counted(state, "sequence"), Reason.SEQUENCE
     asked = hello.pressure_limit
-    limit = settings.pressure_limit if asked is None else min(asked, settings.pressure_limit)
+    limit = own_limit if asked is None else min(asked, own_limit)
     state = replace(
         _vented(state, Flag.NONE),
         mode=Mode.READY,
@@ -404,15 +386,15 @@ class DeviceService:
 
     Attributes:
         hal: the hardware.
-        settings: limits of the device.
+        own_limit: pressure above which it vents, cmH2O.
         state: state of the program.
     """
 
-    def __init__(self, hal: Hal, settings: DeviceSettings, now: float) -> None:
+    def __init__(self, hal: Hal, now: float, own_limit: float = protocol.SAFETY_PRESSURE) -> None:
         """Start vented, at ``now``, s."""
         self.hal = hal
-        self.settings = settings
-        self.state: DeviceState = init(settings, now)
+        self.own_limit = own_limit
+        self.state: DeviceState = init(own_limit, now)
         hal.actuate(now, self.state.u_in, self.state.u_out)
 
     def step(self, now: float, data: bytes = b"") -> bytes:
@@ -426,7 +408,7 @@ class DeviceService:
             Bytes to send.
         """
         sample = self.hal.sample(now)
-        self.state, answers = step(self.settings, self.hal.identity, self.state, now, data, sample)
+        self.state, answers = step(self.own_limit, self.hal.identity, self.state, now, data, sample)
         self.hal.actuate(now, self.state.u_in, self.state.u_out)
         return answers
 

@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_eval.device.program import DeviceSettings, Identity, Sample
+from hardware_eval.device.program import Identity, Sample
 from hardware_eval.wire.messages import Capability
 from ventbench.base.errors import InputError
 
@@ -249,7 +249,8 @@ def _typed(table: type[_TableT], values: Mapping[str, Any], where: str) -> _Tabl
 def _check(configuration: PvpConfiguration, wiring: Revision, part: SensorPart) -> None:
     if len(bytes.fromhex(configuration.device_id)) != 8:
         raise ValueError(f"device_id = {configuration.device_id!r} must have 16 hexadecimal digits")
-    DeviceSettings(configuration.pressure_limit)
+    if not 0.0 < configuration.pressure_limit <= 100.0:
+        raise ValueError(f"pressure_limit = {configuration.pressure_limit:g} is outside 0..100")
     pins = {key: getattr(wiring, key) for key in ("inspiratory_pin", "expiratory_pin")}
     if configuration.heartbeat_pin >= 0:
         pins["heartbeat_pin"] = configuration.heartbeat_pin

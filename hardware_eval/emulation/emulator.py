@@ -15,11 +15,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hardware_eval.device.guard import Guard
-from hardware_eval.device.program import PERIOD, DeviceService, DeviceSettings, Hal
+from hardware_eval.device.program import PERIOD, DeviceService, Hal
 from hardware_eval.emulation.firmware import Firmware
 from hardware_eval.realtime import VirtualClock
 from hardware_eval.wire.port import Port
 from ventbench.base.errors import InputError
+from ventbench.task import protocol
 
 
 class LoopbackDevice:
@@ -33,13 +34,13 @@ class LoopbackDevice:
     """
 
     def __init__(
-        self, hal: Hal, settings: DeviceSettings | None = None, latency: float = 0.001
+        self, hal: Hal, own_limit: float = protocol.SAFETY_PRESSURE, latency: float = 0.001
     ) -> None:
         """Start the device on a clock of its own."""
         self.clock = VirtualClock()
         self.start = self.clock.now()
         self.latency = latency
-        self.service = DeviceService(hal, settings or DeviceSettings(), self.start)
+        self.service = DeviceService(hal, self.start, own_limit)
         self._next = self.start + PERIOD
         self._incoming: deque[tuple[float, bytes]] = deque()  # each with when it arrives, s
         self._outgoing: deque[tuple[float, bytes]] = deque()

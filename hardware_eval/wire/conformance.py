@@ -135,7 +135,7 @@ def _malformed(host: Probe) -> None:
     longest = bytes(LONGEST_PACKET - 4 - 9)
     for kind in (0x00, 0x07, 0x7F, 0x80, 0xFF):
         _counted(host, to_frame(with_crc(bytes([kind]) + header + longest)), malformed=1)
-    echo = Reading(0, 1.0, 5.0, math.nan, 0.0, 1, Mode.READY, Flag.NONE)
+    echo = Reading(1.0, 5.0, math.nan, 0.0, 1, Mode.READY, Flag.NONE)
     _counted(host, host.frame(echo), malformed=1)
 
 

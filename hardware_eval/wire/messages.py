@@ -13,9 +13,10 @@ from __future__ import annotations
 import math
 import struct
 from binascii import crc32
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import Enum, IntEnum, IntFlag
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from cobs import cobs
 
@@ -193,7 +194,6 @@ class Reading:
     """State of the device; the answer to arm, command, heartbeat and vent."""
 
     kind: ClassVar[Kind] = Kind.READING
-    sequence: int  #: sequence number of the message that it answers (from the packet's header).
     time: float  #: time of the sample on the device's clock, s.
     pressure: float  #: airway pressure, cmH2O; NaN if the sensor gives none.
     flow: float  #: flow into the lung, mL/s; NaN if the device does not measure it.
@@ -208,7 +208,6 @@ class Refusal:
     """The device did not do what a message asks."""
 
     kind: ClassVar[Kind] = Kind.REFUSAL
-    sequence: int  #: sequence number of the refused message (from the packet's header).
     reason: Reason  #: why.
     mode: Mode  #: what the device does with the valves.
     flags: Flag  #: as in :class:`Reading`.
@@ -253,13 +252,93 @@ class MalformedPacketError(ValueError):
     """An intact packet is of unknown kind, of wrong length, or holds no value of its type."""
 
 
-_HELLO = struct.Struct("<BH")
-_COMMAND = struct.Struct("<HBI")
-_WELCOME = struct.Struct("<BBBBHHH8s32sB")
-_READING = struct.Struct("<QhhHBBH")
-_REFUSAL = struct.Struct("<BBH")
-_COUNTED = tuple(field.name for field in fields(Counters))
-_COUNTERS = struct.Struct(f"<{len(_COUNTED)}I")
+def microseconds(time: float) -> int:
+    """Device time, s, as :attr:`Reading.time` goes over the wire."""
+    return round(time * 1e6)
+
+
+def milliseconds(time: float) -> int:
+    """Device time, s, as :attr:`Command.seen` holds it.
+
+    By way of the microseconds of a reading, so that no rounding makes a reading newer than now.
+    """
+    return microseconds(time) // 1000 & 0xFFFFFFFF
+
+
+def _scaled(value: float, steps: int, high: int = 65535) -> int:
+    if not math.isfinite(value):
+        raise ValueError(f"{value} cannot be sent")
+    number = round(value * steps)
+    if not 0 <= number <= high:
+        raise ValueError(f"{value:g} is outside 0..{high / steps:g}")
+    return number
+
+
+def fixed_point(value: float, steps: int) -> int:
+    """A pressure or flow as an i16 in units of the wire, steps to its unit; for NaN, not known."""
+    if not math.isfinite(value):
+        return _NO_VALUE
+    return max(-32767, min(32767, round(value * steps)))
+
+
+#: One value on the wire: its code in :mod:`struct`, and what it is there and here.
+_Coded = tuple[str, Callable[[Any], Any], Callable[[Any], Any]]
+
+
+def _unsigned(steps: int) -> _Coded:
+    return "H", lambda value: _scaled(value, steps), lambda number: number / steps
+
+
+def _signed(steps: int) -> _Coded:
+    def value(number: int) -> float:
+        return math.nan if number == _NO_VALUE else number / steps
+
+    return "h", lambda value: fixed_point(value, steps), value
+
+
+def _asked_limit(value: float | None) -> int:
+    return _OWN_LIMIT if value is None else _scaled(value, PRESSURE_STEPS, _OWN_LIMIT - 1)
+
+
+def _limit(number: int) -> float | None:
+    return None if number == _OWN_LIMIT else number / PRESSURE_STEPS
+
+
+_U_IN, _U8 = _unsigned(U_IN_STEPS), ("B", int, int)
+_U32: _Coded = "I", lambda value: value & 0xFFFFFFFF, int
+_MODE, _FLAGS = ("B", int, Mode), ("H", int, Flag)
+
+#: Values of each message in the order of its fields; a welcome ends with the length of its name.
+_LAYOUTS: dict[type[Message], tuple[_Coded, ...]] = {
+    Hello: (_U8, ("H", _asked_limit, _limit)),
+    Arm: (),
+    Command: (_U_IN, _U8, _U32),
+    Heartbeat: (),
+    Vent: (),
+    Statistics: (),
+    Welcome: (
+        _U8,
+        ("3s", bytes, tuple),
+        ("H", int, Capability),
+        _unsigned(WATCHDOG_STEPS),
+        _unsigned(PRESSURE_STEPS),
+        ("8s", bytes, bytes),
+        ("32s", bytes, bytes),
+        ("B", len, int),
+    ),
+    Reading: (
+        ("Q", microseconds, lambda number: number / 1e6),
+        _signed(PRESSURE_STEPS),
+        _signed(FLOW_STEPS),
+        _U_IN,
+        _U8,
+        _MODE,
+        _FLAGS,
+    ),
+    Refusal: (("B", int, Reason), _MODE, _FLAGS),
+    Counters: (_U32,) * len(fields(Counters)),
+}
+_KINDS = {message.kind: message for message in _LAYOUTS}
 
 
 def encode(packet: Packet) -> bytes:
@@ -307,141 +386,36 @@ def decode(content: bytes) -> Packet:
     number, session, sequence = _HEADER.unpack_from(content)
     body = content[_HEADER.size :]
     try:
-        return Packet(session, sequence, _message(Kind(number), sequence, body))
+        return Packet(session, sequence, _message(Kind(number), body))
     except (struct.error, ValueError) as error:
         raise MalformedPacketError(
             f"kind 0x{number:02x} with a body of {len(body)} bytes: {error}"
         ) from error
 
 
-def microseconds(time: float) -> int:
-    """Device time, s, as :attr:`Reading.time` goes over the wire."""
-    return round(time * 1e6)
-
-
-def milliseconds(time: float) -> int:
-    """Device time, s, as :attr:`Command.seen` holds it.
-
-    By way of the microseconds of a reading, so that no rounding makes a reading newer than now.
-    """
-    return microseconds(time) // 1000 & 0xFFFFFFFF
+def _struct(layout: tuple[_Coded, ...]) -> struct.Struct:
+    return struct.Struct("<" + "".join(code for code, _, _ in layout))
 
 
 def _body(message: Message) -> bytes:
-    match message:
-        case Hello(version, limit):
-            return _HELLO.pack(
-                version, _OWN_LIMIT if limit is None else _scaled(limit, PRESSURE_STEPS, 0, 65534)
-            )
-        case Command(u_in, u_out, seen):
-            return _COMMAND.pack(_scaled(u_in, U_IN_STEPS, 0, 65535), u_out, seen)
-        case Welcome():
-            name = message.name.encode()[:_NAME_BYTES]
-            return (
-                _WELCOME.pack(
-                    message.version,
-                    *message.firmware,
-                    message.capabilities,
-                    _scaled(message.watchdog, WATCHDOG_STEPS, 0, 65535),
-                    _scaled(message.pressure_limit, PRESSURE_STEPS, 0, 65535),
-                    message.device_id,
-                    message.calibration,
-                    len(name),
-                )
-                + name
-            )
-        case Reading():
-            return _READING.pack(
-                microseconds(message.time),
-                fixed_point(message.pressure, PRESSURE_STEPS),
-                fixed_point(message.flow, FLOW_STEPS),
-                _scaled(message.u_in, U_IN_STEPS, 0, 65535),
-                message.u_out,
-                message.mode,
-                message.flags,
-            )
-        case Refusal():
-            return _REFUSAL.pack(message.reason, message.mode, message.flags)
-        case Counters():
-            return _COUNTERS.pack(*(getattr(message, name) & 0xFFFFFFFF for name in _COUNTED))
-        case _:
-            return b""
+    layout, name = _LAYOUTS[type(message)], b""
+    values = [getattr(message, field.name) for field in fields(message)]
+    if isinstance(message, Welcome):
+        values[-1] = name = message.name.encode()[:_NAME_BYTES]
+    numbers = (there(value) for (_, there, _), value in zip(layout, values, strict=True))
+    return _struct(layout).pack(*numbers) + name
 
 
-def _message(kind: Kind, sequence: int, body: bytes) -> Message:
-    match kind:
-        case Kind.HELLO:
-            version, limit = _HELLO.unpack(body)
-            return Hello(version, None if limit == _OWN_LIMIT else limit / PRESSURE_STEPS)
-        case Kind.COMMAND:
-            u_in, u_out, seen = _COMMAND.unpack(body)
-            return Command(u_in / U_IN_STEPS, u_out, seen)
-        case Kind.WELCOME:
-            fixed, name = body[: _WELCOME.size], body[_WELCOME.size :]
-            version, *firmware, capabilities, watchdog, limit, device_id, calibration, length = (
-                _WELCOME.unpack(fixed)
-            )
-            if len(name) != length:
-                raise ValueError(f"a name of {len(name)} bytes, announced were {length}")
-            major, minor, patch = firmware
-            return Welcome(
-                version,
-                (major, minor, patch),
-                Capability(capabilities),
-                watchdog / WATCHDOG_STEPS,
-                limit / PRESSURE_STEPS,
-                device_id,
-                calibration,
-                name.decode(),
-            )
-        case Kind.READING:
-            time, pressure, flow, u_in, u_out, mode, flags = _READING.unpack(body)
-            return Reading(
-                sequence,
-                time / 1e6,
-                _or_nan(pressure, PRESSURE_STEPS),
-                _or_nan(flow, FLOW_STEPS),
-                u_in / U_IN_STEPS,
-                u_out,
-                Mode(mode),
-                Flag(flags),
-            )
-        case Kind.REFUSAL:
-            reason, mode, flags = _REFUSAL.unpack(body)
-            return Refusal(sequence, Reason(reason), Mode(mode), Flag(flags))
-        case Kind.COUNTERS:
-            return Counters(*_COUNTERS.unpack(body))
-    if body:
-        raise ValueError("this kind has no body")
-    return _EMPTY[kind]
-
-
-_EMPTY: dict[Kind, Message] = {
-    Kind.ARM: Arm(),
-    Kind.HEARTBEAT: Heartbeat(),
-    Kind.VENT: Vent(),
-    Kind.STATISTICS: Statistics(),
-}
-
-
-def _scaled(value: float, steps: int, low: int, high: int) -> int:
-    if not math.isfinite(value):
-        raise ValueError(f"{value} cannot be sent")
-    number = round(value * steps)
-    if not low <= number <= high:
-        raise ValueError(f"{value:g} is outside {low / steps:g}..{high / steps:g}")
-    return number
-
-
-def fixed_point(value: float, steps: int) -> int:
-    """A pressure or flow as an i16 in units of the wire, steps to its unit; for NaN, not known."""
-    if not math.isfinite(value):
-        return _NO_VALUE
-    return max(-32767, min(32767, round(value * steps)))
-
-
-def _or_nan(number: int, steps: int) -> float:
-    return math.nan if number == _NO_VALUE else number / steps
+def _message(kind: Kind, body: bytes) -> Message:
+    message = _KINDS[kind]
+    layout = _LAYOUTS[message]
+    packed = _struct(layout)
+    numbers = packed.unpack_from(body)
+    values = [here(number) for (_, _, here), number in zip(layout, numbers, strict=True)]
+    name, announced = body[packed.size :], values.pop() if message is Welcome else 0
+    if len(name) != announced:
+        raise ValueError(f"{len(name)} bytes behind its values, announced were {announced}")
+    return message(*values, *[name.decode()] * (message is Welcome))
 
 
 #: Longest frame without its zero bytes: COBS adds one byte to a packet of at most 254.

@@ -16,7 +16,7 @@ from hardware_eval.bench.plan import make_plan
 from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.safety import DEFAULT, VALVE_GAIN
 from hardware_eval.bench.session import run_plan
-from hardware_eval.device.program import DeviceService, DeviceSettings, Sample
+from hardware_eval.device.program import DeviceService, Sample
 from hardware_eval.wire.client import Client
 from tests.hardware_eval import stand_in
 from tests.hardware_eval.faults import Fault, FaultyDevice, LineFaultKind
@@ -38,7 +38,7 @@ class Board:
     def restart(self, boot: float = BOOT) -> None:
         """Begin anew, vented, without a session; bytes of before are lost."""
         device, self.restarts = self.device, self.restarts + 1
-        device.service = DeviceService(device.service.hal, DeviceSettings(), self.clock.now())
+        device.service = DeviceService(device.service.hal, self.clock.now())
         device.unplug()
         device.plug()
         self.ready = self.clock.now() + boot

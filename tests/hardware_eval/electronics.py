@@ -30,7 +30,7 @@ from typing import Any
 
 from hardware_eval import realtime
 from hardware_eval.device import deadman
-from hardware_eval.device.program import DeviceService, DeviceSettings, Identity, Sample
+from hardware_eval.device.program import DeviceService, Identity, Sample
 from hardware_eval.emulation.emulator import Emulator
 from hardware_eval.wire.messages import Flag
 
@@ -240,7 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     wired.pins.close()
     hal = deadman.SupervisedHal(wired, orders, clock)
     try:
-        service = DeviceService(hal, DeviceSettings(), clock())
+        service = DeviceService(hal, clock())
         emulator = LoggedEmulator(service, given.program, link=given.link, begun=begun)
         reason = realtime.prefer()
         if given.realtime and reason:

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from hardware_eval.device.program import DeviceSettings, Hal, Sample
+from hardware_eval.device.program import Hal, Sample
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal
 from hardware_eval.wire.client import DisconnectedError
 from ventbench.plants.catalog import load_simulators
+from ventbench.task import protocol
 from ventbench.task.interfaces import Plant
 
 #: Time in which the sensor of a disconnected tube falls to ambient pressure, s.
@@ -217,11 +218,11 @@ class FaultyDevice(LoopbackDevice):
     """
 
     def __init__(
-        self, hal: Hal, settings: DeviceSettings | None = None, latency: float = 0.001
+        self, hal: Hal, own_limit: float = protocol.SAFETY_PRESSURE, latency: float = 0.001
     ) -> None:
         self.line, self.plugged = Line(), True
         self.actuations = [Actuation(0.0, 0.0, 1)]
-        super().__init__(hal, settings, latency)
+        super().__init__(hal, own_limit, latency)
 
     def unplug(self) -> None:
         """Pull the cable; what is on the way is lost."""

@@ -22,7 +22,6 @@ from hardware_eval.bench.identity import Baseline
 from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.selftest import Finding, selftest
-from hardware_eval.device.program import DeviceSettings
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
@@ -204,7 +203,7 @@ def test_readings_and_limits_are_corrected_by_what_was_calibrated(
 ) -> None:
     """Whatever a sensor of the expected range shows, the corrected reading is the pressure."""
     hal = stand_in.Bench()
-    device = LoopbackDevice(hal, DeviceSettings(50.0))
+    device = LoopbackDevice(hal, 50.0)
     client = Client(device, device.clock)
     client.hello(40.0)
     bench = Bench(client, device.clock, DEFAULT, Shows(hal, lambda p: offset + slope * p))

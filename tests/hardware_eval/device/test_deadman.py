@@ -17,7 +17,7 @@ import pytest
 from hardware_eval.device import deadman
 from hardware_eval.device.deadman import BOUND, DEADMAN, Deadman, SupervisedHal
 from hardware_eval.device.guard import Guard
-from hardware_eval.device.program import DeviceService, DeviceSettings, Identity, Sample
+from hardware_eval.device.program import DeviceService, Identity, Sample
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability, Flag, Mode
@@ -123,7 +123,7 @@ def test_a_blocked_bus_does_not_block_the_guard() -> None:
     orders.setblocking(False)
     sensor = BlockedSensor()
     hal = SupervisedHal(sensor, orders)
-    service = DeviceService(hal, DeviceSettings(), time.monotonic())
+    service = DeviceService(hal, time.monotonic())
     running = replace(service.state, mode=Mode.RUNNING, u_in=50.0, u_out=0)
     # Fed by commands, all the time; a device counts whole microseconds.
     service.state = replace(running, fed=round(1e6 * (time.monotonic() + PATIENCE)))

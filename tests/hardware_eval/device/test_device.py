@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hardware_eval.device.program import OLDEST_SEEN, PERIOD, SENSOR_TIMEOUT, DeviceSettings
+from hardware_eval.device.program import OLDEST_SEEN, PERIOD, SENSOR_TIMEOUT
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.client import Client, RefusedError
 from hardware_eval.wire.messages import (
@@ -21,6 +21,7 @@ from hardware_eval.wire.messages import (
     encode,
 )
 from tests.hardware_eval.stand_in import Bench
+from ventbench.task import protocol
 
 #: From the last command to vented valves, s.
 VENTED_WITHIN = 0.100
@@ -113,7 +114,7 @@ def test_the_host_lowers_the_pressure_limit_and_cannot_raise_it(
     device: LoopbackDevice, bench: Bench
 ) -> None:
     client = Client(device, device.clock)
-    assert client.hello(200.0).pressure_limit == DeviceSettings().pressure_limit
+    assert client.hello(200.0).pressure_limit == protocol.SAFETY_PRESSURE
     assert client.hello(30.0).pressure_limit == 30.0
     _run(client, device)
     bench.pressure = 30.5

@@ -25,9 +25,10 @@ from hardware_eval.wire.messages import (
     with_crc,
 )
 from tests.hardware_eval.stand_in import Bench
+from ventbench.task import protocol
 
 SESSION = 0xC0FFEE
-SETTINGS = program.DeviceSettings()
+SETTINGS = protocol.SAFETY_PRESSURE
 IDENTITY = Bench().identity
 
 #: What happens to a frame: kind, and where.

@@ -22,7 +22,7 @@ import pytest
 
 from hardware_eval.device import __main__ as board
 from hardware_eval.device.guard import Guard
-from hardware_eval.device.program import DeviceService, DeviceSettings
+from hardware_eval.device.program import DeviceService
 from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves, load_machine
 from hardware_eval.wire.client import Client, Link
 from hardware_eval.wire.messages import PROTOCOL_VERSION, Capability, Hello, Mode, Packet, encode
@@ -381,7 +381,7 @@ def test_the_board_serves_one_host_after_another() -> None:
         return connection.detach()
 
     bench = Bench()
-    service = DeviceService(bench, DeviceSettings(), time.monotonic())
+    service = DeviceService(bench, time.monotonic())
     stop = threading.Event()
     port = Port(open_line, os.close)
     thread = threading.Thread(target=Guard(service, port).run, args=(stop.is_set,))

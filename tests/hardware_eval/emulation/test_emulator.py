@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from hardware_eval.device.program import DeviceService, DeviceSettings
+from hardware_eval.device.program import DeviceService
 from hardware_eval.wire.client import (
     Client,
     DisconnectedError,
@@ -48,7 +48,7 @@ class PulledEmulator(LoggedEmulator):
 
 @pytest.fixture
 def emulator(tmp_path: Path) -> Iterator[PulledEmulator]:
-    service = DeviceService(Bench(), DeviceSettings(), 0.0)
+    service = DeviceService(Bench(), 0.0)
     running = PulledEmulator(service, tmp_path / "valves.csv", link=tmp_path / "lung")
     stop = threading.Event()
     thread = threading.Thread(target=running.run, args=(stop.is_set,))

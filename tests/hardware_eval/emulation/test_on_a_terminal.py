@@ -23,7 +23,6 @@ import pytest
 from typer.testing import CliRunner
 
 from hardware_eval import cli
-from hardware_eval.device.program import DeviceSettings
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.results import evaluate
@@ -48,7 +47,7 @@ class DeviceOnTerminal(LoopbackDevice):
         tty.setraw(self._slave)
         self.link = Link(os.ttyname(self._slave))
         self.carried = 0
-        super().__init__(hal, DeviceSettings())
+        super().__init__(hal)
 
     def write(self, data: bytes) -> None:
         self.link.write(data)

@@ -13,9 +13,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from hardware_eval.device.program import DeviceSettings, Hal, Identity, Sample
+from hardware_eval.device.program import Hal, Identity, Sample
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.wire.messages import Mode, microseconds
+from ventbench.task import protocol
 
 HERE = Path(__file__).parent
 FIRMWARE = HERE.parents[2] / "hardware_eval" / "firmware"
@@ -142,9 +143,9 @@ class Core:
 class CoreService:
     """The core in place of :class:`~hardware_eval.device.program.DeviceService`."""
 
-    def __init__(self, program: Path, hal: Hal, settings: DeviceSettings, now: float) -> None:
-        self.hal, self.settings = hal, settings
-        self.core = Core(program, hal.identity, now, settings.pressure_limit)
+    def __init__(self, program: Path, hal: Hal, now: float, own_limit: float) -> None:
+        self.hal = hal
+        self.core = Core(program, hal.identity, now, own_limit)
         self.state = SimpleNamespace(u_in=0.0, u_out=1, mode=Mode.CLOSED, causes=0)
         hal.actuate(now, 0.0, 1)
 
@@ -159,11 +160,11 @@ class CoreService:
 
 @contextlib.contextmanager
 def loopback(
-    program: Path, hal: Hal, settings: DeviceSettings | None = None
+    program: Path, hal: Hal, own_limit: float = protocol.SAFETY_PRESSURE
 ) -> Iterator[LoopbackDevice]:
     """The core on a virtual clock."""
-    device = LoopbackDevice(hal, settings)
-    service = CoreService(program, hal, device.service.settings, device.start)
+    device = LoopbackDevice(hal, own_limit)
+    service = CoreService(program, hal, device.start, own_limit)
     device.service = service  # type: ignore[assignment]
     try:
         yield device

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hardware_eval import cli
-from hardware_eval.device.program import DeviceService, DeviceSettings, Identity
+from hardware_eval.device.program import DeviceService, Identity
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.wire.client import NoAnswerError
@@ -18,6 +18,7 @@ from hardware_eval.wire.conformance import CLAUSES, NOT_TRIED, Clause, conforman
 from hardware_eval.wire.messages import Capability, Packet, feed_bytes
 from tests.hardware_eval.firmware.core import CoreService, loopback
 from tests.hardware_eval.stand_in import Bench
+from ventbench.task import protocol
 
 PROTOCOL = Path(__file__).parents[3] / "hardware_eval" / "PROTOCOL.md"
 
@@ -89,9 +90,9 @@ def test_a_device_answers_the_table_byte_by_byte(harness: Path, device: str) -> 
     now = 1.234567
     service: DeviceService | CoreService
     if device == "python":
-        service = DeviceService(bench, DeviceSettings(), now)
+        service = DeviceService(bench, now)
     else:
-        service = CoreService(harness, bench, DeviceSettings(), now)
+        service = CoreService(harness, bench, now, protocol.SAFETY_PRESSURE)
     for (_, asked), (_, answered) in zip(rows[::2], rows[1::2], strict=True):
         assert service.step(now, bytes.fromhex(asked)).hex() == answered
     if isinstance(service, CoreService):

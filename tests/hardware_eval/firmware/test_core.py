@@ -35,7 +35,7 @@ from tests.hardware_eval.firmware.core import Core, hundredths, loopback
 from tests.hardware_eval.stand_in import Bench
 
 IDENTITY = Identity("fuzzed", b"87654321", bytes(range(32)), Capability.FLOW, 50.8, noisy=True)
-SETTINGS = program.DeviceSettings(50.0)
+SETTINGS = 50.0
 
 #: Times between two steps, us: each limit, and a microsecond beyond it.
 PAUSES = (0, 1, 999, 5000, 20_000, 30_000, 40_000, 40_001, 50_000, 50_001, 80_000, 80_001, 250_001)
@@ -102,7 +102,7 @@ class Stimuli:
                 Statistics(),
                 Vent(),
                 Arm(),
-                Reading(1, 0.0, 5.0, 1.0, 2.0, 1, Mode.READY, Flag.NONE),
+                Reading(0.0, 5.0, 1.0, 2.0, 1, Mode.READY, Flag.NONE),
             ),
             (30, 5, 2, 1, 1, 1),
         )[0]

@@ -49,7 +49,7 @@ pressure = st.integers(-32_767, 32_767).map(lambda n: n / 100)
 modes, flags = st.sampled_from(Mode), st.integers(0, 127).map(Flag)
 
 
-def _message(sequence: int) -> st.SearchStrategy:
+def _message() -> st.SearchStrategy:
     known_flow = st.integers(-32_767, 32_767).map(float)
     return st.one_of(
         st.builds(Hello, u8, st.none() | st.integers(0, 65_534).map(lambda n: n / 100)),
@@ -68,7 +68,6 @@ def _message(sequence: int) -> st.SearchStrategy:
         ),
         st.builds(
             Reading,
-            st.just(sequence),
             st.integers(0, 10**12).map(lambda n: n / 1e6),
             pressure,
             known_flow,
@@ -77,15 +76,14 @@ def _message(sequence: int) -> st.SearchStrategy:
             modes,
             flags,
         ),
-        st.builds(Refusal, st.just(sequence), st.sampled_from(Reason), modes, flags),
+        st.builds(Refusal, st.sampled_from(Reason), modes, flags),
         st.builds(Counters, *[u32] * 14),
     )
 
 
 @st.composite
 def packets(draw: st.DrawFn) -> Packet:
-    sequence = draw(u32)
-    return Packet(draw(u32), sequence, draw(_message(sequence)))
+    return Packet(draw(u32), draw(u32), draw(_message()))
 
 
 def _events(data: bytes) -> list[Event]:
@@ -99,7 +97,7 @@ def test_every_message_comes_back(packet: Packet) -> None:
 
 
 def test_an_unknown_pressure_stays_unknown() -> None:
-    sent = Reading(1, 0.5, math.nan, math.inf, 0.0, 1, Mode.RUNNING, Flag.NONE)
+    sent = Reading(0.5, math.nan, math.inf, 0.0, 1, Mode.RUNNING, Flag.NONE)
     (event,) = _events(encode(Packet(1, 1, sent)))
     assert isinstance(event, Packet)
     assert isinstance(event.message, Reading)
@@ -129,10 +127,10 @@ def test_the_bytes_of_a_devices_answers_are_those_of_the_specification() -> None
     welcome = Welcome(1, (1, 2, 3), Capability.FLOW, 0.08, 60.0, b"12345678", bytes(32), "x")
     body = struct.pack("<BBBBHHH8s32sB", 1, 1, 2, 3, 2, 80, 6000, b"12345678", bytes(32), 1) + b"x"
     assert decode(b"\x81" + head + body) == Packet(5, 6, welcome)
-    reading = Reading(6, 1.5, -0.25, 30.0, 12.34, 1, Mode.VENTED, Flag.SENSOR_NOISY)
+    reading = Reading(1.5, -0.25, 30.0, 12.34, 1, Mode.VENTED, Flag.SENSOR_NOISY)
     body = struct.pack("<QhhHBBH", 1_500_000, -25, 30, 1234, 1, 3, 256)
     assert decode(b"\x82" + head + body) == Packet(5, 6, reading)
-    refusal = Refusal(6, Reason.STALE, Mode.RUNNING, Flag.SATURATED)
+    refusal = Refusal(Reason.STALE, Mode.RUNNING, Flag.SATURATED)
     assert decode(b"\x83" + head + struct.pack("<BBH", 5, 2, 64)) == Packet(5, 6, refusal)
 
 
@@ -223,7 +221,7 @@ def test_an_intact_packet_of_wrong_form_is_malformed(content: bytes) -> None:
 def test_a_reading_is_never_newer_than_now() -> None:
     """A command may rest on a reading that was taken at the moment at which it arrives."""
     for now in (0.0009999, 0.001, 12.3449996, 12.345):
-        reading = Reading(1, now, 5.0, 0.0, 0.0, 1, Mode.RUNNING, Flag.NONE)
+        reading = Reading(now, 5.0, 0.0, 0.0, 1, Mode.RUNNING, Flag.NONE)
         (event,) = _events(encode(Packet(1, 1, reading)))
         assert isinstance(event, Packet)
         assert isinstance(event.message, Reading)

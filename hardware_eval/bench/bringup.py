@@ -225,8 +225,7 @@ def _reference(bench: Bench) -> list[Finding]:
 
 def at_open_tube(bench: Bench) -> Bench:
     """A bench whose checks do not miss the pressure, as there is none at an open tube."""
-    low = replace(bench.settings.low_pressure, duration=math.inf)
-    return replace(bench, settings=replace(bench.settings, low_pressure=low), rest=0.5)
+    return replace(bench, settings=replace(bench.settings, open_tube=True), rest=0.5)
 
 
 def _clicks(valve: str) -> Commands:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -192,7 +192,7 @@ def collect(
         for line in logged:
             if line["type"] == "collection" and line["plan"] != plan:
                 raise InputError(f"{log.path} is of {line['plan']}; choose another --out")
-        safe = asdict(bench.settings)
+        safe = bench.settings.as_dict()
         log.append({"type": "collection", "plan": plan, "safety": safe, **(about or {})})
         try:
             for number in range(1, count + 1):

@@ -297,7 +297,7 @@ class Watched:
         if trips := self._safety.trips:
             self.vent()
             status = "aborted" if all(trip.bench for trip in trips) else "failed"
-            held_up = all(trip.check in safety.TIMING_CHECKS for trip in trips)
+            held_up = all(safety.CHECKS[trip.check].timing for trip in trips)
             messages = tuple(trip.message for trip in trips)
             self.ended = Ended(messages, status, held_up, bench.clock.now() - began)
         return reading

@@ -114,6 +114,10 @@ class Plan:
         return values
 
 
+#: A limit of the valve's commands, %.
+_Percent = Annotated[float, msgspec.Meta(gt=0.0, le=protocol.U_MAX)]
+
+
 class Procedure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a session runs its plan, as a file of TOML says; every key may be left out."""
 
@@ -126,8 +130,8 @@ class Procedure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: Annotated[int, msgspec.Meta(ge=0)] | None = None  #: of the order; drawn if not given.
     blind: bool = False  #: call entries by numbers until the plan is done.
     notes: str = ""  #: for the record.
-    largest_u_in: float = protocol.U_MAX  #: commands are cut to this, %; the record says so.
-    largest_rise: float = protocol.U_MAX  #: of the command in one step, %.
+    largest_u_in: _Percent = protocol.U_MAX  #: commands are cut to this, %; the record says so.
+    largest_rise: _Percent = protocol.U_MAX  #: of the command in one step, %.
     fallback: bool = True  #: a safe controller takes over when an entry is late or unsafe.
     dry_run: bool = True  #: run the plan on the frozen simulators first.
     selftest: bool = True  #: test the bench once each lung is set.

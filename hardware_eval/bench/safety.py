@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ventbench.base.errors import InputError
+import msgspec
+
+from ventbench.base.files import data_beside
 from ventbench.task import protocol
 from ventbench.task.lungs import Lung
 from ventbench.task.metrics.measured import worst
@@ -28,159 +30,41 @@ VALVE_GAIN = 22.8
 #: Resistance of the expiratory valve that the volume estimate empties through, cmH2O/(L/s).
 _OUTLET_RESISTANCE = 5.0
 
-#: A reading is stuck after this even at rest, s (PVP's alarm).
-_STUCK_AT_REST_S = 5.0
-
 
 @dataclass(frozen=True)
 class Check:
-    """One safety check."""
+    """One safety check; a table of ``checks.toml``, which explains the flags."""
 
     threshold: float  #: value beyond which the condition holds, in ``unit``.
     unit: str  #: unit of the threshold.
     duration: float  #: how long the condition must hold to trip, s; 0 for one sample.
-    #: whether the bench is to blame, so that the run is repeated; else the controller is, and its
-    #: run has no score.
-    bench: bool
     reason: str  #: why there is such a check, and why this threshold.
+    below: bool = False
+    bench: bool = False
+    timing: bool = False
+    medium: bool = False
 
-    def __post_init__(self) -> None:
-        if not math.isfinite(self.threshold) or not self.duration >= 0.0:
-            raise ValueError(f"threshold {self.threshold} or duration {self.duration} is no limit")
+    def holds(self, value: float) -> bool:
+        """Whether a value is beyond the threshold; NaN never is."""
+        return value < self.threshold if self.below else value > self.threshold
+
+
+#: All checks by name.
+CHECKS = msgspec.convert(data_beside(__file__, "checks.toml"), dict[str, Check])
 
 
 @dataclass(frozen=True)
 class SafetySettings:
-    """All checks and limits; written into every record."""
+    """What may differ between two benches."""
 
-    #: see the reasons of the checks themselves, also for those that follow.
-    over_pressure: Check = Check(
-        protocol.SAFETY_TIME,
-        "s above min(60, PIP + 15) cmH2O",
-        0.0,
-        False,
-        "The protocol's safety gate, by its own function: a breath may be above that limit for so "
-        "long in all.",
-    )
-    peak_pressure: Check = Check(
-        protocol.SAFETY_PRESSURE + 5.0,
-        "cmH2O",
-        0.0,
-        False,
-        "One sample is enough: the device vents at 60 itself, so this means that it did not.",
-    )
-    over_volume: Check = Check(
-        1.5,
-        "times C (limit - PEEP)",
-        0.0,
-        False,
-        "Volume that would take the labelled lung half beyond the pressure limit has gone in. "
-        "Where no flow is measured, the valve's is taken and twice as much allowed, as a leak "
-        "takes its part; never more than 2.5 L, more than a test lung holds.",
-    )
-    disconnected: Check = Check(
-        0.12,
-        "of V / C",
-        0.15,
-        True,
-        "The volume given should raise the pressure by V / C; less than this share of it says "
-        "that the gas goes elsewhere. Counts once V / C exceeds 8 cmH2O.",
-    )
-    software_delay: Check = Check(
-        0.100,
-        "s late",
-        0.0,
-        True,
-        "Paper's override: the loop stood still so long that the device has vented by itself.",
-    )
-    missed_deadlines: Check = Check(
-        0.010,
-        "s late",
-        0.12,
-        True,
-        "A third of the control step; steps in a row that are so late no longer are 30 ms apart.",
-    )
-    stuck_sensor: Check = Check(
-        8.0,
-        "cmH2O of expected change",
-        0.15,
-        True,
-        "The same reading to the last digit while the commands should have changed the pressure; "
-        "or for 5 s at rest (PVP's alarm).",
-    )
-    implausible_slope: Check = Check(
-        90.0,
-        "cmH2O in a step",
-        0.0,
-        True,
-        "The fully open valve into the stiffest lung gives 53 cmH2O in 30 ms; more is no pressure.",
-    )
-    no_reading: Check = Check(
-        0.0,
-        "readings",
-        0.09,
-        True,
-        "Three steps without a number between -20 and 110 cmH2O, answered or not, as no score "
-        "allows; the device, which samples more often, vents after 50 ms.",
-    )
-    no_answer: Check = Check(
-        0.0,
-        "answers",
-        0.06,
-        True,
-        "Two steps without an answer: the host is blind, and the device's watchdog is about to "
-        "vent.",
-    )
-    low_pressure: Check = Check(
-        1.0,
-        "cmH2O",
-        0.5,
-        True,
-        "Airway near ambient or below for half a second: PEEP is lost, or the sensor's tube is "
-        "off.",
-    )
-    expiratory_valve: Check = Check(
-        0.7,
-        "of the pressure above PEEP",
-        0.15,
-        True,
-        "So much is left 0.6 s after the expiratory valve was told to open, and more than 4 cmH2O: "
-        "it has not opened. The slowest lung leaves a fifth.",
-    )
-    inspiratory_valve: Check = Check(
-        6.0,
-        "cmH2O of rise",
-        0.06,
-        True,
-        "The pressure rises with both valves told to be closed: the inspiratory one has not "
-        "closed.",
-    )
-    applied_command: Check = Check(
-        2.0,
-        "% apart",
-        0.1,
-        True,
-        "The device reports a position of the valve that it was not told.",
-    )
     largest_u_in: float = protocol.U_MAX  #: commands are cut to this, %.
     #: largest rise of the command in one step, %; 100 for none, as in simulation.
-    largest_rise: float = 100.0
+    largest_rise: float = protocol.U_MAX
+    open_tube: bool = False  #: no lung is on, so that no pressure is missed.
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.largest_u_in <= protocol.U_MAX:
-            raise InputError(
-                f"the largest u_in is {self.largest_u_in:g} %; it must be above 0 and at most "
-                f"{protocol.U_MAX:g} %"
-            )
-        if not 0.0 < self.largest_rise <= 100.0:
-            raise InputError(
-                f"the largest rise of u_in is {self.largest_rise:g} % a step; it must be above 0 "
-                "and at most 100 %"
-            )
-
-    def checks(self) -> dict[str, Check]:
-        """All checks by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, Check)}
+    def as_dict(self) -> dict[str, Any]:
+        """These and all checks, for every record."""
+        return {**{name: vars(check) for name, check in CHECKS.items()}, **vars(self)}
 
 
 DEFAULT = SafetySettings()
@@ -202,20 +86,6 @@ class SafetySample(NamedTuple):
     answered: bool = True
 
 
-#: Checks with an alarm of medium priority, in the words of IEC 60601-1-8; the others have high.
-MEDIUM = (
-    "disconnected",
-    "low_pressure",
-    "no_answer",
-    "software_delay",
-    "missed_deadlines",
-    "applied_command",
-)
-
-#: Checks that blame the host or the line, not the lung, its tubes or its sensor.
-TIMING_CHECKS = frozenset({"no_answer", "software_delay", "missed_deadlines"})
-
-
 @dataclass(frozen=True)
 class Trip:
     """A check that has tripped."""
@@ -230,7 +100,7 @@ class Trip:
     @property
     def alarm(self) -> str:
         """What the operator is told."""
-        return f"{'medium' if self.check in MEDIUM else 'high'} priority alarm: {self.message}"
+        return f"{'medium' if CHECKS[self.check].medium else 'high'} priority alarm: {self.message}"
 
 
 @dataclass(frozen=True)
@@ -295,9 +165,8 @@ def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> 
     tripped = {trip.check for trip in trips}
     # A condition that first shows at this sample has held since the sample before, at the latest.
     began = sample.time if state.previous is None else state.previous.time
-    for name, check in settings.checks().items():
-        value, holds = values[name]
-        if not holds:
+    for name, check in CHECKS.items():
+        if not check.holds(value := values[name]):
             continue
         since[name] = state.since.get(name, began if check.duration else sample.time)
         held = sample.time - since[name]
@@ -381,63 +250,53 @@ _LEAST_LEFT = 4.0
 
 def _values(
     settings: SafetySettings, state: SafetyState, sample: SafetySample, number: bool, jump: float
-) -> dict[str, tuple[float, bool]]:
-    """Value of each check, and whether its condition holds.
+) -> dict[str, float]:
+    """Value of each check; NaN where it has nothing to compare.
 
     ``number``: whether the sample has a reading, else it shows the last one. ``jump``: change of
     the reading, cmH2O a step.
     """
-    pressure, C = sample.pressure, state.lung.C
+    pressure, C, inspires = sample.pressure, state.lung.C, not sample.u_out
     limit = float(safety_limit(sample.pip))
     # At or below the limit no breath that was safe becomes unsafe.
     readings = worst(state.breath) if pressure > limit else ()
-    open_for = sample.time - state.switched if sample.u_out else 0.0
+    passes = passes_safety_gate(readings, sample.pip, protocol.DT)
+    above_limit = float(time_above(readings, sample.pip, protocol.DT))
     rise = state.delivered / C
-    share = (pressure - state.start) / rise if rise > _SHOWS else math.nan
-    allowed = settings.over_volume.threshold * (1.0 if math.isfinite(sample.flow) else 2.0)
+    volume = CHECKS["over_volume"].threshold
+    allowed = volume * (1.0 if math.isfinite(sample.flow) else 2.0)
     largest = min(allowed * C * (limit - protocol.PEEP), _LARGEST_VOLUME)
     still = sample.time - state.unchanged
-    climbed = pressure - state.closed_pressure if not math.isnan(state.closed) else 0.0
-    settled = not math.isnan(state.closed) and sample.time - state.closed >= _SETTLES_S
-    apart = abs(sample.applied - sample.u_in)
-    left = (pressure - protocol.PEEP) / max(state.switched_pressure - protocol.PEEP, 1.0)
-    return {
-        "over_pressure": (
-            float(time_above(readings, sample.pip, protocol.DT)),
-            not passes_safety_gate(readings, sample.pip, protocol.DT),
-        ),
-        "peak_pressure": (pressure, pressure > settings.peak_pressure.threshold),
-        "over_volume": (
-            state.volume / (C * (limit - protocol.PEEP)),
-            state.volume > largest and not sample.u_out,
-        ),
+    # A tube that is off shows ambient pressure; any other that does not move is frozen.
+    frozen = still > _FROZEN_S and pressure > CHECKS["low_pressure"].threshold
+    above = pressure - protocol.PEEP
+    opened = not inspires and sample.time - state.switched > _OPENS_S
+    settled = sample.time - state.closed >= _SETTLES_S
+    values = {
+        # A sample above the gate's cap is more than any time, however short.
+        "over_pressure": (max(above_limit, math.nextafter(protocol.SAFETY_TIME, 1.0)), not passes),
+        "peak_pressure": (pressure, True),
+        "over_volume": (volume * state.volume / largest, inspires),
         "disconnected": (
-            share,
-            not sample.u_out
-            and share < settings.disconnected.threshold
-            # A tube that is off shows ambient pressure; any other that does not move is frozen.
-            and not (still > _FROZEN_S and pressure > settings.low_pressure.threshold),
+            (pressure - state.start) / max(rise, _SHOWS),
+            inspires and rise > _SHOWS and not frozen,
         ),
-        "software_delay": (sample.late, sample.late > settings.software_delay.threshold),
-        "missed_deadlines": (sample.late, sample.late > settings.missed_deadlines.threshold),
-        "stuck_sensor": (
-            state.expected,
-            still > 0.0
-            and (state.expected > settings.stuck_sensor.threshold or still > _STUCK_AT_REST_S),
-        ),
-        "implausible_slope": (jump, jump > settings.implausible_slope.threshold),
-        "no_reading": (0.0 if number else 1.0, not number),
-        "no_answer": (0.0 if sample.answered else 1.0, not sample.answered),
-        "low_pressure": (pressure, pressure < settings.low_pressure.threshold),
+        "software_delay": (sample.late, True),
+        "missed_deadlines": (sample.late, True),
+        "stuck_sensor": (state.expected, still > 0.0),
+        "still_sensor": (still, True),
+        "implausible_slope": (jump, True),
+        "no_reading": (float(not number), True),
+        "no_answer": (float(not sample.answered), True),
+        "low_pressure": (pressure, not settings.open_tube),
         "expiratory_valve": (
-            left,
-            open_for > _OPENS_S
-            and pressure - protocol.PEEP > _LEAST_LEFT
-            and left > settings.expiratory_valve.threshold,
+            above / max(state.switched_pressure - protocol.PEEP, 1.0),
+            opened and above > _LEAST_LEFT,
         ),
-        "inspiratory_valve": (climbed, settled and climbed > settings.inspiratory_valve.threshold),
-        "applied_command": (apart, apart > settings.applied_command.threshold),
+        "inspiratory_valve": (pressure - state.closed_pressure, settled),
+        "applied_command": (abs(sample.applied - sample.u_in), True),
     }
+    return {name: value if applies else math.nan for name, (value, applies) in values.items()}
 
 
 def limit_command(settings: SafetySettings, previous: float, wanted: float) -> tuple[float, bool]:

@@ -74,7 +74,9 @@ def run_plan(
     if not any(line["type"] == "plan" for line in logged):
         log.append({"type": "plan", "plan": plan.as_dict()})
     own = None if bench.fallback is None else asdict(bench.fallback)
-    log.append({"type": "session", **about, "safety": {**asdict(bench.settings), "fallback": own}})
+    log.append(
+        {"type": "session", **about, "safety": {**bench.settings.as_dict(), "fallback": own}}
+    )
     remaining, reason = state.remaining(plan), ""
     try:
         reason = _runs(bench, plan, remaining, attempts, make_controller, log, before_lung)

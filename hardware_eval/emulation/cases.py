@@ -6,16 +6,15 @@ An answer is published encrypted, with its hash; the secret that made it opens i
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import msgspec
 import numpy as np
 
 from ventbench.base.errors import InputError
+from ventbench.base.files import data_beside
 from ventbench.task.lungs import LUNGS, Lung
 
 #: Begins what random numbers are drawn from; another text would change every case ever sealed.
@@ -131,10 +130,7 @@ class EffectFamily:
     inside: bool = True  #: whether the library has a mechanism of this name.
 
 
-EFFECTS = msgspec.convert(
-    tomllib.loads(Path(__file__).with_name("effects.toml").read_text("utf-8")),
-    dict[str, EffectFamily],
-)
+EFFECTS = msgspec.convert(data_beside(__file__, "effects.toml"), dict[str, EffectFamily])
 
 #: Mechanisms of the library, in alphabetical order.
 LIBRARY: tuple[str, ...] = tuple(sorted(name for name, e in EFFECTS.items() if e.inside))

@@ -215,6 +215,8 @@ def test_the_manual_lists_every_key_of_a_plan(tmp_path: Path) -> None:
         ("repaets = 3", "unknown field `repaets`"),
         ("pips = 10", "Expected `array`, got `int` - at `$.pips`"),
         ("rest = nan", "$.rest"),
+        ("largest_u_in = 0", "Expected `float` > 0.0 - at `$.largest_u_in`"),
+        ("largest_rise = 101.0", "Expected `float` <= 100.0 - at `$.largest_rise`"),
         ("repeats == 3", "line 1, column"),
     ],
 )

@@ -307,11 +307,13 @@ def driven(
     noises = [0.0] * n
     for part in only:
         each = [selftest.programs(label, noise)[part] for noise in noises]
-        for k, (make, _, pip) in enumerate(each[0]):
-            lengths = [programs[k][1] for programs in each]
+        for k in range(len(each[0])):
+            own_programs = [programs[k] for programs in each]
+            lengths = [program.steps for program in own_programs]
             rest(lungs, label, n)
-            watched = Watched(mounted, lungs, [label] * n, np.full(n, pip), rng)
-            columns = _program(watched, [make() for _ in range(n)], max(lengths))
+            watched = Watched(mounted, lungs, [label] * n, np.full(n, own_programs[0].pip), rng)
+            commands = [program.commands for program in own_programs]
+            columns = _program(watched, commands, max(lengths))
             for i, steps in enumerate(lengths):
                 trips = tuple(trip.message for trip in watched.checks[i].trips)
                 own = Driven(*columns[:, :steps, i], trips, False, 0)  # type: ignore[arg-type]

@@ -20,7 +20,7 @@ import numpy as np
 import typer
 
 from hardware_eval import realtime
-from hardware_eval.bench.drive import Driven, drive
+from hardware_eval.bench.drive import Driven, Program, drive
 from hardware_eval.bench.loop import ON_TIME_S, Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.wire.client import Client, Link
@@ -50,7 +50,7 @@ def main(minutes: float = 0.1, lung: str = "R20C50", simulator: str = "frozen") 
     bench = Bench(client, realtime.RealClock(), DEFAULT, Operator(), rest=0.5)
     steps, parts = round(minutes * 60.0 / protocol.DT), list[Driven]()
     while (left := steps - sum(len(x.late) for x in parts)) > 0:
-        parts.append(drive(bench, lung, breathing, left, pip=PIP))
+        parts.append(drive(bench, lung, Program(breathing, left, PIP)))
     (median, longest), counters = client.round_trips(), client.counters()
     client.close()
     emulator.terminate()

@@ -210,7 +210,6 @@ def bringup(
     Example: `ventbench-hardware bringup --port /dev/ttyACM0 --operator "A. Name"`
     """
     from hardware_eval.bench import bringup as steps
-    from hardware_eval.bench import dated
 
     if not operator.strip():
         raise InputError("--operator: give the name of who stands at the machine")
@@ -227,12 +226,11 @@ def bringup(
             if not all(x.ok for x in findings):
                 raise typer.Exit(1)
             return
-        done = steps.bring_up(bench, operator=operator)
-    path = steps.place(done.device)
-    digest = dated.save(path, done.as_dict())
-    content = {**done.as_dict(), "file": str(path), "sha256": digest}
-    show(content, json, done, f"{path}; SHA-256 {digest}")
-    if not done.go:
+        findings = steps.bring_up(bench)
+        kept = steps.keep(line.client, operator, findings)
+    about = f"bring-up by {operator}: {'confirmed' if kept['go'] else 'NOT CONFIRMED'}"
+    show(kept, json, about, *findings, f"{kept['file']}; SHA-256 {kept['sha256']}")
+    if not kept["go"]:
         raise typer.Exit(1)
 
 

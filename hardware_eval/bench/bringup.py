@@ -9,17 +9,17 @@ as long as it tells the same number and the same hash of wiring and calibration.
 
 from __future__ import annotations
 
-import datetime
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from random import Random, SystemRandom
+from random import SystemRandom
 from typing import Any
 
 import numpy as np
 
 from hardware_eval.bench import dated
-from hardware_eval.bench.drive import Commands, Driven, drive
+from hardware_eval.bench.drive import Commands, Program, drive, in_turn
 from hardware_eval.bench.identity import white_noise
 from hardware_eval.bench.loop import Bench
 from hardware_eval.bench.selftest import Finding, judged, unknown
@@ -43,8 +43,8 @@ _APPLIED = (10.0, 60.0)
 #: Readings of which a pressure is the mean.
 _READINGS = 60
 
-#: A click: opening of the inspiratory valve, %, steps between two movements, and movements.
-_CLICK, _PERIOD, _MOVEMENTS = 40.0, 16, 6
+#: A click: opening of the inspiratory valve, %, steps between two movements, and clicks.
+_CLICK, _PERIOD, _CLICKS = 40.0, 16, 3
 
 #: Lung for the checks of the drive; any label will do where little gas flows.
 _ANY_LUNG = "R20C20"
@@ -56,35 +56,24 @@ _LEAD, _OPENING, _RISE, _FILLING, _CLOSED, _VENTING = 10, 5.0, 10.0, 100, 10, 11
 _VALVES = {1.0: "inspiratory", 2.0: "expiratory", 3.0: "both", 0.0: "none"}
 
 
-@dataclass(frozen=True)
-class BringUp:
-    """What a person saw of a device."""
+def is_confirmed(findings: Sequence[Finding]) -> bool:
+    """Whether all steps were gone, and each was right."""
+    return len(findings) >= len(STEPS) and all(x.ok for x in findings)
 
-    device: dict[str, str]  #: see :func:`hardware_eval.bench.dated.device_of`.
-    date: str  #: when, UTC, ISO 8601.
-    operator: str  #: who.
-    findings: tuple[Finding, ...]  #: of :data:`STEPS`; fewer where one was wrong.
 
-    @property
-    def go(self) -> bool:
-        """Whether all steps were gone, and each was right."""
-        return len(self.findings) >= len(STEPS) and all(x.ok for x in self.findings)
-
-    def __str__(self) -> str:
-        lines = [f"bring-up by {self.operator}: {'confirmed' if self.go else 'NOT CONFIRMED'}"]
-        return "\n".join([*lines, *map(str, self.findings)])
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        return {
-            "format": FORMAT,
-            "device": self.device,
-            "date": self.date,
-            "operator": self.operator,
-            "version": VERSION,
-            "go": self.go,
-            "findings": [x.as_dict() for x in self.findings],
-        }
+def keep(client: Client, operator: str, findings: Sequence[Finding]) -> dict[str, Any]:
+    """Write what a person found on a device; returns it, with the file and its hash."""
+    content = {
+        "format": FORMAT,
+        "device": dated.device_of(client),
+        "date": dated.today().isoformat(timespec="seconds"),
+        "operator": operator,
+        "version": VERSION,
+        "go": is_confirmed(findings),
+        "findings": [x.as_dict() for x in findings],
+    }
+    path = place(content["device"])
+    return {**content, "file": str(path), "sha256": dated.save(path, content)}
 
 
 def place(device: dict[str, str]) -> Path:
@@ -94,7 +83,7 @@ def place(device: dict[str, str]) -> Path:
     return Path(typer.get_app_dir("ventbench")) / "bringup" / f"{device['device_id']}.json"
 
 
-def load(client: Client, now: datetime.datetime | None = None) -> dict[str, Any]:
+def load(client: Client) -> dict[str, Any]:
     """The bring-up of a device, with its hash; from here on the client may arm it.
 
     Raises:
@@ -108,7 +97,7 @@ def load(client: Client, now: datetime.datetime | None = None) -> dict[str, Any]
             f"valves and its sensor do. Run `{REMEDY}`"
         )
     found = dated.load(path, FORMAT, device, REMEDY)
-    dated.check_age(found["date"], "the bring-up of this device", REMEDY, now)
+    dated.check_age(found["date"], "the bring-up of this device", REMEDY)
     if found.get("go") is not True:
         raise InputError(f"{path}: the bring-up was not confirmed. Run `{REMEDY}`")
     _allow(client)
@@ -120,22 +109,10 @@ def _allow(client: Client) -> None:
     client.brought_up = client.welcome.device_id, client.welcome.calibration
 
 
-def bring_up(
-    bench: Bench,
-    *,
-    operator: str,
-    now: datetime.datetime | None = None,
-    random: Random | None = None,
-) -> BringUp:
+def bring_up(bench: Bench) -> list[Finding]:
     """Walk a person through all steps; one that is wrong ends it.
 
     Afterwards the client may arm the device if all was right, and else may not.
-
-    Args:
-        bench: device, clock, safety, person.
-        operator: the person's name.
-        now: the time; that of the computer if not given.
-        random: draws which valve is clicked first.
 
     Raises:
         EmergencyStop: if the person pressed the key.
@@ -146,18 +123,16 @@ def bring_up(
     client.brought_up = None
     client.hello(_LIMIT)
     clicks = list(STEPS[2:4])
-    (random or SystemRandom()).shuffle(clicks)
+    SystemRandom().shuffle(clicks)
     findings: list[Finding] = []
     for step in (*STEPS[:2], *clicks, STEPS[-1]):
         findings += look(bench, step)
         if not all(x.ok for x in findings):
             break
-    date = (now or dated.today()).isoformat(timespec="seconds")
-    done = BringUp(dated.device_of(client), date, operator, tuple(findings))
     client.hello()
-    if done.go:
+    if is_confirmed(findings):
         _allow(client)
-    return done
+    return findings
 
 
 def look(bench: Bench, step: str) -> list[Finding]:
@@ -228,18 +203,12 @@ def at_open_tube(bench: Bench) -> Bench:
     return replace(bench, settings=replace(bench.settings, open_tube=True), rest=0.5)
 
 
-def _clicks(valve: str) -> Commands:
-    def commands(step: int, pressure: float) -> tuple[float, int]:
-        on = step // _PERIOD % 2
-        return (0.0, 1 - on) if valve == "expiratory" else (_CLICK * on, 1)
-
-    return commands
-
-
 def _clicked(bench: Bench, valve: str) -> list[Finding]:
     if refused := _asked(bench, "clicked", "air supply off. A valve will click; listen. Ready?"):
         return refused
-    driven = drive(at_open_tube(bench), _ANY_LUNG, _clicks(valve), _PERIOD * _MOVEMENTS, pip=_LIMIT)
+    moved = (_PERIOD, 0.0, 0) if valve == "expiratory" else (_PERIOD, _CLICK, 1)
+    clicks = in_turn(_LIMIT, *[(_PERIOD, 0.0, 1), moved] * _CLICKS)
+    driven = drive(at_open_tube(bench), _ANY_LUNG, clicks)
     if driven.trips:
         return [unknown("clicked", f"{valve}: {driven.trips[0]}")]
     answer = bench.operator.number(
@@ -274,9 +243,8 @@ def _vent(bench: Bench) -> list[Finding]:
     if refused := _asked(bench, "rise", question):
         return refused
     steps = _LEAD + _FILLING + _CLOSED + _VENTING
-    driven: Driven = drive(
-        replace(at_open_tube(bench), rest=1.0), _ANY_LUNG, _filled_and_vented(), steps, pip=_LIMIT
-    )
+    program = Program(_filled_and_vented(), steps, _LIMIT)
+    driven = drive(replace(at_open_tube(bench), rest=1.0), _ANY_LUNG, program)
     closed = driven.u_out == 0.0
     if not closed.any():
         return [unknown("rise", "; ".join(driven.trips))]

@@ -8,20 +8,19 @@ of another one, was changed, or is stale.
 
 from __future__ import annotations
 
-import datetime
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from hardware_eval.bench import dated
 from hardware_eval.bench.bringup import at_open_tube, vented
-from hardware_eval.bench.drive import Driven, drive
+from hardware_eval.bench.drive import Driven, drive, in_turn
 from hardware_eval.bench.identity import (
     Baseline,
     KnownLung,
@@ -42,17 +41,6 @@ from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 
 FORMAT = "ventbench-calibration-1"
-
-#: What can be calibrated, and the units of reference and reading.
-PARTS = {
-    "zero": ("cmH2O", "cmH2O"),
-    "span": ("cmH2O", "cmH2O"),
-    "peep": ("cmH2O", "cmH2O"),
-    "valve": ("%", "mL/s"),
-    "flow": ("mL/s", "mL/s"),
-    "leak": ("s", "cmH2O"),
-    "lung": ("", ""),
-}
 
 #: Parts that correct readings; the others were measured with what these correct.
 BASE = ("zero", "span", "flow")
@@ -141,7 +129,7 @@ class Part:
             values["slope"] = lost_flow(self, self.lung).value
         for name, value in values.items():
             limit = LIMITS.get(f"{self.kind} {name}")
-            if limit is not None and not limit.low <= value <= limit.high:
+            if limit is not None and not limit.holds(value):
                 expected = f"{limit.low:g} to {limit.high:g} ({limit.unit})"
                 return f"{name} {value:.4g}, expected {expected}: {limit.reason}"
         return ""
@@ -153,15 +141,15 @@ class Part:
                 for x, e in zip(self.reading, self.error, strict=True)
             )
             return f"lung: {self.lung} has R {R} cmH2O/(L/s), 1/C {elastance} cmH2O/L; {self.note}"
-        own, (x, y) = self.fit, PARTS[self.kind]
+        own, x, y = self.fit, PARTS[self.kind].reference, PARTS[self.kind].reading
         parts = [f"{self.kind}: {own.intercept} {y} at 0 {x}"]
         if math.isfinite(own.slope.value):
             parts.append(f"{own.slope} {y} per {x}")
         return f"{'; '.join(parts)}; residual {own.residual:.2g} {y}"
 
 
-#: A point of a series: reference, reading, standard error of the reading.
-Point = tuple[float, float, float]
+#: Points of a series, each reference, reading and standard error of the reading; and a note.
+Series = tuple[list[tuple[float, float, float]], str]
 
 
 def _mean(values: Floats, least: float) -> tuple[float, float]:
@@ -177,7 +165,6 @@ def measure(
     *,
     lung: str,
     reference: Sequence[float] = (),
-    now: datetime.datetime | None = None,
 ) -> Part:
     """Measure one part; a device that moves its valves does so watched, as in a self-test.
 
@@ -187,7 +174,6 @@ def measure(
         lung: label of the mounted lung, for ``valve``, ``leak`` and ``lung``.
         reference: the reference's values: pressures of ``span``, cmH2O, flows of ``flow``, mL/s,
             openings of ``valve``, %, in the order in which they are set; PEEP by an instrument.
-        now: the time; that of the computer if not given.
 
     Raises:
         InputError: if the device or the references cannot tell, what they tell cannot be, or a
@@ -201,21 +187,12 @@ def measure(
     if kind == "flow" and not has_flow:
         raise InputError("flow: this device measures none")
     by_hand = kind == "valve" and not has_flow
-    mounted = f"set the lung to {lung} and connect it. Is it set?"
-    question = {
-        "zero": "open the sensor's tube to air. Is it open?",
-        "peep": f"set the lung to {lung}, PEEP valve as in use. Does it rest?",
-        "valve": "flow meter at the valve, tube open, no lung. Is it so?" if by_hand else mounted,
-    }.get(kind, "" if kind in ("span", "flow") else mounted)
-    if question:
+    if question := _METER if by_hand else PARTS[kind].question.format(lung):
         _confirmed(bench, kind, question)
-    if kind == "lung":
-        points, note = _lung_points(bench, lung)
-    else:
-        points, note = _SERIES[kind](bench, lung, reference), ""
+    points, note = PARTS[kind].points(bench, lung, reference)
     columns = zip(*points, strict=True)
     xs, ys, errors = (tuple(round(float(x), 6) for x in column) for column in columns)
-    date = (now or dated.today()).isoformat(timespec="seconds")
+    date = dated.today().isoformat(timespec="seconds")
     label = lung if kind in ("lung", "leak") else ""
     part = Part(kind, date, xs, ys, errors, by_hand, label, note)
     if wrong := part.problem():
@@ -228,20 +205,20 @@ def _confirmed(bench: Bench, kind: str, question: str) -> None:
         raise InputError(f"{kind}: not confirmed; nothing was measured")
 
 
-def _level_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+def _level_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series:
     """Means of a sensor at one pressure."""
     level = reference[0] if reference else 0.0
     rows = [_mean(vented(bench, _READINGS)[0], _PRESSURE_ERROR) for _ in range(_MEANS)]
-    return [(level, *row) for row in rows]
+    return [(level, *row) for row in rows], ""
 
 
-def _peep_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+def _peep_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series:
     return _level_points(bench, lung, reference or (protocol.PEEP,))
 
 
-def _applied_points(kind: str, bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+def _applied_points(kind: str, bench: Bench, lung: str, reference: Sequence[float]) -> Series:
     """Readings at pressures or flows that a person applies one after another."""
-    unit, flow = PARTS[kind][0], kind == "flow"
+    unit, flow = PARTS[kind].reference, kind == "flow"
     if len(set(reference)) < 2:
         raise InputError(f"{kind}: give two references at least, such as --reference 0,20,40")
     points = []
@@ -251,10 +228,10 @@ def _applied_points(kind: str, bench: Bench, lung: str, reference: Sequence[floa
         _confirmed(bench, kind, f"{what} {value:g} {unit} {where} the sensor. Steady?")
         read = vented(bench, 2 * _READINGS)[int(flow)]
         points.append((value, *_mean(read, _FLOW_ERROR if flow else _PRESSURE_ERROR)))
-    return points
+    return points, ""
 
 
-def _valve_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+def _valve_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series:
     openings = [float(x) for x in reference] or [*OPENINGS, *OPENINGS[::-1]]
     if len(set(openings)) < 2 or min(openings) < 0.0 or max(openings) > protocol.U_MAX:
         raise InputError("valve: give two openings at least, within 0 to 100 %")
@@ -269,25 +246,25 @@ def _valve_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[P
             _opened(at_open_tube(bench), lung, opening, above, 0, _HELD, 1)
             flow = bench.operator.number(f"the meter's steady flow at {opening:g} %, mL/s: ")
             points.append((opening, flow, max(0.02 * abs(flow), 1.0)))  # as meters state it
-    return points
+    return points, ""
 
 
-def _leak_points(bench: Bench, lung: str, reference: Sequence[float]) -> list[Point]:
+def _leak_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series:
     noise = white_noise(vented(bench, _READINGS)[0])
-    ((make, steps, pip),) = programs(lung, noise)["leak"]
+    (program,) = programs(lung, noise)["leak"]
     still = hold(lung, noise)[0]
-    closed = _watched(drive(bench, lung, make(), steps, pip=pip), "leak")
+    closed = _watched(drive(bench, lung, program), "leak")
     time, pressure = closed.time[still:], closed.pressure[still:]
     noise = max(white_noise(pressure), _PRESSURE_ERROR)
-    return [(t - time[0], p, noise) for t, p in zip(time, pressure, strict=True)]
+    return [(t - time[0], p, noise) for t, p in zip(time, pressure, strict=True)], ""
 
 
-def _lung_points(bench: Bench, lung: str) -> tuple[list[Point], str]:
+def _lung_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series:
     """Logarithms of R and 1/C, and what the lung is by them."""
     rest, *probes = (
-        _watched(drive(bench, lung, make(), steps, pip=pip), "lung")
+        _watched(drive(bench, lung, program), "lung")
         for part in ("sensor", "lung")
-        for make, steps, pip in programs(lung)[part]
+        for program in programs(lung)[part]
     )
     own = measured_lung(probes, lung, max(white_noise(rest.pressure), 1e-3))[0]
     points = list(zip((0.0, 1.0), own.logarithms, own.errors, strict=True))
@@ -299,13 +276,30 @@ def _lung_points(bench: Bench, lung: str) -> tuple[list[Point], str]:
     return points, told
 
 
-_SERIES: dict[str, Callable[[Bench, str, Sequence[float]], list[Point]]] = {
-    "zero": _level_points,
-    "peep": _peep_points,
-    "span": partial(_applied_points, "span"),
-    "flow": partial(_applied_points, "flow"),
-    "valve": _valve_points,
-    "leak": _leak_points,
+_METER = "flow meter at the valve, tube open, no lung. Is it so?"
+_MOUNTED = "set the lung to {} and connect it. Is it set?"
+
+
+class Kind(NamedTuple):
+    """What can be calibrated, and how."""
+
+    reference: str  #: unit.
+    reading: str  #: unit.
+    question: str  #: what a person prepares, with a place for the lung's label; empty for nothing.
+    points: Callable[[Bench, str, Sequence[float]], Series]  #: measures the series.
+
+
+#: What can be calibrated, by name.
+PARTS = {
+    "zero": Kind("cmH2O", "cmH2O", "open the sensor's tube to air. Is it open?", _level_points),
+    "span": Kind("cmH2O", "cmH2O", "", partial(_applied_points, "span")),
+    "peep": Kind(
+        "cmH2O", "cmH2O", "set the lung to {}, PEEP valve as in use. Does it rest?", _peep_points
+    ),
+    "valve": Kind("%", "mL/s", _MOUNTED, _valve_points),
+    "flow": Kind("mL/s", "mL/s", "", partial(_applied_points, "flow")),
+    "leak": Kind("s", "cmH2O", _MOUNTED, _leak_points),
+    "lung": Kind("", "", _MOUNTED, _lung_points),
 }
 
 
@@ -319,14 +313,9 @@ def _opened(
     bench: Bench, lung: str, opening: float, above: bool, lead: int, steps: int, u_out: int
 ) -> Driven:
     """Open the valve after some steps, from a larger opening or none, and hold it."""
-    larger = min(_LARGER * opening, protocol.U_MAX)
-
-    def commands(step: int, pressure: float) -> tuple[float, int]:
-        if step < lead:
-            return 0.0, 1
-        return (larger if above and step < lead + _ABOVE else opening), u_out
-
-    return _watched(drive(bench, lung, commands, steps, pip=45.0), "valve")
+    first = min(_LARGER * opening, protocol.U_MAX) if above else opening
+    turns = (lead, 0.0, 1), (_ABOVE, first, u_out), (steps - lead - _ABOVE, opening, u_out)
+    return _watched(drive(bench, lung, in_turn(45.0, *turns)), "valve")
 
 
 @dataclass(frozen=True)
@@ -344,7 +333,12 @@ class Calibration:
         for kind, part in self.parts.items():
             line = part.fit
             found = {"intercept": vars(line.intercept), "slope": vars(line.slope)}
-            parts[kind] = {**vars(part), "units": PARTS[kind], **found, "residual": line.residual}
+            parts[kind] = {
+                **vars(part),
+                "units": PARTS[kind][:2],
+                **found,
+                "residual": line.residual,
+            }
         content = {"format": FORMAT, "device": self.device, "parts": parts}
         return replace(self, sha256=dated.save(path, content))
 
@@ -365,32 +359,31 @@ class Calibration:
         share = float(np.sqrt(np.mean((error**2 + (flow - near) ** 2) / near**2)))
         return Valve(tuple(openings.tolist()), tuple(means.tolist()), share)
 
+    def _line(self, kind: str) -> Fit:
+        """The line of a part; of one that was not calibrated, that of a right one."""
+        part = self.parts.get(kind)
+        return Fit(Interval(0.0), Interval(1.0), 0.0) if part is None else part.fit
+
     def correction(self) -> Correction:
         """What corrects the readings of the device."""
-        offset, slope, error = 0.0, 1.0, 0.0
-        if (part := self.parts.get("span")) is not None:
-            line = part.fit
-            offset, slope = line.intercept.value, line.slope.value
-            error = max(_half(line.intercept), protocol.SAFETY_PRESSURE * _half(line.slope))
-        if (part := self.parts.get("zero")) is not None:
-            zero = part.fit.intercept
-            offset, error = zero.value, math.hypot(error, _half(zero))
-        flow = (0.0, 1.0)
-        if (part := self.parts.get("flow")) is not None:
-            flow = part.fit.intercept.value, part.fit.slope.value
-        return Correction((offset, slope), flow, error)
+        zero, span, flow = map(self._line, ("zero", "span", "flow"))
+        offset = zero.intercept if "zero" in self.parts else span.intercept
+        error = max(_half(span.intercept), protocol.SAFETY_PRESSURE * _half(span.slope))
+        if "zero" in self.parts:
+            error = math.hypot(error, _half(offset))
+        return Correction(
+            (offset.value, span.slope.value), (flow.intercept.value, flow.slope.value), error
+        )
 
     def baseline(self) -> Baseline:
         """What a self-test then expects of the bench."""
-        lung, peep, leak = None, None, 0.0
-        if (part := self.parts.get("lung")) is not None:
-            (R, elastance), (R_error, elastance_error) = part.reading, part.error
-            lung = KnownLung(part.lung, (R, elastance), (R_error, elastance_error))
-        if (part := self.parts.get("peep")) is not None:
-            peep = part.fit.intercept.value
-        if (part := self.parts.get("leak")) is not None:
-            leak = max(lost_flow(part, part.lung).value, 0.0)
-        return Baseline(self.valve, lung, peep, leak)
+        lung, leak = self.parts.get("lung"), self.parts.get("leak")
+        return Baseline(
+            self.valve,
+            None if lung is None else KnownLung(lung.lung, lung.reading, lung.error),
+            self._line("peep").intercept.value if "peep" in self.parts else None,
+            0.0 if leak is None else max(lost_flow(leak, leak.lung).value, 0.0),
+        )
 
     def about(self) -> dict[str, Any]:
         """What a record says of it."""
@@ -398,15 +391,12 @@ class Calibration:
         return {"sha256": self.sha256, "dates": dates, "readings": str(self.correction())}
 
 
-def load(
-    path: Path, device: dict[str, str], *, now: datetime.datetime | None = None, stale: bool = False
-) -> Calibration:
+def load(path: Path, device: dict[str, str], *, stale: bool = False) -> Calibration:
     """Read a calibration.
 
     Args:
         path: of the file.
         device: of :func:`hardware_eval.bench.dated.device_of`.
-        now: the time; that of the computer if not given.
         stale: take stale parts too, to renew them one by one.
 
     Raises:
@@ -418,7 +408,7 @@ def load(
     except (KeyError, msgspec.ValidationError) as error:
         raise InputError(f"{path} is no calibration ({error}); make one by `calibrate`") from None
     for kind, part in () if stale else parts.items():
-        dated.check_age(part.date, f"{path}: {kind}", f"ventbench-hardware calibrate {kind}", now)
+        dated.check_age(part.date, f"{path}: {kind}", f"ventbench-hardware calibrate {kind}")
     return Calibration(content["device"], parts, content["sha256"])
 
 

@@ -252,7 +252,7 @@ class PIDController:
         self._gains = gains
         self._error = self._integral = self._derivative = 0.0
 
-    def act(self, row: Floats, budget: float) -> float | None:
+    def act(self, row: Floats, budget: float) -> float:
         """Next command; the averages restart at each breath."""
         now, dt, pressure, target = (float(value) for value in row[0, :4])
         if now == 0.0:

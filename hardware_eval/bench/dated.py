@@ -68,10 +68,10 @@ def load(path: Path, form: str, device: Mapping[str, str], remedy: str) -> dict[
     return {**content, "sha256": digest}
 
 
-def check_age(date: str, what: str, remedy: str, now: datetime.datetime | None = None) -> None:
+def check_age(date: str, what: str, remedy: str) -> None:
     """Raise InputError if a date, ISO 8601, is too old, or lies ahead."""
     try:
-        age = ((now or today()) - datetime.datetime.fromisoformat(date)).total_seconds() / 86400.0
+        age = (today() - datetime.datetime.fromisoformat(date)).total_seconds() / 86400.0
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} has no date ({error}); run `{remedy}` again") from None
     if not -1.0 <= age <= STALE:

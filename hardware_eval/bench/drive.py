@@ -8,7 +8,7 @@ starts from a lung at rest, as those of a simulator do.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from hardware_eval import realtime
+from hardware_eval.bench.controllers import PIDController
 from hardware_eval.bench.loop import (
     Bench,
     EmergencyStop,
@@ -34,8 +35,42 @@ from ventbench.task.metrics.measured import worst
 from ventbench.task.metrics.score import time_above
 from ventbench.train.exploration import RANGES, explore
 
-#: Chooses valves from the step and the pressure.
+#: Chooses valves from the step and the pressure; begins anew at step 0.
 Commands = Callable[[int, float], tuple[float, int]]
+
+
+@dataclass(frozen=True)
+class Program:
+    """What drives the valves for a while: to measure something, or to look at it."""
+
+    commands: Commands  #: chooses the valves.
+    steps: int  #: how many.
+    pip: float  #: highest pressure that is meant, cmH2O, for the checks.
+
+
+def in_turn(pip: float, *turns: tuple[int, float, int]) -> Program:
+    """Hold valves in turn, each for some steps: these, u_in, %, and u_out."""
+    order = [valves for steps, *valves in turns for _ in range(steps)]
+
+    def commands(step: int, pressure: float) -> tuple[float, int]:
+        u_in, u_out = order[min(step, len(order) - 1)]
+        return u_in, int(u_out)
+
+    return Program(commands, len(order), pip)
+
+
+def towards(targets: Sequence[float], P: float, I: float, u_out: int) -> Commands:  # noqa: E741
+    """The protocol's PI towards a target a step, cmH2O; then the valve closed, with ``u_out``."""
+    controller = PIDController((P, I, 0.0))
+
+    def commands(step: int, pressure: float) -> tuple[float, int]:
+        if step >= len(targets):
+            return 0.0, u_out
+        row = np.array([[step * protocol.DT, protocol.DT, pressure, targets[step]]])
+        return max(controller.act(row, 0.0), 0.0), 0
+
+    return commands
+
 
 #: Rest before a breath that explores in time constants of the labelled lung with its expiratory
 #: valve, and its limits, s.
@@ -76,32 +111,31 @@ def shown(reading: Reading | None) -> float:
     return math.nan if reading is None else reading.pressure
 
 
-def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float) -> Driven:
-    """Drive the valves step by step, watched; the lung is vented before and after.
+def drive(bench: Bench, lung: str, program: Program) -> Driven:
+    """Drive the valves by a program, watched; the lung is vented before and after.
 
     Where the device did not answer a step in time, the pressure is that between its neighbours.
 
     Args:
         bench: device, clock, safety, operator.
         lung: label, for the checks.
-        commands: called with the step and the pressure, cmH2O.
-        steps: how many.
-        pip: highest pressure that is meant, cmH2O, for the checks.
+        program: what to do.
 
     Raises:
         EmergencyStop: if the operator pressed the key.
         LinkError: if the device is lost.
     """
-    watched = Watched(bench, lung, pip)
+    watched = Watched(bench, lung, program.pip)
     try:
         with no_collection(), realtime.priority():
             watched.begin()
-            for step in range(steps):
+            for step in range(program.steps):
                 if watched.ended:
                     break
-                pressure = shown(watched.look(pip))
+                pressure = shown(watched.look(program.pip))
                 known = math.isfinite(pressure)
-                watched.send_limited(*(commands(step, pressure) if known else watched.last))
+                chosen = program.commands(step, pressure) if known else watched.last
+                watched.send_limited(*chosen)
     finally:
         watched.vent()
     log = watched.log
@@ -192,8 +226,14 @@ def collect(
         for line in logged:
             if line["type"] == "collection" and line["plan"] != plan:
                 raise InputError(f"{log.path} is of {line['plan']}; choose another --out")
-        safe = bench.settings.as_dict()
-        log.append({"type": "collection", "plan": plan, "safety": safe, **(about or {})})
+        log.append(
+            {
+                "type": "collection",
+                "plan": plan,
+                "safety": bench.settings.as_dict(),
+                **(about or {}),
+            }
+        )
         try:
             for number in range(1, count + 1):
                 if number in done:

@@ -193,8 +193,8 @@ class KnownLung:
     """A lung by the probes of the self-test, to be compared with itself."""
 
     lung: str  #: its label.
-    logarithms: tuple[float, float]  #: of R, cmH2O/(L/s), and 1/C, cmH2O/L.
-    errors: tuple[float, float]  #: their standard errors, by the noise of the sensor.
+    logarithms: tuple[float, ...]  #: of R, cmH2O/(L/s), and 1/C, cmH2O/L.
+    errors: tuple[float, ...]  #: their standard errors, by the noise of the sensor.
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,14 @@ that stand in ``limits.toml`` with their reasons; the sheet says go or no-go.
 from __future__ import annotations
 
 import math
-import tomllib
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from hardware_eval.bench.drive import Commands, Driven, drive
+from hardware_eval.bench.drive import Driven, Program, drive, in_turn, towards
 from hardware_eval.bench.identity import (
     Baseline,
     KnownLung,
@@ -30,6 +27,7 @@ from hardware_eval.bench.identity import (
 from hardware_eval.bench.loop import ON_TIME_S, Bench
 from hardware_eval.bench.safety import VALVE_GAIN
 from ventbench.base.errors import InputError
+from ventbench.base.files import data_beside
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS
 from ventbench.task.lungs import lung as parse_lung
@@ -45,11 +43,13 @@ class Limit:
     unit: str  #: of both.
     reason: str  #: why.
 
+    def holds(self, value: float) -> bool:
+        """Whether a value is within it, but for rounding."""
+        return bool(self.low - 1e-12 <= value <= self.high + 1e-12)
+
 
 #: Limits of bring-up, self-test and calibration by what is measured.
-LIMITS = msgspec.convert(
-    tomllib.loads(Path(__file__).with_name("limits.toml").read_text("utf-8")), dict[str, Limit]
-)
+LIMITS = msgspec.convert(data_beside(__file__, "limits.toml"), dict[str, Limit])
 
 
 @dataclass(frozen=True)
@@ -186,10 +186,6 @@ _MISSED = 0.05
 #: Parts that can be left out one by one. The sensor is read in any case: the others need its noise.
 PARTS = ("sensor", "leak", "sweep", "lung")
 
-#: What drives the valves for a while: its commands, steps, and highest pressure that is meant,
-#: cmH2O.
-Program = tuple[Callable[[], Commands], int, float]
-
 
 def chosen_parts(skip: Collection[str]) -> tuple[str, ...]:
     """Parts to leave out, in the order of :data:`PARTS`.
@@ -209,13 +205,22 @@ def programs(lung: str, noise: float = 0.0) -> dict[str, list[Program]]:
         lung: the label.
         noise: standard deviation of the sensor's, cmH2O, which decides how long a leak takes.
     """
-    (openings, puff), (closed, held) = _openings(lung), hold(lung, noise)
+    (openings, puff), (closed, steps) = _openings(lung), hold(lung, noise)
+    # The target rises, or a sensor without noise would seem to be stuck.
+    rising = np.linspace(_HELD - 4.0, _HELD, closed - _STILL_AFTER)
     return {
-        "sensor": [(lambda: lambda step, pressure: (0.0, 1), 34, 10.0)],
-        "leak": [(partial(fill_and_close, closed - _STILL_AFTER), held, 30.0)],
-        "sweep": [(partial(_puff, u, puff), _LEAD + puff + _STILL, 30.0) for u in (0.0, *openings)],
+        "sensor": [in_turn(10.0, (34, 0.0, 1))],
+        "leak": [Program(towards(rising.tolist(), 1.0, 2.0, 0), steps, 30.0)],
+        "sweep": [
+            in_turn(30.0, (_LEAD, 0.0, 1), (puff, u_in, 0), (_STILL, 0.0, 0))
+            for u_in in (0.0, *openings)
+        ],
         "lung": [
-            (partial(_probe, pip, _share(lung) * P, rate), protocol.BREATH_STEPS, pip)
+            Program(
+                towards([pip] * protocol.INSPIRATION_STEPS, _share(lung) * P, rate, 1),
+                protocol.BREATH_STEPS,
+                pip,
+            )
             for pip, P, rate in _PROBES
         ],
     }
@@ -260,13 +265,13 @@ def selftest(
         if part in left_out and part != "sensor":
             continue
         driven[part] = []
-        for make, steps, pip in programs(lung, noise)[part]:
+        for program in programs(lung, noise)[part]:
             if any(x.trips for x in everything):
                 break
             for attempt in range(_ATTEMPTS):
-                done = drive(bench, lung, make(), steps, pip=pip)
+                done = drive(bench, lung, program)
                 late = bool(np.any(done.late > LIMITS["latest_step"].high))
-                many = done.missed > _MISSED * steps
+                many = done.missed > _MISSED * program.steps
                 if not (done.held_up or late or many) or attempt == _ATTEMPTS - 1:
                     break
                 repeated += 1
@@ -327,8 +332,7 @@ def judge(
 
 def judged(name: str, value: float, text: str) -> Finding:
     """Hold a value against its limit."""
-    limit = LIMITS[name]
-    return Finding(name, value, bool(limit.low - 1e-12 <= value <= limit.high + 1e-12), text)
+    return Finding(name, value, LIMITS[name].holds(value), text)
 
 
 def unknown(name: str, why: str) -> Finding:
@@ -364,24 +368,6 @@ def hold(lung: str, noise: float) -> tuple[int, int]:
     return closed, closed + round(float(watching) / protocol.DT)
 
 
-def fill_and_close(filling: int) -> Commands:
-    """Fill a lung for some steps, and close both valves.
-
-    The target rises until then, or a sensor without noise would seem to be stuck.
-    """
-    total = 0.0
-
-    def commands(step: int, pressure: float) -> tuple[float, int]:
-        nonlocal total
-        if step >= filling:
-            return 0.0, 0
-        missing = _HELD - 4.0 * (1.0 - step / filling) - pressure
-        total += 0.06 * (missing - total)
-        return max(missing + 2.0 * total, 0.0), 0
-
-    return commands
-
-
 def _closed(held: Driven, lung: str, calibrated: float = 0.0) -> Finding:
     closed, _ = hold(lung, 0.0)
     if len(held.pressure) < closed + 10:
@@ -392,13 +378,6 @@ def _closed(held: Driven, lung: str, calibrated: float = 0.0) -> Finding:
     if beyond := sigmas > _SIGMAS:
         told += f": {sigmas:.1f} standard errors beyond {allowed:g} mL/s and creep"
     return Finding("leak", flow, not beyond, told)
-
-
-def _puff(u_in: float, steps: int) -> Commands:
-    def commands(step: int, pressure: float) -> tuple[float, int]:
-        return (u_in if _LEAD <= step < _LEAD + steps else 0.0), int(step < _LEAD)
-
-    return commands
 
 
 def _share(lung: str) -> float:
@@ -433,19 +412,6 @@ def _sweep(puffs: Sequence[Driven], noise: float, lung: str) -> list[Finding]:
     text = ", ".join(f"{u:g} % {rise:+.2f}" for u, rise in zip(openings, rises[1:], strict=True))
     share = float(np.mean([*further, opens]))
     return [judged("valve_sweep", share, f"{text} cmH2O (SE {error / math.sqrt(2.0):.2f})")]
-
-
-def _probe(pip: float, P: float, I: float) -> Commands:  # noqa: E741 - the field's names
-    total = 0.0
-
-    def commands(step: int, pressure: float) -> tuple[float, int]:
-        nonlocal total
-        if step >= protocol.INSPIRATION_STEPS:
-            return 0.0, 1
-        total += 0.0566 * (pip - pressure - total)
-        return max(P * (pip - pressure) + I * total, 0.0), 0
-
-    return commands
 
 
 def _errors(probes: list[Driven], simulator: Any) -> dict[str, float]:

@@ -16,6 +16,7 @@ from hardware_eval.bench import bringup, dated
 from hardware_eval.bench.bringup import bring_up, load
 from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
+from hardware_eval.bench.selftest import Finding
 from hardware_eval.device.program import Sample
 from hardware_eval.device.pvp import PvpSensor, PvpValves
 from hardware_eval.emulation.emulator import LoopbackDevice
@@ -143,6 +144,8 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setitem(sys.modules, "pigpio", pigpio)
     smbus2: Any = SimpleNamespace(SMBus=lambda number: machine)
     monkeypatch.setitem(sys.modules, "smbus2", smbus2)
+    monkeypatch.setattr(bringup, "SystemRandom", lambda: Random(1))
+    monkeypatch.setattr(dated, "today", lambda: DAY)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "kept"))
     (tmp_path / "valve.csv").write_text(TABLE)
 
@@ -157,10 +160,9 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return make
 
 
-def confirmed(bench: Bench) -> bringup.BringUp:
-    done = bring_up(bench, operator="A. Name", now=DAY, random=Random(1))
-    dated.save(bringup.place(done.device), done.as_dict())
-    return done
+def confirmed(bench: Bench) -> tuple[dict[str, Any], list[Finding]]:
+    findings = bring_up(bench)
+    return bringup.keep(bench.client, "A. Name", findings), findings
 
 
 def test_a_machine_that_is_as_its_files_say_is_confirmed_and_then_arms(rig: Any) -> None:
@@ -168,39 +170,43 @@ def test_a_machine_that_is_as_its_files_say_is_confirmed_and_then_arms(rig: Any)
     with pytest.raises(UnconfirmedError, match="nobody has confirmed"):
         bench.client.arm()
     with pytest.raises(InputError, match="never brought up"):
-        load(bench.client, DAY)
-    done = confirmed(bench)
-    assert done.go, str(done)
-    assert [x.name for x in done.findings] == [
+        load(bench.client)
+    kept, findings = confirmed(bench)
+    assert kept["go"], kept
+    assert [x.name for x in findings] == [
         *("room", "sensor_noise", "reference", "clicked", "clicked", "rise", "vented")
     ]
     bench.client.arm()
     bench = rig()  # the next command
     with pytest.raises(UnconfirmedError):
         bench.client.arm()
-    found = load(bench.client, DAY)
+    found = load(bench.client)
     assert (found["operator"], found["date"]) == ("A. Name", DAY.isoformat())
     assert bench.client.arm().mode is Mode.RUNNING
     bench.client.hello()
     assert bench.client.arm().mode is Mode.RUNNING  # the same device, connected again
 
 
-def test_it_is_stale_after_a_change_and_after_a_month_and_notices_hands(rig: Any) -> None:
-    done = confirmed(rig())
+def test_it_is_stale_after_a_change_and_after_a_month_and_notices_hands(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept, _ = confirmed(rig())
     for change in (("= 17", "= 27"), ("= 2.25\n", "= 2.26\n"), ("open = false", "open = true")):
         client = rig(FILES.replace(*change)).client
         with pytest.raises(InputError, match="other settings of it"):
-            load(client, DAY)
+            load(client)
         with pytest.raises(UnconfirmedError):
             client.arm()
     client = rig().client
-    with pytest.raises(InputError, match="31 days old"):
-        load(client, DAY + datetime.timedelta(days=31))
-    path = bringup.place(done.device)
+    with monkeypatch.context() as later:
+        later.setattr(dated, "today", lambda: DAY + datetime.timedelta(days=31))
+        with pytest.raises(InputError, match="31 days old"):
+            load(client)
+    path = bringup.place(kept["device"])
     content = json.loads(path.read_text())
     path.write_text(json.dumps({**content, "operator": "B. Name"}))
     with pytest.raises(InputError, match="was changed"):
-        load(client, DAY)
+        load(client)
 
 
 @pytest.mark.parametrize(
@@ -222,16 +228,16 @@ def test_what_is_otherwise_or_not_confirmed_never_arms(
     rig: Any, change: tuple[str, str], answers: dict[str, Any], finding: str, message: str
 ) -> None:
     bench = rig(FILES.replace(*change), **answers)
-    done = confirmed(bench)
-    assert not done.go
-    wrong = next(x for x in done.findings if not x.ok)
+    kept, findings = confirmed(bench)
+    assert not kept["go"]
+    wrong = next(x for x in findings if not x.ok)
     assert wrong.name == finding
     assert message in wrong.text
     client = bench.client
     with pytest.raises(UnconfirmedError):
         client.arm()
     with pytest.raises(InputError, match="not confirmed"):
-        load(client, DAY)
+        load(client)
     with pytest.raises(UnconfirmedError):
         client.arm()
     assert bench.operator.machine.duty == 0.0
@@ -240,18 +246,18 @@ def test_what_is_otherwise_or_not_confirmed_never_arms(
 def test_a_mixed_sensor_shows_at_a_pressure_that_a_person_applies(rig: Any) -> None:
     mixed = FILES.replace('"1 PSI-D-4V-MINI"', '"mixed"').replace("35.15", "12.7")
     bench = rig(mixed.replace("= 50.0", "= 20.0") + MIXED)
-    done = confirmed(bench)
-    assert not done.go
-    assert "7.2" in done.findings[-1].text  # 20 cmH2O by a slope of 12.7 instead of 35.15
-    assert "another sensor's" in done.findings[-1].text
+    kept, findings = confirmed(bench)
+    assert not kept["go"]
+    assert "7.2" in findings[-1].text  # 20 cmH2O by a slope of 12.7 instead of 35.15
+    assert "another sensor's" in findings[-1].text
     assert not bench.operator.machine.moved[1:]  # no valve moved after it was vented once
 
 
 def test_a_frozen_sensor_is_named(rig: Any) -> None:
     bench = rig()
     bench.operator.machine.noise = 0.0
-    done = confirmed(bench)
-    assert "frozen" in done.findings[-1].text
+    _, findings = confirmed(bench)
+    assert "frozen" in findings[-1].text
 
 
 def test_software_is_exempt_only_where_software_may_be(monkeypatch: pytest.MonkeyPatch) -> None:

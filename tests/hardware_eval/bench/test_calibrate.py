@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from hardware_eval.bench import calibrate
+from hardware_eval.bench import calibrate, dated
 from hardware_eval.bench.calibrate import Calibration, fit, load, measure
 from hardware_eval.bench.dated import device_of
 from hardware_eval.bench.identity import Baseline
@@ -100,28 +100,30 @@ def test_a_meter_is_read_where_the_device_measures_no_flow() -> None:
 
 
 def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
-    bench: Bench, device: LoopbackDevice, tmp_path: Path
+    bench: Bench, device: LoopbackDevice, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(dated, "today", lambda: DAY)
     openings = (10.0, 30.0, 10.0)
-    parts = {"valve": measure(bench, "valve", lung=LUNG, reference=openings, now=DAY)}
+    parts = {"valve": measure(bench, "valve", lung=LUNG, reference=openings)}
     slope = parts["valve"].fit.slope
     assert slope.value == pytest.approx(22.8, rel=0.02)  # the paper's valve
-    parts["peep"] = measure(bench, "peep", lung=LUNG, reference=(5.0,), now=DAY)
+    parts["peep"] = measure(bench, "peep", lung=LUNG, reference=(5.0,))
     assert parts["peep"].fit.intercept.value == pytest.approx(5.0, abs=0.05)
-    parts["leak"] = measure(bench, "leak", lung=LUNG, now=DAY)
+    parts["leak"] = measure(bench, "leak", lung=LUNG)
     assert calibrate.lost_flow(parts["leak"], LUNG).low < 5.0
-    parts["lung"] = measure(bench, "lung", lung=LUNG, now=DAY)
+    parts["lung"] = measure(bench, "lung", lung=LUNG)
     hal: Any = device.service.hal
     hal.faults = (Fault(FaultKind.LEAK, device.clock.now(), strength=0.006),)
-    leaking = calibrate.lost_flow(measure(bench, "leak", lung=LUNG, now=DAY), LUNG)
+    leaking = calibrate.lost_flow(measure(bench, "leak", lung=LUNG), LUNG)
     assert leaking.low > 10.0
     hal.faults = (Fault(FaultKind.LEAK, device.clock.now(), strength=0.02),)
     with pytest.raises(InputError, match="mL/s are lost: look for the leak"):
-        measure(bench, "leak", lung=LUNG, now=DAY)
+        measure(bench, "leak", lung=LUNG)
     hal.faults = ()
     path, own = tmp_path / "calibration.json", device_of(bench.client)
     saved = Calibration(own, parts).save(path)
-    kept = load(path, own, now=DAY + datetime.timedelta(days=29))
+    monkeypatch.setattr(dated, "today", lambda: DAY + datetime.timedelta(days=29))
+    kept = load(path, own)
     assert kept == saved
     baseline = kept.baseline()
     assert baseline.lung is not None
@@ -144,16 +146,17 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     assert curve.flow(np.array([0.0, 5.0, 20.0, 40.0])).tolist() == [0.0, 114.0, 364.0, 636.0]
     assert curve.error == pytest.approx((2.0 / 3.0) ** 0.5 * 8.0 / 228.0, rel=0.05)
     assert kept.about()["dates"]["peep"] == DAY.isoformat()
+    monkeypatch.setattr(dated, "today", lambda: DAY + datetime.timedelta(days=31))
     with pytest.raises(InputError, match=r"31 days old.*calibrate valve"):
-        load(path, own, now=DAY + datetime.timedelta(days=31))
+        load(path, own)
     assert load(path, own, stale=True) == saved
     with pytest.raises(InputError, match="not of this 00"):
-        load(path, own | {"device_id": "00"}, now=DAY)
+        load(path, own | {"device_id": "00"})
     content = json.loads(path.read_text())
     content["parts"]["valve"]["reading"][0] += 1.0
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match="was changed"):
-        load(path, own, now=DAY)
+        load(path, own)
 
 
 def judged_at(bench: Bench, baseline: Baseline) -> dict[str, Finding]:

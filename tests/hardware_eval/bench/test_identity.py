@@ -28,9 +28,9 @@ def probed(
     A parabolic resistor has its label's R at 1 L/s.
     """
     draw, done = np.random.default_rng(seed), []
-    for make, steps, _ in programs(f"R{R:g}C{C:g}")["lung"]:
-        commands, volume, rows, u_in, u_out = make(), 0.0, [], 0.0, 1
-        for step in range(steps):
+    for program in programs(f"R{R:g}C{C:g}")["lung"]:
+        volume, rows, u_in, u_out = 0.0, [], 0.0, 1
+        for step in range(program.steps):
             for _ in range(FINE):
                 elastic = volume / C
                 if u_out:
@@ -44,7 +44,7 @@ def probed(
                 volume += flow * protocol.DT / FINE
             read = pressure + noise * draw.standard_normal()
             rows.append((0.03 * step, read, flow, u_in, u_out, 0.0, 0.0))
-            u_in, u_out = commands(step, read)
+            u_in, u_out = program.commands(step, read)
             u_in = min(u_in, 100.0)
         done.append(Driven(*np.array(rows, float).T, (), False, 0))  # type: ignore[arg-type]
     return done
@@ -52,7 +52,7 @@ def probed(
 
 @pytest.mark.parametrize(("R", "C"), SETTINGS)
 def test_no_probe_comes_near_the_limit_of_pressure(R: float, C: float) -> None:
-    pips = [pip for _, _, pip in programs(f"R{R:g}C{C:g}")["lung"]]
+    pips = [program.pip for program in programs(f"R{R:g}C{C:g}")["lung"]]
     for pip, probe in zip(pips, probed(R, C, False, 0.3, seed=1), strict=True):
         assert probe.pressure.max() < safety_limit(pip) - 5.0
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from hardware_eval.bench import selftest as selftest_module
-from hardware_eval.bench.drive import collect
+from hardware_eval.bench.drive import Driven, Program, collect
 from hardware_eval.bench.identity import measured_lung
 from hardware_eval.bench.loop import Bench, Operator
-from hardware_eval.bench.selftest import LIMITS, Driven, selftest, span_finding
+from hardware_eval.bench.selftest import LIMITS, programs, selftest, span_finding
 from tests.hardware_eval.faults import Fault, FaultKind, FaultyDevice, LineFaultKind
 from ventbench.base.errors import InputError
 
@@ -95,14 +95,11 @@ def test_a_wrongly_set_lung_is_a_no_go_that_names_it(bench: Bench) -> None:
 SETTINGS = [(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0)]
 
 
-def analytic(
-    u_in: float, puff: int, R: float, C: float, gain: float, draw: Any, noise: float
-) -> Driven:
+def analytic(program: Program, R: float, C: float, gain: float, draw: Any, noise: float) -> Driven:
     """A puff into a lung of R and C, seen by the converter of the PVP."""
     volume, pressures = 0.0, []
-    commands = selftest_module._puff(u_in, puff)
-    for step in range(selftest_module._LEAD + puff + selftest_module._STILL):
-        command, u_out = commands(step, 0.0)
+    for step in range(program.steps):
+        command, u_out = program.commands(step, 0.0)
         flow = 0.0 if u_out else gain * 22.8 * command
         pressures.append(5.0 + volume / C + R * flow / 1000.0)
         volume += flow * 0.03
@@ -117,10 +114,10 @@ def test_the_sweep_knows_its_error_rates(noise: float) -> None:
     draw, trials = np.random.default_rng(0), 100
     for R, C in SETTINGS:
         label, go = f"R{R:g}C{C:g}", {"right": 0, "stuck": 0}
-        openings, steps = selftest_module._openings(label)
+        sweep = programs(label)["sweep"]
         for kind, gain in (("right", 0.87), ("stuck", 0.0)):
             for _ in range(trials):
-                puffs = [analytic(u, steps, R, C, gain, draw, noise) for u in (0.0, *openings)]
+                puffs = [analytic(each, R, C, gain, draw, noise) for each in sweep]
                 assert max(puff.pressure.max() for puff in puffs) < 45.0  # the limit is 65
                 measured = noise * (1.0 + draw.normal(0.0, 0.17))  # from 17 samples
                 go[kind] += selftest_module._sweep(puffs, measured, label)[0].ok

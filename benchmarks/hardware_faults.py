@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import typer
 
-from hardware_eval.bench.controllers import ControllerFailedError, PIDController
+from hardware_eval.bench.controllers import ControllerFailedError, PIController
 from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, run_once
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.bench.safety import DEFAULT
@@ -77,11 +77,11 @@ FAULTS = (
 )
 
 
-class Troubled(PIDController):
+class Troubled(PIController):
     """The paper's PID, which from a moment on, s, does something else if the fault says so."""
 
     def __init__(self, device: FaultyDevice, lung: str, fault: Fault, moment: float) -> None:
-        super().__init__((*CONTROL_GAINS[lung], 0.0))
+        super().__init__(CONTROL_GAINS[lung])
         self._device, self._fault, self._moment = device, fault, moment
         self.began: float | None = None
 

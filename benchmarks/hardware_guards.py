@@ -37,7 +37,7 @@ import typer
 from scipy import stats
 
 from hardware_eval.bench import calibrate, fallback, safety, selftest
-from hardware_eval.bench.controllers import Count, Lateness, PIDController
+from hardware_eval.bench.controllers import Count, Lateness, PIController
 from hardware_eval.bench.drive import Commands, Driven
 from hardware_eval.bench.identity import Baseline, KnownLung, Valve, measured_lung, white_noise
 from hardware_eval.bench.loop import LATE_SHARE
@@ -470,7 +470,7 @@ class Runaways:
 
     def __init__(self, labels: Sequence[str], *, sound: bool = False) -> None:
         random = np.random.default_rng(list(SEED))
-        self._pids = [PIDController((*CONTROL_GAINS[label], 0.0)) for label in labels]
+        self._pids = [PIController(CONTROL_GAINS[label]) for label in labels]
         self._moment = random.integers(0, ASKED, len(labels)) + ASKED * sound
         self._kind, self._step = random.integers(0, 3, len(labels)), -1
 

@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 #: Most tokens of all that is kept by hand beside the tests, and of the largest parts of it.
-LIMITS = {"sum": 483_390, "ventbench": 325_280, "hardware_eval": 62_550}
+LIMITS = {"sum": 482_660, "ventbench": 325_280, "hardware_eval": 61_830}
 
 #: What is counted together.
 PACKAGES = ("ventbench", "hardware_eval", "proofs", "benchmarks", "ci")

@@ -11,6 +11,7 @@ import dataclasses
 import secrets
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
@@ -32,7 +33,7 @@ from hardware_eval.commands import (
     trial,
 )
 from ventbench.base import files
-from ventbench.base.text import plain
+from ventbench.base.text import number, plain
 from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
 
@@ -120,9 +121,8 @@ def run(
 
     with bench_on(port, yes=yes, kept=out) as (line, _, person):
         calibrated = calibration_of(line, calibration)
-        masked = Blind(planned)
-        if how.blind:
-            person.hidden = masked.hidden
+        masked = Blind(planned, how.blind)
+        person.hidden = masked.hidden
         done = ev.evaluate(
             entries,
             line,
@@ -130,12 +130,12 @@ def run(
             person,
             plan=planned,
             how=how,
-            shows=[masked.hiding(show) for show in shows] if how.blind else shows,
+            shows=[masked.hiding(show) for show in shows],
             sandbox=not in_process,
             operator_name=operator,
             calibration=calibrated,
         )
-    reason = masked.hidden(done.reason) if how.blind else done.reason
+    reason = masked.hidden(done.reason)
     emit(
         {
             "complete": done.complete and not done.stopped,
@@ -153,7 +153,7 @@ def run(
         print(f"what is done is in {done.log}; the same command continues", file=shown)
         raise typer.Exit(1)
     for name, path in done.records.items():
-        if how.blind:
+        if name in masked.called:
             print(f"{masked.called[name]} is {name}", file=shown)
         print(f"{name}: record {path}", file=shown)
         if name in done.stopped:
@@ -166,9 +166,7 @@ def run(
 
 @app.command()
 def emulate(
-    lung: Annotated[
-        str, typer.Option(help="Lung on it.", autocompletion=options.complete_lungs)
-    ] = "R20C50",
+    lung: Lung = "R20C50",
     simulator: options.SimulatorName = "frozen",
     link: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Symbolic link to make to the terminal.")
@@ -242,9 +240,7 @@ def selftest(
     with bench_on(port, yes=True) as (line, bench, _):
         baseline = calibration_of(line, calibration).baseline()
         sheet = run_selftest(bench, label, simulator=simulators, baseline=baseline, skip=left_out)
-    show(sheet.as_dict(), json, sheet)
-    if not sheet.go:
-        raise typer.Exit(1)
+    show(sheet.as_dict(), json, sheet, ok=sheet.go)
 
 
 @app.command()
@@ -270,15 +266,14 @@ def conformance(
         )
     finally:
         transport.close()
-    failed = sum(clause.holds is False for clause in clauses)
-    held = sum(clause.holds is True for clause in clauses)
+    counts = Counter(clause.holds for clause in clauses)
+    failed = counts[False]
     show(
         {"holds": not failed, "clauses": [dataclasses.asdict(clause) for clause in clauses]},
         json,
-        f"{held} hold, {failed} fail, {len(clauses) - held - failed} not tried",
+        f"{counts[True]} hold, {failed} fail, {counts[None]} not tried",
+        ok=not failed,
     )
-    if failed:
-        raise typer.Exit(1)
 
 
 @app.command()
@@ -324,12 +319,11 @@ def compare(
             if out is not None:
                 diagnoses[lung].save(out / lung)
     found = {lung: diagnosis.as_dict() for lung, diagnosis in diagnoses.items()}
-    maes = {lung: "-" if x["mae"] is None else f"{x['mae']:.2f}" for lung, x in lungs.items()}
     show(
         {"simulator": tested.name, "unit": "cmH2O", "lungs": lungs, "diagnoses": found},
         json,
         f"open-loop MAE of the {tested.name} simulators, cmH2O",
-        *(f"  {lung}: {maes[lung]} ({x['breaths']} breaths)" for lung, x in lungs.items()),
+        *(f"  {lung}: {number(x['mae'])} ({x['breaths']} breaths)" for lung, x in lungs.items()),
         *(f"{lung}: {diagnosis}" for lung, diagnosis in diagnoses.items()),
     )
 
@@ -355,6 +349,7 @@ def collect(
     Example: `ventbench-hardware collect --port /dev/ttyACM0 --lung R20C50 --breaths 600`
     """
     from hardware_eval.bench.drive import collect as run_collection
+    from hardware_eval.bench.raw_log import RECORDING
     from hardware_eval.results import evaluate as ev
     from ventbench.cli.options import bar
     from ventbench.task.lungs import scored_lung
@@ -365,7 +360,7 @@ def collect(
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
         with bar("exploring") as exploring:
-            done = run_collection(
+            explored, stopped = run_collection(
                 bench,
                 label,
                 breaths,
@@ -375,15 +370,13 @@ def collect(
                 about={"device": ev.device_about(line)},
                 progress=lambda number: exploring(number, breaths),
             )
-    count = len(done.breaths)
-    lines = [f"{count} whole breaths: {done.recording}"]
-    if done.stopped:
-        lines.append(f"stopped: {plain(done.stopped)}; {line.client.ending()}")
+    count, recording = len(explored), str(out / RECORDING)
+    lines = [f"{count} whole breaths: {recording}"]
+    if stopped:
+        lines.append(f"stopped: {plain(stopped)}; {line.client.ending()}")
         lines.append(f"what is done is in {out}; the same command continues")
-    about = {"breaths": count, "recording": str(done.recording), "stopped": done.stopped}
-    show(about, json, *lines)
-    if done.stopped:
-        raise typer.Exit(1)
+    about = {"breaths": count, "recording": recording, "stopped": stopped}
+    show(about, json, *lines, ok=not stopped)
 
 
 @app.command()
@@ -414,9 +407,8 @@ def demo(
         sandbox=not in_process,
         tell=lambda text: print(text, file=to, flush=True),
     )
-    show(done.as_dict(), json, f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}")
-    if not done.better:
-        raise typer.Exit(1)
+    said = f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}"
+    show(done.as_dict(), json, said, ok=done.better)
 
 
 @app.command()
@@ -440,9 +432,7 @@ def replay(
     from hardware_eval.results.record import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
-    show(report.as_dict(), json, report)
-    if report.problems:
-        raise typer.Exit(1)
+    show(report.as_dict(), json, report, ok=not report.problems)
 
 
 app.command()(bringup)

@@ -41,10 +41,16 @@ def told(json: Path | None) -> TextIO:
     return sys.stderr if str(json) == "-" else sys.stdout
 
 
-def show(value: object, json: Path | None, *lines: object) -> None:
-    """Write the result of a command to the file of ``--json``, and lines for people."""
+def show(value: object, json: Path | None, *lines: object, ok: bool = True) -> None:
+    """Write the result of a command to the file of ``--json``, and lines for people.
+
+    Raises:
+        typer.Exit: with code 1 if the answer is no.
+    """
     emit(value, json)
     print(*lines, sep="\n", file=told(json))
+    if not ok:
+        raise typer.Exit(1)
 
 
 @contextlib.contextmanager
@@ -222,16 +228,14 @@ def bringup(
             return
         if only is not None:
             findings = steps.look(bench, only)
-            show({"findings": [x.as_dict() for x in findings]}, json, *findings)
-            if not all(x.ok for x in findings):
-                raise typer.Exit(1)
+            content, ok = [x.as_dict() for x in findings], all(x.ok for x in findings)
+            show({"findings": content}, json, *findings, ok=ok)
             return
         findings = steps.bring_up(bench)
         kept = steps.keep(line.client, operator, findings)
     about = f"bring-up by {operator}: {'confirmed' if kept['go'] else 'NOT CONFIRMED'}"
-    show(kept, json, about, *findings, f"{kept['file']}; SHA-256 {kept['sha256']}")
-    if not kept["go"]:
-        raise typer.Exit(1)
+    file = f"{kept['file']}; SHA-256 {kept['sha256']}"
+    show(kept, json, about, *findings, file, ok=kept["go"])
 
 
 def calibration_of(line: Line, path: Path | None) -> Calibration:

@@ -21,7 +21,6 @@ it, which a bench scores: a slow lung has not emptied since the breath before.
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ from jax import Array
 from hardware_eval.bench.drive import collect
 from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.plan import Procedure, make_plan
-from hardware_eval.bench.raw_log import lines
+from hardware_eval.bench.raw_log import read_session
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.emulation.simulated import (
@@ -55,8 +54,8 @@ from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.diagnosis.diagnose import diagnose
-from ventbench.entries.folder import open_submission
-from ventbench.entries.scaffold import contents
+from ventbench.entries.folder import CONTROLLER, open_submission
+from ventbench.entries.scaffold import create
 from ventbench.task import attainable as bound
 from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
@@ -152,11 +151,9 @@ class PlannedController:
         controller = _CONTROLLER.format(
             step=protocol.DT, time_constant=TIME_CONSTANT, gains=GAINS, rows="\n".join(rows)
         )
-        made = contents(name, "other") | {"controller.py": controller.encode()}
-        (folder / name).mkdir(parents=True, exist_ok=True)
-        for file, content in made.items():
-            (folder / name / file).write_bytes(content)
-        return folder / name
+        made = create(name, "other", folder)
+        (made / CONTROLLER).write_text(controller)
+        return made
 
 
 def _numbers(values: Floats) -> str:
@@ -190,12 +187,7 @@ def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
     Args:
         plant: the simulator of a lung, without a batch shape.
         pips: cmH2O, rising; commands of a PIP between two are interpolated.
-
-    Raises:
-        ValueError: if the PIPs do not rise.
     """
-    if not pips or any(b <= a for a, b in itertools.pairwise(pips)):
-        raise ValueError(f"PIPs {pips} cmH2O must rise")
     n = len(pips)
     with compilation.float64():
         cells = env.nominal_scenario(np.asarray(pips))
@@ -335,7 +327,7 @@ def demo(
     against = _against(simulated, measured, "simulation")
     step("The same controller on the lung", f"{_said(measured)}{against}")
     bench = Bench(line.client, line.clock, DEFAULT, Operator(), rest=_HOW.rest)
-    explored = collect(bench, lung, breaths, out / "explored").breaths
+    explored, _ = collect(bench, lung, breaths, out / "explored")
     step("The lung is explored", f"{len(explored)} breaths")
     diagnosis = diagnose(explored, simulator=tested, lung=lung)
     diagnosis.save(out / "diagnosis")
@@ -420,9 +412,5 @@ def errors_on(
     )
     if not done.complete:
         raise InputError(f"{entry.name} did not finish its plan: {done.reason}")
-    errors = dict.fromkeys(pips, float("inf"))
-    for logged in lines(done.log):
-        scored = logged["type"] == "run" and logged["kind"] == "scored"
-        if scored and logged.get("error") is not None:
-            errors[logged["pip"]] = logged["error"]
-    return errors
+    scored = read_session(done.log).of_type("run", kind="scored", status="complete")
+    return dict.fromkeys(pips, float("inf")) | {line["pip"]: line["error"] for line in scored}

@@ -106,7 +106,7 @@ def load(client: Client) -> dict[str, Any]:
 
 def _allow(client: Client) -> None:
     assert client.welcome is not None
-    client.brought_up = client.welcome.device_id, client.welcome.calibration
+    client.brought_up = client.welcome.device
 
 
 def bring_up(bench: Bench) -> list[Finding]:

@@ -183,7 +183,7 @@ def measure(
     """
     if kind not in PARTS:
         raise InputError(f"{kind!r} cannot be calibrated; choose {', '.join(PARTS)}")
-    has_flow = bool((bench.client.welcome or bench.client.hello()).capabilities & Capability.FLOW)
+    has_flow = _has_flow(bench)
     if kind == "flow" and not has_flow:
         raise InputError("flow: this device measures none")
     by_hand = kind == "valve" and not has_flow
@@ -200,20 +200,20 @@ def measure(
     return part
 
 
+def _has_flow(bench: Bench) -> bool:
+    return Capability.FLOW in (bench.client.welcome or bench.client.hello()).capabilities
+
+
 def _confirmed(bench: Bench, kind: str, question: str) -> None:
     if not bench.operator.confirm(question):
         raise InputError(f"{kind}: not confirmed; nothing was measured")
 
 
-def _level_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series:
-    """Means of a sensor at one pressure."""
-    level = reference[0] if reference else 0.0
+def _level_points(usual: float, bench: Bench, lung: str, reference: Sequence[float]) -> Series:
+    """Means of a sensor at one pressure, the usual one if none is given, cmH2O."""
+    level = reference[0] if reference else usual
     rows = [_mean(vented(bench, _READINGS)[0], _PRESSURE_ERROR) for _ in range(_MEANS)]
     return [(level, *row) for row in rows], ""
-
-
-def _peep_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series:
-    return _level_points(bench, lung, reference or (protocol.PEEP,))
 
 
 def _applied_points(kind: str, bench: Bench, lung: str, reference: Sequence[float]) -> Series:
@@ -235,11 +235,10 @@ def _valve_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series
     openings = [float(x) for x in reference] or [*OPENINGS, *OPENINGS[::-1]]
     if len(set(openings)) < 2 or min(openings) < 0.0 or max(openings) > protocol.U_MAX:
         raise InputError("valve: give two openings at least, within 0 to 100 %")
-    assert bench.client.welcome is not None
-    points = []
+    points, has_flow = [], _has_flow(bench)
     for before, opening in zip([0.0, *openings], openings, strict=False):
         above = before > opening
-        if bench.client.welcome.capabilities & Capability.FLOW:
+        if has_flow:
             puff = _opened(bench, lung, opening, above, _LEAD, _LEAD + _ABOVE + _OWN + 1, 0)
             points.append((opening, *_mean(puff.flow[-_COUNT:], _FLOW_ERROR)))
         else:
@@ -277,6 +276,8 @@ def _lung_points(bench: Bench, lung: str, reference: Sequence[float]) -> Series:
 
 
 _METER = "flow meter at the valve, tube open, no lung. Is it so?"
+_RESTING = "set the lung to {}, PEEP valve as in use. Does it rest?"
+_AMBIENT = "open the sensor's tube to air. Is it open?"
 _MOUNTED = "set the lung to {} and connect it. Is it set?"
 
 
@@ -291,11 +292,9 @@ class Kind(NamedTuple):
 
 #: What can be calibrated, by name.
 PARTS = {
-    "zero": Kind("cmH2O", "cmH2O", "open the sensor's tube to air. Is it open?", _level_points),
+    "zero": Kind("cmH2O", "cmH2O", _AMBIENT, partial(_level_points, 0.0)),
     "span": Kind("cmH2O", "cmH2O", "", partial(_applied_points, "span")),
-    "peep": Kind(
-        "cmH2O", "cmH2O", "set the lung to {}, PEEP valve as in use. Does it rest?", _peep_points
-    ),
+    "peep": Kind("cmH2O", "cmH2O", _RESTING, partial(_level_points, protocol.PEEP)),
     "valve": Kind("%", "mL/s", _MOUNTED, _valve_points),
     "flow": Kind("mL/s", "mL/s", "", partial(_applied_points, "flow")),
     "leak": Kind("s", "cmH2O", _MOUNTED, _leak_points),

@@ -167,20 +167,19 @@ class ConsoleOperator(Operator):
 
 
 class Blind:
-    """Calls entries by numbers, whatever is asked, told or shown.
+    """Calls entries by numbers, whatever is asked, told or shown; or hides nothing.
 
     Attributes:
         called: what each entry is called, by its name.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, hides: bool = True) -> None:
         """Draw the numbers from the plan's seed, so that a session that continues keeps them."""
-        order = np.random.default_rng([plan.seed, 1]).permutation(len(plan.entries))
-        self.called = {
-            name: f"entry {k + 1}" for k, name in zip(order, sorted(plan.entries), strict=True)
-        }
-        names = "|".join(re.escape(x) for x in sorted(self.called, key=len, reverse=True))
-        self._names = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
+        names = sorted(plan.entries) if hides else []
+        order = np.random.default_rng([plan.seed, 1]).permutation(len(names))
+        self.called = {name: f"entry {k + 1}" for k, name in zip(order, names, strict=True)}
+        either = "|".join(re.escape(x) for x in sorted(self.called, key=len, reverse=True))
+        self._names = re.compile(rf"(?<![\w-])(?:{either or '(?!)'})(?![\w-])")
 
     def hidden(self, text: str) -> str:
         """A text without names of entries."""
@@ -246,15 +245,11 @@ class RerunView:
         start = self._elapsed - breath.time[0]
         self._elapsed += breath.time[-1] - breath.time[0] + protocol.DT
         times = rr.TimeColumn("bench_time", duration=np.array(breath.time) + start)
-        for name in ("pressure", "target", "u_in"):
-            values = np.array(getattr(breath, name), float)
-            self._stream.send_columns(
-                f"/{name}", indexes=[times], columns=rr.Scalars.columns(scalars=values)
-            )
         late = 1e3 * np.array(breath.late)
-        self._stream.send_columns(
-            "/late_ms", indexes=[times], columns=rr.Scalars.columns(scalars=late)
-        )
+        shown = {"pressure": breath.pressure, "target": breath.target, "u_in": breath.u_in}
+        for name, values in {**shown, "late_ms": late}.items():
+            columns = rr.Scalars.columns(scalars=np.array(values, float))
+            self._stream.send_columns(f"/{name}", indexes=[times], columns=columns)
         self._stream.set_time("bench_time", duration=float(breath.time[0] + start))
         self._stream.log("/runs", rr.TextLog(_told(run)))
 

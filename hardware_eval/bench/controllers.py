@@ -14,7 +14,6 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Protocol
 
 from scipy import stats
@@ -22,8 +21,8 @@ from scipy import stats
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.realtime import take_priority
 from ventbench.base.arrays import Floats
-from ventbench.entries.folder import open_submission
-from ventbench.entries.scaffold import contents
+from ventbench.entries.folder import CONTROLLER, open_submission
+from ventbench.entries.scaffold import create
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
 
@@ -111,7 +110,7 @@ MakeController = Callable[[PlannedRun], LiveController]
 
 
 #: A controller that computes nothing.
-_EMPTY = b"""class Controller:
+_EMPTY = """class Controller:
     def reset(self, task):
         pass
 
@@ -120,7 +119,33 @@ _EMPTY = b"""class Controller:
 """
 
 
-class EmptyController:
+class _Asked:
+    """A submission in its process, asked by a thread that waits for a pipe."""
+
+    def __init__(self, runner: Any, submission: Any, task: Task, real_time: bool = True) -> None:
+        self._session = runner.start(submission, [task])
+        self._thread = ThreadPoolExecutor(1, initializer=take_priority if real_time else None)
+        self._pending: Future[Floats] | None = None
+        self._began = self._took = self._longest = 0.0
+
+    def _ask(self, row: Floats) -> Future[Floats]:
+        self._began = time.perf_counter()
+        self._pending = self._thread.submit(self._answer, row)
+        return self._pending
+
+    def _answer(self, row: Floats) -> Floats:
+        answer = self._session.act(row)
+        self._took = time.perf_counter() - self._began
+        self._longest = max(self._longest, self._took)
+        return answer
+
+    def close(self) -> None:
+        """End the process; an answer that never comes is not waited for."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        self._session.close()
+
+
+class EmptyController(_Asked):
     """A submission that computes nothing, asked beside others to time the host.
 
     Args:
@@ -129,38 +154,33 @@ class EmptyController:
 
     def __init__(self, runner: Any) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="ventbench-empty-")
-        folder = Path(self._folder.name) / "empty"
-        folder.mkdir()
-        for name, content in (contents("empty", "other") | {"controller.py": _EMPTY}).items():
-            (folder / name).write_bytes(content)
+        folder = create("empty", "other", self._folder.name)
+        (folder / CONTROLLER).write_text(_EMPTY)
         task = Task("robustness", None, protocol.DT, protocol.INSPIRATION_STEPS)
-        self._session = runner.start(open_submission(str(folder)), [task])
-        self._thread = ThreadPoolExecutor(1, "empty", initializer=take_priority)
-        self._pending: Future[bool] | None = None
+        super().__init__(runner, open_submission(str(folder)), task)
+        self._budget = 0.0
         self.count = NONE  #: its answers up to now; one under way is not among them.
 
     def ask(self, row: Floats, budget: float) -> None:
         """Ask it, without waiting; what it has not answered by the next time was late."""
         if self._pending is not None:
-            late = not self._pending.done() or self._pending.result()
-            self.count += Count(late, 1)
-            if not self._pending.done():
+            waits = not self._pending.done()
+            if not waits:
+                self._pending.result()  # raises what it met
+            self.count += Count(waits or self._took > self._budget, 1)
+            if waits:
                 return
-        self._pending = self._thread.submit(self._is_late, row, time.perf_counter() + budget)
-
-    def _is_late(self, row: Floats, until: float) -> bool:
-        self._session.act(row)
-        return time.perf_counter() > until
+        self._budget = budget
+        self._ask(row)
 
     def close(self) -> None:
         """End it."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
-        self._session.close()
+        super().close()
         self._folder.cleanup()
 
 
-class SubmissionController:
-    """A submission in its process, asked by a thread so that the loop need not wait for it.
+class SubmissionController(_Asked):
+    """A submission, asked so that the loop need not wait for it.
 
     Args:
         runner: as in scoring; see :class:`ventbench.entries.cells.Runner`.
@@ -179,21 +199,16 @@ class SubmissionController:
         real_time: bool = True,
         empty: EmptyController | None = None,
     ) -> None:
-        self._session = runner.start(submission, [task])
+        super().__init__(runner, submission, task, real_time)
         self._real_time, self._empty = real_time, empty
         self._before = NONE if empty is None else empty.count
         self._label = submission.manifest.name
-        # A thread that waits for a pipe.
-        begin = take_priority if real_time else None
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="controller", initializer=begin)
-        self._pending: Future[Floats] | None = None
-        self._asked = self._longest = 0.0
         self._check()
 
     @property
     def longest_answer(self) -> float:
         """Longest time that an answer took so far, s; also one that is still to come."""
-        waits = 0.0 if self._pending is None else time.perf_counter() - self._asked
+        waits = 0.0 if self._pending is None else time.perf_counter() - self._began
         return max(self._longest, waits)
 
     @property
@@ -210,15 +225,8 @@ class SubmissionController:
             if self._result(self._pending, budget) is None:
                 return None
             budget -= time.perf_counter() - began
-        self._asked = time.perf_counter()
-        self._pending = self._thread.submit(self._answer, row)
-        answer = self._result(self._pending, budget)
+        answer = self._result(self._ask(row), budget)
         return None if answer is None else float(answer[0])
-
-    def _answer(self, row: Floats) -> Floats:
-        answer = self._session.act(row)
-        self._longest = max(self._longest, time.perf_counter() - self._asked)
-        return answer
 
     def _result(self, pending: Future[Floats], budget: float) -> Floats | None:
         try:
@@ -233,41 +241,31 @@ class SubmissionController:
         for failure in self._session.failures.values():
             raise ControllerFailedError(failure.message(self._label, None))
 
-    def close(self) -> None:
-        """End the process; an answer that never comes is not waited for."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
-        self._session.close()
 
-
-class PIDController:
-    """The PID of the protocol in this process, for control runs.
+class PIController:
+    """The protocol's PID with D = 0 in this process, for control runs and self-tests.
 
     Args:
-        gains: P, I and D, %/cmH2O.
+        gains: P and I, %/cmH2O.
     """
 
     longest_answer, beside = 0.0, NONE
 
-    def __init__(self, gains: tuple[float, float, float]) -> None:
-        self._gains = gains
-        self._error = self._integral = self._derivative = 0.0
+    def __init__(self, gains: tuple[float, float]) -> None:
+        self._gains, self._integral = gains, 0.0
 
     def act(self, row: Floats, budget: float) -> float:
-        """Next command; the averages restart at each breath."""
+        """Next command; the average restarts at each breath."""
         now, dt, pressure, target = (float(value) for value in row[0, :4])
-        if now == 0.0:
-            self._error = self._integral = self._derivative = 0.0
-        error, a = target - pressure, dt / (dt + 0.5)
-        self._integral += a * (error - self._integral)
-        self._derivative += a * (error - self._error - self._derivative)
-        self._error = error
-        P, I, D = self._gains  # noqa: E741 - the field's names
-        return P * error + I * self._integral + D * self._derivative
+        before, error = self._integral if now else 0.0, target - pressure
+        self._integral = before + dt / (dt + 0.5) * (error - before)
+        P, I = self._gains  # noqa: E741 - the field's names
+        return P * error + I * self._integral
 
     def close(self) -> None:
         """Nothing to end."""
 
 
-def control_pid(run: PlannedRun) -> PIDController:
+def control_pid(run: PlannedRun) -> PIController:
     """The control between scored runs."""
-    return PIDController((*CONTROL_GAINS[run.lung], 0.0))
+    return PIController(CONTROL_GAINS[run.lung])

@@ -32,9 +32,9 @@ def today() -> datetime.datetime:
     return datetime.datetime.now(datetime.UTC)
 
 
-def save(path: Path, content: Mapping[str, Any]) -> str:
+def save(path: Path, content: dict[str, Any]) -> str:
     """Write JSON values with their SHA-256, which is returned; the format is one of them."""
-    plain = json.loads(json.dumps(files.json_values(dict(content))))
+    plain = files.json_values(content)
     digest = _digest(plain)
     files.write_json(path, {**plain, "sha256": digest})
     return digest

@@ -15,20 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from hardware_eval import realtime
-from hardware_eval.bench.controllers import PIDController
+from hardware_eval.bench.controllers import PIController
 from hardware_eval.bench.loop import (
     Bench,
     EmergencyStop,
     Watched,
-    no_collection,
+    shown,
+    undisturbed,
 )
 from hardware_eval.bench.plan import PlannedRun
-from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
-from hardware_eval.wire.messages import Reading
+from hardware_eval.bench.raw_log import LOG, RawLog, lines, write_recording
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import Breaths, write
+from ventbench.recordings.breaths import Breaths
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
 from ventbench.task.metrics.measured import worst
@@ -61,7 +60,7 @@ def in_turn(pip: float, *turns: tuple[int, float, int]) -> Program:
 
 def towards(targets: Sequence[float], P: float, I: float, u_out: int) -> Commands:  # noqa: E741
     """The protocol's PI towards a target a step, cmH2O; then the valve closed, with ``u_out``."""
-    controller = PIDController((P, I, 0.0))
+    controller = PIController((P, I))
 
     def commands(step: int, pressure: float) -> tuple[float, int]:
         if step >= len(targets):
@@ -106,11 +105,6 @@ class Driven:
     missed: int
 
 
-def shown(reading: Reading | None) -> float:
-    """Pressure of a reading, cmH2O; NaN if there is none."""
-    return math.nan if reading is None else reading.pressure
-
-
 def drive(bench: Bench, lung: str, program: Program) -> Driven:
     """Drive the valves by a program, watched; the lung is vented before and after.
 
@@ -127,7 +121,7 @@ def drive(bench: Bench, lung: str, program: Program) -> Driven:
     """
     watched = Watched(bench, lung, program.pip)
     try:
-        with no_collection(), realtime.priority():
+        with undisturbed():
             watched.begin()
             for step in range(program.steps):
                 if watched.ended:
@@ -176,15 +170,6 @@ class BenchVentilator(Watched):
         return np.full(1, shown(self.look(self.pip)))
 
 
-@dataclass(frozen=True)
-class Collection:
-    """What was collected."""
-
-    breaths: Breaths  #: all whole breaths of the folder, also of earlier sessions.
-    recording: Path  #: their file in the public schema.
-    stopped: str  #: why it ended early; empty if it did not.
-
-
 def collect(
     bench: Bench,
     lung: str,
@@ -195,7 +180,7 @@ def collect(
     ease: float = protocol.SAFETY_PRESSURE,
     about: dict[str, Any] | None = None,
     progress: Callable[[int], None] = lambda done: None,
-) -> Collection:
+) -> tuple[Breaths, str]:
     """Explore a lung at all PIPs in turn; a folder with breaths of the same seed is continued.
 
     Args:
@@ -207,6 +192,10 @@ def collect(
         ease: pressure above which the valve closes, cmH2O.
         about: device, operator and notes for the log.
         progress: called with the number of finished breaths.
+
+    Returns:
+        All whole breaths of the folder, also of earlier sessions, as its recording holds them; and
+        why it ended early, empty if it did not.
 
     Raises:
         InputError: if there are no ranges for the lung, or the folder is of another collection.
@@ -221,7 +210,7 @@ def collect(
     rest = float(np.clip(_TIME_CONSTANTS * 1e-3 * label.C * (label.R + _OUTLET), *_REST))
     ventilator = BenchVentilator(replace(bench, rest=rest), lung, max(protocol.PIPS))
     with RawLog(out / LOG) as log:
-        logged = list(lines(log.path))
+        logged = lines(log.path)
         done = {line["repeat"] for line in logged if line["type"] == "breath"}
         for line in logged:
             if line["type"] == "collection" and line["plan"] != plan:
@@ -242,7 +231,7 @@ def collect(
                 ventilator.pip = pip
                 # A breath at a time, each with a seed of its own: a restart repeats none.
                 own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-                with no_collection(), realtime.priority():
+                with undisturbed():
                     explore(ventilator, lung, 1, seed=own, ease=ease, pips=(pip,))
                 run = PlannedRun(number, "explore", "exploration", lung, pip, number)
                 line = ventilator.log.line(run, 0, 0)
@@ -258,6 +247,4 @@ def collect(
             stopped = "the operator pressed the emergency stop"
         finally:
             ventilator.vent()
-    breaths = recording(out / LOG, kinds=("explore",))
-    write(breaths, out / RECORDING)
-    return Collection(breaths, out / RECORDING, stopped)
+    return write_recording(out, ("explore",)), stopped

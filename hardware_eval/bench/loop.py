@@ -18,7 +18,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import structs
 
 from hardware_eval import realtime
 from hardware_eval.bench import fallback, safety
@@ -88,8 +90,7 @@ class Operator:
         """Open a leak or pinch the tube now, or undo it."""
 
 
-@dataclass(frozen=True)
-class BreathLog:
+class BreathLog(msgspec.Struct, frozen=True):
     """One breath as it happened; lists of one value a step.
 
     Attributes:
@@ -102,22 +103,22 @@ class BreathLog:
         busy: time from the step's beginning to the command's answer, s.
     """
 
-    time: list[float] = field(default_factory=list)
-    pressure: list[float] = field(default_factory=list)
-    flow: list[float] = field(default_factory=list)
-    requested: list[float] = field(default_factory=list)
-    u_in: list[float] = field(default_factory=list)
-    u_out: list[int] = field(default_factory=list)
-    target: list[float] = field(default_factory=list)
-    late: list[float] = field(default_factory=list)
-    busy: list[float] = field(default_factory=list)
+    time: list[float] = []
+    pressure: list[float] = []
+    flow: list[float] = []
+    requested: list[float] = []
+    u_in: list[float] = []
+    u_out: list[int] = []
+    target: list[float] = []
+    late: list[float] = []
+    busy: list[float] = []
 
     def line(self, run: PlannedRun, attempt: int, breath: int) -> dict[str, Any]:
         """The breath as a line of the log; the pressure after the last command is none of it."""
         steps = len(self.u_in)
         rounded = {
             name: [None if math.isnan(value) else round(value, 6) for value in each[:steps]]
-            for name, each in vars(self).items()
+            for name, each in structs.asdict(self).items()
             if name not in ("target", "u_out")
         }
         return run.line("breath", attempt, breath=breath, **rounded, u_out=[*self.u_out])
@@ -127,7 +128,7 @@ class BreathLog:
         """The breath that a line of the log holds."""
         columns: dict[str, Any] = {
             name: [math.nan if value is None else value for value in line[name]]
-            for name in vars(cls())
+            for name in cls.__struct_fields__
             if name != "target"
         }
         steps = np.arange(len(columns["time"]))
@@ -137,55 +138,6 @@ class BreathLog:
 #: Shows a breath of a run while the lung breathes out; told how many runs of the plan are done, and
 #: how many there are.
 Show = Callable[[PlannedRun, BreathLog, int, int], None]
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """What became of one run.
-
-    Attributes:
-        status: ``"complete"``; ``"failed"`` if its controller is to blame; ``"aborted"`` if the
-            bench is, so that it runs again.
-        reason: why it did not complete; empty if it did.
-        trips: safety checks that tripped.
-        breaths: those that began.
-        late_answers: steps whose controller did not answer in time, though the host asked in time.
-        limited: commands that a limit of the bench cut.
-        vented_after: time from the sample that tripped until the device had vented, s; NaN if
-            nothing tripped.
-        held_up: whether host or line, too slow for the loop, ended it.
-        asked: steps whose controller was asked.
-        longest_answer: longest time that an answer took, s.
-        outside: answers that the fallback refused.
-        fallback, longest_fallback: steps that it commanded, in all and in a row.
-        beside: answers of an empty controller beside the entry.
-    """
-
-    status: str
-    reason: str
-    trips: tuple[Trip, ...]
-    breaths: tuple[BreathLog, ...]
-    late_answers: int
-    limited: int
-    vented_after: float = math.nan
-    held_up: bool = False
-    asked: int = 0
-    longest_answer: float = 0.0
-    outside: int = 0
-    fallback: int = 0
-    longest_fallback: int = 0
-    beside: Count = NONE
-
-    @property
-    def error(self) -> float:
-        """Mean |pressure - PIP| over the scored inspirations, cmH2O; NaN unless complete."""
-        if self.status != "complete":
-            return math.nan
-        pressure, target = (
-            measured.scored([getattr(breath, name) for breath in self.breaths])
-            for name in ("pressure", "target")
-        )
-        return measured.mean_error(pressure, target)
 
 
 class EmergencyStop(Exception):
@@ -211,10 +163,57 @@ class Bench:
 class Ended:
     """Why valves are driven no longer; the lung is vented."""
 
-    reasons: tuple[str, ...]  #: messages of the checks, or what the device or the controller said.
-    status: str = "aborted"  #: see :class:`RunResult`.
+    reasons: tuple[str, ...] = ()  #: messages of the checks, of the device or the controller.
+    #: ``"complete"``; ``"failed"`` if the controller is to blame; ``"aborted"`` if the bench is, so
+    #: that its run is repeated.
+    status: str = "aborted"
     held_up: bool = False  #: whether host or line, too slow for the loop, ended it alone.
-    vented_after: float = math.nan  #: see :class:`RunResult`.
+    #: time from the sample that tripped until the device had vented, s; NaN if nothing tripped.
+    vented_after: float = math.nan
+
+    @property
+    def reason(self) -> str:
+        """The first reason; empty if there is none."""
+        return next(iter(self.reasons), "")
+
+
+@dataclass(frozen=True)
+class RunResult(Ended):
+    """What became of one run.
+
+    Attributes:
+        trips: safety checks that tripped.
+        breaths: those that began.
+        late_answers: steps whose controller did not answer in time, though the host asked in time.
+        limited: commands that a limit of the bench cut.
+        asked: steps whose controller was asked.
+        longest_answer: longest time that an answer took, s.
+        outside: answers that the fallback refused.
+        fallback, longest_fallback: steps that it commanded, in all and in a row.
+        beside: answers of an empty controller beside the entry.
+    """
+
+    trips: tuple[Trip, ...] = ()
+    breaths: tuple[BreathLog, ...] = ()
+    late_answers: int = 0
+    limited: int = 0
+    asked: int = 0
+    longest_answer: float = 0.0
+    outside: int = 0
+    fallback: int = 0
+    longest_fallback: int = 0
+    beside: Count = NONE
+
+    @property
+    def error(self) -> float:
+        """Mean |pressure - PIP| over the scored inspirations, cmH2O; NaN unless complete."""
+        if self.status != "complete":
+            return math.nan
+        pressure, target = (
+            measured.scored([getattr(breath, name) for breath in self.breaths])
+            for name in ("pressure", "target")
+        )
+        return measured.mean_error(pressure, target)
 
 
 class Watched:
@@ -296,8 +295,9 @@ class Watched:
         self._safety = safety.step(bench.settings, self._safety, sample)
         if trips := self._safety.trips:
             self.vent()
-            status = "aborted" if all(trip.bench for trip in trips) else "failed"
-            held_up = all(safety.CHECKS[trip.check].timing for trip in trips)
+            checks = [safety.CHECKS[trip.check] for trip in trips]
+            status = "aborted" if all(check.bench for check in checks) else "failed"
+            held_up = all(check.timing for check in checks)
             messages = tuple(trip.message for trip in trips)
             self.ended = Ended(messages, status, held_up, bench.clock.now() - began)
         return reading
@@ -309,7 +309,8 @@ class Watched:
         if self.ended:
             return
         try:
-            bench.client.command(u_in, u_out, answer_by(deadline, bench.clock.now()))
+            left = deadline + protocol.DT - RESERVE - bench.clock.now()
+            bench.client.command(u_in, u_out, max(left, 0.0))
         except RefusedError as error:
             self._refused(error)
             return
@@ -397,8 +398,7 @@ class _Loop(Watched):
 
     def run(self) -> RunResult:
         """All breaths."""
-        # Collected before the device waits for commands: that takes longer than the watchdog does.
-        with no_collection(), realtime.priority():
+        with undisturbed():
             self.begin()
             for breath in range(protocol.BREATHS):
                 if self.ended:
@@ -414,14 +414,14 @@ class _Loop(Watched):
         if self._disturbed:
             self._bench.operator.disturb(self._run.perturbation, False)
         return RunResult(
+            ended.reasons,
             ended.status,
-            next(iter(ended.reasons), ""),
+            ended.held_up,
+            ended.vented_after,
             self._safety.trips,
             tuple(self._breaths),
             self._late_answers,
             self._limited,
-            ended.vented_after,
-            ended.held_up,
             self._asked,
             self._controller.longest_answer,
             self._fallback.outside,
@@ -466,9 +466,8 @@ class _Loop(Watched):
         reading = self.look(float(waveform.target(step, run.pip)))
         # A controller must see each breath begin; what the last command's answer told is at most a
         # step old, at the end of an expiration.
-        lost = reading is None or not math.isfinite(reading.pressure)
         if not self.ended:
-            if lost and step == 0 and last is not None:
+            if math.isnan(shown(reading)) and step == 0 and last is not None:
                 reading = last
                 log.pressure[-1], log.flow[-1] = last.pressure, last.flow
             self._act(reading, step)
@@ -487,8 +486,8 @@ class _Loop(Watched):
         requested, budget, cut = math.nan, 0.0, False
         previous = _BIAS if step == 0 else self.last[0]
         # A reading without a number would poison the averages of the entry that sees it.
-        if reading is not None and math.isfinite(reading.pressure):
-            row = _row(step, reading.pressure, self.log.target[-1], run.pip, previous)
+        if math.isfinite(pressure := shown(reading)):
+            row = _row(step, pressure, self.log.target[-1], run.pip, previous)
             budget = self._deadline + ANSWER_BY - bench.clock.now()
             self._asked += 1
             try:
@@ -505,7 +504,6 @@ class _Loop(Watched):
         else:
             u_in = None
         if bench.fallback is not None:
-            pressure = math.nan if reading is None else reading.pressure
             self._fallback, u_in = fallback.step(
                 bench.fallback, self._fallback, step, pressure, run.pip, u_in, previous
             )
@@ -531,9 +529,9 @@ def sample_of(
     return SafetySample(began, reading.pressure, reading.flow, *command, pip, late, reading.u_in)
 
 
-def answer_by(deadline: float, now: float) -> float:
-    """Time that the answer to a step's command may take, s."""
-    return max(deadline + protocol.DT - RESERVE - now, 0.0)
+def shown(reading: Reading | None) -> float:
+    """Pressure of a reading, cmH2O; NaN if there is none."""
+    return math.nan if reading is None else reading.pressure
 
 
 def _row(step: int, pressure: float, target: float, pip: float, previous: float) -> Floats:
@@ -544,13 +542,17 @@ def _row(step: int, pressure: float, target: float, pip: float, previous: float)
 
 
 @contextlib.contextmanager
-def no_collection() -> Iterator[None]:
-    """Collect garbage now and not for a while: a collection takes longer than a step may."""
+def undisturbed() -> Iterator[None]:
+    """Run before ordinary work; collect garbage now and not for a while.
+
+    A collection takes longer than a step may, and than the watchdog waits.
+    """
     was = gc.isenabled()
     gc.collect()
     gc.disable()
     try:
-        yield
+        with realtime.priority():
+            yield
     finally:
         if was:
             gc.enable()

@@ -12,12 +12,14 @@ import itertools
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 
+from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS, scored_lung
@@ -95,23 +97,39 @@ _Case = tuple[Kind, str, float, int, str]
 
 @dataclass(frozen=True)
 class Plan:
-    """A plan of runs."""
+    """A plan of runs; see :func:`make_plan`."""
 
     entries: tuple[str, ...]  #: names of the submissions.
-    track: str  #: what controllers are told: ``"performance"`` names the lung.
     lungs: tuple[str, ...]  #: labels, in the order in which they are mounted.
     pips: tuple[float, ...]  #: cmH2O.
-    repeats: int  #: repetitions of each cell.
-    control_every: int  #: see :data:`CONTROL_EVERY`; 0 for no control.
-    perturbations: tuple[str, ...]  #: of each entry on each lung, see :data:`PERTURBATIONS`.
-    seed: int  #: of the order.
-    runs: tuple[PlannedRun, ...]  #: all runs in their order.
+    track: str = "performance"  #: what controllers are told: ``"performance"`` names the lung.
+    repeats: int = REPEATS  #: repetitions of each cell.
+    control_every: int = CONTROL_EVERY  #: see there; 0 for no control.
+    perturbations: Sequence[str] = ()  #: see :data:`PERTURBATIONS`; each once at each PIP.
+    seed: int = 0  #: of the order.
+
+    @cached_property
+    def runs(self) -> tuple[PlannedRun, ...]:
+        """All runs in their order: of each lung the ramps, then all others shuffled."""
+        order = np.random.default_rng(self.seed)
+        order.permutation(len(self.lungs))  # theirs
+        cells = list(itertools.product(self.entries, self.pips))
+        ramps: list[_Case] = [("ramp", *cell, 1, "") for cell in cells]
+        cases: list[_Case] = [
+            ("scored", *cell, repeat + 1, "") for cell in cells for repeat in range(self.repeats)
+        ]
+        cases.extend(("perturbed", *cell, 1, tube) for cell in cells for tube in self.perturbations)
+        runs: list[PlannedRun] = []
+        for lung in self.lungs:
+            shuffled = [cases[k] for k in order.permutation(len(cases))]
+            every = _with_controls(shuffled, self.control_every)
+            for kind, entry, pip, repeat, tube in [*ramps, *every]:
+                runs.append(PlannedRun(len(runs), kind, entry, lung, pip, repeat, tube))
+        return tuple(runs)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values without the runs, which follow from them."""
-        values = asdict(self)
-        del values["runs"]
-        return values
+        return files.json_values(asdict(self))
 
 
 #: A limit of the valve's commands, %.
@@ -159,12 +177,9 @@ def make_plan(
     entries: Sequence[str],
     lungs: Sequence[str],
     *,
-    track: str = "performance",
     pips: Sequence[float] = protocol.PIPS,
-    repeats: int = REPEATS,
-    control_every: int = CONTROL_EVERY,
-    perturbations: Sequence[str] = (),
     seed: int = 0,
+    **how: Any,
 ) -> Plan:
     """Plan the evaluation of entries.
 
@@ -174,112 +189,72 @@ def make_plan(
     Args:
         entries: names of the submissions.
         lungs: labels; mounted in random order.
-        track: ``"performance"`` or ``"robustness"``.
         pips: cmH2O, of the protocol.
-        repeats: repetitions of each cell.
-        control_every: see :data:`CONTROL_EVERY`; 0 for no control.
-        perturbations: see :data:`PERTURBATIONS`; each once at each PIP.
         seed: of the order.
+        how: other fields of :class:`Plan`.
 
     Raises:
         InputError: if something occurs twice, is unknown, or there is nothing to run.
     """
-    _check(entries, lungs, pips, perturbations)
-    if repeats < 1:
-        raise InputError(f"{repeats} repetitions: run each cell once at least")
     # In one order, whatever order they were given in: a log names them in that of mounting.
     named = sorted((scored_lung(lung).id for lung in lungs), key=LUNG_IDS.index)
-    order = np.random.default_rng(seed)
-    mounted = tuple(named[i] for i in order.permutation(len(named)))
-    rising = tuple(sorted(float(pip) for pip in pips))
-    cells = list(itertools.product(entries, rising))
-    cases: list[_Case] = [
-        ("scored", entry, pip, repeat, "")
-        for entry, pip in cells
-        for repeat in range(1, repeats + 1)
-    ]
-    cases.extend(
-        ("perturbed", entry, pip, 1, tube) for entry, pip in cells for tube in perturbations
-    )
-    runs: list[PlannedRun] = []
-    for lung in mounted:
-        shuffled = [cases[k] for k in order.permutation(len(cases))]
-        ramps: list[_Case] = [("ramp", entry, pip, 1, "") for entry, pip in cells]
-        for kind, entry, pip, repeat, tube in [*ramps, *_with_controls(shuffled, control_every)]:
-            runs.append(PlannedRun(len(runs), kind, entry, lung, pip, repeat, tube))
-    return Plan(
-        tuple(entries),
-        track,
-        mounted,
-        rising,
-        repeats,
-        control_every,
-        tuple(perturbations),
-        seed,
-        tuple(runs),
-    )
+    mounted = tuple(named[i] for i in np.random.default_rng(seed).permutation(len(named)))
+    plan = Plan(tuple(entries), mounted, tuple(sorted(map(float, pips))), seed=seed, **how)
+    _check(plan)
+    return plan
 
 
 def _with_controls(cases: Sequence[_Case], every: int) -> Iterator[_Case]:
     """Cases with a control before each so many of them and after the last; 0 for none."""
-    for place, case in enumerate(cases):
-        if every and place % every == 0:
-            yield "control", CONTROL, CONTROL_PIP, place // every + 1, ""
-        yield case
-    if every:
-        yield "control", CONTROL, CONTROL_PIP, -(-len(cases) // every) + 1, ""
+    for place, case in enumerate([*cases, None]):
+        if every and (place % every == 0 or case is None):
+            yield "control", CONTROL, CONTROL_PIP, -(-place // every) + 1, ""
+        if case is not None:
+            yield case
 
 
-def _check(
-    entries: Sequence[str],
-    lungs: Sequence[str],
-    pips: Sequence[float],
-    perturbations: Sequence[str],
-) -> None:
+def _check(plan: Plan) -> None:
     """Refuse what is missing, stands twice or is unknown."""
-    for name, values in (("entry", entries), ("lung", lungs), ("PIP", pips)):
+    for name, values in (("entry", plan.entries), ("lung", plan.lungs), ("PIP", plan.pips)):
         if not values:
             raise InputError(f"the plan has no {name}; give one at least")
         if len(set(values)) != len(values):
             raise InputError(f"the plan names one {name} twice: {', '.join(map(str, values))}")
-    for pip in pips:
+    if plan.repeats < 1:
+        raise InputError(f"{plan.repeats} repetitions: run each cell once at least")
+    for pip in plan.pips:
         if pip not in protocol.PIPS:
-            raise InputError(f"PIP {pip:g} cmH2O is not one of {_listed(protocol.PIPS)}")
-    for name in perturbations:
+            raise InputError(
+                f"PIP {pip:g} cmH2O is not one of {', '.join(f'{pip:g}' for pip in protocol.PIPS)}"
+            )
+    for name in plan.perturbations:
         if name not in PERTURBATIONS:
             raise InputError(f"perturbation {name!r} is not one of {', '.join(PERTURBATIONS)}")
-    if CONTROL in entries:
+    if CONTROL in plan.entries:
         raise InputError(f"no entry can be called {CONTROL}; that is the PID in between")
 
 
-@dataclass(frozen=True)
-class Progress:
-    """How far a plan has come."""
-
-    done: frozenset[int]  #: numbers of the runs that need not run again.
-    attempts: Mapping[int, int]  #: how often each run has been begun.
-
-    def remaining(self, plan: Plan) -> list[PlannedRun]:
-        """Runs that are still to do, in the plan's order."""
-        return [run for run in plan.runs if run.number not in self.done]
-
-
-def progress(plan: Plan, lines: Iterable[Mapping[str, Any]]) -> Progress:
+def progress(
+    plan: Plan, lines: Iterable[Mapping[str, Any]]
+) -> tuple[list[PlannedRun], dict[int, int]]:
     """How far a plan has come by its log.
 
     A run is done when it is complete, or when a check tripped that blames its controller. A run
     that was cut off, that the bench spoilt or of which the log holds too few readings runs again
     from its first breath, as its controller is gone; its logged breaths stay in the log.
 
+    Returns:
+        Runs that are still to do, in the plan's order; and how often each run has been begun.
+
     Raises:
         InputError: if the log is of another plan.
     """
-    logged = list(lines)
+    logged, own = list(lines), plan.as_dict()
     done = {run for run, _ in complete_runs(logged)}
     attempts: dict[int, int] = {}
     for line in logged:
-        if line["type"] == "plan" and line["plan"] != _plain(plan):
-            keys = [key for key, value in _plain(plan).items() if line["plan"].get(key) != value]
+        if line["type"] == "plan" and line["plan"] != own:
+            keys = [key for key, value in own.items() if line["plan"].get(key) != value]
             raise InputError(
                 f"the log is of another plan ({', '.join(keys)} differ); give its options, or "
                 "another --out"
@@ -288,29 +263,19 @@ def progress(plan: Plan, lines: Iterable[Mapping[str, Any]]) -> Progress:
             attempts[line["run"]] = line["attempt"] + 1
         if line["type"] == "run" and line["status"] == "failed":
             done.add(line["run"])
-    return Progress(frozenset(done), attempts)
+    return [run for run in plan.runs if run.number not in done], attempts
 
 
 def complete_runs(lines: Iterable[Mapping[str, Any]]) -> set[tuple[int, int]]:
     """Number and attempt of the runs of a log that are complete, with enough readings to score."""
-    pressures: dict[tuple[int, int], dict[int, list[float | None]]] = {}
+    pressures: dict[Any, dict[int, list[float | None]]] = {}
     complete = set()
     for line in lines:
+        key = line.get("run"), line.get("attempt")
         if line["type"] == "breath":
-            run = pressures.setdefault((line["run"], line["attempt"]), {})
-            run[line["breath"]] = line["pressure"]
+            pressures.setdefault(key, {})[line["breath"]] = line["pressure"]
         elif line["type"] == "run" and line["status"] == "complete":
-            key = line["run"], line["attempt"]
             rows = [pressures.get(key, {}).get(k, []) for k in range(protocol.BREATHS)]
             if line["kind"] not in MEASURED or not measured.too_few(measured.scored(rows)):
                 complete.add(key)
     return complete
-
-
-def _plain(plan: Plan) -> dict[str, Any]:
-    """The plan as it reads back from JSON."""
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in plan.as_dict().items()}
-
-
-def _listed(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:g}" for value in values)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.loop import BreathLog
-from hardware_eval.bench.plan import Plan, PlannedRun, complete_runs, make_plan
+from hardware_eval.bench.plan import Plan, PlannedRun, complete_runs, make_plan, progress
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import Breaths, make_breaths
+from ventbench.recordings.breaths import Breaths, make_breaths, write
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.lungs import lung as parse_lung
 
@@ -101,7 +101,7 @@ def log_of(session: Path) -> Path:
     return path
 
 
-def lines(path: Path) -> Iterator[dict[str, Any]]:
+def lines(path: Path) -> list[dict[str, Any]]:
     """Read a log; a line that was cut off is left out.
 
     Raises:
@@ -110,7 +110,7 @@ def lines(path: Path) -> Iterator[dict[str, Any]]:
     """
     with open(path, "rb") as file:
         raw = file.read().split(b"\n")
-    complete, tail = raw[:-1], raw[-1]
+    complete, tail, read = raw[:-1], raw[-1], list[dict[str, Any]]()
     for number, text in enumerate(complete):
         try:
             line = json.loads(text)
@@ -125,9 +125,10 @@ def lines(path: Path) -> Iterator[dict[str, Any]]:
         if number == 0 and (not isinstance(line, dict) or line.get("format") != FORMAT):
             raise InputError(f"{path} is no log of ventbench-hardware")
         if line != _CUT:
-            yield line
+            read.append(line)
     if not complete and tail:
         raise InputError(f"{path} is no log of ventbench-hardware")
+    return read
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,15 +142,6 @@ class LoggedBreath:
     log: BreathLog  #: what happened.
 
 
-def breaths(path: Path) -> list[LoggedBreath]:
-    """All breaths of a log, in order.
-
-    Raises:
-        InputError: as of :func:`lines`.
-    """
-    return _breaths(list(lines(path)))
-
-
 @dataclass(frozen=True)
 class Session:
     """What the log of a plan says, of all of its sessions."""
@@ -161,16 +153,32 @@ class Session:
     @cached_property
     def breaths(self) -> list[LoggedBreath]:
         """All breaths, in order."""
-        return _breaths(self.logged)
+        return breaths(self.logged)
+
+    @cached_property
+    def ended(self) -> list[dict[str, Any]]:
+        """Last lines of runs that need not run again, failed or complete."""
+        complete = complete_runs(self.logged)
+        return [
+            line
+            for line in self.of_type("run")
+            if line["status"] == "failed" or (line["run"], line["attempt"]) in complete
+        ]
+
+    @property
+    def left(self) -> list[PlannedRun]:
+        """Runs that are still to do."""
+        return progress(self.plan, self.logged)[0]
 
     @property
     def lungs(self) -> list[str]:
         """Lungs of the plan, in the protocol's order."""
         return [lung for lung in LUNG_IDS if lung in self.plan.lungs]
 
-    def of_type(self, kind: str) -> list[dict[str, Any]]:
-        """Lines of a type."""
-        return [line for line in self.logged if line["type"] == kind]
+    def of_type(self, kind: str, /, **about: Any) -> list[dict[str, Any]]:
+        """Lines of a type, with these values."""
+        wanted = {"type": kind, **about}.items()
+        return [line for line in self.logged if all(line.get(k) == v for k, v in wanted)]
 
     @property
     def about(self) -> dict[str, Any]:
@@ -185,14 +193,15 @@ def read_session(folder: Path) -> Session:
         InputError: if there is no log, or it holds no plan.
     """
     path = log_of(folder)
-    logged = list(lines(path))
+    logged = lines(path)
     for line in logged:
         if line["type"] == "plan":
             return Session(path, logged, make_plan(**line["plan"]))
     raise InputError(f"{path} holds no plan: no session has begun")
 
 
-def _breaths(logged: list[dict[str, Any]]) -> list[LoggedBreath]:
+def breaths(logged: list[dict[str, Any]]) -> list[LoggedBreath]:
+    """All breaths of a log's lines, in order."""
     finished = complete_runs(logged)
     return [
         LoggedBreath(
@@ -205,6 +214,13 @@ def _breaths(logged: list[dict[str, Any]]) -> list[LoggedBreath]:
         for line in logged
         if line["type"] == "breath"
     ]
+
+
+def write_recording(folder: Path, kinds: Sequence[str]) -> Breaths:
+    """Write the recording of a folder's log, which is returned; see :func:`recording`."""
+    taken = recording(folder / LOG, kinds)
+    write(taken, folder / RECORDING)
+    return taken
 
 
 def recording(path: Path, kinds: Sequence[str]) -> Breaths:
@@ -221,7 +237,7 @@ def recording(path: Path, kinds: Sequence[str]) -> Breaths:
     Raises:
         InputError: if there is no such breath.
     """
-    taken = [b for b in breaths(path) if b.run.kind in kinds and len(b.log.time) > 1]
+    taken = [b for b in breaths(lines(path)) if b.run.kind in kinds and len(b.log.time) > 1]
     lengths = [len(b.log.time) for b in taken]
     usual = max(set(lengths), key=lengths.count, default=0)
     taken = [b for b in taken if len(b.log.time) == usual and math.isfinite(b.log.pressure[0])]

@@ -92,10 +92,8 @@ class Trip:
 
     check: str  #: its name.
     time: float  #: when, s, on the loop's clock.
-    held: float  #: how long its condition had held, s.
     value: float  #: value that was compared, in the check's unit.
     message: str  #: one sentence for a person.
-    bench: bool  #: see :class:`Check`.
 
     @property
     def alarm(self) -> str:
@@ -175,12 +173,10 @@ def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> 
                 Trip(
                     name,
                     sample.time,
-                    held,
                     value,
                     f"{name.replace('_', ' ')}: {value:.3g} {check.unit}, the limit is "
                     f"{check.threshold:g}"
                     + (f" for {check.duration:g} s" if check.duration else ""),
-                    check.bench,
                 )
             )
     return replace(state, since=since, trips=tuple(trips), previous=sample, seen=seen)
@@ -256,7 +252,7 @@ def _values(
     ``number``: whether the sample has a reading, else it shows the last one. ``jump``: change of
     the reading, cmH2O a step.
     """
-    pressure, C, inspires = sample.pressure, state.lung.C, not sample.u_out
+    pressure, C, inspires, nan = sample.pressure, state.lung.C, not sample.u_out, math.nan
     limit = float(safety_limit(sample.pip))
     # At or below the limit no breath that was safe becomes unsafe.
     readings = worst(state.breath) if pressure > limit else ()
@@ -272,31 +268,32 @@ def _values(
     above = pressure - protocol.PEEP
     opened = not inspires and sample.time - state.switched > _OPENS_S
     settled = sample.time - state.closed >= _SETTLES_S
-    values = {
+    return {
         # A sample above the gate's cap is more than any time, however short.
-        "over_pressure": (max(above_limit, math.nextafter(protocol.SAFETY_TIME, 1.0)), not passes),
-        "peak_pressure": (pressure, True),
-        "over_volume": (volume * state.volume / largest, inspires),
+        "over_pressure": (
+            nan if passes else max(above_limit, math.nextafter(protocol.SAFETY_TIME, 1.0))
+        ),
+        "peak_pressure": pressure,
+        "over_volume": volume * state.volume / largest if inspires else nan,
         "disconnected": (
-            (pressure - state.start) / max(rise, _SHOWS),
-            inspires and rise > _SHOWS and not frozen,
+            (pressure - state.start) / rise if inspires and rise > _SHOWS and not frozen else nan
         ),
-        "software_delay": (sample.late, True),
-        "missed_deadlines": (sample.late, True),
-        "stuck_sensor": (state.expected, still > 0.0),
-        "still_sensor": (still, True),
-        "implausible_slope": (jump, True),
-        "no_reading": (float(not number), True),
-        "no_answer": (float(not sample.answered), True),
-        "low_pressure": (pressure, not settings.open_tube),
+        "software_delay": sample.late,
+        "missed_deadlines": sample.late,
+        "stuck_sensor": state.expected if still > 0.0 else nan,
+        "still_sensor": still,
+        "implausible_slope": jump,
+        "no_reading": float(not number),
+        "no_answer": float(not sample.answered),
+        "low_pressure": nan if settings.open_tube else pressure,
         "expiratory_valve": (
-            above / max(state.switched_pressure - protocol.PEEP, 1.0),
-            opened and above > _LEAST_LEFT,
+            above / max(state.switched_pressure - protocol.PEEP, 1.0)
+            if opened and above > _LEAST_LEFT
+            else nan
         ),
-        "inspiratory_valve": (pressure - state.closed_pressure, settled),
-        "applied_command": (abs(sample.applied - sample.u_in), True),
+        "inspiratory_valve": pressure - state.closed_pressure if settled else nan,
+        "applied_command": abs(sample.applied - sample.u_in),
     }
-    return {name: value if applies else math.nan for name, (value, applies) in values.items()}
 
 
 def limit_command(settings: SafetySettings, previous: float, wanted: float) -> tuple[float, bool]:

@@ -68,16 +68,15 @@ def run_plan(
         InputError: if the log is of another plan.
         KeyboardInterrupt: if interrupted; the lung is vented.
     """
-    logged = list(lines(log.path))
-    state = progress(plan, logged)
-    attempts = dict(state.attempts)
+    logged = lines(log.path)
+    remaining, attempts = progress(plan, logged)
     if not any(line["type"] == "plan" for line in logged):
         log.append({"type": "plan", "plan": plan.as_dict()})
     own = None if bench.fallback is None else asdict(bench.fallback)
     log.append(
         {"type": "session", **about, "safety": {**bench.settings.as_dict(), "fallback": own}}
     )
-    remaining, reason = state.remaining(plan), ""
+    reason = ""
     try:
         reason = _runs(bench, plan, remaining, attempts, make_controller, log, before_lung)
     except EmergencyStop:
@@ -182,7 +181,7 @@ def _one(
         controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
     except ControllerFailedError as error:
         log(_ended(run, attempt, "failed", str(error)))
-        return RunResult("failed", str(error), (), (), 0, 0)
+        return RunResult((str(error),), "failed")
 
     def write(index: int, breath: BreathLog) -> None:
         log(breath.line(run, attempt, index))

@@ -300,14 +300,12 @@ class PvpValves:
         Raises:
             InputError: if the file is wrong, pigpio is missing, or its daemon does not run.
         """
-        machine = load_machine(Path(path))
-        self._configuration, self._wiring = machine.configuration, machine.wiring
-        self._table = machine.valve
+        self._machine = machine = load_machine(Path(path))
         pigpio = _imported("pigpio")
         self._pi: Any = pigpio.pi()
         if not self._pi.connected:
             raise InputError("pigpiod does not run: start it with `sudo pigpiod`")
-        for pin in (self._wiring.expiratory_pin, self._configuration.heartbeat_pin):
+        for pin in (machine.wiring.expiratory_pin, machine.configuration.heartbeat_pin):
             if pin >= 0:
                 self._pi.set_mode(pin, pigpio.OUTPUT)
         self._set: tuple[float, int] | None = None
@@ -316,19 +314,20 @@ class PvpValves:
 
     def actuate(self, u_in: float, u_out: int) -> None:
         """Set the valves; the expiratory one first, so that air finds its way out."""
-        configuration, before = self._configuration, self._set[0] if self._set else 0.0
+        configuration, wiring = self._machine.configuration, self._machine.wiring
+        before = self._set[0] if self._set else 0.0
         if configuration.heartbeat_pin >= 0:
             self._beat = 1 - self._beat
             self._pi.write(configuration.heartbeat_pin, self._beat)
         if (u_in, u_out) == self._set:
             return
         energised = u_out == 0 if configuration.expiratory_normally_open else u_out == 1
-        self._pi.write(self._wiring.expiratory_pin, int(energised))
+        self._pi.write(wiring.expiratory_pin, int(energised))
         if u_in != before:
             self._rising = u_in > before
-        duty = self._table.duty(u_in, self._rising)
+        duty = self._machine.valve.duty(u_in, self._rising)
         self._pi.hardware_PWM(
-            self._wiring.inspiratory_pin, self._wiring.pwm_frequency, round(duty * _FULL_DUTY)
+            wiring.inspiratory_pin, wiring.pwm_frequency, round(duty * _FULL_DUTY)
         )
         self._set = u_in, u_out
 

@@ -165,13 +165,14 @@ class SimulatedHal:
         u_in, share, r_scale = self.forced(now)
         held = max(now - (now if self._since is None else self._since), SHORTEST_HOLD)
         # A gap of seconds, as after a suspended machine, goes in steps that the plant can take.
-        while held > 2.0 * LONGEST_HOLD:
-            inputs = np.array([u_in, share, LONGEST_HOLD, r_scale, self._restart], np.float32)
-            self._state, _ = self._advance(self._state, inputs)
-            self._since = (self._since or now) + LONGEST_HOLD
+        while True:
+            step = LONGEST_HOLD if held > 2.0 * LONGEST_HOLD else held
+            inputs = np.array([u_in, share, step, r_scale, self._restart], np.float32)
+            state, readings = self._advance(self._state, inputs)
+            if step == held:
+                return state, readings
+            self._state, self._since = state, (self._since or now) + LONGEST_HOLD
             self._restart, held = 0.0, held - LONGEST_HOLD
-        inputs = np.array([u_in, share, held, r_scale, self._restart], np.float32)
-        return self._advance(self._state, inputs)
 
 
 def breath_begun(state: Any, restart: jax.Array) -> Any:

@@ -23,14 +23,12 @@ from typing import Any
 
 import numpy as np
 
-import ventbench
 from hardware_eval.bench.plan import PERTURBED_BREATH
 from hardware_eval.bench.raw_log import LoggedBreath, Session
 from hardware_eval.results import page
-from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.base.text import number, page_templates, plain
+from ventbench.base.text import number
 from ventbench.task import protocol
 
 #: Readings at the end of a phase that count: 0.06 s.
@@ -46,8 +44,8 @@ class Setting:
 
     lung: str  #: label.
     pip: float  #: set pressure of the inspiration, cmH2O.
-    inspiration: Floats  #: at the end of each inspiration, less PIP, ``(n,)``.
-    expiration: Floats  #: at the end of each expiration, less PEEP, ``(n,)``.
+    #: at the end of each inspiration, less PIP, ``(n,)``, and of each expiration, less PEEP.
+    errors: tuple[Floats, ...]
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ def settings_of(session: Session, entry: str, tube: str) -> list[Setting]:
             made.setdefault((run.lung, run.pip), []).append(each)
     order = {lung: place for place, lung in enumerate(session.lungs)}
     return [
-        Setting(lung, pip, *(_ends(made[lung, pip], k) - aim for k, aim in _phases(pip)))
+        Setting(lung, pip, tuple(_ends(made[lung, pip], k) - aim for k, aim in _phases(pip)))
         for lung, pip in sorted(made, key=lambda key: (order[key[0]], key[1]))
     ]
 
@@ -130,46 +128,28 @@ def report(session: Session) -> str:
         raise InputError(
             f"{session.path}: no scored run is complete, so there is nothing to report"
         )
-    about = session.about
-    return (
-        page_templates("hardware_eval.results")
-        .get_template("acceptance.html.j2")
-        .render(
-            style=page.style(session.plan.pips),
-            parts=parts,
-            missing=missing,
-            device=about["device"],
-            calibration=about["device"]["about"].get("calibration_file"),
-            operator=plain(about["operator"]),
-            lungs=session.lungs,
-            pips=session.plan.pips,
-            peep=protocol.PEEP,
-            inspiration=protocol.INSPIRATION_STEPS * protocol.DT,
-            breath=protocol.BREATH_STEPS * protocol.DT,
-            window=1000.0 * LAST * protocol.DT,
-            sha256=files.sha256(session.path),
-            log=session.path.name,
-            version=ventbench.__version__,
-        )
+    return page.rendered(
+        "acceptance.html.j2",
+        session,
+        parts=parts,
+        missing=missing,
+        calibration=session.about["device"]["about"].get("calibration_file"),
+        peep=protocol.PEEP,
+        inspiration=protocol.INSPIRATION_STEPS * protocol.DT,
+        breath=protocol.BREATH_STEPS * protocol.DT,
+        window=1000.0 * LAST * protocol.DT,
     )
 
 
 def _part(entry: str, condition: str, settings: Sequence[Setting]) -> dict[str, Any]:
-    rows = [
-        {
-            "lung": x.lung,
-            "pip": f"{x.pip:g}",
-            "breaths": min(len(x.inspiration), len(x.expiration)),
-            "ends": [_figures(x.inspiration), _figures(x.expiration)],
-        }
-        for x in settings
-    ]
-    inspired = [x for x in settings if len(x.inspiration)]
-    expired = [x for x in settings if len(x.expiration)]
-    statements = (
-        stated([x.inspiration for x in inspired], [x.pip for x in inspired]),
-        stated([x.expiration for x in expired], [protocol.PEEP] * len(expired)),
-    )
+    rows, statements = [], []
+    for x in settings:
+        about = {"lung": x.lung, "pip": f"{x.pip:g}", "breaths": min(map(len, x.errors))}
+        rows.append({**about, "ends": [_figures(errors) for errors in x.errors]})
+    for k in range(2):
+        ended = [x for x in settings if len(x.errors[k])]
+        aims = [_phases(x.pip)[k][1] for x in ended]
+        statements.append(stated([x.errors[k] for x in ended], aims))
     return {"entry": entry, "condition": condition, "rows": rows, "statements": statements}
 
 

@@ -26,7 +26,7 @@ from hardware_eval.bench.controllers import (
 from hardware_eval.bench.fallback import DEFAULT as FALLBACK
 from hardware_eval.bench.loop import Bench, Operator, Show
 from hardware_eval.bench.plan import UNDISTURBED, Plan, PlannedRun, Procedure
-from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, recording
+from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, write_recording
 from hardware_eval.bench.safety import SafetySettings
 from hardware_eval.bench.selftest import Sheet, chosen_parts, selftest
 from hardware_eval.realtime import ENTRY_PRIORITY, Clock, RealClock
@@ -36,10 +36,7 @@ from hardware_eval.wire.client import ANSWER_TIMEOUT, Client, Link
 from hardware_eval.wire.messages import Capability
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.board import record
-from ventbench.board.record import HardwareRecord
 from ventbench.entries.folder import Submission, open_submission
-from ventbench.recordings.breaths import write
 from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
@@ -354,18 +351,16 @@ def evaluate(
         reason = session.run_plan(bench, plan, make, log, about=about, before_lung=tested)
     written: Path | None = None
     with contextlib.suppress(InputError):  # no whole breath yet
-        breaths = recording(log_path, kinds=UNDISTURBED)
+        write_recording(out, UNDISTURBED)
         written = out / RECORDING
-        write(breaths, written)
     made: dict[str, Path] = {}
     stopped: dict[str, str] = {}
     unrun: set[str] = set()
     for submission in () if reason else submissions:
         name = submission.manifest.name
-        content = records.hardware_record(log_path, submission)
+        content, checked = records.hardware_record(log_path, submission)
         made[name] = records.save(out, content)
-        checked = record.from_bytes(content, str(made[name]))
-        if isinstance(checked, HardwareRecord) and (stops := checked.header.stops):
+        if stops := checked.header.stops:
             runs = checked.errors.size
             stopped[name] = f"{len(stops)} of {runs} runs failed, the first: {stops[0].reason}"
             unrun |= {name} if len(stops) == runs else set()

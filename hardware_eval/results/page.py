@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 import ventbench
-from hardware_eval.bench.plan import progress
 from hardware_eval.bench.raw_log import LoggedBreath, Session, read_session
 from hardware_eval.results import record, trial
 from ventbench import palette
@@ -29,51 +28,53 @@ from ventbench.task import protocol, waveform
 PAGE, ACCEPTANCE = "session.html", "acceptance.html"
 
 
-def style(columns: Sequence[Any]) -> str:
-    """The style of all reports, for panels in some columns."""
+def rendered(template: str, session: Session, **content: Any) -> str:
+    """A page by a template of this room, which knows the session, its device and its log too."""
+    pips, about = session.plan.pips, session.about
     sheet = page_templates("ventbench.pages").get_template("report.css.j2")
     given = {"colors": palette.css(), "run_colors": palette.RUNS, "shades": (), "names": ()}
-    return sheet.render(**given, pips=columns)
+    page = page_templates("hardware_eval.results").get_template(template)
+    return page.render(
+        style=sheet.render(**given, pips=pips),
+        plan=session.plan,
+        lungs=session.lungs,
+        device=about["device"],
+        operator=plain(about["operator"]),
+        log=session.path.name,
+        sha256=files.sha256(session.path),
+        version=ventbench.__version__,
+        **content,
+    )
 
 
 def page(session: Session) -> str:
     """The page."""
     plan, about = session.plan, session.about
-    done = progress(plan, session.logged)
+    left = len(session.left)
     try:
         analysed, missing = trial.analyse([session.path]), ()
     except InputError as error:
         analysed, missing = None, (str(error),)
-    return (
-        page_templates("hardware_eval.results")
-        .get_template("session.html.j2")
-        .render(
-            style=style(plan.pips),
-            plan=plan,
-            lungs=session.lungs,
-            device=about["device"],
-            operator=plain(about["operator"]),
-            notes=plain(about["notes"]),
-            done=len(plan.runs) - len(done.remaining(plan)),
-            table=[] if analysed is None else _table(session, analysed),
-            agreement={
-                name.capitalize(): shown(value)
-                for name, value in ({} if analysed is None else analysed.agreement).items()
-            },
-            missing=missing if analysed is None else analysed.missing,
-            entries=[_entry(session, name) for name in plan.entries],
-            timing=[_timing(session, name) for name in plan.entries],
-            stopped=_stopped(session),
-            tests=[line for line in session.of_type("selftest") if "go" in line],
-            control=record.control(session),
-            skipped=_skipped(session, len(done.remaining(plan))),
-            shown_breath=panels.BREATH + 1,
-            log=session.path.name,
-            sha256=files.sha256(session.path),
-            priority=about.get("priority"),
-            sessions=len(session.of_type("session")),
-            version=ventbench.__version__,
-        )
+    return rendered(
+        "session.html.j2",
+        session,
+        notes=plain(about["notes"]),
+        done=len(plan.runs) - left,
+        table=[] if analysed is None else _table(session, analysed),
+        agreement={
+            name.capitalize(): shown(value)
+            for name, value in ({} if analysed is None else analysed.agreement).items()
+        },
+        missing=missing if analysed is None else analysed.missing,
+        entries=[_entry(session, name) for name in plan.entries],
+        timing=[_timing(session, name) for name in plan.entries],
+        stopped=_stopped(session),
+        tests=[line for line in session.of_type("selftest") if "go" in line],
+        control=record.control(session),
+        skipped=_skipped(session, left),
+        shown_breath=panels.BREATH + 1,
+        priority=about.get("priority"),
+        sessions=len(session.of_type("session")),
     )
 
 
@@ -142,7 +143,7 @@ def _panel(pip: float, repeats: Sequence[LoggedBreath]) -> dict[str, Any]:
 
 def _timing(session: Session, name: str) -> dict[str, Any]:
     """Late answers and fallbacks of an entry in all of its attempts, and what ran beside it."""
-    runs = [x for x in session.of_type("run") if x["entry"] == name]
+    runs = session.of_type("run", entry=name)
     beside = [x["beside"] for x in runs if x.get("beside")]
     try:
         figures: Any = record.timing(session, name)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.loop import ON_TIME_S, BreathLog
-from hardware_eval.bench.plan import CONTROL, UNDISTURBED, complete_runs, progress
+from hardware_eval.bench.plan import CONTROL, UNDISTURBED
 from hardware_eval.bench.raw_log import (
     LOG,
     LoggedBreath,
@@ -59,38 +59,38 @@ def timing(session: Session, entry: str | None = None) -> dict[str, float]:
     Raises:
         InputError: if it holds no step.
     """
-    late, busy, longest = [], [], {"longest_answer": 0.0, "longest_fallback": 0}
-    sums = {"late_answers": 0, "asked": 0, "outside": 0, "fallback": 0}
-    for line in session.of_type("breath"):
-        late += line["late"]
-        busy += line["busy"]
-    for line in session.of_type("run"):
-        if line["entry"] == (entry or line["entry"]):
-            sums = {name: value + line.get(name, 0) for name, value in sums.items()}
-            longest = {name: max(value, line.get(name, 0)) for name, value in longest.items()}
-    if not late:
+    late, busy = (
+        np.array([x for line in session.of_type("breath") for x in line[name]], float)
+        for name in ("late", "busy")
+    )
+    if not late.size:
         raise InputError(f"{session.path} holds no breath")
-    delays, asked = np.array(late, float), max(sums["asked"], 1)
+    runs = session.of_type("run", **({"entry": entry} if entry else {}))
+    told = ("late_answers", "asked", "outside", "fallback", "longest_answer", "longest_fallback")
+    answers = {name: [line.get(name, 0) for line in runs] or [0] for name in told}
+    sums = {name: sum(counts) for name, counts in answers.items()}
+    asked = max(sums["asked"], 1)
     return {
-        "steps": len(delays),
-        "on_time": float(np.mean(delays <= ON_TIME_S)),
-        "lost": int(np.sum(delays > protocol.DT)),
-        "worst": float(delays.max()),
+        "steps": len(late),
+        "on_time": float(np.mean(late <= ON_TIME_S)),
+        "lost": int(np.sum(late > protocol.DT)),
+        "worst": float(late.max()),
         "asked": sums["asked"],
         "late_answers": sums["late_answers"],
         "late_share": sums["late_answers"] / asked,
         "outside": sums["outside"],
         "fallback_share": sums["fallback"] / asked,
-        **longest,
+        **{name: max(answers[name]) for name in told[-2:]},
         "busy_median": float(np.median(busy)),
         "busy_worst": float(np.max(busy)),
     }
 
 
-def hardware_record(log: Path, submission: Submission) -> bytes:
+def hardware_record(log: Path, submission: Submission) -> tuple[bytes, HardwareRecord]:
     """Make the hardware record of an entry, with the files that ran, from the log of a plan.
 
-    It is canonical JSON, checked as the leaderboard checks it.
+    Returns:
+        Canonical JSON, and what the leaderboard reads of it.
 
     Raises:
         InputError: if the plan is not finished, the entry is not in it, or its files have changed.
@@ -99,7 +99,7 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
     plan, name = session.plan, submission.manifest.name
     if name not in plan.entries:
         raise InputError(f"{log} is of {', '.join(plan.entries)}, not of {name}")
-    left = [run for run in progress(plan, session.logged).remaining(plan) if run.entry == name]
+    left = [run for run in session.left if run.entry == name]
     if left:
         raise InputError(
             f"{log}: {len(left)} runs of {name} are left; run the same command again, it continues"
@@ -146,7 +146,7 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
     made = canonical.canonical(canonical.through_json(content))
     checked = record.from_bytes(made, f"the hardware record of {name}")
     assert isinstance(checked, HardwareRecord)
-    return made
+    return made, checked
 
 
 def _check_same(session: Session, name: str) -> None:
@@ -169,8 +169,7 @@ def _tables(session: Session, name: str) -> dict[str, Any]:
             runs.setdefault((run.lung, run.pip, run.repeat), []).append(breath.log)
     failed = {
         (line["lung"], line["pip"], line["repeat"]): line["reason"]
-        for line in session.of_type("run")
-        if (line["status"], line["entry"], line["kind"]) == ("failed", name, "scored")
+        for line in session.of_type("run", status="failed", entry=name, kind="scored")
     }
     cells = list(product(session.lungs, plan.pips, range(1, plan.repeats + 1)))
     rows = [_cell(runs[cell], cell[1]) if cell in runs else _STOPPED for cell in cells]
@@ -226,9 +225,8 @@ def control(session: Session) -> dict[str, Any]:
     cmH2O; beside it stands its standard error.
     """
     by_lung: dict[str, list[float]] = {}
-    complete = complete_runs(session.logged)
-    for line in session.of_type("run"):
-        if line["entry"] == CONTROL and (line["run"], line["attempt"]) in complete:
+    for line in session.ended:
+        if (line["entry"], line["status"]) == (CONTROL, "complete"):
             by_lung.setdefault(line["lung"], []).append(line["error"])
     figures: dict[str, Any] = {}
     for lung, errors in by_lung.items():
@@ -244,7 +242,7 @@ def control(session: Session) -> dict[str, Any]:
 def save(folder: Path, content: bytes) -> Path:
     """Write a record, named by its hash; returns its path, for ``ventbench board add``."""
     path = folder / f"{canonical.digest(content)}{record.SUFFIX}"
-    files.write_atomically(path, lambda file: file.write(content))
+    files.write_bytes(path, content)
     return path
 
 
@@ -291,8 +289,7 @@ def replay(
     runs, everything = len(session.plan.runs), session.breaths
     _show(everything, rerun, mcap, runs)
     problems = () if record is None else tuple(_differences(record, session))
-    done = len(progress(session.plan, session.logged).done)
-    return Replay(runs, done, len(everything), timing(session), problems)
+    return Replay(runs, runs - len(session.left), len(everything), timing(session), problems)
 
 
 def _show(everything: list[LoggedBreath], rerun: str | None, mcap: Path | None, total: int) -> None:

@@ -28,7 +28,6 @@ import numpy as np
 from scipy import stats
 
 from hardware_eval.bench.identity import interval
-from hardware_eval.bench.plan import complete_runs
 from hardware_eval.bench.raw_log import read_session
 from ventbench.base import files
 from ventbench.base.arrays import Floats
@@ -221,12 +220,10 @@ def _tables(logs: Sequence[Path]) -> tuple[Sequence[str], list[str], Floats, Flo
         for key, of in (("entries", sorted), ("pips", tuple), ("repeats", int), ("track", str)):
             if of(getattr(plan, key)) != of(getattr(first, key)):
                 raise InputError(f"{log} is of another trial than {logs[0]}: {key} differ")
-        complete = complete_runs(session.logged)
         ended = {
             (x["entry"], x["lung"], x["pip"], x["repeat"]): x.get("error")
-            for x in session.of_type("run")
+            for x in session.ended
             if x["kind"] == "scored"
-            and (x["status"] == "failed" or (x["run"], x["attempt"]) in complete)
         }
         predicted: dict[tuple[str, str, float], float] = {}
         for line in session.of_type("session"):

@@ -386,12 +386,13 @@ class Client:
             if not self.transport.raise_lines():
                 raise
             self.welcome = self._persist(hello, Welcome, HELLOS)
-        now = self.welcome.device_id, self.welcome.calibration
-        if before is not None and now != (before.device_id, before.calibration):
+        if before is not None and self.welcome.device != before.device:
+            now, then = (
+                f"{x.name} {x.device_id.hex()} with calibration {x.calibration.hex()[:8]}"
+                for x in (self.welcome, before)
+            )
             raise DeviceChangedError(
-                f"the device is {self.welcome.name} {now[0].hex()} with calibration "
-                f"{now[1].hex()[:8]}; the session began with {before.name} "
-                f"{before.device_id.hex()}, {before.calibration.hex()[:8]}: begin a new one"
+                f"the device is {now}; the session began with {then}: begin a new one"
             )
         self._persist(Heartbeat(), Reading)
         return self.welcome
@@ -421,8 +422,7 @@ class Client:
         Raises:
             UnconfirmedError: if the device is real, and was not brought up as it is now.
         """
-        now = self.welcome and (self.welcome.device_id, self.welcome.calibration)
-        if not self.simulated and (now is None or now != self.brought_up):
+        if not self.simulated and (self.welcome is None or self.welcome.device != self.brought_up):
             raise UnconfirmedError(
                 "nobody has confirmed what the valves and the sensor of this device do, as it is "
                 "configured now: run `ventbench-hardware bringup --port PORT`; nothing was armed"
@@ -504,13 +504,13 @@ class Client:
     def _persist(
         self, message: HostMessage, answer: type[AnswerT], attempts: int = ATTEMPTS
     ) -> AnswerT:
-        for attempt in range(attempts):
+        while True:
+            attempts -= 1
             try:
                 return self._ask(message, answer, PATIENCE)
             except NoAnswerError:
-                if attempt == attempts - 1:
+                if not attempts:
                     raise
-        raise AssertionError("unreachable")
 
     def _ask(self, message: HostMessage, answer: type[AnswerT], timeout: float) -> AnswerT:
         self._sequence += 1

@@ -188,6 +188,11 @@ class Welcome:
     calibration: bytes  #: SHA-256 of the device's calibration (sensor and valve tables), 32 bytes.
     name: str  #: what people call the device, at most 32 bytes of UTF-8.
 
+    @property
+    def device(self) -> tuple[bytes, bytes]:
+        """Which device it is, wired and calibrated as it is."""
+        return self.device_id, self.calibration
+
 
 @dataclass(frozen=True, slots=True)
 class Reading:

@@ -10,7 +10,7 @@ from random import Random
 
 import numpy as np
 
-from hardware_eval.bench.controllers import PIDController
+from hardware_eval.bench.controllers import PIController
 from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.plan import make_plan
 from hardware_eval.bench.raw_log import RawLog, lines
@@ -126,7 +126,7 @@ def bad_day(path: Path, seed: int, repeats: int = 3) -> Day:
     )
     happened: Counter[str] = Counter()
 
-    class Troubled(PIDController):
+    class Troubled(PIController):
         def act(self, row: np.ndarray, budget: float) -> float | None:
             happened["answers"] += 1
             count = happened["answers"]
@@ -144,7 +144,7 @@ def bad_day(path: Path, seed: int, repeats: int = 3) -> Day:
     plan = make_plan(["a"], ["R5C20"], pips=(10.0,), repeats=repeats, control_every=0, seed=seed)
     bench = Bench(client, board.clock, DEFAULT, Operator(), rest=0.5)
     with RawLog(path) as log:
-        end = run_plan(bench, plan, lambda run: Troubled((2.0, 5.0, 0.0)), log, about={})
+        end = run_plan(bench, plan, lambda run: Troubled((2.0, 5.0)), log, about={})
     runs = [x for x in lines(path) if x["type"] == "run"]
     done = {x["run"] for x in runs if x["status"] == "complete"}
     happened["restarts"] = board.restarts - 1

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from hardware_eval import cli
 from hardware_eval.bench.controllers import ControllerFailedError, SubmissionController
 from hardware_eval.bench.plan import read_procedure
-from hardware_eval.bench.raw_log import breaths
+from hardware_eval.bench.raw_log import breaths, lines
 from hardware_eval.device.program import Identity
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results import evaluate
@@ -76,7 +76,7 @@ def test_run_makes_a_record_and_replay_agrees(
     again = invoke("replay", str(out), "--record", told["records"]["pid_best"], "--mcap", str(file))
     with open(file, "rb") as opened:  # read by the package's own reader
         messages = [json.loads(x.data) for _, _, x in make_reader(opened).iter_messages()]
-    logged = [breath.log for breath in breaths(out / "raw.jsonl") if breath.log.time]
+    logged = [breath.log for breath in breaths(lines(out / "raw.jsonl")) if breath.log.time]
     assert len(messages) == sum(len(breath.time) for breath in logged)
     assert messages[5]["pressure"] == logged[0].pressure[5]
     assert again.exit_code == 0, again.output

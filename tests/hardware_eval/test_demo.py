@@ -52,12 +52,6 @@ def test_a_written_entry_sends_its_plan_and_answers_what_is_missing(tmp_path: Pa
     controller.close()
 
 
-@pytest.mark.parametrize("pips", [(), (20.0, 10.0), (10.0, 10.0)])
-def test_pips_that_do_not_rise_are_refused(pips: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="must rise"):
-        plan_controller(physics(lung(LUNG)), pips)
-
-
 @pytest.mark.slow
 def test_what_the_simulator_lacks_costs_and_a_plan_with_it_does_better(tmp_path: Path) -> None:
     plain: Plant = physics(lung(LUNG))

@@ -76,11 +76,9 @@ def test_progress_repeats_what_the_bench_spoilt_and_keeps_what_failed() -> None:
         {"type": "run", "run": k, "attempt": 0, "status": status, "kind": "ramp"}
         for k, status in enumerate(("complete", "aborted", "failed"))
     ]
-    state = progress(plan, [*begins, *ends])
-    assert [run.number for run in state.remaining(plan)] == [
-        k for k in range(len(plan.runs)) if k not in (0, 2)
-    ]
-    assert state.attempts[3] == 1
+    left, attempts = progress(plan, [*begins, *ends])
+    assert [run.number for run in left] == [k for k in range(len(plan.runs)) if k not in (0, 2)]
+    assert attempts[3] == 1
 
 
 def test_a_log_of_another_plan_is_refused() -> None:

@@ -14,6 +14,7 @@ from hardware_eval.bench import selftest as selftest_module
 from hardware_eval.bench.drive import Driven, Program, collect
 from hardware_eval.bench.identity import measured_lung
 from hardware_eval.bench.loop import Bench, Operator
+from hardware_eval.bench.raw_log import RECORDING
 from hardware_eval.bench.selftest import LIMITS, programs, selftest, span_finding
 from tests.hardware_eval.faults import Fault, FaultKind, FaultyDevice, LineFaultKind
 from ventbench.base.errors import InputError
@@ -195,14 +196,14 @@ def test_a_fault_is_a_no_go(name: str, bench: Bench, device: FaultyDevice) -> No
 
 
 def test_exploring_continues_where_it_ended(bench: Bench, tmp_path: Path) -> None:
-    first = collect(bench, LUNG, 2, tmp_path, seed=3)
-    assert len(first.breaths) == 2
-    both = collect(bench, LUNG, 4, tmp_path, seed=3)
-    assert len(both.breaths) == 4
-    assert (both.breaths.u_in[:2] == first.breaths.u_in).all()
-    assert both.recording.is_file()
-    assert both.breaths.flow is not None
-    assert both.stopped == ""
+    first, _ = collect(bench, LUNG, 2, tmp_path, seed=3)
+    assert len(first) == 2
+    both, stopped = collect(bench, LUNG, 4, tmp_path, seed=3)
+    assert len(both) == 4
+    assert (both.u_in[:2] == first.u_in).all()
+    assert (tmp_path / RECORDING).is_file()
+    assert both.flow is not None
+    assert stopped == ""
     with pytest.raises(InputError, match="choose another --out"):
         collect(bench, LUNG, 4, tmp_path, seed=4)
 
@@ -219,7 +220,7 @@ def test_exploring_stops_when_nothing_can_be_trusted(
         def tell(self, text: str) -> None:
             told.append(text)
 
-    ended = collect(replace(bench, operator=Listens()), LUNG, 10, tmp_path)
-    assert ended.stopped
+    explored, stopped = collect(replace(bench, operator=Listens()), LUNG, 10, tmp_path)
+    assert stopped
     assert len(told) == 3
-    assert len(ended.breaths) == 1
+    assert len(explored) == 1

@@ -45,9 +45,14 @@ def answer(
         Why a case is lost, by name.
 
     Raises:
-        InputError: if there is no challenge, or a recording is missing or cannot be read.
+        InputError: if there is no challenge or no such case, or a recording is missing or cannot be
+            read.
     """
-    names = [name for name in folder.cases() if not only or name in only]
+    cases = list(folder.cases())
+    if unknown := set(only) - set(cases):
+        unlike = f"but {cases[0]} to {cases[-1]}"
+        raise InputError(f"{folder.path} has no case {min(unknown)}, {unlike}")
+    names = [name for name in cases if not only or name in only]
     missing = [name for name in names if not folder.recording(name).is_file()]
     if missing:
         raise InputError(f"{folder.recording(missing[0])} is missing")

@@ -10,6 +10,7 @@ import pytest
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import flow_drive
 from ventbench.diagnosis.diagnose import diagnose
+from ventbench.diagnosis.jumps import without_noise
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths, make_breaths
@@ -112,6 +113,36 @@ def test_the_ventilators_side_is_left_out():
     assert terms is not None
     assert not {"valve_shape", "outlet_shape"} & set(terms)
     assert "flow_shape" in terms
+
+
+def test_noise_leaves_the_flow_and_its_edges_stay():
+    breaths = recorded(6, 50.0)
+    assert breaths.flow is not None
+    rng = np.random.default_rng(0)
+    for flow in breaths.flow:
+        np.testing.assert_allclose(without_noise(flow), flow, atol=2.0)
+        noise = rng.normal(0.0, 10.0, flow.shape)
+        error = without_noise(flow + noise) - flow
+        assert np.std(error) < 0.7 * np.std(noise)
+        assert np.abs(error).max() < 45.0  # the edges are 300 to 900 mL/s high
+        assert np.std(np.cumsum(error - noise)) / 50.0 < 0.5  # mL of volume
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by_volume", [False, True])
+def test_noise_of_the_flow_is_no_physics(by_volume):
+    """A filter would take it off the prediction, though the rig has none."""
+    breaths, rng = recorded(24, 50.0, noise=0.15), np.random.default_rng(1)
+    flow = breaths.flow
+    assert flow is not None
+    volume = np.cumsum(flow * breaths.dt, axis=1) + rng.normal(0.0, 1.0, flow.shape)
+    noisy = (
+        {"flow": None, "volume": volume}
+        if by_volume
+        else {"flow": flow + rng.normal(0.0, 15.0, flow.shape)}
+    )
+    diagnosis = diagnose(dataclasses.replace(breaths, **noisy))
+    assert diagnosis.verdict == "nothing_missing"
 
 
 @pytest.mark.slow

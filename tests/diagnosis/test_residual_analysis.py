@@ -127,10 +127,10 @@ def test_an_error_of_one_lung_is_found_on_it():
 def test_an_error_of_volume_is_found_along_it():
     recorded, pressure, flow, volume = exact(6)
     noise = coloured(np.random.default_rng(7), pressure.shape, 0.3)
-    seen = dataclasses.replace(recorded, pressure=pressure + noise + 0.5 * (volume > 400.0))
+    seen = dataclasses.replace(recorded, pressure=pressure + noise + 0.5 * (volume > 450.0))
     places = locate(seen, pressure, SD, flow, volume)
     place = max((p for p in places if p.axis == "volume"), key=lambda p: p.share)
-    assert (place.low, place.unit) == (400.0, "mL")
+    assert (place.low, place.unit) == (450.0, "mL")
     assert place.mean_error == pytest.approx(0.5, abs=0.1)
 
 
@@ -219,6 +219,13 @@ def test_time_since_an_edge():
     time = recorded.time
     np.testing.assert_allclose(since[:, 11:21], time[:, 11:21] - time[:, [10]])
     np.testing.assert_allclose(since[:, 21:], time[:, 21:] - time[:, [20]])
+
+
+def test_no_range_ends_at_a_value_that_comes_again_and_again():
+    rng = np.random.default_rng(0)
+    values = np.concatenate([rng.uniform(5.0, 40.0, 200), rng.normal(5.0, 0.1, 300)])[None]
+    edges = round_edges(values, np.ones(values.shape, bool))
+    np.testing.assert_allclose(edges, np.arange(2.5, 46.0, 5.0)[: len(edges)])
 
 
 def test_ranges_end_at_round_numbers():

@@ -110,6 +110,22 @@ def test_noise_is_estimated_in_spite_of_misfits():
             assert told == pytest.approx(slow * ar**lag, abs=0.08)
 
 
+def test_noise_of_every_second_sample_is_that_of_its_readings():
+    rng = np.random.default_rng(2)
+    apart = np.abs(np.subtract.outer(np.arange(80), np.arange(80)))
+    residual = rng.multivariate_normal(np.zeros(80), 0.04 * 0.9**apart, size=80)[:, None]
+    weight = np.zeros_like(residual)
+    weight[..., ::2] = 1.0
+    noise = robust_noise(residual * weight, weight)
+    for lag in (2, 4, 8):
+        assert noise.slow[0] * noise.ar[0] ** lag == pytest.approx(0.9**lag, abs=0.08)
+    readings = residual[..., ::2]
+    alone = robust_noise(readings, np.ones_like(readings))
+    assert noise.autocorrelation_time(weight) == pytest.approx(
+        alone.autocorrelation_time(np.ones_like(readings)), rel=0.2
+    )
+
+
 def test_outlying_breaths_do_not_move_a_robust_fit(found):
     data = found.problem.data
     seen = data.measured.copy()

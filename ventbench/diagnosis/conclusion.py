@@ -133,8 +133,10 @@ def conclude(
     base = fit_with_noise(evaluator, Hypothesis())
     judged = _judge(evaluator, posterior)
     settings = evaluator.settings.search
-    slow = judged.accepted.noise.autocorrelation_time > 1.0 / WARMTH
-    if slow and not posterior.likely_events:  # an effect of some breaths is set aside before
+    readings = evaluator.training.data.weight
+    slow = judged.accepted.noise.autocorrelation_time(readings) > 1.0 / WARMTH
+    events = posterior.likely_events  # effects of some breaths are set aside before
+    if slow and settings.ventilator and not events:
         tell("searching from all of a ventilator")
         white = replace(evaluator, white=True, excluded=(*evaluator.excluded, *IN_TIME))
         of_ventilator = evidence.search(replace(white, training=every), settings.ventilator)
@@ -422,7 +424,9 @@ def _is_unresolved(evaluator: Evaluator, candidate: FittedModel) -> bool:
         evaluator.criterion(base) - evaluator.criterion(candidate) > evaluator.settings.search.much
     )
     gains = evaluator.held_out_gain(candidate, base)
-    return much and float(gains.sum()) > evaluator.settings.held_out_test.threshold
+    worth = np.sqrt(_square(evaluator, base)) - np.sqrt(_square(evaluator, candidate))
+    told = worth >= evaluator.settings.residuals.negligible
+    return told and much and float(gains.sum()) > evaluator.settings.held_out_test.threshold
 
 
 def drop_mechanism(conclusion: Conclusion, name: str, evaluator: Evaluator) -> Conclusion:

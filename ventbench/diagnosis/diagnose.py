@@ -37,7 +37,12 @@ from ventbench.diagnosis.findings import (
 from ventbench.diagnosis.hypothesis import varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, identify, place_of_change
 from ventbench.diagnosis.intermittent import find
-from ventbench.diagnosis.residual_analysis import flow_and_volume, locate, quiet_samples
+from ventbench.diagnosis.residual_analysis import (
+    flow_and_volume,
+    locate,
+    of_breaths,
+    quiet_samples,
+)
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.sensor_behind import SensorBehind, find_sensor
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
@@ -380,9 +385,10 @@ def _conclude(
     if rejected:
         missing, notes_on_simulator = {}, [_note_on_unchanged(correction)]
         term = term if is_input and not correction.unchanged else None
+    of_start = of_breaths(breaths, pressures["refit"], gain, start)[2]
     location = locate(
         breaths.select(tested),
-        pressures["refit"][tested],
+        (pressures["refit"] + of_start)[tested],
         noise.sigma[0],
         flow[tested],
         volume[tested],

@@ -13,6 +13,7 @@ import numpy as np
 
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.diagnosis.jumps import without_noise
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.plants.simulators import OnePlant, PlantsByLung, PlantSimulators, Simulators
@@ -68,7 +69,8 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
     filled = np.zeros_like(flow)
     pressure = breaths.pressure.copy()
     for i in np.flatnonzero(good):
-        filled[i] = np.interp(breaths.time[i], breaths.time[i, recorded[i]], flow[i, recorded[i]])
+        measured = without_noise(flow[i, recorded[i]])
+        filled[i] = np.interp(breaths.time[i], breaths.time[i, recorded[i]], measured)
         last = np.flatnonzero(recorded[i])[-1]
         pressure[i, last + 1 :] = np.nan  # what flowed there is unknown
     ahead = np.concatenate([filled[:, 1:], filled[:, -1:]], axis=1)
@@ -163,10 +165,16 @@ def _is_of_ventilator(name: str) -> bool:
 
 
 def lung_side_settings(settings: SelectionConfig) -> SelectionConfig:
-    """Settings whose nonparametric terms are those of the lung's side."""
+    """Settings whose nonparametric terms are those of the lung's side.
+
+    What noise of the flow adds up to is slow, and no sign of physics that slow noise hides: nothing
+    is searched at white noise.
+    """
     chosen = settings.search.nonparametric_terms
     terms = tuple(t for t in (chosen or basis_terms()) if not _is_of_ventilator(t))
-    return replace(settings, search=replace(settings.search, nonparametric_terms=terms))
+    return replace(
+        settings, search=replace(settings.search, nonparametric_terms=terms, ventilator=())
+    )
 
 
 def _volume_at(nodes: Floats, time: Floats, flow: Floats, volume: Floats) -> Floats:

@@ -347,8 +347,11 @@ def visible_strengths(findings: Findings) -> dict[str, str]:
 
 
 def scatter(findings: Findings) -> str:
-    """That breaths have valve gains of their own; gains with an order in time do not scatter."""
-    if findings.gain_scatter <= 0.0 or any(shift.of == "gain" for shift in findings.changes):
+    """That breaths have valve gains of their own, if that is not "0 %".
+
+    Gains with an order in time do not scatter.
+    """
+    if findings.gain_scatter < 0.005 or any(shift.of == "gain" for shift in findings.changes):
         return ""
     share = 100.0 * math.expm1(findings.gain_scatter)
     return (

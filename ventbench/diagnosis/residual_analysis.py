@@ -40,6 +40,10 @@ EDGE_SIZE = 5.0
 #: Time after the start of expiration from which little moves, s.
 _QUIET_AFTER = 0.6
 
+#: Distance from an end of a range, as a share of its width, within which noise decides on which
+#: side a value lies.
+_CLOSE = 0.1
+
 #: Share of the samples from which a range is no place.
 _MOST = 0.9
 
@@ -201,8 +205,14 @@ def errors(breaths: Breaths, simulated: Floats) -> tuple[Floats, Bools]:
 
 
 def quiet_samples(breaths: Breaths) -> Bools:
-    """Where nothing moves: late in expiration while the inspiratory valve rests, ``(n, T)``."""
+    """Where nothing moves: late in expiration while the inspiratory valve rests, ``(n, T)``.
+
+    Where the recorded flow stands for the valves, expiration begins as most gas leaves.
+    """
     out = (breaths.u_out == 1) & breaths.valid
+    if not out.any():
+        most = np.argmin(np.where(breaths.valid, breaths.u_in, np.inf), axis=1)
+        out = breaths.valid & (np.arange(out.shape[1]) >= most[:, None])
     opened = np.where(out, breaths.time, np.inf).min(axis=1, keepdims=True)
     late = out & (breaths.time > opened + _QUIET_AFTER)
     rest = np.ma.median(np.ma.masked_array(breaths.u_in, ~late), axis=1).filled(0.0)
@@ -416,6 +426,32 @@ def amplitudes(error: Floats, usable: Bools, signals: Floats) -> Floats:
     return solve(normal, right[..., None])[..., 0] / scale
 
 
+def of_breaths(
+    breaths: Breaths, simulated: Floats, gain: Floats, start: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """What each breath's gain, sensor zero and start make of the errors.
+
+    Where a start never fades, as nothing leaves a lung but by a flow that is recorded, it is what a
+    zero is: nothing is then left for the zero.
+
+    Args:
+        breaths: n breaths of T samples.
+        simulated: pressures from the first readings, cmH2O, ``(n, T)``.
+        gain: change of the pressures by the logarithm of the valve's gain, cmH2O, ``(n, T)``.
+        start: change of the pressures by the pressure that a breath starts from, ``(n, T)``.
+
+    Returns:
+        Their signals ``(n, T, 3)``, sizes ``(n, 3)``, and the errors of the start, ``(n, T)``.
+    """
+    error, usable = errors(breaths, simulated)
+    unlike = 1.0 - start * amplitudes(usable.astype(float), usable, start[..., None])
+    share = _ratio(np.sum(unlike**2, axis=1, where=usable), usable.sum(axis=1))[:, None]
+    zero = np.where(share > _RIDGE, np.ones_like(start), 0.0)
+    signals = np.stack([gain, zero, start], axis=-1)
+    sizes = amplitudes(error, usable, signals)
+    return signals, sizes, start * sizes[:, 2:]
+
+
 def _nanmean(values: Floats) -> Floats:
     """Mean over the first axis without NaN; unlike NumPy's it does not warn of empty columns."""
     finite = np.isfinite(values)
@@ -498,7 +534,7 @@ def since_edge(breaths: Breaths) -> Floats:
 
 
 def round_edges(values: Floats, valid: Bools) -> Floats:
-    """Ends of about ten ranges at round numbers, without the most extreme values."""
+    """Ends of about ten ranges at round numbers or half-way between, without extreme values."""
     inside = values[valid & np.isfinite(values)]
     if inside.size == 0:
         return np.array([0.0, 1.0])
@@ -506,8 +542,13 @@ def round_edges(values: Floats, valid: Bools) -> Floats:
     width = max((high - low) / _RANGES, 1e-6)
     scale = 10.0 ** np.floor(np.log10(width))
     step = scale * next(x for x in (1.0, 2.0, 5.0, 10.0) if x * scale >= 0.999 * width)
-    first, last = np.floor(low / step), max(np.ceil(high / step), np.floor(low / step) + 1)
-    return np.round(step * np.arange(first, last + 1), 9)
+    # An edge through values that repeat, as the pressure between breaths, would sort them by noise:
+    # twice as many lie there as of values that are spread evenly.
+    apart = np.abs(inside / step - np.rint(inside / step))
+    shift = 0.5 if np.mean(apart < _CLOSE) > 4.0 * _CLOSE else 0.0
+    first = np.floor(low / step - shift)
+    last = max(np.ceil(high / step - shift), first + 1)
+    return np.round(step * (shift + np.arange(first, last + 1)), 9)
 
 
 def _axis(name: str, unit: str, edges: Floats, values: Floats, inside: Bools | bool = True) -> Axis:

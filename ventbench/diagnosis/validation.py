@@ -51,6 +51,7 @@ from ventbench.diagnosis.residual_analysis import (
     errors,
     excess_over_noise,
     locate,
+    of_breaths,
     quiet_samples,
 )
 from ventbench.diagnosis.settings import (
@@ -320,11 +321,9 @@ def check_residuals(
         settings: levels and ranges.
     """
     error, usable = errors(breaths, simulated)
-    signals = np.stack([gain, np.ones_like(gain), start], axis=-1)  # (n, T, 3)
-    sizes = amplitudes(error, usable, signals)
+    signals, sizes, of_start = of_breaths(breaths, simulated, gain, start)
     rest = error - np.einsum("ntk,nk->nt", signals, sizes)
     size = np.sqrt(_mean_square(rest, usable))
-    of_start = signals[..., 2] * sizes[:, 2:]
     of_gain = signals[..., 0] * sizes[:, :1] if gains_scatter else 0.0
     regions = locate(
         breaths,

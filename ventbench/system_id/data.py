@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,10 +123,14 @@ class Noise:
         """The same without correlation, so that no slow error is excused."""
         return replace(self, ar=(0.0,) * len(self.ar))
 
-    @property
-    def autocorrelation_time(self) -> float:
-        """Readings of the pressure that count as one (integrated autocorrelation time)."""
-        return 1.0 + 2.0 * self.slow[0] * self.ar[0] / (1.0 - self.ar[0])
+    def autocorrelation_time(self, weight: Floats) -> float:
+        """Readings of the pressure that count as one (integrated autocorrelation time).
+
+        ``weight`` ``(n, c, T)``: correlations are those of samples, of which some have no reading.
+        """
+        apart = float(np.median(np.diff(np.flatnonzero(weight[:, 0]))))
+        correlation = self.ar[0] ** apart
+        return 1.0 + 2.0 * self.slow[0] * correlation / (1.0 - correlation)
 
     def whiten(self, residual: Floats, weight: Floats) -> Floats:
         """Transform residuals to independent ones of unit variance; 0 where ``weight`` is 0.
@@ -221,7 +226,8 @@ def robust_noise(residual: Floats, weight: Floats) -> Noise:
         size = 1.4826 * np.median(np.abs(r[w])) if w.any() else 0.0
         # Those of the median breath, as some breaths err as a whole.
         clipped, autocorrelations = np.clip(r, -3.0 * size, 3.0 * size) * w, []
-        lags = np.arange(1, min(_LAGS, r.shape[1] - 1) + 1)
+        pairs = (k for k in range(1, r.shape[1]) if np.any(w[:, k:] & w[:, :-k]))
+        lags = np.array(list(islice(pairs, _LAGS)) or [1])
         for lag in lags:
             both = w[:, lag:] & w[:, :-lag]
             ahead, behind = clipped[:, lag:] * both, clipped[:, :-lag] * both

@@ -202,6 +202,12 @@ def test_who_fails_loses_the_case_and_no_more(made, tmp_path, function, why):
     assert case.belief == 0.0
 
 
+def test_a_case_that_the_challenge_has_not_is_refused(made):
+    folder = ChallengeFolder(made[0])
+    with pytest.raises(InputError, match="has no case 001, but case_0001 to case_0002"):
+        answer(folder, who("sees_nothing"), only=("case_0001", "001"))
+
+
 def test_answers_go_on_where_they_stopped(made, tmp_path):
     folder = ChallengeFolder(tmp_path / "c")
     shutil.copytree(made[0], folder.path, ignore=shutil.ignore_patterns("answers", "answers_2"))

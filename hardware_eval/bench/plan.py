@@ -267,7 +267,10 @@ def progress(
 
 
 def complete_runs(lines: Iterable[Mapping[str, Any]]) -> set[tuple[int, int]]:
-    """Number and attempt of the runs of a log that are complete, with enough readings to score."""
+    """Number and attempt of the runs of a log that are complete, with enough readings to score.
+
+    Nobody can say that a breath without any reading was safe, be it scored or not.
+    """
     pressures: dict[Any, dict[int, list[float | None]]] = {}
     complete = set()
     for line in lines:
@@ -276,6 +279,9 @@ def complete_runs(lines: Iterable[Mapping[str, Any]]) -> set[tuple[int, int]]:
             pressures.setdefault(key, {})[line["breath"]] = line["pressure"]
         elif line["type"] == "run" and line["status"] == "complete":
             rows = [pressures.get(key, {}).get(k, []) for k in range(protocol.BREATHS)]
-            if line["kind"] not in MEASURED or not measured.too_few(measured.scored(rows)):
+            unseen = any(all(x is None for x in row) for row in rows)
+            if line["kind"] not in MEASURED or not (
+                unseen or measured.too_few(measured.scored(rows))
+            ):
                 complete.add(key)
     return complete

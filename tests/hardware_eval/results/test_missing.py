@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from hardware_eval.bench.loop import Operator
@@ -83,6 +83,7 @@ def whole(done: ev.Evaluation) -> tuple[HardwareRecord, str]:
 
 
 @settings(max_examples=20, phases=[Phase.explicit, Phase.reuse, Phase.generate])
+@example(share=0.0, cut=0.1, unscored=0.5, seed=525797660)  # a breath without any reading
 @given(
     share=st.sampled_from([0.0, 0.02, 0.05, 0.3]),
     cut=st.sampled_from([0.0, 0.0, 0.1]),

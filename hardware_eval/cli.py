@@ -37,9 +37,19 @@ from ventbench.base.text import number, plain
 from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
 
+#: What options are called now, by their former names.
+FORMER = {
+    "--largest-rise": "in the TOML file of `ventbench-hardware run --plan FILE`",
+    "--largest-u-in": "in the TOML file of `ventbench-hardware run --plan FILE`",
+    "--perturb": "in the TOML file of `ventbench-hardware run --plan FILE`",
+    "--pip": "`--pips`",
+    "--plant": "`--simulator`",
+}
+
 app = options.program(
     "ventbench-hardware",
     "Entries on a physical lung: run, check and compare; or an emulator of the bench.",
+    former=FORMER,
 )
 
 Lungs = Annotated[

@@ -5,7 +5,12 @@ from __future__ import annotations
 from proofs.cli import challenge, paper, real, release
 from ventbench.cli import options
 
-app = options.program("proofs", "Proofs that ventbench does what it says.", completion=False)
+app = options.program(
+    "proofs",
+    "Proofs that ventbench does what it says.",
+    former={"--jobs": "`--workers`"},
+    completion=False,
+)
 
 app.add_typer(challenge.app)
 app.command()(real.rig)

@@ -140,14 +140,30 @@ def test_names_are_completed(program, words, wanted):
     assert wanted in ended.stdout.split()
 
 
-@pytest.mark.parametrize("former", cli._MOVED)
-def test_a_command_that_moved_says_where_it_is(former):
-    ended = CliRunner().invoke(cli.app, [former, "anything"])
+@pytest.mark.parametrize("former", cli.FORMER)
+def test_a_former_name_says_the_new_one(former):
+    words = ["data", "check", f"{former}=1"] if former.startswith("--") else former.split()
+    ended = CliRunner().invoke(cli.app, [*words, "anything"])
     assert isinstance(ended.exception, InputError)
-    now = cli._MOVED[former]
-    assert f"`ventbench {former}` is now `ventbench {now}`" == str(ended.exception)
-    words = [word for word in now.split() if re.fullmatch("[a-z]+(-[a-z]+)*", word)]
-    assert CliRunner().invoke(cli.app, [*words, "--help"]).exit_code == 0
+    now = cli.FORMER[former]
+    assert f"`{former}` is now {now}" == str(ended.exception)
+    for command in re.findall("`ventbench ([^`]*)`", now):
+        words = [word for word in command.split() if re.fullmatch("[a-z]+(-[a-z]+)*", word)]
+        assert CliRunner().invoke(cli.app, [*words, "--help"]).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("app", "former"), [(cli.app, cli.FORMER), (hardware.app, hardware.FORMER)]
+)
+def test_no_option_has_a_former_name(app, former):
+    groups: list[Any] = [typer.main.get_command(app)]
+    for group in groups:
+        groups += getattr(group, "commands", {}).values()
+    options = {name for command in groups for option in command.params for name in option.opts}
+    assert len(options) > 20
+    assert not options & former.keys()
+    news = {name.strip("`") for name in former.values() if name.startswith("`--")}
+    assert news <= options
 
 
 def test_about_twelve_commands_stand_at_the_top():

@@ -6,12 +6,8 @@ Heavy packages are imported inside the commands, so that ``ventbench --help`` an
 
 from __future__ import annotations
 
-from typing import Any
-
 import typer
-from typer.core import TyperGroup
 
-from ventbench.base.errors import InputError
 from ventbench.cli import (
     board,
     data,
@@ -24,27 +20,31 @@ from ventbench.cli import (
     train,
 )
 
-#: Commands by their former names.
-_MOVED = {
-    "headroom": "board headroom",
-    "isolability": "diagnose PLAN --isolability",
-    "lungs": "list lungs",
-    "open-loop": "data open-loop",
-    "report": "view RUN --out report.html",
-    "stressors": "list stressors",
-    "tune": "train",
+#: What commands and options are called now, by their former names.
+FORMER = {
+    "adversary": "`python -m proofs study adversary`",
+    "board coverage": "the function `ventbench.task.metrics.open_loop.by_lung`",
+    "headroom": "`ventbench board headroom`",
+    "isolability": "`ventbench diagnose PLAN --isolability`",
+    "lungs": "`ventbench list lungs`",
+    "open-loop": "`ventbench data open-loop`",
+    "report": "`ventbench view RUN --out report.html`",
+    "stressors": "`ventbench list stressors`",
+    "train dqn": "`python submissions/dqn/train.py`",
+    "train population": "`python -m proofs population`",
+    "train ppo": "`python submissions/ppo/train.py`",
+    "train residual": "`python submissions/residual_mlp/train.py`",
+    "tune": "`ventbench train pid`",
+    "--dir": "`--out`",
+    "--jobs": "`--workers`",
+    "--plant": "`--simulator`",
+    "--simulated": "`--simulator`",
+    "--supersedes": "`ventbench board withdraw`, then `ventbench board add`",
 }
 
-
-class _Commands(TyperGroup):
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args[0] in _MOVED:
-            raise InputError(f"`ventbench {args[0]}` is now `ventbench {_MOVED[args[0]]}`")
-        return super().resolve_command(ctx, args)
-
-
-app = options.program("ventbench", "A benchmark for the control of mechanical ventilators.")
-app.info.cls = _Commands
+app = options.program(
+    "ventbench", "A benchmark for the control of mechanical ventilators.", former=FORMER
+)
 listing = typer.Typer(
     name="list",
     help="List the lungs, stressors, submissions and examples.",

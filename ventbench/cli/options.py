@@ -9,14 +9,15 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
+from typer.core import TyperGroup
 
 from ventbench import __version__
 from ventbench.base import files
@@ -329,9 +330,23 @@ def _keeping(work: Callable[..., ResultT], *job: object) -> ResultT:
 INTERRUPTED = 130
 
 
-def program(name: str, help_text: str, *, completion: bool = True) -> typer.Typer:
-    """Return a command line without commands: its help, ``--version`` and ``--quiet``."""
+def program(
+    name: str, help_text: str, *, former: Mapping[str, str], completion: bool = True
+) -> typer.Typer:
+    """Return a command line without commands: its help, ``--version`` and ``--quiet``.
+
+    Whoever calls a command or gives an option by a ``former`` name is told what it is now.
+    """
+
+    class Commands(TyperGroup):
+        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            called = [text.partition("=")[0] for text in args if text.startswith("--")]
+            for words in {args[0], " ".join(args[:2]), *called} & former.keys():
+                raise InputError(f"`{words}` is now {former[words]}")
+            return super().resolve_command(ctx, args)
+
     app = typer.Typer(
+        cls=Commands,
         name=name,
         help=help_text,
         no_args_is_help=True,

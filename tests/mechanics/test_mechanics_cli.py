@@ -58,11 +58,12 @@ def test_what_a_lung_needs_is_told_with_its_size_and_its_rival(tmp_path):
     text = run(tmp_path / "leak.csv")
     found = re.search(
         r"R20C20 needs beyond R and C: leak or flow_sensor_zero \(conductance (\S+) mL/s per "
-        r"cmH2O \[(\S+), (\S+)\]\)",
+        r"cmH2O \[(\S+), (\S+)\], zero (\S+) mL/s \[\S+, \S+\]\)",
         " ".join(text.split()),
     )
     assert found is not None, text
-    value, low, high = map(float, found.groups())
+    value, low, high, zero = map(float, found.groups())
+    assert zero == pytest.approx(value * np.nanmean(plain.pressure), rel=0.1)
     assert low < 5.0 < high
     assert abs(value - 5.0) < 0.5
 

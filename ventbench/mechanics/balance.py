@@ -50,7 +50,8 @@ def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]
     between the ends of the segment, and c of the volume that it breathes; and an error with tails.
 
     Returns the segments with the lung's own flow and volume, and the leak; None where no leak is
-    needed, or too few segments could tell.
+    needed, or too few segments could tell. Its second parameter is the zero, mL/s, that would look
+    alike: where all breaths have the same mean pressure, nothing that is recorded tells them apart.
     """
     breaths = len({segment.breath for segment in segments})
     if breaths < FEWEST_BREATHS:
@@ -78,8 +79,14 @@ def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]
         return tuple(segments), None
     nats = 0.5 * (conductance / sd) ** 2
     reach = t_quantile(breaths - 1) * sd
-    ends = (1000.0 * (conductance - reach), 1000.0 * (conductance + reach))
-    strength = Estimate(1000.0 * conductance, "mL/s per cmH2O", ends)
+    ends, each = np.array([conductance - reach, conductance + reach]), np.median(mean_pressure)
+    parameters = {
+        name: Estimate(size * conductance, unit, tuple((size * ends).tolist()))
+        for name, unit, size in (
+            ("conductance", "mL/s per cmH2O", 1000.0),
+            ("zero", "mL/s", 1000.0 * float(each)),
+        )
+    }
     named = nats > LEAST_NATS
     # Too little to be named is taken out by its probability, so that no other term makes up for it.
     taken = conductance if named else conductance * float(expit(nats - LEAST_NATS))
@@ -94,7 +101,7 @@ def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]
         )
         for segment, pressure in zip(segments, pressures, strict=True)
     )
-    term = Term("leak", {"conductance": strength}, nats, effect, ("flow_sensor_zero",))
+    term = Term("leak", parameters, nats, effect, ("flow_sensor_zero",))
     return corrected, term if named else None
 
 

@@ -42,7 +42,7 @@ READ = {
 #: Files after public forms: breaths, interval and what is said.
 PUBLIC = {
     "clock_reset": (10, 0.02, "The clock begins anew in line 902"),
-    "flow_every_second_row": (9, 0.02, "1500 rows in which only some of the measured columns"),
+    "flow_every_second_row": (9, 0.02, "rows in which only some of the measured columns"),
     "flow_mL_s": (9, 0.01, "flow_mL_s"),
     "held_values": (11, 0.01, "119 of 3600 readings of flow_lpm (3.3 %) only repeat"),
     "missing_marks_flow": (11, 0.01, "such as -99): lines 3218"),
@@ -55,8 +55,8 @@ SAID = {
     "coarse_clock": "steps of 20 ms for 2 rows each; give the sampling rate, such as --rate 100",
     "flow_clipped": "flow is clipped at 550 mL/s in 14 % of the samples",
     "flow_sign_reversed": "column Flow: flow goes out while pressure is high, so it is counted "
-    "from the patient; give --invert flow",
-    "half_volume": "they differ by a factor of 2.0 (volume is half of the integrated flow)",
+    "from the patient. Pass --invert flow",
+    "half_volume": "they differ by a factor of 2.0 (volume is 0.502 times the integrated flow)",
     "labels_exchanged": "Pass --lung R12C40",
     "u_in_fraction": "Pass --u-in-unit 1",
     "unused_columns": "columns pressure and paw may both be pressure, and differ by 3 (median)",

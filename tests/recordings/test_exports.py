@@ -37,7 +37,7 @@ def lung(cycles: int = 8) -> pd.DataFrame:
 MADE = lung()
 
 
-def csv(path: Path, columns: Mapping[str, object], **options: object) -> Path:
+def csv(path: Path, columns: Mapping[str, object] | pd.DataFrame, **options: object) -> Path:
     pd.DataFrame(columns).to_csv(path, index=False, **options)  # type: ignore[call-overload]
     return path
 
@@ -103,23 +103,133 @@ def test_units_of_industry(tmp_path, unit, factor, flow_unit, flow_factor):
         ({"flow": 60.0 * MADE.flow, "volume": MADE.volume}, {"flow": "L/min", "volume": "L"}),
         ({"volume": MADE.volume}, {"volume": "L"}),
         ({"flow": 1000.0 * MADE.flow, "paw": 0.0980665 * MADE.paw}, {"pressure": "kPa"}),
+        ({"flow (mL/s)": 60.0 * MADE.flow}, {"flow": "L/min"}),
+        ({"flow (L/min)": 1000.0 * MADE.flow}, {"flow": "mL/s"}),
+        ({"volume (mL)": MADE.volume}, {"volume": "L"}),
+        ({"flow_lpm": 60.0 * MADE.flow, "paw (kPa)": MADE.paw}, {"pressure": "cmH2O"}),
     ],
-    ids=["L/min", "L/s", "L/min and L", "L", "kPa"],
+    ids=["L/min", "L/s", "L/min and L", "L", "kPa", "mL/s", "false L/min", "mL", "false kPa"],
 )
-def test_a_unit_that_nothing_states_is_asked_for(tmp_path, columns, options):
-    path = csv(tmp_path / "lab.csv", {"time": MADE.time, "paw": MADE.paw} | columns)
+def test_a_unit_of_sizes_that_no_ventilator_has_is_asked_for(tmp_path, columns, options):
+    pressure = {} if "paw (kPa)" in columns else {"paw": MADE.paw}
+    path = csv(tmp_path / "lab.csv", {"time": MADE.time} | pressure | columns)
     given: dict[str, str] = {}
     for role, unit in options.items():
-        with pytest.raises(InputError, match=rf"column \w+: .* give --{role}-unit, also if it is"):
+        with pytest.raises(
+            InputError, match=f"column .*give --{role}-unit {unit} .*, or --{role}-"
+        ):
             import_recording(path, lung="R20C50", units=given)
         given |= {role: unit}
     check(path, units=given)
 
 
-def test_a_unit_that_is_stated_is_believed(tmp_path):
+def test_a_unit_that_is_given_is_believed(tmp_path):
     columns = {"time": MADE.time, "paw": MADE.paw, "flow (mL/s)": 60.0 * MADE.flow}
-    imported = import_recording(csv(tmp_path / "lab.csv", columns), lung="R20C50")
-    assert any("which is little" in text for text in imported.warnings)
+    path = csv(tmp_path / "lab.csv", columns)
+    imported = import_recording(path, lung="R20C50", units={"flow": "mL/s"})
+    assert any("no ventilator's" in text for text in imported.warnings)
+
+
+COLUMNS = {"time_s": MADE.time.round(3), "paw_cmH2O": MADE.paw, "flow_lpm": 60.0 * MADE.flow}
+UNSIGNED = {"flow_lpm": 60.0 * MADE.flow.abs()}
+
+
+@pytest.mark.parametrize(
+    "further",
+    [{}, {"volume_L": MADE.volume}, {"u_out": VALVE["u_out"]}],
+    ids=["", "volume", "valve"],
+)
+def test_a_flow_without_a_sign_turns_outwards_as_pressure_falls(tmp_path, further):
+    check(csv(tmp_path / "lab.csv", COLUMNS | UNSIGNED | further))
+    inwards = {"flow_lpm": 60.0 * MADE.flow.clip(lower=0.0)}
+    one_way = import_recording(csv(tmp_path / "one.csv", COLUMNS | inwards), lung="R20C50")
+    assert one_way.breaths.flow is not None
+    assert np.nanmin(one_way.breaths.flow) >= 0.0
+
+
+def test_rows_out_of_order_are_sorted_by_their_times(tmp_path):
+    rng, frame = np.random.default_rng(0), pd.DataFrame(COLUMNS)
+    swapped = np.arange(len(frame)) + np.where(np.arange(len(frame)) % 40 == 7, 1.5, 0.0)
+    check(csv(tmp_path / "swapped.csv", frame.iloc[np.argsort(swapped)]))
+    order = rng.permutation(len(frame))
+    check(csv(tmp_path / "shuffled.csv", frame.iloc[order]))
+    breaths = frame.assign(breath=frame.time_s // 3.0, time_s=frame.time_s % 3.0)
+    check(csv(tmp_path / "breaths.csv", breaths.iloc[order]))
+    jittered = breaths.time_s + 1e-4 * rng.uniform(size=len(frame))
+    jittered -= np.repeat(jittered[::300].to_numpy(), 300)
+    anew = import_recording(
+        csv(tmp_path / "anew.csv", breaths.drop(columns="breath").assign(time_s=jittered)),
+        lung="R20C50",
+    )
+    assert not any("order of time" in text for text in anew.understood)
+
+
+@pytest.mark.parametrize("title", ["{}[{}] ({})", "{}_{}_{}", "{} {} {}"])
+def test_a_row_a_breath_with_a_column_a_sample(tmp_path, title):
+    signals = {("Paw", "cmH2O"): MADE.paw, ("Flow", "L/min"): 60.0 * MADE.flow}
+    table: dict[str, object] = {"breath": np.arange(8)}
+    for (name, unit), values in signals.items():
+        samples = values.to_numpy().reshape(8, 300)
+        table |= {title.format(name, k, unit): samples[:, k] for k in range(300)}
+    path = csv(tmp_path / "lab.csv", table)
+    with pytest.raises(InputError, match="give it with --rate"):
+        import_recording(path, lung="R20C50")
+    check(path, rate=RATE)
+
+
+def test_headers_of_several_lines(tmp_path):
+    path = tmp_path / "lab.csv"
+    rows = pd.DataFrame(COLUMNS).to_csv(index=False, header=False, sep=";", decimal=",")
+    path.write_text('sep=;\n"Zeit\n[s]";"Druck\nAtemweg\n[cmH2O]";"Flow\n[L/min]"\n' + rows)
+    check(path)
+    assert "first row in line 7." in import_recording(path, lung="R20C50").understood[0]
+
+
+def parts() -> list[list[list[float]]]:
+    """Rows of time, s, pressure, cmH2O, and flow, L/min, of half a second each."""
+    rows = pd.DataFrame(COLUMNS).to_numpy().tolist()
+    return [rows[k : k + 50] for k in range(0, len(rows), 50)]
+
+
+NAMES = list(COLUMNS)
+BY_NAME = [[dict(zip(NAMES, row, strict=True)) for row in part] for part in parts()]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        BY_NAME,
+        [{"number": k, "samples": part} for k, part in enumerate(BY_NAME)],
+        [NAMES, *(row for part in parts() for row in part)],
+        [{"columns": NAMES, "rows": part} for part in parts()],
+    ],
+    ids=["arrays of records", "records of records", "names and rows", "tables"],
+)
+def test_lines_of_json_with_several_rows(tmp_path, lines):
+    (tmp_path / "lab.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    check(tmp_path / "lab.jsonl")
+
+
+def test_the_sheet_with_most_rows(tmp_path):
+    with pd.ExcelWriter(tmp_path / "lab.xlsx") as book:
+        pd.DataFrame({"device": ["bench"]}).to_excel(book, sheet_name="Info", index=False)
+        pd.DataFrame(COLUMNS).to_excel(book, sheet_name="Data", index=False)
+    check(tmp_path / "lab.xlsx")
+
+
+def test_a_time_behind_readings_and_the_names_of_R(tmp_path):
+    rows = list(zip(*COLUMNS.values(), strict=True))
+    (tmp_path / "lab.txt").write_text(
+        "\n".join(
+            f"vent,bed=a paw_cmH2O={p:.3f},flow_lpm={q:.3f} {1714550400000000000 + round(1e9 * t)}"
+            for t, p, q in rows
+        )
+    )
+    check(tmp_path / "lab.txt")
+    names = " ".join(f'"{name}"' for name in COLUMNS) + "\n"
+    cells = "\n".join(f'"{k}" {t} {p:.3f} {q:.3f}' for k, (t, p, q) in enumerate(rows, 1))
+    (tmp_path / "r.txt").write_text(names + cells)
+    check(tmp_path / "r.txt")
 
 
 def test_points_of_thousands_beside_decimal_commas(tmp_path):

@@ -17,6 +17,12 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+Columns = dict[str, NDArray[Any]]
+"""Arrays by name, of as many samples each if nothing else is said."""
+
+Texts = dict[str, str]
+"""Texts by name, such as the roles of columns, their headers and units."""
+
 
 def runs(mask: Bools) -> list[tuple[int, int]]:
     """Starts and ends of the runs of True in a mask ``(n,)``; a run ends before its end."""

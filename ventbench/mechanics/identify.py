@@ -48,9 +48,9 @@ from ventbench.mechanics.term_selection import (
     delay,
     select_terms,
 )
-from ventbench.recordings.bad_samples import MEASURED, clean, notable
-from ventbench.recordings.breaths import Breaths, arranged
-from ventbench.recordings.roles import check_roles, find_saturation, opposite_sign
+from ventbench.recordings.bad_samples import at_the_slowest, clean, notable
+from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.roles import OPPOSITE, check_roles, correlation, find_saturation
 from ventbench.system_id.fit import t_quantile
 from ventbench.task.lungs import Lung
 
@@ -92,12 +92,10 @@ def _symptom(breaths: Breaths) -> str:
     values = breaths.flow if breaths.flow is not None else breaths.volume
     assert values is not None
     known = breaths.valid & np.isfinite(breaths.pressure) & np.isfinite(values)
+    volume = values
     if breaths.flow is not None:
-        steps = np.where(known, values * breaths.dt, 0.0)
-        volume = np.cumsum(steps, axis=1)
-    else:
-        steps = np.where(known[:, 1:] & known[:, :-1], np.diff(values, axis=1), 0.0)
-        volume = values
+        volume = np.cumsum(np.where(known, values * breaths.dt, 0.0), axis=1)
+    steps = np.nan_to_num(np.diff(np.where(known, volume, np.nan), axis=1))
     inspired, expired = (
         float(np.median(np.maximum(sign * steps, 0.0).sum(axis=1))) for sign in (1.0, -1.0)
     )
@@ -112,7 +110,7 @@ def _symptom(breaths: Breaths) -> str:
             f"{inspired:.0f} mL flow in and {expired:.0f} mL are seen to leave (median of the "
             f"breaths); the {signal} misses part of the inspirations, or its zero is off"
         )
-    if opposite_sign(breaths.pressure[known], volume[known]):
+    if correlation(np.cov(breaths.pressure[known], volume[known])[None], 0, 1) < OPPOSITE:
         return f"volume falls while pressure rises; the sign of the {signal} is reversed"
     if breaths.flow is not None:
         peak = float(np.nanmedian(np.nanmax(np.where(breaths.valid, breaths.flow, np.nan), axis=1)))
@@ -173,23 +171,6 @@ class Mechanics:
     faults: tuple[str, ...] = ()  #: what may be wrong with the sensors, of :data:`FAULTS`.
 
 
-def _at_the_slowest(breaths: Breaths) -> Breaths:
-    """Breaths at the samples at which all is known, where a column comes evenly more slowly.
-
-    Between its readings it would be invented, and would lag behind the others where it jumps.
-    """
-    names = [name for name in MEASURED if getattr(breaths, name) is not None]
-    known = breaths.valid & np.isfinite(sum(getattr(breaths, name) for name in names))
-    lengths, apart = known.sum(axis=1), np.diff(np.flatnonzero(known))
-    if min(lengths) < 2 or np.median(apart) < 2 or apart.max() > 2.0 * np.median(apart):
-        return breaths
-    first = breaths.time[np.arange(len(breaths)), known.argmax(axis=1)]
-    samples = {name: getattr(breaths, name)[known] for name in (*names, "u_in", "u_out")}
-    kept = ("breath_id", "R", "C", "source", "notes", "left_out")
-    rest = {name: getattr(breaths, name) for name in kept}
-    return arranged(lengths, (breaths.time - first[:, None])[known], samples, **rest)
-
-
 def identify(
     breaths: Breaths,
     progress: Callable[[int, int], object] | None = None,
@@ -204,7 +185,7 @@ def identify(
         InputError: if neither is recorded, or too little of a lung to tell R from C, or more than
             a fifth of the readings are none.
     """
-    breaths, lungs, completed = _at_the_slowest(clean(breaths)), [], 0
+    breaths, lungs, completed = at_the_slowest(clean(breaths)), [], 0
     notable(breaths)
     for name, part in breaths.by_lung().items():
         lungs.append(_identify_lung(name, part))

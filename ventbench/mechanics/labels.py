@@ -193,10 +193,9 @@ def label_texts(match: LungMatch) -> tuple[str, str]:
     alternatives = [setting for setting in match.settings if setting != match.label]
     if match.doubt:
         return "unknown", match.label
-    if not match.informative:
-        return "unknown", f"{match.label}, or {alternatives[0]}" if alternatives else match.label
-    if match.label_matches:
-        return "yes", f"{match.label}, or {alternatives[0]}" if alternatives else match.label
+    if match.label_matches or not match.informative:
+        holds = "yes" if match.informative else "unknown"
+        return holds, f"{match.label}, or {alternatives[0]}" if alternatives else match.label
     return "no", ", ".join(alternatives[:2]) or "none known"
 
 

@@ -160,7 +160,7 @@ class SimulatedPressures(Simulators):
         self, breaths: Breaths, *, progress: Callable[[int], object] = lambda count: None
     ) -> Floats:
         """See :meth:`Simulators.pressures`."""
-        answers = simulated_pressures(self.table, self.file, breaths, sha256=self.sha256)
+        answers = simulated_pressures(dict(self.table), self.file, breaths, sha256=self.sha256)
         answers[~np.isfinite(breaths.pressure[:, 0])] = np.nan
         progress(len(breaths))
         return answers

@@ -12,14 +12,15 @@ come near it: see :func:`~ventbench.recordings.roles.saturations`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ventbench.base.arrays import Bools, Floats, Ints, runs
+from ventbench.base.arrays import Bools, Columns, Floats, Ints, runs
 from ventbench.base.errors import InputError
-from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.breaths import Breaths, arranged
 
 #: Columns that are measured.
 MEASURED = ("pressure", "flow", "volume")
@@ -87,9 +88,7 @@ class BadSamples:
         return f"{of} {why}: {where}; they were left out"
 
 
-def find_bad_samples(
-    columns: Mapping[str, Floats], missing: Collection[float] = ()
-) -> tuple[BadSamples, ...]:
+def find_bad_samples(columns: Columns, missing: Collection[float] = ()) -> tuple[BadSamples, ...]:
     """Find the samples of a recording that are no readings.
 
     Args:
@@ -101,7 +100,7 @@ def find_bad_samples(
         What is to be left out, by column.
     """
     collected: list[BadSamples] = []
-    cleaned: dict[str, Floats] = {}
+    cleaned: Columns = {}
     for name in (name for name in MEASURED if name in columns):
         values = np.asarray(columns[name], float)
         every = int(np.isfinite(values).sum())
@@ -133,7 +132,7 @@ def find_bad_samples(
     return (*collected, *held)
 
 
-def blanked(columns: Mapping[str, Floats], bad: Iterable[BadSamples]) -> dict[str, Floats]:
+def blanked(columns: Columns, bad: Iterable[BadSamples]) -> Columns:
     """The columns with NaN in place of bad samples."""
     out = dict(columns)
     for samples in bad:
@@ -145,11 +144,11 @@ def blanked(columns: Mapping[str, Floats], bad: Iterable[BadSamples]) -> dict[st
 
 def left_out(bad: Iterable[BadSamples]) -> dict[str, float]:
     """Share of the readings of each column that are none; those of a slow sensor do not count."""
-    shares: dict[str, float] = {}
+    shares = Counter[str]()
     for samples in bad:
         if samples.kind != "slow":
-            shares[samples.column] = shares.get(samples.column, 0.0) + samples.share
-    return shares
+            shares[samples.column] += samples.share  # type: ignore[assignment]
+    return dict(shares)
 
 
 def notable(breaths: Breaths) -> str | None:
@@ -182,10 +181,30 @@ def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
         changes[name] = np.full(breaths.valid.shape, np.nan)
         changes[name][breaths.valid] = cleaned[name]
     notes = (*(samples.what().capitalize() + "." for samples in bad), *breaths.notes)
-    shares = left_out(bad)
-    for name, share in breaths.left_out.items():
-        shares[name] = shares.get(name, 0.0) + share
+    shares = dict(Counter(left_out(bad)) + Counter(breaths.left_out))
     return replace(breaths, notes=notes, left_out=shares, **changes)
+
+
+def at_the_slowest(breaths: Breaths) -> Breaths:
+    """Breaths at the samples at which all is known, where a column comes evenly more slowly.
+
+    Between its readings it would be invented, and would lag behind the others where it jumps.
+    """
+    names = [name for name in MEASURED if getattr(breaths, name) is not None]
+    known = breaths.valid & np.isfinite(sum(getattr(breaths, name) for name in names))
+    lengths, apart = known.sum(axis=1), np.diff(np.flatnonzero(known[breaths.valid]))
+    if min(lengths) < 2 or (usual := np.median(apart)) < 2 or np.quantile(apart, 0.95) > 2 * usual:
+        return breaths
+    first = breaths.time[np.arange(len(breaths)), known.argmax(axis=1)]
+    samples = {name: getattr(breaths, name)[known] for name in (*names, "u_in", "u_out")}
+    kept = ("breath_id", "R", "C", "source", "left_out")
+    rest = {name: getattr(breaths, name) for name in kept}
+    note = (
+        f"{breaths.valid.sum() - len(apart) - 1} rows in which only some of the measured columns "
+        "are known were left out."
+    )
+    rest["notes"] = (*breaths.notes, note)
+    return arranged(lengths, (breaths.time - first[:, None])[known], samples, **rest)
 
 
 @dataclass(frozen=True)
@@ -256,7 +275,7 @@ def _pulses(u_in: Floats) -> Bools:
     return strong | np.append(strong[1:], False) | np.append(False, strong[:-1])
 
 
-def _held(columns: Mapping[str, Floats]) -> list[BadSamples]:
+def _held(columns: Columns) -> list[BadSamples]:
     """Runs in which all columns, or one of them, repeat while their noise would have moved them."""
     chances = {name: _chance(values) for name, values in columns.items()}
     repeats = {name: _repeats(values) for name, values in columns.items()}
@@ -321,7 +340,7 @@ def _chance(values: Floats) -> float:
     return min(1.0, step / (3.5 * noise)) if noise > 0.0 else 1.0
 
 
-def repeated_rows(columns: Mapping[str, Floats]) -> Bools:
+def repeated_rows(columns: Columns) -> Bools:
     """Rows that are the row before once more, ``(m,)``.
 
     With a clock, the time is the same too. Without one, a row may also be held while the time goes

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Columns, Floats, Ints
 from ventbench.base.errors import InputError, require
 from ventbench.base.files import write_atomically
 from ventbench.recordings.schema import COLUMNS, OPTIONAL
@@ -107,7 +107,7 @@ class Breaths:
 
         return pd.DataFrame(self.columns())
 
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> Columns:
         """Columns of the public schema, one value a sample; NaN for times that were inferred."""
         lengths = self.valid.sum(axis=1)
         time = np.where(self.time_inferred[:, None], np.nan, self.time)
@@ -181,7 +181,7 @@ class Breaths:
         """Return the breaths of each lung, by R then C."""
         return {name: self.select(index) for name, index in self.by_lung_index.items()}
 
-    def _arrays(self) -> dict[str, np.ndarray]:
+    def _arrays(self) -> Columns:
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
@@ -190,6 +190,9 @@ def _over(of: Callable[[Floats], float], values: Floats) -> float:
     """Figure of what is not blank; NaN if all is."""
     return float("nan") if np.isnan(values).all() else float(of(values))
 
+
+#: How the names of recordings end.
+SUFFIXES = (".csv", ".csv.gz", ".parquet", ".pq")
 
 FILL = {"u_in": 0.0, "u_out": 1, "pressure": np.nan, "flow": np.nan, "volume": np.nan}
 """Values of padding."""
@@ -235,7 +238,7 @@ def valid_mask(lengths: Ints, width: int | None = None) -> Bools:
 def arranged(
     lengths: Ints,
     time: Floats,
-    samples: Mapping[str, np.ndarray],
+    samples: Columns,
     width: int | None = None,
     **rest: Any,
 ) -> Breaths:
@@ -318,9 +321,11 @@ def join(parts: Sequence[Breaths]) -> Breaths:
         if all(getattr(part, name) is not None for part in parts)
     }
     sizes = np.array([part.valid.sum() for part in parts])
-    shares = {name: 0.0 for part in parts for name in part.left_out}
-    for name in shares:
-        shares[name] = float(np.average([p.left_out.get(name, 0.0) for p in parts], weights=sizes))
+    shares = {
+        name: float(np.average([each.left_out.get(name, 0.0) for each in parts], weights=sizes))
+        for part in parts
+        for name in part.left_out
+    }
     return arranged(
         np.concatenate([part.valid.sum(axis=1) for part in parts]),
         samples.pop("time"),
@@ -345,7 +350,7 @@ def write(breaths: Breaths, path: str | os.PathLike[str]) -> None:
     name = str(path)
     if len(breaths) == 0:
         raise InputError(f"{name}: there are no breaths to write")
-    if not name.endswith((".csv", ".csv.gz", ".parquet", ".pq")):
+    if not name.endswith(SUFFIXES):
         raise InputError(f"{name}: the name must end in .csv, .csv.gz, .parquet or .pq")
     table = _table(breaths)
     form = _write_parquet if name.endswith((".parquet", ".pq")) else _write_csv

@@ -237,7 +237,7 @@ def _meaning(text: str, unit: str | None) -> tuple[str | None, str, bool]:
         certain &= role not in ("R", "C", "f") or len(words) == 1
     elif letters:
         certain = False
-    elif not words:  # a unit alone
+    elif all(map(str.isdigit, words)):  # a unit alone, or beside a number
         names = set(measured[:1])
     side = next(iter(sides)) if len(sides) == 1 else ""
     if names == {"valve"} and side:

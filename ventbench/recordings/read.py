@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from ventbench.base.arrays import Floats
+from ventbench.base.arrays import Columns, Floats
 from ventbench.base.errors import InputError
 from ventbench.base.text import few
 from ventbench.recordings.bad_samples import UNUSABLE, clean, left_out
-from ventbench.recordings.breaths import Breaths, arranged, join
+from ventbench.recordings.breaths import SUFFIXES, Breaths, arranged, join
 from ventbench.recordings.roles import few_breaths, findings
 from ventbench.recordings.scan import ProblemLog, Progress, Scanned, scan
 from ventbench.recordings.schema import OPTIONAL, RecordingError, RecordingProblem
@@ -36,7 +36,7 @@ _TIMES = ("time_step", "time")
 
 
 def simulated_pressures(
-    table: Mapping[str, np.ndarray], name: str, breaths: Breaths, *, sha256: str | None = None
+    table: Columns, name: str, breaths: Breaths, *, sha256: str | None = None
 ) -> Floats:
     """Simulated pressures of recorded breaths.
 
@@ -110,7 +110,7 @@ def simulated_pressures(
     return answers
 
 
-def _by_rows(table: Mapping[str, np.ndarray], name: str, breaths: Breaths) -> dict[str, np.ndarray]:
+def _by_rows(table: Columns, name: str, breaths: Breaths) -> Columns:
     """A table whose ids count the rows of the recording, with their breaths."""
     ids = _numbers(table["id"], name, "id")
     rows = int(breaths.valid.sum())
@@ -269,9 +269,8 @@ def _intervals(scanned: Scanned) -> dict[str, float]:
     means = scanned.interval[np.isfinite(scanned.interval)]
     if not (len(means) and len(steps)):
         return {}
-    p5, median, p95 = (float(q) for q in np.quantile(means, [0.05, 0.5, 0.95]))
-    least, most = float(steps.min()), float(steps.max())
-    return {"min": least, "p5": p5, "median": median, "p95": p95, "max": most}
+    figures = [steps.min(), *np.quantile(means, [0.05, 0.5, 0.95]), steps.max()]
+    return dict(zip(("min", "p5", "median", "p95", "max"), map(float, figures), strict=True))
 
 
 def check_lengths(scanned: Scanned, log: ProblemLog, *, pad: bool) -> None:
@@ -316,8 +315,8 @@ VARIABLE = "VENTBENCH_RECORDINGS"
 
 FilePath = str | os.PathLike[str]
 
-#: What a session on a bench calls its recording, and how the names of recordings end.
-SESSION, _SUFFIXES = "recording.csv.gz", (".csv", ".csv.gz", ".parquet", ".pq")
+#: What a session on a bench calls its recording.
+SESSION = "recording.csv.gz"
 
 
 def load(
@@ -382,7 +381,7 @@ def session_files(path: FilePath) -> tuple[Path, ...]:
         return (folder,)
     if (folder / SESSION).is_file():
         return (folder / SESSION,)
-    files = (file for file in folder.iterdir() if file.name.endswith(_SUFFIXES))
+    files = (file for file in folder.iterdir() if file.name.endswith(SUFFIXES))
     if not (recordings_found := tuple(sorted(files))):
         raise InputError(
             f"{folder} has no recording; name a file, or a folder with some (`ventbench data "

@@ -7,14 +7,12 @@ opposite, flow is counted from the patient.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Pieces
+from ventbench.base.arrays import Bools, Columns, Floats, Pieces
 from ventbench.base.errors import InputError
 from ventbench.base.linear import solve
 from ventbench.recordings.bad_samples import MEASURED, notable
@@ -34,7 +32,7 @@ _MOST = 0.8
 _FLAT, _MOVES = 0.02, 1.0
 
 #: Correlation of flow and pressure below which the sign of the flow is the opposite.
-_OPPOSITE = -0.25
+OPPOSITE = -0.25
 
 #: Share of a breath that is its end, and of its range of pressure above which it ends at its peak.
 _END, _PEAK = 0.1, 0.6
@@ -98,9 +96,7 @@ class Saturation:
         return f"{subject} at {self.level:.4g} {unit} in {100 * self.share:.2g} % of the samples"
 
 
-def breath_figures(
-    time: Floats, samples: Mapping[str, NDArray[Any]], breaths: Pieces
-) -> dict[str, Floats]:
+def breath_figures(time: Floats, samples: Columns, breaths: Pieces) -> Columns:
     """Reduce breaths to the numbers that :func:`findings` and :func:`saturations` judge.
 
     Args:
@@ -164,9 +160,7 @@ def _integral(time: Floats, rate: Floats, breaths: Pieces) -> Floats:
 _SHIFTS = (0, -1, 1)
 
 
-def _commands_of(
-    time: Floats, pressure: Floats, u_in: Floats, breaths: Pieces
-) -> dict[str, Floats]:
+def _commands_of(time: Floats, pressure: Floats, u_in: Floats, breaths: Pieces) -> Columns:
     """Cross products of p = a u + b V + c over inspirations, with the commands of three breaths."""
     volume = _integral(time, np.nan_to_num(u_in), breaths)
     products = {}
@@ -201,7 +195,7 @@ def _covariances(products: Floats) -> Floats:
     return products / count[..., None] - mean[:, :, None] * mean[:, None, :]
 
 
-def _ends(values: Floats, breaths: Pieces) -> dict[str, Floats]:
+def _ends(values: Floats, breaths: Pieces) -> Columns:
     """Largest value of each breath, how often, the next one, how often, and the step to the top."""
     starts, breath = breaths.starts, breaths.owner
     with np.errstate(invalid="ignore"):
@@ -228,7 +222,7 @@ def _regression(
     flow: Floats,
     measured: Floats | None,
     breaths: Pieces,
-) -> dict[str, Floats]:
+) -> Columns:
     """Correlation of pressure and flow, and cross products of Q, V, 1 and p (p = R Q + V / C + p0).
 
     With a measured volume also how many times the integrated flow it is, and their correlation.
@@ -239,16 +233,17 @@ def _regression(
     columns = [q, volume, np.ones(len(q)), pressure]
     figures = {"flow_products": _cross_products(columns, finite, breaths)}
     spread = _covariances(figures["flow_products"])
-    figures["correlation"] = _correlation(spread, 0, 3)
+    figures["correlation"] = correlation(spread, 0, 3)
     if measured is not None:
         columns[3] = measured
         spread = _covariances(_cross_products(columns, finite & np.isfinite(measured), breaths))
         figures["volume_ratio"] = _ratio(spread[:, 1, 3], spread[:, 1, 1])
-        figures["volume_correlation"] = _correlation(spread, 1, 3)
+        figures["volume_correlation"] = correlation(spread, 1, 3)
     return figures
 
 
-def _correlation(covariances: Floats, i: int, j: int) -> Floats:
+def correlation(covariances: Floats, i: int, j: int) -> Floats:
+    """Correlation of two columns by covariances of k breaths, ``(k, n, n)``; NaN if one rests."""
     variances = np.maximum(covariances[:, i, i] * covariances[:, j, j], 0.0)
     return _ratio(covariances[:, i, j], np.sqrt(variances))
 
@@ -258,7 +253,7 @@ def _ratio(a: Floats, b: Floats) -> Floats:
     return np.where(b > 0, a / np.where(b > 0, b, 1.0), np.nan)
 
 
-def saturations(figures: Mapping[str, Floats]) -> tuple[Saturation, ...]:
+def saturations(figures: Columns) -> tuple[Saturation, ...]:
     """Levels at which sensors end: reached again and again, exactly, and left by small steps."""
     levels = []
     for name in ("pressure", "flow"):
@@ -282,9 +277,7 @@ def saturations(figures: Mapping[str, Floats]) -> tuple[Saturation, ...]:
     return tuple(levels)
 
 
-def findings(
-    figures: Mapping[str, Floats], interval: Floats, R: Floats, C: Floats
-) -> tuple[Finding, ...]:
+def findings(figures: Columns, interval: Floats, R: Floats, C: Floats) -> tuple[Finding, ...]:
     """What about the roles of columns contradicts physics, the worst first.
 
     Takes figures of k breaths, from :func:`breath_figures`, their mean sampling intervals, s, NaN
@@ -302,7 +295,7 @@ def findings(
         advice = "Say which column is the pressure with --map NAME=pressure."
         return (Finding("pressure", message, advice, "refused", float(np.nanmedian(high))),)
     collected = [*_times(interval)]
-    if _agree(figures.get("correlation", np.zeros(0)), _OPPOSITE):
+    if _agree(figures.get("correlation", np.zeros(0)), OPPOSITE):
         message = "flow goes out while pressure is high, so it is counted from the patient"
         collected.append(
             Finding(
@@ -376,7 +369,7 @@ def _times(interval: Floats) -> Iterator[Finding]:
     yield Finding("time_step", message, f"{advice}`ventbench data import`.", level, median)
 
 
-def _volumes(figures: Mapping[str, Floats]) -> Iterator[Finding]:
+def _volumes(figures: Columns) -> Iterator[Finding]:
     """Volume against the integral of flow: by a unit, or by any other factor."""
     ratio = figures.get("volume_ratio", np.zeros(0))
     ratio = ratio[figures.get("volume_correlation", ratio) > _OF_ONE_LUNG]
@@ -392,19 +385,16 @@ def _volumes(figures: Mapping[str, Floats]) -> Iterator[Finding]:
         for unit, size in UNITS[role].items()
         if size != 1 and abs(np.log(factor * float(size) ** -sense)) < np.log(1.1)
     ]
-    whole = round(apart) if abs(apart / round(apart) - 1.0) <= 0.05 else 0
-    share = {2: "half of", 3: "a third of", 4: "a quarter of"}.get(whole, f"1/{apart:.3g} of")
-    times = {2: "twice", 3: "three times"}.get(whole, f"{apart:.3g} times")
     message = (
         f"flow and volume contradict each other: they differ by a factor of {apart:.1f} (volume is "
-        f"{share if factor < 1.0 else times} the integrated flow)"
+        f"{factor:.3g} times the integrated flow)"
     )
     advice = "Say which is wrong: --map NAME=unused leaves it out, "
     advice += f"{' or '.join(units) or 'a unit such as --flow-unit L/min'} corrects it."
     yield Finding("volume", message, advice, "refused", factor)
 
 
-def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> Iterator[Finding]:
+def _numbering(figures: Columns, R: Floats, C: Floats) -> Iterator[Finding]:
     """Pressures that follow the commands of the breath before, or after, by far better."""
     residual = dict.fromkeys(_SHIFTS, 0.0)
     rows = dict.fromkeys(_SHIFTS, 0.0)
@@ -429,7 +419,7 @@ def _numbering(figures: Mapping[str, Floats], R: Floats, C: Floats) -> Iterator[
     yield Finding("breath_id", message, advice, "refused", float(best))
 
 
-def _commands(figures: Mapping[str, Floats]) -> Iterator[Finding]:
+def _commands(figures: Columns) -> Iterator[Finding]:
     largest = float(figures["u_in"].max())
     inside, outside = figures["u_in_inside"], figures["u_in_outside"]
     if 0.0 < largest <= 1.0:
@@ -442,9 +432,7 @@ def _commands(figures: Mapping[str, Floats]) -> Iterator[Finding]:
         yield Finding("u_in", message, f"{advice}--invert u_in if 100 % is shut.")
 
 
-def _phases(
-    figures: Mapping[str, Floats], low: Floats, spans: Floats, moves: Bools
-) -> Iterator[Finding]:
+def _phases(figures: Columns, low: Floats, spans: Floats, moves: Bools) -> Iterator[Finding]:
     share = float(np.nanmedian(figures["inspiration"]))
     height = _ratio(figures["end"] - low, spans)[moves]
     if _agree(-height, -_PEAK):
@@ -467,7 +455,7 @@ def _pressures(peep: float, pip: float) -> Iterator[Finding]:
     yield Finding("pressure", message, f"{advice}`ventbench data import`.", value=pip)
 
 
-def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> Iterator[Finding]:
+def _labels(figures: Columns, R: Floats, C: Floats) -> Iterator[Finding]:
     """Labels whose R and C are exchanged, by a regression of pressure on flow and volume."""
     if "flow_products" not in figures:
         return
@@ -497,14 +485,6 @@ def _by_label(R: Floats, C: Floats) -> Iterator[tuple[float, float, Bools]]:
         yield *label, (label[0] == R) & (label[1] == C)
 
 
-def opposite_sign(pressure: Floats, flow: Floats) -> bool:
-    """Whether flow is counted from the patient, by whole breaths of both, ``(m,)`` each."""
-    finite = np.isfinite(pressure) & np.isfinite(flow)
-    if finite.sum() < 3 or np.ptp(pressure[finite]) < _FLAT or np.ptp(flow[finite]) == 0.0:
-        return False
-    return bool(np.corrcoef(pressure[finite], flow[finite])[0, 1] < _OPPOSITE)
-
-
 def check_roles(breaths: Breaths) -> tuple[Finding, ...]:
     """Check the roles of columns of breaths in memory; see :func:`findings`."""
     lengths = breaths.valid.sum(axis=1)
@@ -529,7 +509,7 @@ def require_roles(breaths: Breaths) -> None:
         raise InputError("\n".join(f"column {f.column}: {f}" for f in refused))
 
 
-def _figures_of(breaths: Breaths) -> dict[str, Floats]:
+def _figures_of(breaths: Breaths) -> Columns:
     """Figures of breaths, some at a time since they need many arrays as large as the recording."""
     parts = []
     together = max(1, _TOGETHER // breaths.valid.shape[1])

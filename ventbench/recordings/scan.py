@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints, Pieces
+from ventbench.base.arrays import Bools, Columns, Floats, Ints, Pieces
 from ventbench.recordings.bad_samples import BadSamples, blanked, find_bad_samples
 from ventbench.recordings.roles import breath_figures
 from ventbench.recordings.schema import (
@@ -50,7 +50,7 @@ class Rows:
 
     #: arrays by column name, each (m,): int64 for id and breath_id, float64 with NaN for blank
     #: otherwise, in the units of the schema.
-    columns: dict[str, NDArray[Any]]
+    columns: Columns
     #: rows with a blank breath_id, (m,) bool; breath_id then repeats the one before.
     blank_id: Bools
     first: int = 0  #: row of the file that is the first of these.
@@ -191,7 +191,7 @@ class ProblemLog:
 _OFTEN = 10
 
 
-def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str, NDArray[Any]]:
+def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> Columns:
     """Check each cell: blank, infinite, out of range. Return the columns.
 
     With ``clip``, u_in is clipped to 0..100 % with a warning; otherwise it is a problem.
@@ -340,18 +340,12 @@ def complete_times(time: Floats, breaths: Pieces) -> Floats:
     time = time.copy()
     for breath in np.flatnonzero((missing > 0) & ~blank):
         span = slice(breaths.starts[breath], breaths.starts[breath] + breaths.lengths[breath])
-        time[span] = _interpolate(time[span])
+        known, k = time[span], np.arange(breaths.lengths[breath])
+        at = np.flatnonzero(np.isfinite(known))
+        slope = (known[at[-1]] - known[at[0]]) / (at[-1] - at[0])
+        inside = np.clip(k, at[0], at[-1])
+        time[span] = np.interp(inside, at, known[at]) + slope * (k - inside)
     return time - np.where(blank, np.nan, time[breaths.starts])[breaths.owner]
-
-
-def _interpolate(time: Floats) -> Floats:
-    at = np.arange(len(time))
-    finite = np.flatnonzero(np.isfinite(time))
-    first, last = finite[0], finite[-1]
-    slope = (time[last] - time[first]) / (last - first)
-    filled = np.interp(at, finite, time[finite])
-    filled = np.where(at < first, time[first] + slope * (at - first), filled)
-    return np.where(at > last, time[last] + slope * (at - last), filled)
 
 
 @dataclass(frozen=True)
@@ -370,12 +364,12 @@ class Scanned:
     time_shifted: Bools  #: breaths that do not start at 0 in the file, (k,) bool.
     #: shortest and longest interval between two samples of each breath, s, (k, 2).
     steps: Floats
-    figures: dict[str, Floats]  #: of :func:`~.roles.breath_figures`, (k, ...) each.
+    figures: Columns  #: of :func:`~.roles.breath_figures`, (k, ...) each.
     bad: tuple[BadSamples, ...]  #: samples that were left out, by rows of the file.
     #: time, s from each breath's first sample, NaN in all of a breath without times; u_in %, u_out
     #: 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file has them, each (m,).
     #: Nothing if only checked.
-    samples: dict[str, NDArray[Any]]
+    samples: Columns
 
     @cached_property
     def inferred(self) -> dict[int, float]:
@@ -429,9 +423,7 @@ def scan(
     return parts[0] if len(parts) == 1 else _together(parts)
 
 
-def _scanned(
-    rows: Rows, columns: dict[str, NDArray[Any]], bad: Sequence[BadSamples], keep: bool
-) -> Scanned:
+def _scanned(rows: Rows, columns: Columns, bad: Sequence[BadSamples], keep: bool) -> Scanned:
     starts, lengths = rows.breaths.starts, rows.breaths.lengths
     given = columns["time_step"]
     time = complete_times(given, rows.breaths)

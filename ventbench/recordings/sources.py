@@ -310,9 +310,7 @@ def to_numpy(array: pa.Array | pa.ChunkedArray, integer: bool = False) -> NDArra
     import pyarrow as pa
 
     kind, blank = (pa.int64(), 0) if integer else (pa.float64(), float("nan"))
-    if isinstance(array, pa.ChunkedArray):
-        parts = [to_numpy(chunk, integer) for chunk in array.chunks]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    array = array.combine_chunks() if isinstance(array, pa.ChunkedArray) else array
     array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
     array = array.cast(kind, safe=False)  # counters beyond 2^53 are rounded
     return np.from_dlpack(array.fill_null(blank) if array.null_count else array)

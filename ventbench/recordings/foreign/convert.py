@@ -8,7 +8,7 @@ resampled or smoothed.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -16,14 +16,14 @@ from shlex import quote
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints, Pieces
+from ventbench.base.arrays import Bools, Columns, Floats, Ints, Pieces, Texts
 from ventbench.base.errors import InputError
 from ventbench.base.text import few
 from ventbench.recordings.bad_samples import (
     MEASURED,
     BadSamples,
+    at_the_slowest,
     blanked,
     find_bad_samples,
     left_out,
@@ -31,13 +31,13 @@ from ventbench.recordings.bad_samples import (
     repeated_rows,
 )
 from ventbench.recordings.breaths import Breaths, arranged
-from ventbench.recordings.foreign.cycles import expiratory_valve, find_breaths
+from ventbench.recordings.foreign.cycles import expiratory_valve, find_breaths, signed_flow
 from ventbench.recordings.foreign.formats import read_table
 from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, Layout, recognise
-from ventbench.recordings.foreign.shapes import epoch_unit, one_row_a_sample
+from ventbench.recordings.foreign.shapes import change_of, epoch_unit, one_row_a_sample
 from ventbench.recordings.foreign.tables import Table
 from ventbench.recordings.headers import STATES, Conversion, conversion, in_file_unit, read_header
-from ventbench.recordings.roles import SLOW, Finding, check_roles, few_breaths, opposite_sign
+from ventbench.recordings.roles import SLOW, check_roles, few_breaths
 from ventbench.recordings.scan import complete_times
 from ventbench.recordings.schema import COLUMNS
 from ventbench.task.lungs import Lung
@@ -45,9 +45,15 @@ from ventbench.task.lungs import Lung
 #: Roles with units, and flows that a sensor counts in one direction.
 _MEASURED, _ONE_WAY = ("time", "pressure", "flow", "volume", "u_in"), ("flow_in", "flow_out")
 
-#: Flow, mL/s, and volume, mL, below which another unit is likely; pressure, cmH2O, from which it
-#: is absolute.
-_SMALL_FLOW, _SMALL_VOLUME, _ABSOLUTE = 150.0, 5.0, 500.0
+#: Sizes of a ventilator's signals, in the schema's unit, and units that are taken for one another.
+_USUAL = {
+    "pressure": (5.0, 80.0, ("cmH2O", "kPa", "Pa")),
+    "flow": (150.0, 3000.0, ("mL/s", "L/s", "L/min")),
+    "volume": (5.0, 5000.0, ("mL", "L")),
+}
+
+#: Pressure, cmH2O, from which it is absolute.
+_ABSOLUTE = 500.0
 
 #: Share of the steps of a clock that may be zero, and precision of a rate that it tells.
 _STANDS_STILL, _PRECISE = 0.2, 0.005
@@ -57,8 +63,8 @@ _STANDS_STILL, _PRECISE = 0.2, 0.005
 _WRAPS = (2.0**16, 2.0**24, 2.0**31, 2.0**32, *(10.0**k for k in range(2, 10)), 60.0, 3600.0)
 _WRAPS += (43_200.0, 86_400.0, 3_600_000.0, 86_400_000.0)
 
-#: Share of the rows from which blanks of a column are those of a slower rate.
-_SPARSE = 0.05
+#: Share of the median step of a clock that nearly all of its steps exceed.
+_EVEN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +73,7 @@ class Imported:
 
     breaths: Breaths  #: the breaths, in the units of the schema.
     conversions: Mapping[str, Conversion]  #: change of units by role.
-    columns: Mapping[str, str]  #: role of each column of the file that is used.
+    columns: Texts  #: role of each column of the file that is used.
     understood: tuple[str, ...]  #: what was understood, a sentence each.
     warnings: tuple[str, ...]  #: what may be wrong, a sentence each.
     bad: tuple[BadSamples, ...] = ()  #: samples that were left out, in the unit of the file.
@@ -168,6 +174,8 @@ def import_recording(
         ...     "lab.csv", columns={"Paw": "pressure"}, units={"flow": "L/min"}, lung="R20C50"
         ... )  # doctest: +SKIP
     """
+    import pandas as pd
+
     table = path
     if not isinstance(table, Table):
         table = read_table(table, separator=separator, decimal=decimal)
@@ -183,7 +191,7 @@ def import_recording(
     changes = _conversions(table, by_role, units, spec)
     if spec.about:
         table = table.noted(f"Layout {layout}: {spec.about}.")
-    table = _in_order(table, by_role.get("time"))
+    table = _in_order(table, by_role)
     raw = {
         role: _numbers(table, name, spoken)
         for role, name in by_role.items()
@@ -193,13 +201,10 @@ def import_recording(
     if "time" not in raw:
         raw["time"], changes["time"], how = _even(table, by_role, rate)
         table = table.noted(how)
-    table, raw = _without(table, raw, _knows_little(raw), _PARTIAL)
     measured = {role: raw[role] for role in (*MEASURED, "u_in") if role in raw}
     bad = find_bad_samples(measured, tuple(missing))
     raw |= blanked(measured, bad)
     warnings = [_of_file(bad_samples, table, by_role) for bad_samples in bad]
-    slow = "slow" in [bad_samples.kind for bad_samples in bad]
-    table, raw = _without(table, raw, _knows_little(raw) & slow, _PARTIAL)
     notes = list(table.notes)
     added = dict(offsets or {})
     if unknown := set(added) - set(raw):
@@ -211,21 +216,23 @@ def import_recording(
         for role in changes.keys() & raw.keys()
     }
     del raw, measured  # a copy of every column that is no longer needed
-    _net_flow(values)
-    for role in ("flow", "volume"):
-        if role in values and not np.isfinite(values[role]).any():
-            notes.append(f"Column {by_role[role]} is blank throughout.")
-            del values[role]
     if not np.isfinite(values["pressure"]).any():
         raise InputError(
             f"{table.file}, column {by_role['pressure']}: every pressure is blank, so there is "
             "nothing to compare a simulator with"
         )
+    notes += _net_flow(table, values)
+    for role in ("flow", "volume"):
+        if role in values and not np.isfinite(values[role]).any():
+            notes.append(f"Column {by_role.get(role, role)} is blank throughout.")
+            del values[role]
     _invert(values, invert)
-    _check_signs(table, by_role, values, changes)
-    keys = groups = [_labels(table.columns[n]) for n, role in roles.items() if role == "group"]
+    warnings += _check_sizes(table, by_role, values, changes, _USUAL if layout else units)
+    keys = groups = [
+        pd.factorize(table.columns[name])[0] for name, role in roles.items() if role == "group"
+    ]
     if "breath" in by_role and not split_breaths:
-        keys = [*groups, _labels(table.columns[by_role["breath"]])]
+        keys = [*groups, pd.factorize(table.columns[by_role["breath"]])[0]]
     time = values["time"]
     notes += _checked_clock(table, time, keys)
     if "u_in" in values:
@@ -271,20 +278,14 @@ def import_recording(
         left_out=left_out(bad),
     )
     notable(breaths)
-    doubts = [*_small(samples), *check_roles(breaths)]
+    breaths = breaths if "u_in" in values else at_the_slowest(breaths)
+    doubts = check_roles(breaths)
     for doubt in doubts:
-        column = f"{table.file}, column {by_role.get(doubt.column, doubt.column)}"
         if doubt.level == "refused":
-            raise InputError(f"{column}: {doubt}")
-        change = changes.get(doubt.column) if layout is None else None
-        of_unit = f"--{doubt.column}-unit" in doubt.advice
-        if of_unit and change is not None and not change.stated:
-            raise InputError(
-                f"{column}: {doubt} Nothing states its unit; give --{doubt.column}-unit, also if "
-                f"it is {change.to}."
-            )
+            column = by_role.get(doubt.column, doubt.column)
+            raise InputError(f"{table.file}, column {column}: {doubt}")
     warnings += map(str, doubts)
-    notes += few_breaths(len(breaths))
+    notes = [*breaths.notes, *few_breaths(len(breaths))]
     used = {name: role for name, role in roles.items() if role != "unused"}
     return Imported(breaths, changes, used, tuple(notes), tuple(warnings), bad)
 
@@ -298,6 +299,7 @@ def import_runs(path: str | Path) -> dict[str, Breaths]:
         Breaths by the values of the columns that do, in the order of the file: of RespiraWorks by
         run and test, ``"2020-07-31-UFlow-Performance 4"``. Nothing of any other file.
     """
+    import pandas as pd
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -309,18 +311,16 @@ def import_runs(path: str | Path) -> dict[str, Breaths]:
     if not groups:
         return {}
     table = read_table(path)
-    cells = (
-        [f"{value:g}" if isinstance(value, float) else value for value in column]
-        for column in (table.columns[name].tolist() for name in groups)
-    )
-    keys = np.array([" ".join(row) for row in zip(*cells, strict=True)])
+    frame = pd.DataFrame({name: table.columns[name] for name in groups})
     return {
-        key: import_recording(table.rows(keys == key)).breaths
-        for key in dict.fromkeys(keys.tolist())
+        " ".join(f"{x:g}" if isinstance(x, float) else x for x in key): import_recording(  # type: ignore[attr-defined]
+            table.rows(run.index.to_numpy())
+        ).breaths
+        for key, run in frame.groupby(groups, sort=False)
     }
 
 
-def _selected(table: Table, select: dict[str, str]) -> Table:
+def _selected(table: Table, select: Texts) -> Table:
     """Rows whose columns have given values."""
     keep = np.ones(len(table), bool)
     for name, value in select.items():
@@ -328,11 +328,7 @@ def _selected(table: Table, select: dict[str, str]) -> Table:
             raise InputError(
                 f"--select {name}={value}: {table.file} has no column {name}; it has {table.names}"
             )
-        values = table.columns[name]
-        if table.is_numeric(name):
-            keep &= values == _number(value)
-        else:
-            keep &= values == value
+        keep &= table.columns[name] == (_number(value) if table.is_numeric(name) else value)
     if not keep.any():
         conditions = ", ".join(f"{n}={v}" for n, v in select.items())
         raise InputError(f"{table.file}: no row has {conditions}")
@@ -362,9 +358,7 @@ def _layout(name: str | None, table: Table) -> Layout:
     return LAYOUTS[name]
 
 
-def _roles(
-    table: Table, mapped: dict[str, str], layout: Layout, rate: float | None
-) -> dict[str, str]:
+def _roles(table: Table, mapped: Texts, layout: Layout, rate: float | None) -> Texts:
     """Role of each column: as mapped, by the layout, by its header; the first of each role."""
     roles = _mapped(table, mapped)
     assigned = {role for role in roles.values() if role not in ("group", "unused")}
@@ -397,7 +391,7 @@ def _roles(
     return roles
 
 
-def _mapped(table: Table, mapped: dict[str, str]) -> dict[str, str]:
+def _mapped(table: Table, mapped: Texts) -> Texts:
     """Roles of columns that a user maps, by their names in the table."""
     headers = {text: name for name, text in table.headers.items()}
     roles = {}
@@ -424,9 +418,7 @@ _NEEDED = {
 }
 
 
-def _check_needed(
-    table: Table, roles: Mapping[str, str], layout: Layout, rate: float | None
-) -> None:
+def _check_needed(table: Table, roles: Texts, layout: Layout, rate: float | None) -> None:
     """Ask for a column that is needed and not understood, with the option that says it."""
     if set(table.columns) == {"id", "pressure"}:  # as the competition's submissions
         raise InputError(
@@ -439,17 +431,17 @@ def _check_needed(
         is_time = accepted[0] == "time"
         if has & set(accepted) or (is_time and timed):
             continue
-        headers = {name: table.header(name) for name in table.columns if name not in roles}
-        headers = {n: x for n, x in headers.items() if table.is_numeric(n)}
+        others = filter(table.is_numeric, table.columns.keys() - roles.keys())
+        headers = {name: table.header(name) for name in sorted(others)}
         likely = [name for name, header in headers.items() if header.role in accepted]
         open_ = likely or [name for name, x in headers.items() if not (x.role or x.excluded)]
         if len(accepted) > 1 and (not open_ or layout.columns):
             continue
-        onwards = {n: np.mean(np.diff(table.columns[n], prepend=-np.inf) >= 0) > 0.9 for n in open_}
-        open_.sort(key=lambda name: onwards[name] != is_time)
+        back = {name: (np.diff(table.columns[name]) < 0).sum() > len(table) // 10 for name in open_}
+        open_.sort(key=lambda name: back[name] == is_time)
         columns = f"{table.file}: no column is {quantity}; the columns are {table.names}"
         role = next((headers[n].role for n in likely), None) or accepted[0]
-        option = f"--map {quote((open_ or ['NAME'])[0])}={role}"
+        option = f"--map {quote([*open_, *headers, 'NAME'][0])}={role}"
         if is_time:
             raise InputError(
                 f"{columns}. Say which with {option}, or give the sampling rate with --rate 50"
@@ -480,33 +472,26 @@ def _check_duplicates(table: Table, role: str, names: Sequence[str]) -> None:
 
 
 def _conversions(
-    table: Table, by_role: Mapping[str, str], units: dict[str, str], layout: Layout
+    table: Table, by_role: Texts, units: Texts, layout: Layout
 ) -> dict[str, Conversion]:
     for role in units:
         if role not in _MEASURED:
             raise InputError(f"{role} has no unit; units are for {', '.join(_MEASURED)}")
-
-    def unit(role: str, name: str) -> str | None:
-        header = None if layout.columns else table.header(name).unit
-        unit = units.get(role) or layout.units.get(role) or header or table.units.get(name)
-        return unit or (epoch_unit(table.columns[name]) if role == "time" else None)
-
     quantities = {role: role for role in _MEASURED} | dict.fromkeys(_ONE_WAY, "flow")
+    given = layout.units | units
     return {
-        role: conversion(quantities[role], unit(quantities[role], name))
+        role: change_of(table, name, quantities[role], given.get(quantities[role]))
         for role, name in by_role.items()
         if role in quantities
     }
 
 
-def _states(
-    table: Table, roles: dict[str, str], spoken: Mapping[str, float]
-) -> tuple[Table, dict[str, str]]:
-    """Numbers in place of a pair of words such as open and closed in the columns of valves.
+def _states(table: Table, roles: Texts, spoken: dict[str, float]) -> tuple[Table, Texts]:
+    """Add a pair of words such as open and closed in the columns of valves to those with numbers.
 
     A column of inspiration and expiration is that of the expiratory valve if there is no other.
     """
-    columns, units, roles, sentences = dict(table.columns), dict(table.units), dict(roles), []
+    units, roles, sentences = dict(table.units), dict(roles), []
     for name, values in table.columns.items():
         if values.dtype.kind != "U" or roles.get(name, "u_out") not in ("u_in", "u_out"):
             continue
@@ -516,13 +501,15 @@ def _states(
             continue
         if name not in roles and not (state.phase and "u_out" not in roles.values()):
             continue
-        one, zero = words[state.one], words[state.zero]
+        one, zero = state.one, state.zero
         if roles.setdefault(name, "u_out") == "u_in":
             one, zero = (zero, one) if state.phase else (one, zero)
             units[name] = "1"
-        columns[name] = np.where(values == "", np.nan, np.where(values == one, 1.0, 0.0))
-        sentences.append(f"{name}: {one} is 1 (open) and {zero} is 0; else give --map-values.")
-    return replace(table, columns=columns, units=units).noted(*sentences), roles
+        spoken |= {one: 1.0, zero: 0.0}
+        sentences.append(
+            f"{name}: {words[one]} is 1 (open) and {words[zero]} is 0; else give --map-values."
+        )
+    return replace(table, units=units).noted(*sentences), roles
 
 
 def _numbers(table: Table, name: str, spoken: Mapping[str, float]) -> Floats:
@@ -543,22 +530,33 @@ def _numbers(table: Table, name: str, spoken: Mapping[str, float]) -> Floats:
     return np.array(numbers, float)[which.reshape(-1)]
 
 
-def _in_order(table: Table, clock: str | None) -> Table:
-    """Rows from the oldest to the newest; notes what a clock counts by its size."""
+def _in_order(table: Table, by_role: Texts) -> Table:
+    """Rows from the oldest to the newest; notes what a clock counts by its size.
+
+    Rows out of order are sorted if their times, by breaths where these are numbered, are then even:
+    those of a clock that begins anew are not.
+    """
+    clock = by_role.get("time")
     if clock is None or not table.is_numeric(clock):
         return table
     if (unit := epoch_unit(table.columns[clock])) not in (None, "s"):
         since = {"day": 1899}.get(unit, 1970)
         table = table.noted(f"{clock} counts {unit} since {since}, by the size of its values.")
-    if np.nansum(np.sign(np.diff(table.columns[clock]))) >= 0:
+    keys = [table.columns[by_role[role]] for role in ("time", "breath") if role in by_role]
+    steps = np.diff(keys[0])
+    if (steps < 0).sum() > max(3, len(table) // 1000):
+        order = np.lexsort(keys)
+        after = np.abs(np.diff(keys[0][order]))
+        even = np.quantile(after, 0.1) > _EVEN * np.median(after)
+        if even and (np.diff(order) != 1).any():
+            return table.rows(order).noted("Rows were put in the order of time.")
+    if np.nansum(np.sign(steps)) >= 0:
         return table
     backwards = table.rows(np.arange(len(table))[::-1])
     return backwards.noted("The newest row comes first: rows were put in the order of time.")
 
 
-def _without(
-    table: Table, raw: dict[str, Floats], omitted: Bools, why: str
-) -> tuple[Table, dict[str, Floats]]:
+def _without(table: Table, raw: Columns, omitted: Bools, why: str) -> tuple[Table, Columns]:
     """Leave out rows, and say which."""
     if not omitted.any():
         return table, raw
@@ -567,24 +565,7 @@ def _without(
     return table.rows(~omitted).noted(sentence), {role: x[~omitted] for role, x in raw.items()}
 
 
-#: What rows are of which :func:`_knows_little` tells.
-_PARTIAL = "in which only some of the measured columns are known"
-
-
-def _knows_little(raw: Mapping[str, Floats]) -> Bools:
-    """Rows without the slowest measured column, where it comes more slowly than the others.
-
-    Between, it would be invented, and would lag behind the others where it jumps. Commands are not
-    thinned.
-    """
-    finite = [np.isfinite(raw[role]) for role in MEASURED if role in raw]
-    finite = [x for x in finite if x.any()] or [np.ones(1, bool)]
-    least, both = min(x.mean() for x in finite), np.logical_and.reduce(finite)
-    slow = least <= 1.0 - _SPARSE and both.mean() >= 0.9 * least
-    return ~both & (slow and "u_in" not in raw)
-
-
-def _of_file(bad: BadSamples, table: Table, by_role: Mapping[str, str]) -> str:
+def _of_file(bad: BadSamples, table: Table, by_role: Texts) -> str:
     """What was left out, by the name and the lines of the file."""
     at = bad.rows[:6].tolist()
     first = [int(row) + 1 if table.lines is None else int(table.lines[row]) for row in at]
@@ -592,12 +573,20 @@ def _of_file(bad: BadSamples, table: Table, by_role: Mapping[str, str]) -> str:
     return text.replace(f"of {bad.column} ", f"of {by_role[bad.column]} ", 1) + "."
 
 
-def _net_flow(values: dict[str, Floats]) -> None:
-    """Replace two one-way flows by their difference."""
+def _net_flow(table: Table, values: Columns) -> list[str]:
+    """Replace two one-way flows by their difference, and a flow without a sign; a note."""
     if "flow_in" in values:
         out = values.pop("flow_out")
-        outward = 1.0 if np.nanmean(out) >= 0.0 else -1.0
+        outward = np.copysign(1.0, np.nanmean(out))
         values["flow"] = values.pop("flow_in") - outward * out
+    flow = values.get("flow")
+    if flow is None or not np.isfinite(flow).any():
+        return []
+    signed = signed_flow(table.file, values["time"], values["pressure"], flow)
+    if signed is None:
+        return []
+    values["flow"] = signed
+    return ["Flow has no sign: it was turned outwards as pressure falls."]
 
 
 def _continued(table: Table, time: Floats) -> tuple[Floats, list[str]]:
@@ -635,14 +624,7 @@ def _held(u_in: Floats, name: str) -> tuple[Floats, list[str]]:
     return np.where(held, u_in[last], np.nan), [sentence] if every > 1.0 else []
 
 
-def _labels(values: NDArray[Any]) -> Ints:
-    """Number of each distinct value."""
-    return np.unique(values, return_inverse=True)[1].reshape(-1)
-
-
-def _even(
-    table: Table, by_role: Mapping[str, str], rate: float | None
-) -> tuple[Floats, Conversion, str]:
+def _even(table: Table, by_role: Texts, rate: float | None) -> tuple[Floats, Conversion, str]:
     """Times of rows at an even rate, s, and what they are, where no clock is used."""
     stated = next(filter(None, (table.header(n).interval for n in by_role.values())), None)
     hertz = rate if rate is not None else table.rate or 1.0 / (stated or np.nan)
@@ -688,9 +670,7 @@ def _plain(rate: float, precision: float) -> str:
     return f"{float(f'{rate:.{digits}g}'):g}"
 
 
-def _lung(
-    label_id: str | None, values: Mapping[str, Floats], count: int
-) -> tuple[Floats, Floats, str]:
+def _lung(label_id: str | None, values: Columns, count: int) -> tuple[Floats, Floats, str]:
     """R and C of each row."""
     from ventbench.task.lungs import lung as parse
 
@@ -709,7 +689,7 @@ def _lung(
     )
 
 
-def _invert(values: dict[str, Floats], roles: Iterable[str]) -> None:
+def _invert(values: Columns, roles: Iterable[str]) -> None:
     """Change signs; of a valve, what is open."""
     open_at = {"u_in": 100.0, "u_out": 1.0}
     for role in roles:
@@ -718,35 +698,46 @@ def _invert(values: dict[str, Floats], roles: Iterable[str]) -> None:
         values[role] = open_at.get(role, 0.0) - values[role]
 
 
-def _check_signs(
+def _check_sizes(
     table: Table,
-    by_role: Mapping[str, str],
-    values: Mapping[str, Floats],
+    by_role: Texts,
+    values: Columns,
     changes: Mapping[str, Conversion],
-) -> None:
-    """Refuse absolute pressure, and flow that is counted from the patient.
+    given: Collection[str],
+) -> Iterator[str]:
+    """Refuse absolute pressure, and sizes that no ventilator's are but would be in another unit.
 
-    Before anything is inferred from them: breaths and valves would be wrong too.
+    Where the unit of a role is ``given`` by the user, that is only told.
     """
-    pressure = values["pressure"]
-    if np.nanmedian(pressure) > _ABSOLUTE:
-        change = changes["pressure"]
-        raise InputError(
-            f"{table.file}, column {by_role['pressure']}: pressure is {np.nanmedian(pressure):.4g} "
-            f"cmH2O in the median, so it is absolute; subtract that of the air, in {change.unit}: "
-            f"--offset pressure=-{in_file_unit(change, 101325):.6g}"
-        )
-    if "flow" in values and opposite_sign(pressure, values["flow"]):
-        raise InputError(
-            f"{table.file}, column {by_role['flow']}: flow goes out while pressure is high, so it "
-            "is counted from the patient; give --invert flow"
-        )
+    for role, (least, most, units) in _USUAL.items():
+        if role not in values:
+            continue
+        change = changes.get(role) or changes["flow_in"]
+        column, option = f"{table.file}, column {by_role.get(role, role)}", f"--{role}-unit"
+        median, size = np.nanquantile(np.abs(values[role]), [0.5, 0.99]).tolist()
+        if role == "pressure" and median > _ABSOLUTE:
+            raise InputError(
+                f"{column}: pressure is {median:.4g} cmH2O in the median, so "
+                f"it is absolute; subtract that of the air, in {change.unit}: "
+                f"--offset pressure=-{in_file_unit(change, 101325):.6g}"
+            )
+        sizes = {x: size * float(conversion(role, x).factor / change.factor) for x in units}
+        likely = [unit for unit, other in sizes.items() if least <= other <= most]
+        if least <= size <= most or not likely:
+            continue
+        message = f"{role} is {size:.3g} {change.to} at most (99 %), which is no ventilator's"
+        if role not in given:
+            raise InputError(
+                f"{column}: {message}; give {option} {likely[0]} ({sizes[likely[0]]:.3g} "
+                f"{change.to}), or {option} {change.unit} if that is right"
+            )
+        yield f"{message}. Is it in {likely[0]} ({option})?"
 
 
 def _sound(
     table: Table,
-    by_role: Mapping[str, str],
-    samples: Mapping[str, NDArray[Any]],
+    by_role: Texts,
+    samples: Columns,
     time: Floats,
     pieces: list[Ints],
     skip: bool,
@@ -786,16 +777,3 @@ def _sound(
     reasons = [f"{table.place(int(pieces[k][0]))} ({why})" for k, why in sorted(bad.items())]
     sentence = f"{len(reasons)} bad breaths were left out: {few(reasons, 10)}."
     return intact, [sentence] if reasons else []
-
-
-def _small(samples: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
-    """Sizes that look like a forgotten unit."""
-    for role, small, unit, other in (
-        ("flow", _SMALL_FLOW, "mL/s", "L/min or L/s"),
-        ("volume", _SMALL_VOLUME, "mL", "L"),
-    ):
-        if role in samples and np.isfinite(samples[role]).any():
-            size = float(np.nanquantile(np.abs(samples[role]), 0.99))
-            if size < small:
-                message = f"{role} is {size:.3g} {unit} at most (99 %), which is little"
-                yield Finding(role, message, f"Is it in {other} (--{role}-unit)?")

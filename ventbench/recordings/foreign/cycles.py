@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Columns, Floats, Ints
 from ventbench.base.errors import InputError
 
 #: Shortest breath, s, and longest.
@@ -15,6 +15,9 @@ _SHORTEST, _LONGEST = 0.5, 30.0
 
 #: Share of the range of flow or pressure that an inspiration exceeds.
 _ONSET = 0.1
+
+#: Share of the largest flow below which none flows, and of all flow that may not come back.
+_RESTS, _UNBALANCED = 0.02, 0.1
 
 #: A gap in time of more than so many intervals ends a breath.
 _GAP = 5.0
@@ -26,7 +29,7 @@ _FEWEST, _PIECES = 10, 4
 def find_breaths(
     file: str,
     time: Floats,
-    values: Mapping[str, Floats],
+    values: Columns,
     keys: list[Ints],
     groups: list[Ints],
     lead: float,
@@ -117,9 +120,7 @@ def _are_breaths(pieces: list[Floats]) -> bool:
     return len(pieces) >= _PIECES and bool(np.mean([is_breath(p) for p in pieces]) >= 0.8)
 
 
-def expiratory_valve(
-    values: Mapping[str, Floats], pieces: list[Ints]
-) -> tuple[NDArray[np.int8], str]:
+def expiratory_valve(values: Columns, pieces: list[Ints]) -> tuple[NDArray[np.int8], str]:
     """Return u_out of each row, ``(N,)``, and a sentence that says where it is from.
 
     Args:
@@ -134,7 +135,7 @@ def expiratory_valve(
     u_out = np.zeros(len(values["pressure"]), np.int8)
     if "flow" in values:
         flow = _bridged(values["flow"])
-        limit = -0.02 * float(np.quantile(np.abs(flow), 0.99))
+        limit = -_RESTS * float(np.quantile(np.abs(flow), 0.99))
         for piece in pieces:
             inward = flow[piece] > -limit
             after = np.maximum.accumulate(inward) | ~inward.any()
@@ -150,7 +151,7 @@ def expiratory_valve(
     return u_out, "u_out is 1 from where pressure has fallen half-way from its peak (a guess)."
 
 
-def _onsets(file: str, time: Floats, values: Mapping[str, Floats]) -> tuple[Ints, str]:
+def _onsets(file: str, time: Floats, values: Columns) -> tuple[Ints, str]:
     """Rows at which inspirations begin, and what shows them."""
     if "u_out" in values:
         shut = values["u_out"] < 0.5
@@ -174,6 +175,25 @@ def _onsets(file: str, time: Floats, values: Mapping[str, Floats]) -> tuple[Ints
     rise = pressure - low
     span = high - low
     return _crossings(rise, 0.3 * span, _ONSET * span), "where pressure rises"
+
+
+def signed_flow(file: str, time: Floats, pressure: Floats, flow: Floats) -> Floats | None:
+    """Flow that was recorded without its sign, mL/s, with it, ``(N,)``; None of any other flow.
+
+    Such a flow is never negative. It turns outwards where it is least between the peak of the
+    pressure and its fall; as much goes out as came in then, which no one-way flow does.
+    """
+    pressure, signed = _bridged(pressure), _bridged(flow)
+    if np.quantile(signed, 0.01) < -_RESTS * np.quantile(signed, 0.99):
+        return None
+    onsets, _ = _onsets(file, time, {"pressure": pressure})
+    for start, end in pairwise(sorted({0, *onsets.tolist(), len(time)})):
+        p, q = pressure[start:end], signed[start:end]
+        peak = np.argmax(p)
+        fallen = np.argmax(p[peak:] < np.quantile(p, _ONSET) + _ONSET * np.ptp(p))
+        q[peak + np.argmin(q[peak : peak + fallen + 1]) :] *= -1.0
+    is_balanced = abs(signed.sum()) < _UNBALANCED * np.abs(signed).sum()
+    return np.where(np.isfinite(flow), signed, np.nan) if is_balanced else None
 
 
 def _crossings(signal: Floats, high: float, low: float) -> Ints:
@@ -202,7 +222,6 @@ def _is_high(signal: Floats) -> Bools:
 
 def _bridged(values: Floats) -> Floats:
     """Values with their blanks interpolated, shape ``(N,)``."""
-    finite = np.isfinite(values)
-    if finite.all():
-        return values
-    return np.interp(np.arange(len(values)), np.flatnonzero(finite), values[finite])
+    import pandas as pd
+
+    return pd.Series(values).interpolate(limit_direction="both").to_numpy(copy=True)

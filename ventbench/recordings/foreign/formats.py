@@ -11,12 +11,14 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.arrays import Columns, Texts
 from ventbench.base.errors import InputError, require
 from ventbench.base.text import few
 from ventbench.recordings.foreign import sizes
@@ -128,7 +130,7 @@ def _json(file: str) -> Table | None:
 
 def _of_document(file: str, content: Any, kind: str) -> Table:
     """The table in records, lists and arrays: their longest columns."""
-    columns, beside = dict[str, NDArray[Any]](), dict[str, Any]()
+    columns, beside = Columns(), dict[str, Any]()
     for path, value in _leaves(content).items():
         array = np.squeeze(value if isinstance(value, np.ndarray) else np.array(value, object))
         if array.ndim == 0:
@@ -165,10 +167,20 @@ def _leaves(value: Any, path: str = "") -> dict[str, Any]:
     """Columns and single values of a document by their paths, whose parts are joined by points."""
     if isinstance(value, np.ndarray) and value.dtype.names:
         value = {name: value[name] for name in value.dtype.names}
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        first = next(iter(value[0]), None)
+        if isinstance(first, dict | list):  # parts of one table
+            return _leaves(list(chain.from_iterable(value)), path)
+        if isinstance(first, str):
+            return _leaves(_by_name({"names": value[0], path: value[1:]}))
     if isinstance(value, list) and value and all(isinstance(x, dict) for x in value):
         from pandas import json_normalize
 
-        frame = json_normalize(value)
+        frame = json_normalize(list(map(_by_name, value)))
+        for key, cell in frame.iloc[0].items():
+            if isinstance(cell, list) and cell and isinstance(cell[0], dict):
+                frame = frame.explode(key, ignore_index=True).dropna(subset=[key])
+                frame = json_normalize(list(frame[key])).join(frame.drop(columns=key))
         return {f"{path}.{key}".lstrip("."): frame[key].to_numpy() for key in frame}
     if not isinstance(value, dict):
         return {path: value}
@@ -215,23 +227,18 @@ def _channels(
         (r for name, r in zip(names, rates, strict=True) if read_header(name).role == "pressure"),
         Counter(rates).most_common(1)[0][0] if rates else 0.0,
     )
-    columns: dict[str, NDArray[Any]] = {}
-    spelt: dict[str, str] = {}
-    for name, unit, signal_rate, signal in zip(names, units, rates, values, strict=True):
-        if signal_rate != rate:
-            continue
-        while name in columns:
-            name += "_"
-        columns[name] = np.asarray(signal, float)
-        if unit and unit != "NU":  # WFDB's "no units"
-            spelt[name] = unit
+    chosen = [k for k, each in enumerate(rates) if each == rate]
+    headers = named([names[k] for k in chosen])
+    pairs = list(zip(headers, chosen, strict=True))
+    columns = {name: np.asarray(values[k], float) for name, k in pairs}
+    spelt = {name: units[k] for name, k in pairs if units[k] != "NU"}  # WFDB's "no units"
     if not columns or not len(next(iter(columns.values()))):
         raise InputError(f"{file} holds no signal; name the file of the waveforms")
     notes = [f"{kind} with {len(columns)} signals at {rate:g} Hz."]
     omitted = [f"{n} ({r:g} Hz)" for n, r in zip(names, rates, strict=True) if r != rate]
     if omitted:
         notes.append(f"Signals of other rates were left out ({', '.join(omitted)}).")
-    return Table(file, columns, spelt, None, float(rate), tuple(notes))
+    return Table(file, columns, spelt, None, float(rate), tuple(notes), headers)
 
 
 def _edf(file: str) -> Table:
@@ -272,8 +279,8 @@ def _of_values(file: str, columns: Mapping[str, Any], kind: str) -> Table:
     """Columns of any values: numbers where they are, words elsewhere."""
     from pandas import Series
 
-    names, units = named(list(columns)), dict[str, str]()
-    arrays: dict[str, NDArray[Any]] = {}
+    names, units = named(list(columns)), Texts()
+    arrays: Columns = {}
     for name, header in names.items():
         values = Series(columns[header])
         if values.dtype.kind == "M":
@@ -318,7 +325,7 @@ def _rosbag(file: str) -> Table:
     store = get_typestore(Stores.LATEST)
     folder = path if path.is_dir() or path.suffix == ".bag" else path.parent
     with (
-        readable(file, "a bag of ROS", also=AnyReaderError),
+        readable(file, "a bag of ROS", "; export another database as CSV", AnyReaderError),
         AnyReader([folder], default_typestore=store) as bag,
     ):
         for connection, at, data in bag.messages():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
+from ventbench.base.arrays import Texts
 from ventbench.base.files import data_beside
 
 #: What a column may stand for.
@@ -19,10 +20,10 @@ class Layout:
     """Columns of a known kind of file; of any other, none."""
 
     about: str = ""  #: what writes such files.
-    columns: dict[str, str] = field(default_factory=dict)  #: role of each column.
+    columns: Texts = field(default_factory=dict)  #: role of each column.
     required: tuple[str, ...] = ()  #: columns by which a file is recognised.
     #: units by role, where they are not those of the schema.
-    units: dict[str, str] = field(default_factory=dict)
+    units: Texts = field(default_factory=dict)
     words: dict[str, float] = field(default_factory=dict)  #: numbers that words stand for.
     lead: float = 0.0  #: time before the number of a breath changes at which its samples begin, s.
 

@@ -7,18 +7,20 @@ databases of time series export it; a packed one has a row a breath or a message
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from ventbench.base.arrays import Floats, Pieces
+from ventbench.base.arrays import Floats, Pieces, Texts
 from ventbench.base.errors import InputError
 from ventbench.recordings.foreign.tables import Table, named, rate_of
 from ventbench.recordings.headers import Conversion, conversion, is_unit
 
 #: Names of the values of a long table, and most things that it measures.
 _VALUES, _MOST = ("value", "values", "reading", "measurement", "val", "amplitude", "payload"), 100
+
+#: Number of a sample in a header, which no letter follows as in units.
+_PLACE = re.compile(r"[\s_.#-]*(?:[\[(]\d+[\])]|\d+(?![^\W_]))")
 
 #: Seconds since 1970 that a recording may be of: 2001 to 2100.
 _RECORDED = (1e9, 4.1e9)
@@ -32,7 +34,7 @@ _AGREEING, _ALIKE = 0.8, 0.02
 
 
 def one_row_a_sample(
-    table: Table, mapped: Mapping[str, str], time_unit: str | None, rate: float | None
+    table: Table, mapped: Texts, time_unit: str | None, rate: float | None
 ) -> Table:
     """Bring a long or a packed table into the usual shape; any other comes back as it is.
 
@@ -45,7 +47,8 @@ def one_row_a_sample(
     Raises:
         InputError: if lists of one row differ in length, or nothing tells the time within them.
     """
-    return _unpacked(_pivoted(_with_units(table), mapped), mapped, time_unit, rate)
+    table = _gathered(_pivoted(_with_units(table), mapped))
+    return _unpacked(table, mapped, time_unit, rate)
 
 
 def epoch_unit(values: Floats) -> str | None:
@@ -62,10 +65,12 @@ def epoch_unit(values: Floats) -> str | None:
     return None
 
 
-def time_change(table: Table, name: str, unit: str | None) -> Conversion:
-    """Change of units of a clock: as given, by its header, beside it, or since 1970."""
+def change_of(table: Table, name: str, quantity: str, unit: str | None) -> Conversion:
+    """Change of units of a column: as given, by its header, beside it; a clock's since 1970."""
     unit = unit or table.header(name).unit or table.units.get(name)
-    return conversion("time", unit or epoch_unit(table.columns[name]))
+    if quantity == "time":
+        unit = unit or epoch_unit(table.columns[name])
+    return conversion(quantity, unit)
 
 
 def _with_units(table: Table) -> Table:
@@ -78,19 +83,19 @@ def _with_units(table: Table) -> Table:
     return replace(table, units=units | table.units)
 
 
-def _role(table: Table, name: str, mapped: Mapping[str, str]) -> str | None:
+def _role(table: Table, name: str, mapped: Texts) -> str | None:
     header = table.header(name)
     written = table.headers.get(name, name)
     return mapped.get(name) or mapped.get(written) or (header.role if header.certain else None)
 
 
-def _clock(table: Table, mapped: Mapping[str, str]) -> str | None:
+def _clock(table: Table, mapped: Texts) -> str | None:
     """The column of numbers that is the time."""
     numeric = filter(table.is_numeric, table.columns)
     return next((name for name in numeric if _role(table, name, mapped) == "time"), None)
 
 
-def _pivoted(table: Table, mapped: Mapping[str, str]) -> Table:
+def _pivoted(table: Table, mapped: Texts) -> Table:
     """A column each of what a long table measures; a row each time, in the order of time."""
     numeric = list(filter(table.is_numeric, table.columns))
     if any(_role(table, name, mapped) == "pressure" for name in numeric):
@@ -122,30 +127,45 @@ def _pivoted(table: Table, mapped: Mapping[str, str]) -> Table:
     row = places.ngroup().to_numpy()
     first = np.unique(row, return_index=True)[1]
     unit_column = next((name for name, x in words.items() if _units(x)), None)
-    headers, units = named(kinds[kind]), dict[str, str]()
+    headers, units = named(kinds[kind]), dict(table.units)
     wide = pd.Series(table.columns[values], [row, table.columns[kind]]).unstack()
     columns = {name: wide[written].to_numpy() for name, written in headers.items()}
     if unit_column is not None:
         of_kind = dict(zip(table.columns[kind], table.columns[unit_column], strict=True))
-        units = {name: str(of_kind[written]) for name, written in headers.items()}
+        units |= {name: str(of_kind[written]) for name, written in headers.items()}
     for name, x in table.columns.items():
         kept = name not in (kind, values, unit_column) and len(pd.unique(x)) > 1
         if kept and name not in columns and (x == x[first][row]).all():
             columns[name] = x[first]
             headers[name] = table.headers.get(name, name)
-            units |= {name: table.units[name]} if name in table.units else {}
     note = f"A row a measurement: {kind} names it, {values} is its value ({', '.join(headers)})."
     shorter = table.rows(first).noted(note)
     return replace(shorter, columns=columns, units=units, headers=headers)
+
+
+def _gathered(table: Table) -> Table:
+    """Lists of samples in place of columns that number them: ``Paw[0]``, ``Paw[1]``, ...
+
+    There are more of them than rows, which channels of a device are not.
+    """
+    series: dict[str, list[str]] = {}
+    for name in filter(table.is_numeric, table.columns):
+        series.setdefault(_PLACE.sub(" ", table.headers.get(name, name)), []).append(name)
+    titles = [base for base, x in series.items() if base.strip() and len(x) > len(table)]
+    for base, header in named(titles).items():
+        names = series[header]
+        lists = np.empty(len(table), object)
+        lists[:] = list(np.stack([table.columns[name] for name in names], axis=1))
+        columns = {n: x for n, x in table.columns.items() if n not in names} | {base: lists}
+        table = replace(table, columns=columns, headers=table.headers | {base: header})
+    return table
 
 
 def _units(words: list[str]) -> bool:
     return bool(words) and all(map(is_unit, words))
 
 
-def _unpacked(
-    table: Table, mapped: Mapping[str, str], time_unit: str | None, rate: float | None
-) -> Table:
+def _unpacked(table: Table, mapped: Texts, time_unit: str | None, rate: float | None) -> Table:
     """A row each sample of the lists that stand in cells; their times go on from those of rows."""
     packed = {
         name: x
@@ -175,7 +195,7 @@ def _unpacked(
     if rate is not None or any(_role(table, name, mapped) == "time" for name in packed):
         return unrolled
     time = _clock(table, mapped)
-    factor = 1.0 if time is None else float(time_change(table, time, time_unit).factor)
+    factor = 1.0 if time is None else float(change_of(table, time, "time", time_unit).factor)
     starts = None if time is None else factor * np.asarray(table.columns[time], float)
     interval = _interval(table, starts, lengths)
     if interval is None:

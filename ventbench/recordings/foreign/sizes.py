@@ -24,7 +24,7 @@ LARGEST = 2_000_000_000
 _HEAD, _COMPRESSED, _NESTED = 512, 15, (1, 2, 3)
 
 #: Bytes of a number, and of a spreadsheet's cell once it is an object.
-_NUMBER, _CELL = 8, 40
+_NUMBER, CELL = 8, 40
 
 
 def refuse(file: str, size: float, part: str) -> None:
@@ -34,11 +34,6 @@ def refuse(file: str, size: float, part: str) -> None:
             f"{file}: {part} take {size / 1e9:.3g} GB, more than the {LARGEST / 1e9:g} GB that are "
             "read; export a part of it"
         )
-
-
-def check_samples(file: str, samples: float) -> None:
-    """Check the number of samples that a header claims, over all signals."""
-    refuse(file, _NUMBER * samples, f"{samples:.3g} samples by its header")
 
 
 def check_parquet(file: str) -> None:
@@ -56,16 +51,6 @@ def check_archive(file: str) -> None:
     """Check what the members of a zip archive, such as a spreadsheet, unpack to."""
     with zipfile.ZipFile(file) as archive:
         refuse(file, sum(member.file_size for member in archive.infolist()), "its unpacked parts")
-
-
-def check_cells(file: str, cells: float) -> None:
-    """Check the number of a spreadsheet's cells."""
-    refuse(file, _CELL * cells, f"{cells:.3g} cells")
-
-
-def check_text(file: str, cells: Any) -> None:
-    """Check a column of words, each of which takes as much as the longest."""
-    refuse(file, 4.0 * len(cells) * float(cells.str.len().max()), "the words of one column")
 
 
 def check_numpy(file: str) -> None:
@@ -124,7 +109,8 @@ def check_wfdb(file: str) -> None:
     import wfdb
 
     header = wfdb.rdheader(file.removesuffix(".hea"))
-    check_samples(file, (header.sig_len or 0) * (getattr(header, "n_sig", 1) or 1))
+    samples = (header.sig_len or 0) * (getattr(header, "n_sig", 1) or 1)
+    refuse(file, _NUMBER * samples, f"{samples:.3g} samples by its header")
 
 
 def gunzipped(file: str) -> bytes:

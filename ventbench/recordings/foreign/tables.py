@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.arrays import Bools, Columns, Floats, Ints, Texts
 from ventbench.base.errors import InputError, require
 from ventbench.base.files import data_beside
 from ventbench.base.text import few
@@ -58,6 +58,9 @@ _NUMBER = {
 #: A reading with its unit behind it.
 _READING = re.compile(r"([-+.,\d]*\d(?:[eE][-+]?\d+)?)\s*((?:[^\W\d]|%).*)")
 
+#: A quoted cell of several lines.
+_BROKEN = re.compile(rb'(?<![^\t,;|\n])"[^"\n]*(?:\n[^"\n]*){1,4}"(?![^\t,;|\n])')
+
 #: A list of samples in one cell, also as JSON writes it, and least number of them.
 _LIST = {
     mark: re.compile(rf"[\[({{]?\s*{number}(?:{separators}{number}){{7,}}\s*[\])}}]?")
@@ -91,9 +94,11 @@ _LABELLED = re.compile(
     re.IGNORECASE,
 )
 
-#: A time before such readings: a time of day, or a number at the very beginning of the line.
+#: A time beside such readings: a time of day before them, one since 1970 behind them, or a number
+#: at the very beginning of the line.
 _STAMP = re.compile(
-    rf"(?:.*?(?P<clock>{re.sub(r'[(](?![?])', '(?:', _CLOCK.pattern)})|\W*(?P<row>\d+\.?\d*)\b)?"
+    rf"(?:.*?(?P<clock>{re.sub(r'[(](?![?])', '(?:', _CLOCK.pattern)})"
+    r"|.*\s(?P<timestamp>\d{10,19})\s*$|\W*(?P<row>\d+\.?\d*)\b)?"
 )
 
 #: Names and units of channels, a line each, above the header of BIOPAC AcqKnowledge.
@@ -121,12 +126,12 @@ class Table:
     file: str  #: path as the caller wrote it.
     #: values by name, float64 with NaN for blank, ``(m,)``; text only where no cell is a number,
     #: objects where cells are lists of samples. Times of day are seconds.
-    columns: dict[str, NDArray[Any]]
-    units: dict[str, str] = field(default_factory=dict)  #: units beside the names, by name.
+    columns: Columns
+    units: Texts = field(default_factory=dict)  #: units beside the names, by name.
     lines: Ints | None = None  #: line of each row in a text file, ``(m,)``, else None.
     rate: float | None = None  #: sampling rate that stands beside the columns, Hz, or None.
     notes: tuple[str, ...] = ()  #: what was understood, a sentence each.
-    headers: dict[str, str] = field(default_factory=dict)  #: headers as written, by name.
+    headers: Texts = field(default_factory=dict)  #: headers as written, by name.
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -162,9 +167,9 @@ class Table:
         return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
 
 
-def named(headers: Sequence[str]) -> dict[str, str]:
+def named(headers: Sequence[str]) -> Texts:
     """Headers by the names of their columns: without units, and each once."""
-    names: dict[str, str] = {}
+    names: Texts = {}
     for k, text in enumerate(headers):
         name = read_header(text).name or str(k + 1)
         while name in names:
@@ -187,6 +192,7 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
         data, kind = _between(data, form)
     elif not form:
         data, kind = _plain_lines(data, _beginning(data))
+    data = _unbroken(data)
     above = _beginning(data)
     stated = re.fullmatch(r"\"?sep=(.)\"?", above[0])
     if stated is not None:  # a spreadsheet's own line
@@ -202,7 +208,7 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     note = f"Text ({encoding}), {kind}cells "
     if len(above) < _ROWS:  # rows in the place of columns
         cells = [x for line in above if len(x := _cells(line, separator)) > _ROWS]
-        if len(cells) > 1:
+        if len(cells) > 1 and _mostly_numbers(cells[0]):
             above = ["\t".join(x) for x in zip(*cells, strict=False)]
             data, note, separator = "\n".join(above).encode(), f"{note}of rows, ", "\t"
     table = _table(file, data, above[:_LOOKED_AT], separator, decimal, note)
@@ -211,6 +217,13 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     if "rate" in form:
         table = replace(table, rate=form["rate"])
     return _by_units(table) if "by_units" in form else table
+
+
+def _unbroken(data: bytes) -> bytes:
+    """A text with each of its headers in one line, below as many blank lines as it had more."""
+    whole = _BROKEN.sub(lambda cell: cell[0].replace(b"\n", b" "), data[: 1 << 16])
+    whole += data[1 << 16 :]
+    return b"\n" * (data.count(b"\n") - whole.count(b"\n")) + whole
 
 
 def decoded(file: str) -> tuple[bytes, str]:
@@ -278,8 +291,8 @@ def _dialect(
     best, most = None, 0.0
     quoted = any('"' in line for line in lines)
     for candidate in (separator,) if separator else _SEPARATORS:
-        split = [cells for cells in (_cells(line, candidate) for line in lines) if len(cells) > 1]
-        split = [cells for cells in map(_filled, split) if cells]
+        split = [cells for line in lines if len(cells := _cells(line, candidate)) > 1]
+        split = list(filter(None, map(_filled, split)))
         for mark in (decimal,) if decimal else (".", ","):
             if mark == candidate and not quoted:
                 continue
@@ -395,9 +408,7 @@ def _arrow(
     count = Counter(len(_cells(line, separator)) for line in looked_at if line.strip())
     usual = max(width, count.most_common(1)[0][0])
 
-    def read(
-        text: bytes | memoryview, kinds: dict[str, Any], only: list[str] | None = None
-    ) -> tuple[Any, list[str]]:
+    def read(text: bytes | memoryview, words: Sequence[str] = ()) -> tuple[Any, list[str]]:
         odd: list[str] = []
         table = arrow.read_csv(
             BufferReader(py_buffer(text)),
@@ -408,8 +419,7 @@ def _arrow(
                 delimiter=separator, invalid_row_handler=lambda row: odd.append(row.text) or "skip"
             ),
             arrow.ConvertOptions(
-                column_types=kinds,
-                include_columns=only,
+                column_types=dict.fromkeys(words, string()),
                 decimal_point=mark,
                 null_values=sorted(
                     {spelling for x in _BLANKS for spelling in (x, x.upper(), x.title(), "NaN")}
@@ -425,7 +435,7 @@ def _arrow(
     try:
         if data.find(b"\n#", offset) >= 0 or (again and data.find(b"\n" + again, offset) >= 0):
             raise ArrowInvalid
-        table, odd = read(body, {})
+        table, odd = read(body)
     except ArrowInvalid:
         table, odd = None, []
     stray: list[tuple[int, str]] = []
@@ -449,15 +459,13 @@ def _arrow(
         body, lines = "\n".join(regular).encode(), np.array(numbers, np.int64)
         if not regular:
             return None, lines, stray
-        table = read(body, {})[0]
+        table = read(body)[0]
     else:
         lines = np.arange(table.num_rows)
     numeric = (types.is_integer, types.is_floating, types.is_null)
     words = [x.name for x in table.schema if not any(is_kind(x.type) for is_kind in numeric)]
     if words:
-        text = read(body, dict.fromkeys(words, string()), words)[0]
-        for name in words:
-            table = table.set_column(table.schema.get_field_index(name), name, text.column(name))
+        table = read(body, words)[0]
     return table.select(list(map(str, range(width)))), lines, stray
 
 
@@ -498,11 +506,12 @@ def _header(
         units_row = texts.pop()
     # The names are the last line of as many cells as columns; an alarm may stand below them.
     cells = next((text for text in reversed(texts) if sum(map(bool, text)) == width), texts[-1])
+    # Names of R's write.table have no row's own; they are quoted where blanks are between them.
+    if width == len(cells) + 1 and not units_row and (not packed or above[-1][0][:1] in "'\""):
+        cells = ["row", *cells]
     if packed and len(cells) != width:
         note = f"{len(cells)} words stand above {width} columns; the columns are 1, 2, ..."
         return numbered, [], [note]
-    if width == len(cells) + 1 and not units_row:  # names of R's write.table have no row's own
-        cells = ["row", *cells]
     cells = cells + [""] * (width - len(cells))
     skipped = len(texts) - 1
     return cells, units_row, [f"{skipped} lines above the header were skipped."] if skipped else []
@@ -544,12 +553,12 @@ def rate_of(name: str, number: Any, unit: str = "", certain: bool = False) -> An
 
 
 def _columns(
-    file: str, names: dict[str, str], units_row: list[str], cells: Any, mark: str, notes: list[str]
-) -> tuple[dict[str, NDArray[Any]], dict[str, str], list[str], Bools]:
+    file: str, names: Texts, units_row: list[str], cells: Any, mark: str, notes: list[str]
+) -> tuple[Columns, Texts, list[str], Bools]:
     """Values and units by name; odd cells in words; rows of a word with hardly a number."""
     import pyarrow as pa
 
-    columns: dict[str, NDArray[Any]] = {}
+    columns: Columns = {}
     units = {name: unit for name, unit in zip(names, units_row, strict=False) if unit}
     odd_cells: list[tuple[str, Bools, Any]] = []
     any_odd, filled = np.zeros(len(cells), bool), np.zeros(len(cells), int)
@@ -580,7 +589,8 @@ def _columns(
                 continue
             clock = clock_seconds(texts)
             if clock is None:
-                sizes.check_text(file, texts)
+                longest = float(texts.str.len().max())  # each word takes as much
+                sizes.refuse(file, 4.0 * len(texts) * longest, "the words of one column")
                 columns[name] = texts.to_numpy(str)
                 continue
             values, units[name] = clock, "s"
@@ -643,20 +653,16 @@ def listed(cells: Sequence[Any], mark: str = ".") -> NDArray[Any] | None:
 def clock_seconds(cells: Any) -> Floats | None:
     """Seconds of times of day, on over midnight; None if hardly any cell is one."""
     parts = cells.str.extract(rf"^{_CLOCK.pattern}$")
-    times = parts[[0, 1, 2]].astype(float).to_numpy(float, na_value=np.nan)
-    if np.isfinite(times[:, 0]).mean() < 0.9:
+    times, half = parts[[0, 1, 2]].astype(float), parts[5].str.lower()
+    if times[0].notna().mean() < 0.9:
         return None
-    stopwatch = np.isnan(times[:, 2])  # 05:23.450 is minutes and seconds
-    times[stopwatch] = np.roll(times[stopwatch], 1, axis=1)
-    times[stopwatch, 0] = 0.0
-    hours, minutes, seconds = times.T
-    digits = parts[4].fillna("0")
+    stopwatch = times[2].isna()  # 05:23.450 is minutes and seconds
+    times[stopwatch] = times[stopwatch].shift(axis=1, fill_value=0.0)
+    times[0] = times[0].where(half.isna(), times[0] % 12.0 + 12.0 * (half == "pm"))
     # After a colon stand milliseconds, after a mark decimals.
-    scale = np.where(parts[3] == ":", 1000.0, 10.0 ** digits.str.len().to_numpy(float))
-    seconds = seconds + digits.astype(float).to_numpy(float) / scale
-    half = parts[5].str.lower()
-    hours = np.where(half.notna(), hours % 12 + 12 * (half == "pm"), hours)
-    out = 3600.0 * hours + 60.0 * minutes + seconds
+    digits = parts[4].fillna("0")
+    decimals = "0." + digits.where(parts[3] != ":", digits.str.zfill(3))
+    out = (times @ np.array([3600.0, 60.0, 1.0]) + decimals.astype(float)).to_numpy(copy=True)
     finite = np.flatnonzero(np.isfinite(out))
     back = np.diff(out[finite], prepend=out[finite[0]]) < -43200.0
     out[finite] += 86400.0 * np.cumsum(back)
@@ -725,7 +731,7 @@ def _plain_lines(data: bytes, above: list[str]) -> tuple[bytes, str]:
     return text.encode(), kind
 
 
-def _readings(line: str) -> dict[str, str]:
+def _readings(line: str) -> Texts:
     """Cells of a line by the names before them, and the time before all."""
     return dict(_LABELLED.findall(line)) | next(_STAMP.finditer(line)).groupdict("")
 
@@ -757,8 +763,8 @@ def _by_units(table: Table) -> Table:
     roles, units = {next(iter(table.columns)): "time"}, {"time": "s"}
     for name in table.columns:
         unit = table.header(name).unit
-        role = next((r for r in ("pressure", "flow", "volume") if unit in UNITS[r]), "time")
-        if unit and role not in units:
+        role = read_header(f"[{unit}]").role
+        if unit and role and role not in units:
             roles[name], units[role] = role, unit
     columns = {roles.get(name, name): values for name, values in table.columns.items()}
     phases = [x for x in columns.values() if x.dtype.kind == "U" and np.mean(x != "") > 0.5]
@@ -772,7 +778,7 @@ def _by_units(table: Table) -> Table:
 
 
 def read_spreadsheet(file: str) -> Table:
-    """Read the first sheet of a spreadsheet."""
+    """Read the sheet of a spreadsheet that has most rows."""
     require("openpyxl", extra="excel", what="spreadsheets")
     from openpyxl import load_workbook
 
@@ -781,13 +787,21 @@ def read_spreadsheet(file: str) -> Table:
             if "xl/workbook.xml" not in archive.namelist():
                 raise InputError(f"{file} is a zip archive; unpack it and name the file in it")
         sizes.check_archive(file)
-        sheet = load_workbook(file, read_only=True, data_only=True).worksheets[0]
+        book = load_workbook(file, read_only=True, data_only=True)
     rows, cells = [], 0
-    for row in sheet.iter_rows(values_only=True):  # padded to the last row and column
-        sizes.check_cells(file, cells := cells + len(row))
-        texts = ["" if cell is None else " ".join(str(cell).split()) for cell in row]
-        rows.append("\t".join(texts))
+    with closing(book):
+        sheet = max(book.worksheets, key=lambda x: x.max_row or 0)
+        for row in sheet.iter_rows(values_only=True):  # padded to the last row and column
+            cells += len(row)
+            sizes.refuse(file, sizes.CELL * cells, f"{cells:.3g} cells")
+            texts = ["" if cell is None else " ".join(str(cell).split()) for cell in row]
+            rows.append("\t".join(texts))
     text = "\n".join(rows).rstrip()
     return _table(
-        file, text.encode(), text.split("\n")[:_LOOKED_AT], "\t", ".", "First sheet, cells "
+        file,
+        text.encode(),
+        text.split("\n")[:_LOOKED_AT],
+        "\t",
+        ".",
+        f"Sheet {sheet.title}, cells ",
     )

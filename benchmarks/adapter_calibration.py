@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -81,7 +81,7 @@ def tell(what: str, cases: list[JudgedCase]) -> None:
     )
 
 
-def main(folders: list[Path], seed: list[str]) -> None:
+def main(folders: list[Path], seed: Annotated[list[str], typer.Option()]) -> None:
     """What shares do the parts of a diagnosis deserve?"""
     if len(folders) != len(seed):
         raise typer.BadParameter("give a seed for each folder, in their order")

@@ -16,6 +16,7 @@ from shlex import quote
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ventbench.base.arrays import Bools, Columns, Floats, Ints, Pieces, Texts
 from ventbench.base.errors import InputError
@@ -174,8 +175,6 @@ def import_recording(
         ...     "lab.csv", columns={"Paw": "pressure"}, units={"flow": "L/min"}, lung="R20C50"
         ... )  # doctest: +SKIP
     """
-    import pandas as pd
-
     table = path
     if not isinstance(table, Table):
         table = read_table(table, separator=separator, decimal=decimal)
@@ -229,10 +228,10 @@ def import_recording(
     _invert(values, invert)
     warnings += _check_sizes(table, by_role, values, changes, _USUAL if layout else units)
     keys = groups = [
-        pd.factorize(table.columns[name])[0] for name, role in roles.items() if role == "group"
+        _labels(table.columns[name]) for name, role in roles.items() if role == "group"
     ]
     if "breath" in by_role and not split_breaths:
-        keys = [*groups, pd.factorize(table.columns[by_role["breath"]])[0]]
+        keys = [*groups, _labels(table.columns[by_role["breath"]])]
     time = values["time"]
     notes += _checked_clock(table, time, keys)
     if "u_in" in values:
@@ -571,6 +570,11 @@ def _of_file(bad: BadSamples, table: Table, by_role: Texts) -> str:
     first = [int(row) + 1 if table.lines is None else int(table.lines[row]) for row in at]
     text = bad.what("rows" if table.lines is None else "lines", first)
     return text.replace(f"of {bad.column} ", f"of {by_role[bad.column]} ", 1) + "."
+
+
+def _labels(values: NDArray[Any]) -> Ints:
+    """Number of each distinct value."""
+    return np.unique(values, return_inverse=True)[1].reshape(-1)
 
 
 def _net_flow(table: Table, values: Columns) -> list[str]:

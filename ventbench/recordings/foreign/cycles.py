@@ -222,6 +222,7 @@ def _is_high(signal: Floats) -> Bools:
 
 def _bridged(values: Floats) -> Floats:
     """Values with their blanks interpolated, shape ``(N,)``."""
-    import pandas as pd
-
-    return pd.Series(values).interpolate(limit_direction="both").to_numpy(copy=True)
+    finite = np.isfinite(values)
+    if finite.all():
+        return values
+    return np.interp(np.arange(len(values)), np.flatnonzero(finite), values[finite])

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from ventbench.base.errors import InputError
 from ventbench.base.files import data_beside
 from ventbench.task import protocol
 from ventbench.task.lungs import Lung
@@ -61,6 +62,13 @@ class SafetySettings:
     #: largest rise of the command in one step, %; 100 for none, as in simulation.
     largest_rise: float = protocol.U_MAX
     open_tube: bool = False  #: no lung is on, so that no pressure is missed.
+
+    def __post_init__(self) -> None:
+        for name in ("largest_u_in", "largest_rise"):
+            if not 0.0 < (value := getattr(self, name)) <= protocol.U_MAX:
+                raise InputError(
+                    f"{name} is {value:g} %; it must be above 0 and at most {protocol.U_MAX:g} %"
+                )
 
     def as_dict(self) -> dict[str, Any]:
         """These and all checks, for every record."""

@@ -239,6 +239,7 @@ def test_what_stays_unexplained_is_told_first():
         "cmH2O stay unexplained beyond the noise of 0.41."
     )
     assert any("differs from breath to breath by about 13 %" in text for text in others)
+    assert report_text.scatter(dataclasses.replace(left, gain_scatter=0.003)) == ""
     place = ErrorRegion("volume", 0.0, 50.0, "mL", 0.8, 0.001, 0.9)
     better = dataclasses.replace(errors, after=OpenLoopError(0.5, 0.8))
     still = dataclasses.replace(left, open_loop=better, remaining=(place,))

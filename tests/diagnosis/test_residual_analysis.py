@@ -17,6 +17,7 @@ from ventbench.diagnosis.residual_analysis import (
     before,
     excess_over_noise,
     locate,
+    of_breaths,
     p_values,
     profiles,
     quiet_samples,
@@ -219,6 +220,26 @@ def test_time_since_an_edge():
     time = recorded.time
     np.testing.assert_allclose(since[:, 11:21], time[:, 11:21] - time[:, [10]])
     np.testing.assert_allclose(since[:, 21:], time[:, 21:] - time[:, [20]])
+
+
+def test_a_start_that_never_fades_takes_what_is_left_of_a_zero():
+    recorded, pressure, _, _ = exact(2, n=6)
+    off = np.linspace(-0.4, 0.6, 6)[:, None]
+    seen = dataclasses.replace(recorded, pressure=pressure + off)
+    stays, fades = np.ones_like(pressure), np.exp(-recorded.time / 0.1)
+    for start, of_zero in ((stays, 0.0 * off), (fades, off)):
+        _, sizes, of_start = of_breaths(seen, pressure, pressure - 5.0, start)
+        np.testing.assert_allclose(sizes[:, 1:2], of_zero, atol=0.02)
+        np.testing.assert_allclose(of_start, off * stays - of_zero, atol=0.02)
+
+
+def test_a_flow_that_drives_is_at_rest_after_most_gas_has_left():
+    recorded, _, _, _ = exact(3, n=4)
+    flow = np.where(recorded.u_out == 1, -80.0 * np.exp(-(recorded.time - 1.0) / 0.3), 20.0)
+    driven = dataclasses.replace(recorded, u_in=flow, u_out=np.zeros_like(recorded.u_out))
+    quiet = quiet_samples(driven)
+    assert quiet[recorded.time > 1.7].all()
+    assert not quiet[recorded.time < 1.55].any()
 
 
 def test_no_range_ends_at_a_value_that_comes_again_and_again():

@@ -424,9 +424,7 @@ def _is_unresolved(evaluator: Evaluator, candidate: FittedModel) -> bool:
         evaluator.criterion(base) - evaluator.criterion(candidate) > evaluator.settings.search.much
     )
     gains = evaluator.held_out_gain(candidate, base)
-    worth = np.sqrt(_square(evaluator, base)) - np.sqrt(_square(evaluator, candidate))
-    told = worth >= evaluator.settings.residuals.negligible
-    return told and much and float(gains.sum()) > evaluator.settings.held_out_test.threshold
+    return much and float(gains.sum()) > evaluator.settings.held_out_test.threshold
 
 
 def drop_mechanism(conclusion: Conclusion, name: str, evaluator: Evaluator) -> Conclusion:

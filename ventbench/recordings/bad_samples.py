@@ -144,11 +144,11 @@ def blanked(columns: Columns, bad: Iterable[BadSamples]) -> Columns:
 
 def left_out(bad: Iterable[BadSamples]) -> dict[str, float]:
     """Share of the readings of each column that are none; those of a slow sensor do not count."""
-    shares = Counter[str]()
+    shares: dict[str, float] = {}
     for samples in bad:
         if samples.kind != "slow":
-            shares[samples.column] += samples.share  # type: ignore[assignment]
-    return dict(shares)
+            shares[samples.column] = shares.get(samples.column, 0.0) + samples.share
+    return shares
 
 
 def notable(breaths: Breaths) -> str | None:

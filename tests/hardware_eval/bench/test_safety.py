@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hardware_eval.bench import safety
 from hardware_eval.bench.drive import BenchVentilator
 from hardware_eval.bench.loop import Bench
 from hardware_eval.bench.safety import DEFAULT, SafetySample, SafetyState
+from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.lungs import lung
 from ventbench.task.metrics import measured
@@ -190,6 +192,13 @@ def test_over_pressure_blames_the_controller_and_a_loose_tube_the_bench() -> Non
     assert all(check.reason for check in checks.values())
     assert checks["over_pressure"].threshold == protocol.SAFETY_TIME
     assert checks["peak_pressure"].threshold == protocol.SAFETY_PRESSURE + 5.0
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 101.0, math.nan])
+@pytest.mark.parametrize("name", ["largest_u_in", "largest_rise"])
+def test_a_limit_that_is_none_is_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"{name} is .* above 0 and at most 100"):
+        replace(DEFAULT, **{name: value})
 
 
 def test_commands_are_cut_to_range_size_and_rise() -> None:

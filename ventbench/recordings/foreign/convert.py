@@ -430,8 +430,8 @@ def _check_needed(table: Table, roles: Texts, layout: Layout, rate: float | None
         is_time = accepted[0] == "time"
         if has & set(accepted) or (is_time and timed):
             continue
-        others = filter(table.is_numeric, table.columns.keys() - roles.keys())
-        headers = {name: table.header(name) for name in sorted(others)}
+        others = (name for name in table.columns if name not in roles)
+        headers = {name: table.header(name) for name in filter(table.is_numeric, others)}
         likely = [name for name, header in headers.items() if header.role in accepted]
         open_ = likely or [name for name, x in headers.items() if not (x.role or x.excluded)]
         if len(accepted) > 1 and (not open_ or layout.columns):

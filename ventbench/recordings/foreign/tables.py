@@ -221,7 +221,9 @@ def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
 
 def _unbroken(data: bytes) -> bytes:
     """A text with each of its headers in one line, below as many blank lines as it had more."""
-    whole = _BROKEN.sub(lambda cell: cell[0].replace(b"\n", b" "), data[: 1 << 16])
+    whole, count = _BROKEN.subn(lambda cell: cell[0].replace(b"\n", b" "), data[: 1 << 16])
+    if not count:
+        return data
     whole += data[1 << 16 :]
     return b"\n" * (data.count(b"\n") - whole.count(b"\n")) + whole
 

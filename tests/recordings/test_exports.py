@@ -13,6 +13,7 @@ import pytest
 from ventbench.base.errors import InputError
 from ventbench.mechanics import identify
 from ventbench.recordings.foreign import import_recording
+from ventbench.recordings.foreign.cycles import signed_flow
 
 R, C, RATE = 12.0, 45.0, 100.0
 
@@ -255,3 +256,24 @@ def test_signals_with_their_units_in_json(tmp_path):
     }
     (tmp_path / "lab.json").write_text(json.dumps({"fs": RATE, "signals": signals}))
     check(tmp_path / "lab.json")
+
+
+def test_a_flow_that_is_no_flow_without_its_sign_stays_as_it_was() -> None:
+    """A sensor of one direction: nothing of it may be turned, not even on the way."""
+    time = np.arange(0.0, 30.0, 0.02)
+    phase = time % 3.0
+    pressure = 5.0 + np.where(phase < 1.0, 15.0 * phase, 15.0 * np.exp(-(phase - 1.0) / 0.3))
+    inward = np.where(phase < 1.0, 500.0, 0.0)
+    there_and_back = np.where(phase < 1.0, 500.0, 500.0 / 0.3 * np.exp(-(phase - 1.0) / 0.3))
+    there_and_back[np.abs(phase - 1.0) < 0.015] = 0.0  # as it turns
+    for flow, is_turned in ((inward, False), (there_and_back, True)):
+        given = flow.copy()
+        flow.setflags(write=False)
+        signed = signed_flow("x.csv", time, pressure, flow)
+        assert (signed is not None) is is_turned
+        np.testing.assert_array_equal(flow, given)
+        if signed is not None:
+            np.testing.assert_array_equal(np.abs(signed), given)
+            whole = time > 3.0  # the first breath may have begun before
+            assert (signed[whole & (phase > 1.1) & (phase < 2.9)] < 0.0).all()
+            assert (signed[whole & (phase > 0.35) & (phase < 0.95)] > 0.0).all()

@@ -183,7 +183,7 @@ def signed_flow(file: str, time: Floats, pressure: Floats, flow: Floats) -> Floa
     Such a flow is never negative. It turns outwards where it is least between the peak of the
     pressure and its fall; as much goes out as came in then, which no one-way flow does.
     """
-    pressure, signed = _bridged(pressure), _bridged(flow)
+    pressure, signed = _bridged(pressure), _bridged(flow).copy()
     if np.quantile(signed, 0.01) < -_RESTS * np.quantile(signed, 0.99):
         return None
     onsets, _ = _onsets(file, time, {"pressure": pressure})

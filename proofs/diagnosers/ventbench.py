@@ -57,6 +57,9 @@ class Calibration:
 
 CALIBRATION = Calibration()
 
+#: Share by which logs round readings.
+_ROUNDED = 1e-6
+
 #: Most hypotheses.
 _MOST = 100
 
@@ -167,7 +170,8 @@ def _parameters(found: Any, names: dict[str, Any]) -> dict[str, dict[str, float]
             values[f"{name}.change"] = (size, size, size)
             values[f"{name}.breath"] = (change.breath, change.breath, change.breath)
     if found.saturated is not None:
-        values["saturation.level"] = (found.saturated[0],) * 3
+        level = found.saturated[0]  # as the log rounds it
+        values["saturation.level"] = (level, level * (1.0 - _ROUNDED), level * (1.0 + _ROUNDED))
     known = {f"{name}.{key}" for name, about in names.items() for key in about["parameters"]}
     return {
         path: estimated(*triple)

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from tests.physics import cases
+from ventbench.base.interval import Interval
 from ventbench.diagnosis.diagnose import diagnose
 from ventbench.diagnosis.evaluator import fit_with_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.identification import place_of_change
+from ventbench.diagnosis.identification import first_after, place_of_change
 from ventbench.recordings import join
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Noise, make_data
@@ -64,6 +65,13 @@ def selected(breaths: Breaths) -> FittedModel:
 def by_oracle(m: dict[str, dict[str, float]], noise: float = 0.1) -> Breaths:
     """Recording of the oracle; 64 samples a breath."""
     return cases.recording(small.BREATHS, m, R=20.0, C=20.0, noise=noise)
+
+
+def test_a_change_beside_a_breath_that_nobody_saw_may_have_come_before_it():
+    ids, position = np.array([3, 4, 6, 7]), np.array([0.0, 0.25, 0.75, 1.0])
+    assert first_after(Interval(0.5, 0.5, 0.5), position, ids) == (6, 5, 6)
+    assert first_after(Interval(0.9, 0.5, 0.95), position, ids) == (7, 5, 7)
+    assert first_after(Interval(0.1, -0.1, 1.1), position, ids) == (4, 3, 7)
 
 
 @pytest.mark.parametrize("name", STEPS)

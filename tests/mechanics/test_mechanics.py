@@ -405,6 +405,8 @@ def test_labels_by_pressure_alone():
     assert bent.label_matches
     assert bent.fitted_R == 6.0
     assert bent.source == "pressure"
+    # Noise knows R to 1 %; the equations, which leave out what every rig has a little of, do not.
+    assert bent.ci95_R == pytest.approx((6.0 * 0.9691, 6.0 * 1.0319), rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,12 @@ from ventbench.diagnosis.findings import (
     Verdict,
 )
 from ventbench.diagnosis.hypothesis import varies_by_breath
-from ventbench.diagnosis.identification import IdentifiedModel, identify, place_of_change
+from ventbench.diagnosis.identification import (
+    IdentifiedModel,
+    first_after,
+    identify,
+    place_of_change,
+)
 from ventbench.diagnosis.intermittent import find
 from ventbench.diagnosis.residual_analysis import (
     flow_and_volume,
@@ -695,11 +700,9 @@ def _missing_mechanism(
         model, path = recording_model, f"{name}.{changes[0]}"
         at = place_of_change(model.evaluator, model.fit, experiment.identification_data, path)
         values[changes[0]] = replace(values[changes[0]], value=at.value, ci95=(at.low, at.high))
-        ids = experiment.breaths.breath_id
-        change = (at.value, at.low, at.high)
-        first = np.searchsorted(experiment.data.position, change).clip(max=len(ids) - 1)
-        now, low, high = (int(i) for i in ids[first])
-        affected = (now, low, high)
+        seen = experiment.uses.identifying
+        ids, position = experiment.breaths.breath_id[seen], experiment.data.position[seen]
+        affected = first_after(at, position, ids)
     return MissingMechanism(
         name=name,
         parameters=values,

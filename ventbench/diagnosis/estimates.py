@@ -14,9 +14,9 @@ from ventbench.diagnosis.conclusion import Conclusion, Swing, UnnamedEffect
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import MissingMechanism, NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
-from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, SUPPLY
+from ventbench.diagnosis.in_time import ALVEOLUS, CIRCUIT, INPUT_ERROR, SUPPLY
 from ventbench.diagnosis.validation import explained_share
-from ventbench.mechanics.labels import Estimate
+from ventbench.mechanics.labels import FORM_ERROR, Estimate
 from ventbench.physics.catalogue import (
     library,
     mechanism,
@@ -31,11 +31,6 @@ from ventbench.system_id import Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Floats
 from ventbench.system_id.predictor import START
 from ventbench.task.interfaces import Plant
-
-#: Share of a parameter that the equations of the library miss, as a standard deviation. Lags, dead
-#: times and compliances that strangers' recordings know to 1 % by their noise were 1 to 3 % off:
-#: steps of time, jitter of the clock, forms of what acts beside them.
-FORM_ERROR = 0.015
 
 #: Mechanisms that a periodic input is, by its place, and least weight of one that counts.
 _OSCILLATIONS = {SUPPLY: "supply_ripple", CIRCUIT: "circuit_water"}
@@ -135,29 +130,9 @@ def with_form_error(
         if spec.scope != "breath" and not spec.change_point:
             # A time that is written as 1 s when it does not matter is not off there.
             off = spec.neutral if spec is description.strength else 0.0
-            low, high = _wider(
-                estimate.value - off, estimate.ci95[0] - off, estimate.ci95[1] - off, share
-            )
-            if np.isfinite(low) and np.isfinite(high):
-                low, high = max(off + low, spec.low), min(off + high, spec.high)
-                estimate = replace(estimate, ci95=(low, high))
+            estimate = estimate.with_error(share, off, spec.low, spec.high)
         widened[spec.name] = estimate
     return widened
-
-
-def _wider(value: float, low: float, high: float, share: float) -> tuple[float, float]:
-    """Ends of an interval with an error of so much of the value, as a standard deviation.
-
-    Positive values err by factors; an interval that reaches zero errs by a sum.
-    """
-    if value < 0.0:
-        upper, lower = _wider(-value, -high, -low, share)
-        return -lower, -upper
-    if low > 0.0 and np.isfinite(high):
-        down, up = np.hypot(np.log([value / low, high / value]), 1.96 * share)
-        return float(value * np.exp(-down)), float(value * np.exp(up))
-    down, up = np.hypot([value - low, high - value], 1.96 * share * value)
-    return float(value - down), float(value + up)
 
 
 #: Intervals that are kept: whether a strength is definite asks for them, then the report.
@@ -244,10 +219,11 @@ def oscillation(
     amplitude, wide = float(sizes.mean()), 1.96 * float(sizes.std()) / len(sizes) ** 0.5
     frequency, sd = source.frequency, 1.96 * source.frequency_sd
     unit = mechanism(name).description.strength.unit
+    size = Estimate(amplitude, unit, (amplitude - wide, amplitude + wide))
     return MissingMechanism(
         name,
         {
-            "amplitude": Estimate(amplitude, unit, (amplitude - wide, amplitude + wide)),
+            "amplitude": size.with_error(INPUT_ERROR),
             "frequency": Estimate(frequency, "Hz", (frequency - sd, frequency + sd)),
         },
         effect.probability,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ventbench.base.arrays import Bools, Floats
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.interval import Interval
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion, conclude, drop_mechanism
@@ -150,6 +150,23 @@ def place_of_change(evaluator: Evaluator, fitted: FittedModel, data: Data, path:
         starts.append(minimise(side.cost, side.normal, side.start({}), *bounds).x)
     places, costs = side.change_costs(starts[0], path, after=starts[1])
     return likely_places(places, costs, float(places[np.argmin(costs)]))
+
+
+def first_after(place: Interval, position: Floats, ids: Ints) -> tuple[int, int, int]:
+    """First breath after a change, with the first and the last that it may be.
+
+    Breaths that judge, or that were left out, are not seen: a change beside one may have come
+    before or after it.
+
+    Args:
+        place: of the change, 0..1.
+        position: of the n breaths that are seen, in rising order, ``(n,)``.
+        ids: their ids, ``(n,)``.
+    """
+    low, now, high = np.searchsorted(position, (place.low, place.value, place.high))
+    last = len(ids) - 1
+    earliest = int(ids[low - 1]) + 1 if low else int(ids[0])
+    return int(ids[min(now, last)]), earliest, int(ids[min(high, last)])
 
 
 def _is_idle_form(conclusion: Conclusion, name: str, settings: SelectionConfig) -> bool:

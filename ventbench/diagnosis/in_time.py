@@ -62,6 +62,9 @@ _COMMANDS = {"lost_commands": (0.08, (None,)), "late_commands": (0.18, (2, 3, 4)
 #: Permutations of breaths, and p-value from which commands do not predict which are affected.
 _PERMUTATIONS, EXCHANGEABLE = 2000, 0.01
 
+#: Share by which the course of an input is off, as only the lung and the valves are modelled.
+INPUT_ERROR = 0.1
+
 #: Paths that are kept in each breath, and difference of commands, %, that is none.
 _PATHS, _SAME = 6, 0.3
 
@@ -333,7 +336,7 @@ def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
     """Change of the pressure by a unit input at one sample that no command explains, cmH2O.
 
     Only resistance, compliance and the expiratory valve are modelled. Other mechanisms are left
-    out, so that an input's course is right to about 10 %.
+    out, so that an input's course is right to :data:`INPUT_ERROR`.
 
     Args:
         partition: n breaths of T samples.

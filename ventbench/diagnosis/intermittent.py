@@ -49,8 +49,9 @@ _SHARES = np.array([0.03, 0.08, 0.15, 0.25, 0.4, 0.6])
 #: Standard deviation of the logarithm of strengths between affected breaths.
 _SPREAD = 0.3
 
-#: Multiples of the strength that refine it, and most alternations of fit and affected breaths.
-_MULTIPLES, _ROUNDS = np.geomspace(0.6, 1.0 / 0.6, 9), 4
+#: Multiples of the strength that refine it; most alternations of fit and affected breaths, and
+#: change of a start, cmH2O, at which that of commands and starts ends.
+_MULTIPLES, _ROUNDS, _SETTLED = np.geomspace(0.6, 1.0 / 0.6, 9), 4, 0.02
 
 #: Fewest breaths that must be affected, and must not be.
 _FEWEST, _MIN_UNAFFECTED = 2, 4
@@ -232,11 +233,12 @@ def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_EventFit]:
     """Lost and late commands beside a model of all training breaths."""
     training, fitted, share, candidates = evaluator.training, alone, float(_SHARES[1]), []
     least = float(evaluator.log_likelihood(alone, training).sum()) + _least(evaluator)
-    for _ in range(_ROUNDS):
+    for k in range(_ROUNDS):
         paths = _paths(evaluator, fitted, training, share, 0)
-        if fitted is alone and float(paths.nats.sum()) < least:
-            return candidates  # late ones seem lost, too
         share = float(np.clip(paths.missed.sum() / max(paths.sent.sum(), 1.0), _RARE, _SHARES[-1]))
+        # At a share that is too large each command that came costs: rare losses would be none.
+        if not k and _paths(evaluator, alone, training, share, 0).nats.sum() < least:
+            return candidates  # late ones seem lost, too
         now = replace(evaluator, training=_with_commands(evaluator, training, paths))
         before, fitted = fitted, fit_with_noise(now, alone.hypothesis, fitted)
         if not paths.missed.any() or before.noise == fitted.noise:
@@ -256,10 +258,12 @@ def _paths(
 ) -> Paths:
     """The commands that reached the valve in breaths whose shared parameters are known."""
     problem, x = _from_first_readings(evaluator, fitted, partition)
-    for _ in range(2):  # the start is that of a breath with the commands that reached the valve
+    for _ in range(_ROUNDS):  # the start is that of a breath with the commands that reached it
         paths = follow(problem, x, partition, share, lag or None)
-        reached = _with_commands(evaluator, partition, paths)
+        reached, before = _with_commands(evaluator, partition, paths), x
         x = evaluator.refit_breath_parameters(fitted, reached)[1]
+        if np.allclose(x, before, rtol=0.0, atol=_SETTLED):
+            break
     return paths
 
 

@@ -7,6 +7,7 @@ import inspect
 import pickle
 import subprocess
 import sys
+import traceback
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -188,6 +189,14 @@ def test_bad_input_is_refused_in_one_line_and_at_the_door(call):
     inside = [Path(entry.path) for entry in caught.traceback]
     assert set(inside) <= {ROOT / "ventbench" / "__init__.py", TESTS}
     assert caught.value._render_traceback_() == [f"{type(caught.value).__name__}: {caught.value}"]
+
+
+def test_the_exception_of_a_controller_is_chained_with_its_traceback():
+    with pytest.raises(ventbench.InputError, match="nothing works") as caught:
+        ventbench.score(broken, simulator="physics")
+    cause = caught.value.__cause__
+    assert isinstance(cause, ValueError)
+    assert broken.__code__ in {frame.f_code for frame, _ in traceback.walk_tb(cause.__traceback__)}
 
 
 def test_a_folder_runs_apart_unless_told_otherwise(monkeypatch):

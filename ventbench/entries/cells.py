@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from typing import Protocol as Interface
 
@@ -231,7 +231,7 @@ class InProcessSession(PolledControllers):
             try:
                 self._cells[index] = Cell(controller, task, submission.folder, source)
             except Failed as failed:
-                self.failures[index] = failed.failure
+                self.failures[index] = replace(failed.failure, cause=failed.__cause__)
 
     def ask(self, cells: Ints, observations: Floats) -> None:
         """Ask some controllers for their next command, as of the base class."""
@@ -241,7 +241,7 @@ class InProcessSession(PolledControllers):
                 try:
                     self._answers[index] = self._cells[index].act(row)
                 except Failed as failed:
-                    self.failures[index] = failed.failure
+                    self.failures[index] = replace(failed.failure, cause=failed.__cause__)
                     del self._cells[index]
 
     def answers(self) -> tuple[Ints, Floats]:

@@ -109,7 +109,8 @@ def score(
         progress=progress,
     )
     if len(result.failures) == result.requested[..., 0, 0].size and entry.sha256 is None:
-        raise SubmissionError(result.failures[0].message)  # a class or function that never works
+        first = result.failures[0]  # a class or function that never works
+        raise SubmissionError(first.message) from first.failure.cause
     return result
 
 

@@ -51,6 +51,8 @@ class Failure:
     detail: str = ""  #: the exception's text, or empty.
     breath: int | None = None  #: counted from 1; None before the first step.
     step: int | None = None  #: of the breath, counted from 1; None before the first step.
+    #: the exception, of code that runs in this process; not part of a record.
+    cause: BaseException | None = dataclasses.field(default=None, repr=False, compare=False)
 
     def message(self, submission: str, lung: str | None) -> str:
         """One sentence for a person, with the folder as written and the lung's id, if known."""
@@ -60,8 +62,9 @@ class Failure:
         return f"{submission}: {self.what}{when} {where}{detail}; the entry is not ranked."
 
     def to_json(self) -> dict[str, Any]:
-        """Return the attributes as JSON values."""
-        return dataclasses.asdict(self)
+        """Return the attributes as JSON values, without the exception."""
+        values = dataclasses.asdict(dataclasses.replace(self, cause=None))
+        return {name: value for name, value in values.items() if name != "cause"}
 
 
 #: Floats of one observation on the way to a controller, in the order of :class:`Observation`.

@@ -12,7 +12,8 @@ import pytest
 
 from ventbench.base import compilation
 from ventbench.base.errors import InputError
-from ventbench.diagnosis.diagnose import _Comparison, diagnose
+from ventbench.diagnosis.diagnose import _Comparison, _helps, diagnose
+from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.physics import physics
 from ventbench.plants.catalog import load_simulators
@@ -282,3 +283,17 @@ def test_efforts_that_differ_are_neither_doubted_nor_unexplained():
     assert errors.scatter_error > errors.noise_floor
     assert errors.unexplained < 0.5 * errors.after.rmse
     assert "patient_effort is worth" not in str(active)
+
+
+def test_efforts_are_not_judged_by_breaths_whose_efforts_nobody_knows():
+    """Held-out breaths told of them with each breath's effort integrated out."""
+    full = SimpleNamespace(hypothesis=Hypothesis(("patient_effort",)))
+    worse = SimpleNamespace(rmse=2.0)
+    open_loop: Any = SimpleNamespace(after=worse, refit=worse)
+    conclusion = SimpleNamespace(full=full, base=SimpleNamespace(hypothesis=Hypothesis()))
+    model: Any = SimpleNamespace(evaluator=None, conclusion=conclusion)
+    nobody: Any = None  # no judge is asked
+    for unchanged in (False, True):
+        correction: Any = SimpleNamespace(unchanged=unchanged, helps=False)
+        told = _helps(nobody, correction, model, open_loop, by_breath=False)
+        assert told is not unchanged

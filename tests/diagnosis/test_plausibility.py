@@ -12,7 +12,6 @@ from ventbench.diagnosis.settings import DEFAULT
 from ventbench.diagnosis.validation import (
     excludes_neutral,
     explained_share,
-    is_consistent,
     is_plausible,
 )
 from ventbench.mechanics.labels import Estimate
@@ -59,17 +58,6 @@ def test_an_interval_around_zero_names_nothing():
     assert not excludes_neutral(Estimate(0.3, "s", (0.0, 0.7)), "valve_delay")
     assert not excludes_neutral(Estimate(-0.2, "cmH2O", (-1.0, 0.5)), "sensor_drift")
     assert excludes_neutral(Estimate(-0.2, "cmH2O", (-0.3, -0.1)), "sensor_drift")
-
-
-def test_a_gain_that_few_breaths_carry_or_that_is_negative_is_none():
-    rng = np.random.default_rng(1)
-    assert not is_consistent(rng.normal(-1.0, 1.0, 20), SETTINGS)
-    assert not is_consistent(rng.normal(0.1, 3.0, 20), SETTINGS)
-    assert is_consistent(rng.normal(2.0, 3.0, 20), SETTINGS)
-    assert not is_consistent(np.array([-21.0, 3.0]), SETTINGS)
-    few = np.zeros(20)
-    few[:5] = 30.0  # an effect that lives in a quarter of the breaths
-    assert is_consistent(few + 0.01, SETTINGS)
 
 
 def test_a_shadow_of_an_effect_explains_the_square_of_their_correlation():

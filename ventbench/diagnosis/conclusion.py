@@ -15,18 +15,13 @@ import numpy as np
 
 from ventbench.base.arrays import Floats
 from ventbench.diagnosis import evidence
-from ventbench.diagnosis.evaluator import (
-    Evaluator,
-    cross_validated_gain,
-    fit_with_noise,
-)
+from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise
 from ventbench.diagnosis.evidence import IN_TIME, WARMTH, Posterior, Scored
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, linearise
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
 from ventbench.diagnosis.in_time import SWINGS, swing_columns, swing_spreads
-from ventbench.diagnosis.linearised import EFFORT, Term, gaussian, names_of
+from ventbench.diagnosis.linearised import EFFORT, Term, names_of
 from ventbench.diagnosis.unknown import preference, unplaced_gain
 from ventbench.diagnosis.validation import (
-    is_consistent,
     is_needed,
     is_negligible,
     passes_heldout_test,
@@ -141,7 +136,7 @@ def conclude(
         white = replace(evaluator, white=True, excluded=(*evaluator.excluded, *IN_TIME))
         of_ventilator = evidence.search(replace(white, training=every), settings.ventilator)
         rival = _judge(white, of_ventilator)
-        errors = [_square(each.evaluator, each.accepted) for each in (rival, judged)]
+        errors = [each.evaluator.mean_square(each.accepted) for each in (rival, judged)]
         if errors[0] < settings.error_ratio**2 * errors[1]:
             posterior, judged = of_ventilator, rival
     best, evaluator, candidate, full, gains, worths = judged
@@ -226,7 +221,7 @@ def _judge(evaluator: Evaluator, posterior: Posterior) -> _Judgement:
             now = replace(evaluator, gain_sd=gain_sd)
             candidate = fit_with_noise(now, candidate.hypothesis, candidate)
         judged = _Judgement(chosen, now, candidate, *eliminate(now, candidate))
-        judgements.append((_square(now, judged.accepted), judged))
+        judgements.append((now.mean_square(judged.accepted), judged))
         dropped = frozenset(candidate.names) - frozenset(judged.accepted.names)
         rejected |= dropped
         rest = names_of(chosen.terms) - dropped
@@ -269,7 +264,7 @@ def eliminate(
     def compared(name: str) -> tuple[Floats, float, bool]:
         reduced = evaluator.fit(model.hypothesis.minus(name), model.noise, model)
         gains = evaluator.held_out_gain(model, reduced)
-        before, after = _square(evaluator, reduced), _square(evaluator, model)
+        before, after = evaluator.mean_square(reduced), evaluator.mean_square(model)
         worth = float(np.sqrt(before) - np.sqrt(after))
         if evaluator.white:  # its likelihood counts a slow error once for each sample
             least = settings.held_out_test.threshold / WARMTH
@@ -280,12 +275,7 @@ def eliminate(
         if name in basis_terms():
             least = max(settings.search.least_change, 0.5 * model.noise.sigma[0])
             return gains, worth, before - after > least**2 or len(model.names) == 1
-        if is_negligible(evaluator, model, reduced, name):
-            return gains, worth, False
-        if not is_consistent(gains, settings.plausibility):
-            gains = cross_validated_gain(evaluator, model, reduced)
-            return gains, worth, is_consistent(gains, settings.plausibility)
-        return gains, worth, True
+        return gains, worth, not is_negligible(evaluator, model, reduced, name)
 
     while True:
         results = {n: compared(n) for n in model.names if judged is None or n in judged}
@@ -297,41 +287,11 @@ def eliminate(
         model = fit_with_noise(evaluator, model.hypothesis.minus(least), model)
 
 
-def _square(evaluator: Evaluator, model: FittedModel) -> float:
-    """Mean square of the open-loop error on held-out breaths, cmH2O^2."""
-    count = np.sum(evaluator.held_out.data.weight > 0.0)
-    return evaluator.square_error(model, evaluator.held_out) / float(count)
-
-
-def _marginal_gains(
-    evaluator: Evaluator, fitted: FittedModel, partition: Partition, columns: Floats, sd: Floats
-) -> tuple[Floats, Floats]:
-    """What changes of each breath's own gain there, integrated out, and their sizes.
-
-    Args:
-        evaluator: evaluator of the recording.
-        fitted: a model.
-        partition: n breaths.
-        columns: changes of the pressure by the coefficients, ``(n, k, T)``.
-        sd: their prior standard deviations, ``(k,)``.
-
-    Returns:
-        Log-likelihood of each breath, nats, ``(n,)``, and expected coefficients, ``(n, k)``.
-    """
-    linear = linearise(*evaluator.refit_breath_parameters(fitted, partition), clip=6.0)
-    white = linear.project_out_breath(linear.whiten(columns[:, :, None]))
-    nats, means = [], []
-    for X, residual in zip(white, linear.residual, strict=True):
-        value, mean, _ = gaussian(X @ X.T, -X @ residual, sd)
-        nats.append(value)
-        means.append(mean)
-    return np.array(nats), np.array(means)
-
-
 def _gain_sd(evaluator: Evaluator, fitted: FittedModel, sd: float) -> float:
     """Standard deviation of the logarithm of the breaths' gains if held-out breaths ask for it."""
     slopes = evaluator.sensitivities(fitted, evaluator.held_out)[0][:, None]
-    gains = _marginal_gains(evaluator, fitted, evaluator.held_out, slopes, np.array([sd]))[0]
+    linear = evaluator.linearised(fitted, evaluator.held_out)
+    gains = linear.integrate_out(slopes, np.array([sd]))[0]
     return sd if passes_heldout_test(gains, evaluator.settings.held_out_test) else 0.0
 
 
@@ -350,7 +310,7 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
         values = evaluator.transferred_values(model, partition)
         columns, courses = swing_columns(term.name, partition, values, frequency)
         sds = swing_spreads(columns.shape[1], spread)
-        nats, sizes = _marginal_gains(evaluator, model, partition, columns, sds)
+        nats, sizes = evaluator.linearised(model, partition).integrate_out(columns, sds)
         change, course = (np.einsum("nk,nkt->nt", sizes, basis) for basis in (columns, courses))
         return nats, sizes, change, course
 
@@ -378,8 +338,8 @@ def _swing(evaluator: Evaluator, fitted: FittedModel, term: Term) -> tuple[Swing
     nats = evaluator.held_out_log_likelihood(beside) + gain
     gained = nats - evaluator.held_out_log_likelihood(fitted)
     less = replace(held_out.data, measured=held_out.data.measured - change[:, None])
-    after = _square(replace(evaluator, held_out=Partition(less, held_out.predictor)), beside)
-    worth = float(np.sqrt(_square(evaluator, fitted)) - np.sqrt(after))
+    after = evaluator.mean_square(beside, Partition(less, held_out.predictor))
+    worth = float(np.sqrt(evaluator.mean_square(fitted)) - np.sqrt(after))
     return Swing(reported, sd, course, beside.noise, nats, worth), gained
 
 

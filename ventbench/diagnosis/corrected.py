@@ -438,7 +438,7 @@ def fit_open_loop(
         starts.append({"R": data.R, "C": data.C})
         starts.append(_best_lung(partition, settings))
     models = [evaluator.fit(fitted.hypothesis, noise, start=s, partition=partition) for s in starts]
-    return min(models, key=lambda model: evaluator.square_error(model, partition))
+    return min(models, key=lambda model: evaluator.mean_square(model, partition))
 
 
 def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, Floats]:

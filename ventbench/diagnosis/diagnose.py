@@ -505,13 +505,16 @@ def _helps(
 
     Its error need not be lower in a recording where a mild effect drowns in slow noise, but then
     the likelihood of those breaths must rise. A periodic input, which differs from breath to breath
-    (``by_breath``), corrects nothing and is not judged here.
+    (``by_breath``), corrects nothing, and nobody knows the efforts of breaths to come: neither is
+    judged here.
     """
     if correction.unchanged:
         return False
     if correction.helps and open_loop.after.rmse < open_loop.refit.rmse:
         return True
     evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
+    if conclusion.full.hypothesis.breath_terms:  # held-out breaths have said so, with their own
+        return True
     if conclusion.base.hypothesis == conclusion.full.hypothesis:
         return by_breath or correction.helps
     base = evaluator.fit(conclusion.base.hypothesis, conclusion.full.noise)

@@ -21,6 +21,7 @@ from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
     Hypothesis,
+    Linearisation,
     Partition,
     linearise,
     make_partition,
@@ -351,11 +352,20 @@ class Evaluator:
         names = partition.predictor.names
         return {name: values[:, k] for k, name in enumerate(names) if name != "position"}
 
-    def square_error(self, fitted: FittedModel, partition: Partition) -> float:
-        """Sum of the squared errors of breaths that start from their first readings, cmH2O^2."""
-        data = partition.data
-        error = self.predict(fitted, partition) - data.measured
-        return float(np.sum(np.square(error[data.weight > 0.0])))
+    def linearised(self, fitted: FittedModel, partition: Partition) -> Linearisation:
+        """A model around other breaths with starts, and perhaps gains, of their own."""
+        return linearise(*self.refit_breath_parameters(fitted, partition), clip=np.inf)
+
+    def mean_square(self, fitted: FittedModel, partition: Partition | None = None) -> float:
+        """Mean square of the open-loop error of breaths from their first readings, cmH2O^2.
+
+        Args:
+            fitted: a model.
+            partition: the breaths; the held-out ones if None.
+        """
+        partition = partition or self.held_out
+        error = self.predict(fitted, partition) - partition.data.measured
+        return float(np.mean(np.square(error[partition.data.weight > 0.0])))
 
     def breath_term(self, fitted: FittedModel) -> BreathTerm:
         """Term of a model whose parameters differ from breath to breath."""

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ventbench.base.linear import solve
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import (
     basis_terms,
@@ -28,6 +29,9 @@ from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.fit import Fit
 from ventbench.system_id.predictor import Predictor
 from ventbench.system_id.problem import Partition, Problem, free_paths
+
+#: Steps towards the likeliest sizes under noise with tails.
+_STEPS = 6
 
 #: Breaths that are simulated by functions of their own: those of a batch would be mostly idle.
 _FEW = 16
@@ -69,6 +73,31 @@ class Linearisation:
         """Part of another prediction ``(n, c, T)`` that no refit can absorb, ``(n, m)``."""
         white = self.project_out_breath(self.whiten(prediction - self.prediction)[:, None])
         return self.project_out_shared(white)[:, 0]
+
+    def integrate_out(self, columns: Floats, sd: Floats) -> tuple[Floats, Floats]:
+        """Integrate out changes that have a size of their own in each breath.
+
+        Noise has tails, so that the sizes are those where Laplace's method is exact to second
+        order: the likeliest, by reweighted least squares.
+
+        Args:
+            columns: changes of the pressure by the k sizes, ``(n, k, T)``.
+            sd: prior standard deviations of the sizes, ``(k,)``.
+
+        Returns:
+            Log-likelihood that each breath gains, nats, ``(n,)``, and the sizes, ``(n, k)``.
+        """
+        X = sd[:, None] * self.project_out_breath(self.whiten(columns[:, :, None]))  # (n, k, m)
+        noise, error = self.problem.noise, self.residual
+        sizes, left, eye = np.zeros(X.shape[:2]), error, np.eye(len(sd))
+        for _ in range(_STEPS):
+            weighted = X * noise.influence(left)[:, None]
+            curvature = weighted @ X.swapaxes(1, 2) + eye
+            sizes = -solve(curvature, weighted @ error[:, :, None])[:, :, 0]
+            left = error + np.einsum("nk,nkm->nm", sizes, X)
+        lost = noise.loss(left).sum(axis=1) + 0.5 * np.sum(sizes**2, axis=1)
+        volume = 0.5 * np.linalg.slogdet(curvature)[1]
+        return noise.loss(error).sum(axis=1) - lost - volume, sd * sizes
 
 
 def linearise(problem: Problem, x: Floats, *, clip: float = 4.0) -> Linearisation:

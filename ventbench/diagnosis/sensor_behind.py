@@ -21,7 +21,7 @@ from ventbench.diagnosis.estimates import with_form_error
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.diagnosis.unknown import preference
-from ventbench.diagnosis.validation import explained_share, is_consistent, passes_heldout_test
+from ventbench.diagnosis.validation import explained_share, passes_heldout_test
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import library, mechanism
 from ventbench.physics.mechanism import Parameter
@@ -113,8 +113,6 @@ def find_sensor(
 
     gains = log_likelihood(best.error, held) - log_likelihood(given, held)
     if not passes_heldout_test(gains, settings.held_out_test):
-        return None
-    if not is_consistent(gains, settings.plausibility):
         return None
     # Each against the best, tempered as the posterior of a search is.
     likeliest = float(log_likelihood(best.error, held).sum())

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "evidence-3"
+VERSION = "evidence-4"
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,7 @@ class HeldOutTestSettings:
     #: log-likelihood ratio on held-out breaths, nats: log(1 / 0.01), so that chance exceeds it in
     #: at most 1 % of recordings (Markov's inequality).
     threshold: float = 4.6
-    #: share of the threshold that must be left once outlying breaths are cut off.
-    kept_share: float = 0.5
-    #: standard deviations by which the sum over breaths must exceed its scatter.
-    consistency: float = 1.3
-    typical_quantile: float = 0.8  #: quantile of the gains' absolute values that counts as typical.
-    outlier_factor: float = 1.5  #: times that beyond which the gain of one breath is cut off.
+    resampled: float = 2.3  #: the same of resampled breaths, in 97.5 % of draws: log(10).
     #: gain of criterion on the training breaths from which cross-validation is tried where the
     #: held-out breaths are too few to tell.
     clear_criterion: float = 20.0
@@ -124,9 +119,6 @@ class PlausibilitySettings:
     #: least share of the sum of their squares that must pull: muscles that push at random are
     #: another effect.
     effort_pulls: float = 0.8
-    bootstraps: int = 1000  #: resamplings of the held-out breaths.
-    bootstrap_level: float = 0.025  #: quantile of the resampled gains that must be positive.
-    bootstrap_breaths: int = 4  #: fewest held-out breaths that can be resampled.
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from itertools import product
 import numpy as np
 
 from ventbench.base.arrays import Floats
-from ventbench.base.linear import solve
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.evidence import WARMTH
-from ventbench.diagnosis.hypothesis import FittedModel, Partition, linearise
+from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.system_id.data import Data
 
 #: Distance of the hat functions, s: the time constant of a slow valve or of a stiff lung.
@@ -31,37 +30,21 @@ _SPACING = 0.15
 #: Standard deviations of the course, cmH2O, and shares of the breaths; each pair is as likely.
 _SIZES, _SHARES = (0.3, 1.0, 3.0, 10.0), (0.1, 0.3, 0.6, 0.95)
 
-#: Steps towards the likeliest course under noise with tails.
-_STEPS = 6
-
 
 def unplaced_gain(evaluator: Evaluator, fitted: FittedModel, partition: Partition) -> float:
     """Log-likelihood that breaths gain if they err by courses of their own, nats.
 
-    The course is integrated out by Laplace's method, share and size by a sum.
+    The course is integrated out, share and size are summed over.
 
     Args:
         evaluator: evaluator of the recording.
         fitted: the model beside it.
         partition: n breaths.
     """
-    linear = linearise(*evaluator.refit_breath_parameters(fitted, partition), clip=np.inf)
-    columns = linear.whiten(_hats(partition.data)[:, :, None])
-    X = linear.project_out_breath(columns)  # (n, k, m)
-    noise, error = linear.problem.noise, linear.residual
-    before = noise.loss(error).sum(axis=1)
-    totals = []
-    for size in _SIZES:
-        course, eye = np.zeros(X.shape[:2]), np.eye(X.shape[1]) / size**2
-        residual = error
-        for _ in range(_STEPS):
-            weighted = X * noise.influence(residual)[:, None]
-            curvature = weighted @ X.swapaxes(1, 2) + eye
-            course = -solve(curvature, (weighted @ error[:, :, None]))[:, :, 0]
-            residual = error + np.einsum("nk,nkm->nm", course, X)
-        after = noise.loss(residual).sum(axis=1) + 0.5 * np.sum(course**2, axis=1) / size**2
-        volume = 0.5 * np.linalg.slogdet(curvature * size**2)[1]
-        totals.append(before - after - volume)
+    linear = evaluator.linearised(fitted, partition)
+    hats = _hats(partition.data)
+    spreads = (np.full(hats.shape[1], size) for size in _SIZES)
+    totals = [linear.integrate_out(hats, sd)[0] for sd in spreads]
     log_evidence = [mixture(share, gained).sum() for gained, share in product(totals, _SHARES)]
     return float(np.logaddexp.reduce(log_evidence) - np.log(len(log_evidence)))
 
@@ -93,11 +76,11 @@ def explained(
     Returns:
         Root-mean-square error that the term takes away, cmH2O, and the share, 0..1.
     """
-    linear = linearise(*evaluator.refit_breath_parameters(fitted, partition), clip=np.inf)
+    linear = evaluator.linearised(fitted, partition)
     count = float(np.sum(partition.data.weight > 0.0))
     lost = float(linear.problem.noise.loss(linear.residual).sum()) - 0.5 * count
     share = min(max(nats, 0.0) / max(lost, nats, 1e-9), 1.0)
-    before = evaluator.square_error(fitted, partition) / count
+    before = evaluator.mean_square(fitted, partition)
     above = max(before - linear.problem.noise.sigma[0] ** 2, 0.0)
     return float(np.sqrt(before) - np.sqrt(before - share * above)), share
 

@@ -63,6 +63,7 @@ from ventbench.diagnosis.settings import (
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.recordings.breaths import Breaths
+from ventbench.task.metrics.bootstrap import limits, resampled_means
 
 #: Gain on the testing breaths that is expected at a detection limit, nats: twice the bound of the
 #: held-out test, since the gain itself scatters; and strengths at which the effect is simulated.
@@ -114,25 +115,6 @@ def is_weak(name: str, beyond: Floats, share: float) -> bool:
     return bool(np.max(np.abs(beyond)) <= share * abs(strength.mild - strength.neutral))
 
 
-def is_consistent(gains: np.ndarray, settings: PlausibilitySettings) -> bool:
-    """Whether held-out breaths agree that a mechanism helps.
-
-    The sum over breaths must be positive, and so must all but the lowest few percent of the sums of
-    resampled breaths (bootstrap by breath).
-
-    Args:
-        gains: log-likelihood that the mechanism gains in each held-out breath, nats, ``(n,)``.
-        settings: every threshold.
-    """
-    if gains.sum() <= 0.0:
-        return False
-    if len(gains) < settings.bootstrap_breaths:
-        return True
-    rng = np.random.default_rng(0)
-    resampled = gains[rng.integers(0, len(gains), (settings.bootstraps, len(gains)))]
-    return bool(np.quantile(resampled.sum(axis=1), settings.bootstrap_level) > 0.0)
-
-
 def explained_share(worth: float, error: float, rest: float) -> float:
     """Share of the squared error which is no noise that a name explains, 0..1.
 
@@ -156,13 +138,12 @@ def passes_heldout_test(
     settings: HeldOutTestSettings = DEFAULT.held_out_test,
     threshold: float | None = None,
 ) -> bool:
-    """Whether held-out breaths ask for a term.
+    """Whether held-out breaths ask for a term, and agree in that.
 
     The sum of the gains is a split likelihood ratio: whatever the term and however it was chosen,
-    chance exceeds the threshold in at most 1 % of recordings. The sum must not depend on a few
-    breaths either, and a few breaths that no model fits, as those of another rig, must not outvote
-    the rest. With gains far beyond the typical ones cut off, half of the threshold must be left,
-    and more than the sum's own scatter.
+    chance exceeds the threshold in at most 1 % of recordings. A few breaths that no model fits, as
+    those of another rig, must not decide: odds of 10 to 1 are left in 97.5 % of the sums over
+    resampled breaths.
 
     Args:
         gains: log-likelihood that the term gains in each held-out breath, nats, ``(n,)``.
@@ -170,13 +151,8 @@ def passes_heldout_test(
         threshold: nats that the sum must exceed; as in ``settings`` if None.
     """
     threshold = settings.threshold if threshold is None else threshold
-    if float(gains.sum()) <= threshold:
-        return False
-    typical = float(np.quantile(np.abs(gains), settings.typical_quantile))
-    bound = settings.outlier_factor * typical
-    clipped = np.clip(gains, -bound, bound)
-    total, scatter = float(clipped.sum()), float(np.sqrt(np.sum(clipped**2)))
-    return total > settings.kept_share * threshold and total > settings.consistency * scatter
+    least = len(gains) * limits(resampled_means(gains))[0]
+    return float(gains.sum()) > threshold and least > settings.resampled
 
 
 def is_needed(evaluator: Evaluator, full: FittedModel, reduced: FittedModel) -> bool:

@@ -62,7 +62,8 @@ class Estimate:
             low: least possible value.
             high: largest possible value.
         """
-        ends = _wider(self.value - neutral, *(end - neutral for end in self.ci95), share)
+        first, last = self.ci95
+        ends = _wider(self.value - neutral, first - neutral, last - neutral, share)
         if not all(map(math.isfinite, ends)):
             return self
         return replace(self, ci95=(max(neutral + ends[0], low), min(neutral + ends[1], high)))

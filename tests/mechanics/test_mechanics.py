@@ -291,6 +291,21 @@ def test_a_cough_and_pieces_of_breaths_are_no_leak():
     assert leak(segments(replace(plain, volume=None, valid=inspirations)))[1] is None
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_pieces_of_breaths_between_missing_readings_are_no_leak(seed):
+    """At 30 Hz, three missing readings of the flow part a breath where it holds gas."""
+    plain = recording(45.0, 56.0, n=16, seed=seed, dt=1 / 30, sensors=("flow",), sigma=0.05)
+    assert plain.flow is not None
+    flow, rng = plain.flow.copy(), np.random.default_rng(seed)
+    for breath in range(0, 16, 2):
+        first = rng.integers(10, 70)
+        flow[breath, first : first + 3] = np.nan
+    found = only(replace(plain, flow=flow))
+    assert found.terms == ()
+    for truth, estimate in ((45.0, found.R), (56.0, found.C)):
+        assert estimate.ci95[0] < truth < estimate.ci95[1]
+
+
 @pytest.mark.slow
 def test_nothing_is_found_where_nothing_is():
     rng = np.random.default_rng(0)

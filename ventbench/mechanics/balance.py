@@ -69,12 +69,13 @@ def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]
         stored = (inside[-1] - inside[0]) / elastance
         missing = segment.volume[-1] - segment.volume[0] - stored
         dose = segment.dose[-1] - segment.dose[0]
-        rows.append((missing, dose, stored, np.ptp(segment.volume)))
+        # A piece of a breath ends where the lung holds gas; of a whole one, noise is left here.
+        rows.append((missing, dose, stored, np.ptp(segment.volume), abs(stored)))
     times = np.array([segment.time[-1] - segment.time[0] for segment in segments])
-    imbalance, mean_pressure, stored, breathed = np.array(rows).T / times
+    imbalance, mean_pressure, stored, breathed, doubt = np.array(rows).T / times
     columns = np.stack([mean_pressure, np.ones(len(rows)), stored, breathed], axis=1)
     deviations = np.array([np.inf, ZERO, _STORED_ERROR, _CALIBRATION_ERROR])
-    conductance, sd = _first_coefficient(imbalance, columns, deviations)
+    conductance, sd = _first_coefficient(imbalance, _STORED_ERROR * doubt, columns, deviations)
     if conductance <= 0.0:
         return tuple(segments), None
     nats = 0.5 * (conductance / sd) ** 2
@@ -105,18 +106,22 @@ def leak(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None]
     return corrected, term if named else None
 
 
-def _first_coefficient(values: Floats, columns: Floats, deviations: Floats) -> tuple[float, float]:
+def _first_coefficient(
+    values: Floats, errors: Floats, columns: Floats, deviations: Floats
+) -> tuple[float, float]:
     """First coefficient of a regression with errors of Student's t, and its standard deviation.
 
     Args:
         values: ``(n,)``.
+        errors: standard deviations of what each value has beside the scatter of all, ``(n,)``.
         columns: ``(n, k)``.
         deviations: prior standard deviations of the coefficients around zero, ``(k,)``.
     """
     residual = values - np.median(values)
     for _ in range(_STEPS):
         scatter = max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SCATTER)
-        weight = (_TAILS + 1.0) / (_TAILS + (residual / scatter) ** 2) / scatter**2
+        variance = scatter**2 + errors**2
+        weight = (_TAILS + 1.0) / (_TAILS * variance + residual**2)
         covariance = np.linalg.inv((columns.T * weight) @ columns + np.diag(deviations**-2.0))
         coefficients = covariance @ (columns.T @ (weight * values))
         residual = values - columns @ coefficients

@@ -182,19 +182,13 @@ def _compared(fine: NDArray[np.intp], valid: Bools, half: int, step: int) -> tup
 
 
 def _unclipped(values: Floats) -> Floats:
-    """The readings, NaN where they are clipped."""
-    return np.where(_clipped(values), np.nan, values)
-
-
-def _clipped(values: Floats) -> Bools:
-    """Samples in runs at the highest or the lowest of all readings, bool ``(n, T)``."""
-    out = np.zeros(values.shape, bool)
-    if not np.isfinite(values).any():
-        return out
-    for end in (np.nanmax(values), np.nanmin(values)):
+    """The readings ``(n, T)``, NaN in runs at the highest or the lowest of all."""
+    out = values.copy()
+    for end in (np.fmax.reduce(values, axis=None), np.fmin.reduce(values, axis=None)):
         for row, at_end in enumerate(values == end):
             for start, stop in runs(at_end):
-                out[row, start:stop] = stop - start >= _CLIPPED_RUN
+                if stop - start >= _CLIPPED_RUN:
+                    out[row, start:stop] = np.nan
     return out
 
 

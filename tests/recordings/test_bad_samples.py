@@ -96,6 +96,24 @@ def test_held_values_are_found_but_not_a_level_of_a_simulation():
     assert find_bad_samples({"pressure": level}) == ()
 
 
+def test_zeros_while_packets_are_lost_are_found_however_few_follow_one_another():
+    columns = signals()
+    rows = np.concatenate([np.arange(at, at + k) for k, at in enumerate((310, 618, 1060, 1215), 2)])
+    columns["flow"][rows] = 0.0
+    bad = find_bad_samples(columns)
+    assert {x.column for x in bad} == {"flow"}
+    np.testing.assert_array_equal(np.sort(np.concatenate([x.rows for x in bad])), rows)
+
+
+def test_a_spike_that_others_hide_is_found():
+    columns = signals()
+    rows = np.array([320, 322, 324])
+    columns["pressure"][rows] = [80.0, 50.0, 60.0]
+    (found,) = find_bad_samples(columns)
+    assert found.kind == "isolated"
+    np.testing.assert_array_equal(found.rows, rows)
+
+
 def test_no_flow_at_rest_is_a_reading_and_a_dead_sensor_is_not():
     """A flow without noise, which steps with the valve, is exactly zero in a lung at rest."""
     rng = np.random.default_rng(0)

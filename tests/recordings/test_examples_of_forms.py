@@ -238,7 +238,7 @@ def test_decimal_commas_between_commas_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("form", ["{:.2f} paw={} flow_lpm={}", "vent {} paw={} flow_lpm={}"])
 def test_a_log_without_a_clock_asks_for_it(tmp_path: Path, form: str) -> None:
     path = text(tmp_path, lines(form))
-    with pytest.raises(InputError, match=r"--map (row|NAME)=time, or .* --rate 50"):
+    with pytest.raises(InputError, match=r"--map (row|NAME)=time, or .* --rate HZ"):
         import_recording(path, lung="R20C50")
     imported = import_recording(path, lung="R20C50", rate=50.0)
     np.testing.assert_allclose(lung(imported), [20.0, 50.0, 6.0], rtol=0.05)

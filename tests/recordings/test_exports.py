@@ -148,6 +148,22 @@ def test_a_flow_without_a_sign_turns_outwards_as_pressure_falls(tmp_path, furthe
     assert np.nanmin(one_way.breaths.flow) >= 0.0
 
 
+@pytest.mark.parametrize("late", [0.25, 0.5])
+def test_pressure_and_flow_in_rows_of_their_own(tmp_path, late):
+    """As two topics of a log or two channels of a database come: never at the same moment."""
+    read_at = MADE.time + late / RATE
+    rows = pd.concat(
+        [
+            pd.DataFrame({"time_s": MADE.time, "paw": MADE.paw}),
+            pd.DataFrame({"time_s": read_at, "flow_Lps": np.interp(read_at, MADE.time, MADE.flow)}),
+        ]
+    ).sort_values("time_s")
+    path = csv(tmp_path / "topics.csv", rows)
+    check(path)
+    understood = import_recording(path, lung="R20C50").understood
+    assert any("short blanks in the others are interpolated" in x for x in understood)
+
+
 def test_rows_out_of_order_are_sorted_by_their_times(tmp_path):
     rng, frame = np.random.default_rng(0), pd.DataFrame(COLUMNS)
     swapped = np.arange(len(frame)) + np.where(np.arange(len(frame)) % 40 == 7, 1.5, 0.0)
@@ -176,6 +192,17 @@ def test_a_row_a_breath_with_a_column_a_sample(tmp_path, title):
     with pytest.raises(InputError, match="give it with --rate"):
         import_recording(path, lung="R20C50")
     check(path, rate=RATE)
+
+
+def test_more_rows_of_breaths_than_columns_of_samples(tmp_path):
+    table: dict[str, object] = {"breath": np.arange(80)}
+    for name, values in (("Paw", MADE.paw), ("Flow", 60.0 * MADE.flow)):
+        samples = np.tile(values.to_numpy().reshape(8, 300)[:, ::5], (10, 1))
+        table |= {
+            f"{name}_{k} [{'L/min' if name == 'Flow' else 'cmH2O'}]": x
+            for k, x in enumerate(samples.T)
+        }
+    check(csv(tmp_path / "lab.csv", table), rate=RATE / 5)
 
 
 def test_headers_of_several_lines(tmp_path):

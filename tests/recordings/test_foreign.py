@@ -182,7 +182,7 @@ def test_breaths_from_pressure_alone_and_from_a_rate(tmp_path):
     imported = import_recording(path, columns=columns, rate=RATE, lung="R20C50")
     assert len(imported.breaths) == 4
     assert "where pressure rises" in " ".join(imported.understood)
-    with pytest.raises(InputError, match="--rate 50"):
+    with pytest.raises(InputError, match="--rate HZ"):
         import_recording(path, columns=columns, lung="R20C50")
 
 

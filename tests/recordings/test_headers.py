@@ -122,6 +122,8 @@ def test_every_quantity_unit_and_style_gives_the_same_breaths():
         ("breath_id", "breath", None),
         ("u_in_%", "u_in", "%"),
         ("exp valve", "u_out", None),
+        ("AWF [L/min]", "flow", "L/min"),
+        ("AWV (mL)", "volume", "mL"),
     ],
 )
 def test_headers_of_real_files(header, role, unit):
@@ -132,7 +134,16 @@ def test_headers_of_real_files(header, role, unit):
 @pytest.mark.parametrize(
     "header",
     [
-        *("Volume (L/min)", "Paw_min", "PEEP", "Pes", "Pmean", "foo_pressure", "tidal volume"),
+        *(
+            "Volume (L/min)",
+            "Paw_min",
+            "P0.1 [cmH2O]",
+            "PEEP",
+            "Pes",
+            "Pmean",
+            "foo_pressure",
+            "tidal volume",
+        ),
         *(
             "Muscle Pressure [cmH2O]",
             "flow temperature",
@@ -154,7 +165,7 @@ def test_what_is_ambiguous_or_something_else_is_never_guessed(header):
             ("time", "foo_pressure", "flow"),
             "no column is the pressure.*--map foo_pressure=pressure",
         ),
-        (("clock7b", "Paw", "flow"), r"no column is the time.*--map clock7b=time.*--rate 50"),
+        (("clock7b", "Paw", "flow"), r"no column is the time.*--map clock7b=time.*--rate HZ"),
         (
             ("time", "Paw", "F 1 x"),
             "--map 'F 1 x'=flow; or, if none of them is, --map 'F 1 x'=unused",

@@ -120,6 +120,43 @@ def test_a_coarse_clock_names_the_rate(tmp_path):
     assert "not used: Time" in " ".join(imported.understood)
 
 
+def test_a_clock_of_fewer_digits_than_the_rate_names_the_rate(tmp_path):
+    """At 111 Hz with two digits, one step in ten is none."""
+    made = lung()
+    rounded = texts(0.9 * made["time"], 2)
+    path = table(tmp_path / "a.csv", NAMES, [rounded, *plain(made)[1:]])
+    with pytest.raises(InputError, match=r"--rate 111\.1$"):
+        import_recording(path, lung=LABEL)
+
+
+def test_few_readings_that_no_airway_has_are_left_out(tmp_path):
+    """Where the pressure falls at once, a spike is not far from what its neighbours span."""
+    made = lung()
+    at = int(np.argmin(np.diff(made["pressure"])))
+    made["pressure"][at] = -24.0
+    path = table(tmp_path / "a.csv", NAMES, plain(made))
+    (warning,) = import_recording(path, lung=LABEL).warnings
+    assert f"such as -24): lines {at + 2}; they were left out" in warning
+    made["pressure"][at : at + 40] = -24.0 - np.arange(40.0)
+    path = table(tmp_path / "a.csv", NAMES, plain(made))
+    with pytest.raises(InputError, match=r"are outside -20..120 cmH2O.*\n.*--skip-bad-breaths"):
+        import_recording(path, lung=LABEL)
+
+
+@pytest.mark.parametrize(("factor", "level"), [(1.0, 0), (1.3, 1), (0.5, 2)])
+def test_a_volume_that_is_not_the_integrated_flow_is_said(tmp_path, factor, level):
+    made = lung()
+    volume = factor * np.cumsum(made["flow"]) / RATE
+    path = table(tmp_path / "a.csv", [*NAMES, "Vol"], [*plain(made), texts(volume)])
+    if level == 2:
+        with pytest.raises(InputError, match=r"by a factor of 2\.0 .* by --map Vol=unused\.$"):
+            import_recording(path, lung=LABEL)
+        return
+    warnings = import_recording(path, lung=LABEL).warnings
+    assert len(warnings) == level
+    assert all("they differ by a factor of 1.3" in x for x in warnings)
+
+
 def test_an_alarm_below_the_names_and_signs_of_type(tmp_path):
     made = lung()
     columns = [[x.replace("-", "\N{MINUS SIGN}") for x in column] for column in plain(made)]

@@ -208,7 +208,11 @@ def test_a_breath_that_comes_again(rows, write_csv):
 
 def test_breaths_of_unequal_length(rows, write_csv):
     error = refused(write_csv(rows[:11] + rows[12:]))
-    has(error, 8, "breath_id", "2", "breath 2 has 5 samples, the others have 6", "pass --pad")
+    text = "1 of 3 breaths have not the usual 6 samples, the first is breath 2"
+    has(error, 8, "breath_id", "2", text, "pass --pad")
+    error = refused(write_csv(rows[:4] + rows[6:11] + rows[12:]))
+    assert "2 of 3 breaths have not the usual" in error.problems[0].what
+    assert error.total == 1
 
 
 def test_padding_that_would_fill_the_memory_is_refused(rows, write_csv):
@@ -252,7 +256,7 @@ def test_files_that_are_no_text(rows, write_csv, tmp_path):
         (b"\n", "first line is blank"),
         (b"PK\x03\x04....", "zip archive"),
         (b"\x1f\x8b\x08\x00broken", "cannot be read"),
-        (b"PAR1 and no more", "Parquet file cannot be read"),
+        (b"PAR1 and no more", "the file cannot be read (Parquet"),
         ("\r".join(NAMES).encode(), "CR alone"),
         (",".join(NAMES).encode(), "a header but no rows"),
         (",".join(NAMES).encode() + b"\n\n\n", "a header but no rows"),

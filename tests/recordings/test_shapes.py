@@ -98,7 +98,7 @@ def test_lists_of_samples_in_cells_of_text(tmp_path, cell, clock):
     path = tmp_path / "packed.csv"
     path.write_text("\n".join(lines) + "\n")
     if clock == "asked":
-        with pytest.raises(InputError, match="give it with --rate 50"):
+        with pytest.raises(InputError, match="give it with --rate HZ"):
             imported(path)
     options = {"starts": {"columns": {"start": "time"}}, "asked": {"rate": 50.0}}
     same(imported(path, **options.get(clock, {})), atol=1e-3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -22,9 +22,6 @@ from ventbench.cli.options import (
     written_console,
 )
 from ventbench.task import protocol
-
-if TYPE_CHECKING:
-    pass
 
 
 def lungs(json: JsonFile = None) -> None:

@@ -12,7 +12,7 @@ come near it: see :func:`~ventbench.recordings.roles.saturations`.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -21,6 +21,7 @@ import numpy as np
 from ventbench.base.arrays import Bools, Columns, Floats, Ints, runs
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, arranged
+from ventbench.recordings.schema import COLUMNS
 
 #: Columns that are measured.
 MEASURED = ("pressure", "flow", "volume")
@@ -38,6 +39,9 @@ _AGAIN, _MOST, _APART = 3, 0.2, 0.1
 #: An isolated reading leaves what its neighbours span by so many times that span, so many standard
 #: deviations of the noise, and this share of the inner range.
 _SPANS, _DEVIATIONS, _RANGE = 4.0, 12.0, 0.03
+
+#: Times that isolated readings are looked for, as those that are found are no neighbours.
+_PASSES = 3
 
 #: Expected number of runs of equal readings by chance below which a run is held.
 _CHANCE = 1e-3
@@ -74,8 +78,9 @@ class BadSamples:
         where = f"{place} {', '.join(map(str, listed[:_SHOWN]))}{', ...' if count > _SHOWN else ''}"
         if self.kind == "slow":
             return (
-                f"{self.column} changes in one of {self.values[0]:g} rows only, so it is read more "
-                f"slowly than it is written: the {count} values that only repeat were left out"
+                f"{self.column} changes in one of {self.of / (self.of - count):.0f} rows only, so "
+                f"it is read more slowly than it is written: the {count} values that only repeat "
+                "were left out"
             )
         why = {
             "mark": f"are {self.values[0]:g}, which stands for a missing value",
@@ -88,13 +93,17 @@ class BadSamples:
         return f"{of} {why}: {where}; they were left out"
 
 
-def find_bad_samples(columns: Columns, missing: Collection[float] = ()) -> tuple[BadSamples, ...]:
+def find_bad_samples(
+    columns: Columns, missing: Collection[float] = (), schema: Columns | None = None
+) -> tuple[BadSamples, ...]:
     """Find the samples of a recording that are no readings.
 
     Args:
         columns: those of :data:`MEASURED` that there are, and perhaps ``u_in``, in any unit and in
             the order of time, NaN where blank, ``(m,)`` each.
         missing: values that stand for a missing one, whatever their neighbours say.
+        schema: the columns in the units of the schema, whose ranges few readings may leave; such a
+            reading is refused if this is not given.
 
     Returns:
         What is to be left out, by column.
@@ -106,12 +115,11 @@ def find_bad_samples(columns: Columns, missing: Collection[float] = ()) -> tuple
         every = int(np.isfinite(values).sum())
         bad = np.zeros(len(values), bool)
 
-        def add(kind: str, where: Bools, value: float | None = None) -> None:
+        def add(kind: str, where: Bools) -> None:
             rows = np.flatnonzero(where & ~bad)  # noqa: B023
             if len(rows):
                 bad[rows] = True  # noqa: B023
-                rejected = values[rows] if value is None else np.full(len(rows), value)  # noqa: B023
-                collected.append(BadSamples(name, kind, rows, rejected, every))  # noqa: B023
+                collected.append(BadSamples(name, kind, rows, values[rows], every))  # noqa: B023
 
         for value in missing:
             add("mark", np.isclose(values, value, rtol=1e-6, atol=0.0))
@@ -120,13 +128,15 @@ def find_bad_samples(columns: Columns, missing: Collection[float] = ()) -> tuple
             signal = _Signal.of(rest)
             for value in signal.marks:
                 add("mark", values == value)
-            if (every_nth := signal.slow()) is not None:
-                add("slow", _repeats(values), float(every_nth))
+            if signal.is_slow:
+                add("slow", _repeats(values))
             else:
-                isolated = signal.isolated(bad)
+                isolated = signal.isolated()
                 if "u_in" in columns:
                     isolated &= ~_pulses(columns["u_in"])
                 add("isolated", isolated)
+        if schema and (out := COLUMNS[name].outside(schema[name]) & ~bad).mean() <= _NOTABLE:
+            add("isolated", out)
         cleaned[name] = np.where(bad, np.nan, values)
     held = _held(cleaned)
     return (*collected, *held)
@@ -144,10 +154,10 @@ def blanked(columns: Columns, bad: Iterable[BadSamples]) -> Columns:
 
 def left_out(bad: Iterable[BadSamples]) -> dict[str, float]:
     """Share of the readings of each column that are none; those of a slow sensor do not count."""
-    shares: dict[str, float] = {}
+    shares = defaultdict[str, float](float)
     for samples in bad:
         if samples.kind != "slow":
-            shares[samples.column] = shares.get(samples.column, 0.0) + samples.share
+            shares[samples.column] += samples.share
     return shares
 
 
@@ -171,8 +181,8 @@ def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
         breaths: the recording.
         missing: see :func:`find_bad_samples`.
     """
-    names = [name for name in (*MEASURED, "u_in") if getattr(breaths, name) is not None]
-    columns = {name: getattr(breaths, name)[breaths.valid] for name in names}
+    arrays = {name: getattr(breaths, name) for name in (*MEASURED, "u_in")}
+    columns = {name: x[breaths.valid] for name, x in arrays.items() if x is not None}
     bad = find_bad_samples(columns, missing)
     if not bad:
         return breaths
@@ -186,22 +196,33 @@ def clean(breaths: Breaths, missing: Collection[float] = ()) -> Breaths:
 
 
 def at_the_slowest(breaths: Breaths) -> Breaths:
-    """Breaths at the samples at which all is known, where a column comes evenly more slowly.
+    """Breaths at the readings of the column that comes most slowly, where one does, and evenly.
 
-    Between its readings it would be invented, and would lag behind the others where it jumps.
+    Others that were read in rows of their own are interpolated there. The slowest would lag behind
+    the others between its readings, where it jumps.
     """
-    names = [name for name in MEASURED if getattr(breaths, name) is not None]
-    known = breaths.valid & np.isfinite(sum(getattr(breaths, name) for name in names))
-    lengths, apart = known.sum(axis=1), np.diff(np.flatnonzero(known[breaths.valid]))
+    columns = {name: x for name in MEASURED if (x := getattr(breaths, name)) is not None}
+    slowest = min(columns.values(), key=lambda x: np.isfinite(x).sum())
+    known = breaths.valid & np.isfinite(slowest)
+    rows, lengths = np.flatnonzero(known[breaths.valid]), known.sum(axis=1)
+    apart = np.diff(rows)
     if min(lengths) < 2 or (usual := np.median(apart)) < 2 or np.quantile(apart, 0.95) > 2 * usual:
         return breaths
     first = breaths.time[np.arange(len(breaths)), known.argmax(axis=1)]
-    samples = {name: getattr(breaths, name)[known] for name in (*names, "u_in", "u_out")}
+    clock = np.append(0.0, np.cumsum(breaths.dt[breaths.valid]))
+    samples = {name: getattr(breaths, name)[known] for name in ("u_in", "u_out")}
+    for name, x in columns.items():
+        values = x[breaths.valid]
+        at = np.flatnonzero(np.isfinite(values))
+        after = np.searchsorted(at, rows).clip(1, len(at) - 1)
+        near = np.isfinite(values[rows]) | (at[after] - at[after - 1] <= 2 * usual)
+        between = np.interp(clock[rows], clock[at], values[at])
+        samples[name] = np.where(near, between, np.nan)
     kept = ("breath_id", "R", "C", "source", "left_out")
     rest = {name: getattr(breaths, name) for name in kept}
     note = (
-        f"{breaths.valid.sum() - len(apart) - 1} rows in which only some of the measured columns "
-        "are known were left out."
+        f"{breaths.valid.sum() - len(rows)} rows in which only some of the measured columns "
+        "are known were left out; short blanks in the others are interpolated."
     )
     rest["notes"] = (*breaths.notes, note)
     return arranged(lengths, (breaths.time - first[:, None])[known], samples, **rest)
@@ -234,33 +255,38 @@ class _Signal:
         resolution = float(np.median(inner)) if len(inner) else 0.0
         return cls(values, float(high - low), noise, resolution, marks)
 
-    def isolated(self, bad: Bools) -> Bools:
-        """Samples far outside of what the three on both sides of them span, but one of them."""
-        out = np.zeros(len(self.values), bool)
-        at = np.flatnonzero(np.isfinite(self.values) & ~bad)
-        if len(at) < _READINGS or self.span <= 0.0:
-            return out
-        centre = self.values[at]
-        padded = np.pad(centre, 3, mode="edge")  # at an end nothing is isolated
-        limit = _DEVIATIONS * self.noise + max(_RANGE * self.span, 3.0 * self.resolution)
-        steps = np.abs(np.diff(centre, prepend=centre[0], append=centre[-1])) > limit
-        some = np.flatnonzero(steps[1:] | steps[:-1])  # others cannot be far from five of six
-        neighbours = np.sort(padded[some[:, None] + np.array([0, 1, 2, 4, 5, 6])], axis=1)
-        low, high = neighbours[:, 1], neighbours[:, 4]
-        beyond = np.maximum(centre[some] - high, low - centre[some])
-        remote = beyond > limit + _SPANS * (high - low)
-        if remote.sum() <= _MOST * len(centre):
-            out[at[some[remote]]] = True
+    def isolated(self) -> Bools:
+        """Samples far outside of what the three on both sides of them span, but one of them.
+
+        Zeros that follow one another are one sample. One that is found hides others no more.
+        """
+        out = np.isin(self.values, self.marks)
+        for _ in range(_PASSES if self.span > 0.0 else 0):
+            left = np.isfinite(self.values) & ~out
+            first = left & ~((self.values == 0.0) & _repeats(self.values))
+            centre = self.values[first]
+            padded = np.pad(centre, 3, mode="edge")  # at an end nothing is isolated
+            limit = _DEVIATIONS * self.noise + max(_RANGE * self.span, 3.0 * self.resolution)
+            steps = np.abs(np.diff(centre, prepend=centre[0], append=centre[-1])) > limit
+            some = np.flatnonzero(steps[1:] | steps[:-1])  # others cannot be far from five of six
+            neighbours = np.sort(padded[some[:, None] + np.array([0, 1, 2, 4, 5, 6])], axis=1)
+            low, high = neighbours[:, 1], neighbours[:, 4]
+            beyond = np.maximum(centre[some] - high, low - centre[some])
+            found = np.zeros(len(centre), bool)
+            found[some[beyond > limit + _SPANS * (high - low)]] = True
+            remote = left & found[np.cumsum(first) - 1]
+            if remote.sum() <= _MOST * left.sum():
+                out |= remote
         return out
 
-    def slow(self) -> int | None:
-        """Rows from one reading to the next of a sensor that is slower than the rows, or None."""
+    @property
+    def is_slow(self) -> bool:
+        """Whether the sensor is slower than the rows: its readings change at equal steps."""
         changes = np.flatnonzero(np.diff(self.values[np.isfinite(self.values)]) != 0)
         lengths = np.diff(changes)
         if len(lengths) < _READINGS // 2 or (usual := int(np.median(lengths))) < 2:
-            return None
-        same = np.abs(lengths - usual) <= (usual > 2)
-        return usual if same.mean() >= _REGULAR else None
+            return False
+        return bool((np.abs(lengths - usual) <= (usual > 2)).mean() >= _REGULAR)
 
 
 def _repeats(values: Floats) -> Bools:
@@ -279,17 +305,11 @@ def _held(columns: Columns) -> list[BadSamples]:
     """Runs in which all columns, or one of them, repeat while their noise would have moved them."""
     chances = {name: _chance(values) for name, values in columns.items()}
     repeats = {name: _repeats(values) for name, values in columns.items()}
-    every = np.logical_and.reduce(list(repeats.values())) if len(repeats) > 1 else None
-    together = np.zeros(len(next(iter(columns.values()), ())), bool)
-    if every is not None:
-        together = _improbable(every, float(np.prod(list(chances.values()))))
+    every = np.logical_and.reduce(list(repeats.values()))
+    together = _improbable(every, float(np.prod(list(chances.values())))) & (len(repeats) > 1)
     collected = []
     for name, values in columns.items():
-        ends = (
-            np.isin(values, [np.nanmin(values), np.nanmax(values)])
-            if np.isfinite(values).any()
-            else together
-        )
+        ends = np.isin(values, [np.fmin.reduce(values), np.fmax.reduce(values)])
         if name == "flow" and "pressure" in columns:
             ends = ends | _at_rest(values, columns["pressure"])
         rows = np.flatnonzero(together | (_improbable(repeats[name], chances[name]) & ~ends))
@@ -307,8 +327,7 @@ def _at_rest(flow: Floats, pressure: Floats) -> Bools:
     span = float(np.diff(np.nanquantile(pressure, [0.05, 0.95]))[0])
     for start, stop in runs(flow == 0.0):
         during = pressure[start:stop]
-        if np.isfinite(during).any():
-            out[start:stop] = np.nanmax(during) - np.nanmin(during) < _RESTS * span
+        out[start:stop] = np.fmax.reduce(during) - np.fmin.reduce(during) < _RESTS * span
     return out
 
 
@@ -347,12 +366,12 @@ def repeated_rows(columns: Columns) -> Bools:
     on: then the signal jumps by two steps behind it, else by one.
     """
     repeats = np.logical_and.reduce([_repeats(values) for values in columns.values()])
-    measured = [columns[name] for name in MEASURED if name in columns]
-    if "time" in columns or not repeats.any() or len(measured) < 2:
-        return repeats if "time" in columns else np.zeros(len(repeats), bool)
+    if "time" in columns:
+        return repeats
+    measured, none = [columns[name] for name in MEASURED if name in columns], repeats & False
     chance = float(np.prod([_chance(values) for values in measured]))
-    if repeats.sum() < 10.0 * (1.0 + len(repeats) * chance):
-        return np.zeros(len(repeats), bool)
+    if len(measured) < 2 or repeats.sum() < 10.0 * (1.0 + len(repeats) * chance):
+        return none
     single = np.flatnonzero(repeats[1:-2] & ~repeats[:-3] & ~repeats[2:-1]) + 1
     single = single[(single > 2) & (single < len(repeats) - 3)]
     jumps = slopes = 0.0
@@ -364,4 +383,4 @@ def repeated_rows(columns: Columns) -> Bools:
         size = max(float(np.nanvar(values)), 1e-12)
         jumps += float((slope * (values[single + 1] - values[single]))[finite].sum()) / size
         slopes += float((slope**2)[finite].sum()) / size
-    return repeats if slopes > 0.0 and jumps < 1.5 * slopes else np.zeros(len(repeats), bool)
+    return repeats if slopes > 0.0 and jumps < 1.5 * slopes else none

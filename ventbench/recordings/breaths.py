@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import html
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -78,8 +78,8 @@ class Breaths:
             name: {
                 "breaths": len(index),
                 "interval, ms": 1e3 * float(np.median(self.dt[index][self.valid[index]])),
-                "highest, cmH2O": _over(np.nanmax, self.pressure[index]),
-                "lowest, cmH2O": _over(np.nanmin, self.pressure[index]),
+                "highest, cmH2O": float(np.fmax.reduce(self.pressure[index], axis=None)),
+                "lowest, cmH2O": float(np.fmin.reduce(self.pressure[index], axis=None)),
                 "u_in up to, %": float(self.u_in[index].max()),
             }
             for name, index in self.by_lung_index.items()
@@ -184,11 +184,6 @@ class Breaths:
     def _arrays(self) -> Columns:
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-
-
-def _over(of: Callable[[Floats], float], values: Floats) -> float:
-    """Figure of what is not blank; NaN if all is."""
-    return float("nan") if np.isnan(values).all() else float(of(values))
 
 
 #: How the names of recordings end.

@@ -31,8 +31,11 @@ UNITS: dict[str, dict[str, Fraction]] = {
     for quantity, sizes in _DATA["units"].items()
 }
 
-#: Pascal in a centimetre of water (conventional, at 4 degrees Celsius).
-_CMH2O = Fraction(_DATA["units"]["pressure"]["cmH2O"])
+#: Sizes of a ventilator's signals, in the schema's unit, and units that are taken for one another.
+USUAL: dict[str, tuple[float, float, list[str]]] = _DATA["usual"]
+
+#: Numbers at which clocks begin anew, in the unit of the file.
+WRAPS: list[int] = _DATA["clocks"]["wraps"]
 
 
 @dataclass(frozen=True)
@@ -90,11 +93,6 @@ def conversion(quantity: str, unit: str | None) -> Conversion:
             f"{unit!r} is no unit of {quantity} that is known; choose one of {', '.join(spellings)}"
         )
     return Conversion(name, to, spellings[name], unit is not None)
-
-
-def in_file_unit(change: Conversion, pascal: float) -> float:
-    """A pressure in the unit of a file."""
-    return pascal / float(change.factor * _CMH2O)
 
 
 def _in_words(factor: Fraction) -> str:

@@ -292,11 +292,11 @@ def check_lengths(scanned: Scanned, log: ProblemLog, *, pad: bool) -> None:
             log.add(scanned.starts[at], "breath_id", message, advice, values=ids[at])
         return
     usual = int(np.bincount(lengths).argmax())
-    for length in np.unique(lengths[lengths != usual]):
-        at = np.flatnonzero(lengths == length)
-        message = f"breath {{value}} has {length} samples, the others have {usual}"
-        advice = "Fix the breath, or pass --pad to fill short ones."
-        log.add(scanned.starts[at], "breath_id", message, advice, values=ids[at])
+    at = np.flatnonzero(lengths != usual)
+    message = f"{len(at)} of {len(lengths)} breaths have not the usual {usual} samples, the first "
+    message += "is breath {value}"
+    advice = "Fix them, or pass --pad to fill short ones."
+    log.add(scanned.starts[at[:1]], "breath_id", message, advice, values=ids[at])
 
 
 def check_inferable(scanned: Scanned, log: ProblemLog) -> None:

@@ -38,8 +38,8 @@ OPPOSITE = -0.25
 _END, _PEAK = 0.1, 0.6
 
 #: Correlation of volume and integrated flow from which they are of one lung, and ratio from which
-#: they contradict each other: leaks and drifts of a sensor make less.
-_OF_ONE_LUNG, _CONTRADICTS = 0.9, 1.4
+#: they differ more than by leaks and drifts, and from which they contradict each other.
+_OF_ONE_LUNG, _DIFFERS, _CONTRADICTS = 0.9, 1.2, 1.4
 
 #: A clock jumps over rows with a step of so many usual ones.
 _JUMP = 2.5
@@ -377,7 +377,7 @@ def _volumes(figures: Columns) -> Iterator[Finding]:
         return
     factor = float(np.median(ratio))
     apart = max(factor, 1.0 / factor)
-    if apart < _CONTRADICTS:
+    if apart < _DIFFERS:
         return
     units = [
         f"--{role}-unit {unit}"
@@ -389,9 +389,9 @@ def _volumes(figures: Columns) -> Iterator[Finding]:
         f"flow and volume contradict each other: they differ by a factor of {apart:.1f} (volume is "
         f"{factor:.3g} times the integrated flow)"
     )
-    advice = "Say which is wrong: --map NAME=unused leaves it out, "
-    advice += f"{' or '.join(units) or 'a unit such as --flow-unit L/min'} corrects it."
-    yield Finding("volume", message, advice, "refused", factor)
+    advice = f"Mend the one that is wrong by {' or '.join([*units, '--map NAME=unused'])}."
+    level = "refused" if apart >= _CONTRADICTS else "suspicious"
+    yield Finding("volume", message, advice, level, factor)
 
 
 def _numbering(figures: Columns, R: Floats, C: Floats) -> Iterator[Finding]:

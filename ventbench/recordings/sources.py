@@ -107,8 +107,7 @@ class CsvSource(Source):
                     raise fail(self.file, str(error).strip().rstrip("."), "Fix the file.") from None
                 raise RecordingError(problems, total) from None
         except (OSError, EOFError) as error:
-            advice = "Copy or download the file again."
-            raise fail(self.file, f"the file cannot be read ({error})", advice) from None
+            raise _damaged(self.file, error) from None
         self.sha256 = sha256(Path(self.file))
 
     def locate(self, rows: Collection[int]) -> Mapping[int, Place]:
@@ -148,8 +147,7 @@ def _header(file: str, kind: Kind) -> tuple[str, ...]:
         with open_bytes(file, kind) as stream:
             first = stream.readline(1 << 16)
     except (OSError, EOFError) as error:
-        advice = "Copy or download the file again."
-        raise fail(file, f"the file cannot be read ({error})", advice) from None
+        raise _damaged(file, error) from None
     try:
         text = first.decode("utf-8-sig").rstrip("\r\n")
     except UnicodeDecodeError as error:
@@ -302,7 +300,7 @@ def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[RecordingPr
 
 def _damaged(file: str, error: Exception) -> RecordingError:
     text = str(error).strip().splitlines()[0].rstrip(".")
-    return fail(file, f"the Parquet file cannot be read ({text})", "Write or copy it again.")
+    return fail(file, f"the file cannot be read ({text})", "Write or copy it again.")
 
 
 def to_numpy(array: pa.Array | pa.ChunkedArray, integer: bool = False) -> NDArray[Any]:

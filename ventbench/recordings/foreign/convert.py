@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.arrays import Bools, Columns, Floats, Ints, Pieces, Texts
+from ventbench.base.arrays import Columns, Floats, Ints, Pieces, Texts
 from ventbench.base.errors import InputError
 from ventbench.base.text import few
 from ventbench.recordings.bad_samples import (
@@ -37,32 +37,28 @@ from ventbench.recordings.foreign.formats import read_table
 from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, Layout, recognise
 from ventbench.recordings.foreign.shapes import change_of, epoch_unit, one_row_a_sample
 from ventbench.recordings.foreign.tables import Table
-from ventbench.recordings.headers import STATES, Conversion, conversion, in_file_unit, read_header
+from ventbench.recordings.headers import (
+    STATES,
+    UNITS,
+    USUAL,
+    WRAPS,
+    Conversion,
+    conversion,
+    read_header,
+)
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths
 from ventbench.recordings.scan import complete_times
 from ventbench.recordings.schema import COLUMNS
-from ventbench.task.lungs import Lung
+from ventbench.task.lungs import lung as parse
 
-#: Roles with units, and flows that a sensor counts in one direction.
-_MEASURED, _ONE_WAY = ("time", "pressure", "flow", "volume", "u_in"), ("flow_in", "flow_out")
+#: Flows that a sensor counts in one direction.
+_ONE_WAY = ("flow_in", "flow_out")
 
-#: Sizes of a ventilator's signals, in the schema's unit, and units that are taken for one another.
-_USUAL = {
-    "pressure": (5.0, 80.0, ("cmH2O", "kPa", "Pa")),
-    "flow": (150.0, 3000.0, ("mL/s", "L/s", "L/min")),
-    "volume": (5.0, 5000.0, ("mL", "L")),
-}
-
-#: Pressure, cmH2O, from which it is absolute.
-_ABSOLUTE = 500.0
+#: Pressure, cmH2O, from which it is absolute, and that of the air.
+_ABSOLUTE, _AIR = 500.0, 1033.2275
 
 #: Share of the steps of a clock that may be zero, and precision of a rate that it tells.
-_STANDS_STILL, _PRECISE = 0.2, 0.005
-
-#: Numbers at which clocks begin anew, in the unit of the file: counters of 16 to 32 bits, decimal
-#: ones, and minutes, hours, half days and days.
-_WRAPS = (2.0**16, 2.0**24, 2.0**31, 2.0**32, *(10.0**k for k in range(2, 10)), 60.0, 3600.0)
-_WRAPS += (43_200.0, 86_400.0, 3_600_000.0, 86_400_000.0)
+_STANDS_STILL, _PRECISE = 0.02, 0.005
 
 #: Share of the median step of a clock that nearly all of its steps exceed.
 _EVEN = 0.5
@@ -82,7 +78,7 @@ class Imported:
     @property
     def preview(self) -> str:
         """The first rows as they are written."""
-        return self.breaths.to_frame().head(5).to_string(index=False)
+        return self.breaths[:1].to_frame().head(5).to_string(index=False)
 
     def __repr__(self) -> str:
         """Breaths and columns."""
@@ -196,12 +192,13 @@ def import_recording(
         for role, name in by_role.items()
         if role != "breath" and not (role == "time" and rate is not None)
     }
-    table, raw = _without(table, raw, repeated_rows(raw), "that repeat the row before")
+    table, raw = _without_repeats(table, raw)
     if "time" not in raw:
         raw["time"], changes["time"], how = _even(table, by_role, rate)
         table = table.noted(how)
     measured = {role: raw[role] for role in (*MEASURED, "u_in") if role in raw}
-    bad = find_bad_samples(measured, tuple(missing))
+    schema = {role: changes[role].apply(x) for role, x in measured.items()}
+    bad = find_bad_samples(measured, tuple(missing), schema)
     raw |= blanked(measured, bad)
     warnings = [_of_file(bad_samples, table, by_role) for bad_samples in bad]
     notes = list(table.notes)
@@ -214,7 +211,7 @@ def import_recording(
         role: changes[role].apply(raw[role] + added[role] if role in added else raw[role])
         for role in changes.keys() & raw.keys()
     }
-    del raw, measured  # a copy of every column that is no longer needed
+    del raw, measured, schema  # a copy of every column that is no longer needed
     if not np.isfinite(values["pressure"]).any():
         raise InputError(
             f"{table.file}, column {by_role['pressure']}: every pressure is blank, so there is "
@@ -226,7 +223,7 @@ def import_recording(
             notes.append(f"Column {by_role.get(role, role)} is blank throughout.")
             del values[role]
     _invert(values, invert)
-    warnings += _check_sizes(table, by_role, values, changes, _USUAL if layout else units)
+    warnings += _check_sizes(table, by_role, values, changes, USUAL if layout else units)
     keys = groups = [
         _labels(table.columns[name]) for name, role in roles.items() if role == "group"
     ]
@@ -282,7 +279,8 @@ def import_recording(
     for doubt in doubts:
         if doubt.level == "refused":
             column = by_role.get(doubt.column, doubt.column)
-            raise InputError(f"{table.file}, column {column}: {doubt}")
+            refusal = f"{table.file}, column {column}: {doubt}"
+            raise InputError(refusal.replace("NAME", quote(column)))
     warnings += map(str, doubts)
     notes = [*breaths.notes, *few_breaths(len(breaths))]
     used = {name: role for name, role in roles.items() if role != "unused"}
@@ -443,7 +441,7 @@ def _check_needed(table: Table, roles: Texts, layout: Layout, rate: float | None
         option = f"--map {quote([*open_, *headers, 'NAME'][0])}={role}"
         if is_time:
             raise InputError(
-                f"{columns}. Say which with {option}, or give the sampling rate with --rate 50"
+                f"{columns}. Say which with {option}, or give the sampling rate with --rate HZ"
             )
         remedy = ""
         if len(accepted) > 1:
@@ -454,7 +452,7 @@ def _check_needed(table: Table, roles: Texts, layout: Layout, rate: float | None
 
 def _check_duplicates(table: Table, role: str, names: Sequence[str]) -> None:
     """Refuse to choose among columns of one role that differ."""
-    if role not in _MEASURED or role == "time":
+    if role not in UNITS or role == "time":
         return
     first = table.columns[names[0]]
     for name in names[1:]:
@@ -474,9 +472,9 @@ def _conversions(
     table: Table, by_role: Texts, units: Texts, layout: Layout
 ) -> dict[str, Conversion]:
     for role in units:
-        if role not in _MEASURED:
-            raise InputError(f"{role} has no unit; units are for {', '.join(_MEASURED)}")
-    quantities = {role: role for role in _MEASURED} | dict.fromkeys(_ONE_WAY, "flow")
+        if role not in UNITS:
+            raise InputError(f"{role} has no unit; units are for {', '.join(UNITS)}")
+    quantities = {role: role for role in UNITS} | dict.fromkeys(_ONE_WAY, "flow")
     given = layout.units | units
     return {
         role: change_of(table, name, quantities[role], given.get(quantities[role]))
@@ -520,7 +518,7 @@ def _numbers(table: Table, name: str, spoken: Mapping[str, float]) -> Floats:
     numbers = [spoken.get(word.casefold(), _number(word)) for word in kinds.tolist()]
     if None in numbers:
         examples = [str(x) for x in dict.fromkeys(values.tolist()) if x][:2]
-        examples.sort(key=lambda x: not re.match("open|on|true|yes|high|1", x, re.IGNORECASE))
+        examples.sort(key=lambda x: not re.match("open|on|true|yes|hi|1", x, re.IGNORECASE))
         option = ",".join(f"{x}={1 - n}" for n, x in enumerate(examples))
         raise InputError(
             f"{table.file}, column {name}: its cells are no numbers, such as {examples[0]!r}; say "
@@ -555,20 +553,21 @@ def _in_order(table: Table, by_role: Texts) -> Table:
     return backwards.noted("The newest row comes first: rows were put in the order of time.")
 
 
-def _without(table: Table, raw: Columns, omitted: Bools, why: str) -> tuple[Table, Columns]:
-    """Leave out rows, and say which."""
+def _without_repeats(table: Table, raw: Columns) -> tuple[Table, Columns]:
+    """Leave out rows that are there twice, and say which."""
+    omitted = repeated_rows(raw)
     if not omitted.any():
         return table, raw
     first = table.place(int(np.argmax(omitted)))
-    sentence = f"{int(omitted.sum())} rows {why} were left out, the first in {first}."
-    return table.rows(~omitted).noted(sentence), {role: x[~omitted] for role, x in raw.items()}
+    sentence = f"{omitted.sum()} rows that repeat the row before were left out, the first in "
+    table = table.rows(~omitted).noted(f"{sentence}{first}.")
+    return table, {role: x[~omitted] for role, x in raw.items()}
 
 
 def _of_file(bad: BadSamples, table: Table, by_role: Texts) -> str:
     """What was left out, by the name and the lines of the file."""
-    at = bad.rows[:6].tolist()
-    first = [int(row) + 1 if table.lines is None else int(table.lines[row]) for row in at]
-    text = bad.what("rows" if table.lines is None else "lines", first)
+    lines = np.arange(1, len(table) + 1) if table.lines is None else table.lines
+    text = bad.what("rows" if table.lines is None else "lines", lines[bad.rows[:6]].tolist())
     return text.replace(f"of {bad.column} ", f"of {by_role[bad.column]} ", 1) + "."
 
 
@@ -602,7 +601,7 @@ def _continued(table: Table, time: Floats) -> tuple[Floats, list[str]]:
         return time, []
     usual, time, wraps, resets = float(np.median(steps[steps > 0])), time.copy(), [], []
     for k in back.tolist():
-        size = next((w for w in _WRAPS if 0.0 < steps[k] + w <= 2.5 * usual), None)
+        size = next((w for w in WRAPS if 0.0 < steps[k] + w <= 2.5 * usual), None)
         place = table.place(int(at[k + 1]))
         if size is None:
             resets.append(place)
@@ -663,7 +662,7 @@ def _checked_clock(table: Table, time: Floats, keys: list[Ints]) -> list[str]:
     if median > SLOW:
         raise InputError(
             f"{table.file}: the median sampling interval is {median:.4g} s, and rates are 20 to "
-            "1000 Hz; give --time-unit ms, or the sampling rate with --rate 100"
+            "1000 Hz; give --time-unit ms, or the sampling rate with --rate HZ"
         )
     return [f"Sampling interval {1e3 * median:.4g} ms (median), {1 / median:.4g} Hz."]
 
@@ -676,10 +675,8 @@ def _plain(rate: float, precision: float) -> str:
 
 def _lung(label_id: str | None, values: Columns, count: int) -> tuple[Floats, Floats, str]:
     """R and C of each row."""
-    from ventbench.task.lungs import lung as parse
-
     if label_id is not None:
-        label: Lung = parse(label_id)
+        label = parse(label_id)
         over = " in place of R and C of the file" if {"R", "C"} <= values.keys() else ""
         how = f"Lung {label.id}, as given{over}."
         return np.full(count, label.R), np.full(count, label.C), how
@@ -697,7 +694,7 @@ def _invert(values: Columns, roles: Iterable[str]) -> None:
     """Change signs; of a valve, what is open."""
     open_at = {"u_in": 100.0, "u_out": 1.0}
     for role in roles:
-        if role not in values or role not in (*_MEASURED, "u_out"):
+        if role not in values or role not in (*UNITS, "u_out"):
             raise InputError(f"--invert {role}: no column is {role}")
         values[role] = open_at.get(role, 0.0) - values[role]
 
@@ -713,7 +710,7 @@ def _check_sizes(
 
     Where the unit of a role is ``given`` by the user, that is only told.
     """
-    for role, (least, most, units) in _USUAL.items():
+    for role, (least, most, units) in USUAL.items():
         if role not in values:
             continue
         change = changes.get(role) or changes["flow_in"]
@@ -723,7 +720,7 @@ def _check_sizes(
             raise InputError(
                 f"{column}: pressure is {median:.4g} cmH2O in the median, so "
                 f"it is absolute; subtract that of the air, in {change.unit}: "
-                f"--offset pressure=-{in_file_unit(change, 101325):.6g}"
+                f"--offset pressure=-{_AIR / change.factor:.6g}"
             )
         sizes = {x: size * float(conversion(role, x).factor / change.factor) for x in units}
         likely = [unit for unit, other in sizes.items() if least <= other <= most]
@@ -763,7 +760,7 @@ def _sound(
             bad.setdefault(int(owner[at]), f"{name} is {cells[at]:g}")
     for k, piece in enumerate(pieces):
         at = time[piece][np.isfinite(time[piece])]
-        reason = "the time goes back" if np.any(np.diff(at) <= 0) else None
+        reason = "the time stands still or goes back" if np.any(np.diff(at) <= 0) else None
         for name in ("R", "C"):
             if reason is None and np.any(samples[name][piece] != samples[name][piece[0]]):
                 reason = f"{name} changes"
@@ -774,7 +771,11 @@ def _sound(
         some = len(bad) < len(pieces)
         problems.append(
             f"{len(bad)} of {len(pieces)} breaths are concerned"
-            + ("; --skip-bad-breaths leaves them out." if some else ".")
+            + (
+                "; --skip-bad-breaths leaves them out."
+                if some
+                else "; where rows are even, --rate HZ takes the place of such a time."
+            )
         )
         raise InputError("\n".join([*problems[:5], *problems[5:][-1:]]))
     intact = [piece for k, piece in enumerate(pieces) if k not in bad]

@@ -19,6 +19,9 @@ from ventbench.recordings.headers import Conversion, conversion, is_unit
 #: Names of the values of a long table, and most things that it measures.
 _VALUES, _MOST = ("value", "values", "reading", "measurement", "val", "amplitude", "payload"), 100
 
+#: Most channels of one quantity that a device has.
+_CHANNELS = 32
+
 #: Number of a sample in a header, which no letter follows as in units.
 _PLACE = re.compile(r"[\s_.#-]*(?:[\[(]\d+[\])]|\d+(?![^\W_]))")
 
@@ -146,12 +149,14 @@ def _pivoted(table: Table, mapped: Texts) -> Table:
 def _gathered(table: Table) -> Table:
     """Lists of samples in place of columns that number them: ``Paw[0]``, ``Paw[1]``, ...
 
-    There are more of them than rows, which channels of a device are not.
+    There are more of them than rows, or than a device has channels.
     """
     series: dict[str, list[str]] = {}
     for name in filter(table.is_numeric, table.columns):
         series.setdefault(_PLACE.sub(" ", table.headers.get(name, name)), []).append(name)
-    titles = [base for base, x in series.items() if base.strip() and len(x) > len(table)]
+    titles = [
+        base for base, x in series.items() if base.strip() and len(x) > min(len(table), _CHANNELS)
+    ]
     for base, header in named(titles).items():
         names = series[header]
         lists = np.empty(len(table), object)
@@ -201,7 +206,7 @@ def _unpacked(table: Table, mapped: Texts, time_unit: str | None, rate: float | 
     if interval is None:
         raise InputError(
             f"{table.file}: lists of samples stand in the cells of {', '.join(packed)}, and no "
-            "column tells their rate; give it with --rate 50"
+            "column tells their rate; give it with --rate HZ"
         )
     if starts is None:
         starts = np.cumsum(interval * lengths) - interval * lengths

@@ -42,7 +42,7 @@ _ROWS = 30
 #: Separators, the likelier first.
 _SEPARATORS = ("\t", ";", ",", "|", " ")
 
-#: Cells that stand for nothing.
+#: Cells that stand for nothing, as they are written and in lower case.
 _BLANKS = _TEXTS["cells"]["blank"]
 
 #: Numbers by decimal mark, also with thousands apart: "1,061.3" or "1.061,3".
@@ -423,9 +423,7 @@ def _arrow(
             arrow.ConvertOptions(
                 column_types=dict.fromkeys(words, string()),
                 decimal_point=mark,
-                null_values=sorted(
-                    {spelling for x in _BLANKS for spelling in (x, x.upper(), x.title(), "NaN")}
-                ),
+                null_values=_BLANKS,
                 strings_can_be_null=False,
             ),
             system_memory_pool(),  # which gives back what is freed

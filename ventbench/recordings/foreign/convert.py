@@ -633,7 +633,10 @@ def _even(table: Table, by_role: Texts, rate: float | None) -> tuple[Floats, Con
     hertz = rate if rate is not None else table.rate or 1.0 / (stated or np.nan)
     if hertz <= 0:
         raise InputError(f"--rate {hertz:g}: a positive rate in Hz is needed")
-    how = f"Sampling rate {hertz:g} Hz, {'of the file' if rate is None else 'as given'}."
+    origin = (
+        "of the file" if rate is None else "as given (C is too small by the share of lost rows)"
+    )
+    how = f"Sampling rate {hertz:g} Hz, {origin}."
     return np.arange(len(table)) / hertz, conversion("time", None), how
 
 

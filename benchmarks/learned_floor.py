@@ -1,14 +1,13 @@
 """What a network attains that is told more than readings: an upper bound of the floor.
 
 The network of ``submissions/recurrent`` is trained on from its published weights, by its own
-program, but on no runs far beyond. Its encoder reads further numbers,
-whose weights begin at 0:
+program, but on no runs far beyond. Its encoder reads further numbers, whose weights begin at 0:
 
 - *nothing*: zeros, the control, which comes first;
 - *rig*: resistance, elastance, valve and all else of the rig, with the deviations of the run;
 - *gain*: these, and the gain of the valve in the breath to come. All that the best commands depend
-  on is then known but PEEP and the pressure at the start: what is left is mostly what the method
-  misses.
+  on is then known but PEEP and the pressure at the start: part of what is left is no lack of
+  knowledge but what the method misses.
 
 Runs are on rigs of the population that the rigs of rounds are drawn from, and on the entry's
 recorded rigs. The entry itself may not know that population, which holds rigs that are held out of

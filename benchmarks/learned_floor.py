@@ -5,9 +5,8 @@ program, but on no runs far beyond. Its encoder reads further numbers, whose wei
 
 - *nothing*: zeros, the control, which comes first;
 - *rig*: resistance, elastance, valve and all else of the rig, with the deviations of the run;
-- *gain*: these, and the gain of the valve in the breath to come. All that the best commands depend
-  on is then known but PEEP and the pressure at the start: part of what is left is no lack of
-  knowledge but what the method misses.
+- *gain*: these, and the gain of the valve in the breath to come; PEEP, the pressure at the start
+  and noise stay unknown.
 
 Runs are on rigs of the population that the rigs of rounds are drawn from, and on the entry's
 recorded rigs. The entry itself may not know that population, which holds rigs that are held out of
@@ -85,14 +84,14 @@ def parameters(runs: Any) -> Array:
     return jnp.concatenate([x.reshape(len(cells.pip), -1) for x in (*columns, cells.delay)], 1)
 
 
-def telling(runs: Any, known: Any) -> Any:
+def informed(runs: Any, knowledge: Any) -> Any:
     """Context in which the encoder is told something about n runs.
 
     Args:
         runs: n of them.
-        known: an index of :data:`TOLD`, mean and standard deviation of :func:`parameters`.
+        knowledge: an index of :data:`TOLD`, mean and standard deviation of :func:`parameters`.
     """
-    told, mean, deviation = known
+    told, mean, deviation = knowledge
     rig = (told > 0) * jnp.clip((parameters(runs) - mean) / deviation, -4.0, 4.0)
     gain = (told > 1) * jnp.log(runs.cells.gain) / 0.1
 
@@ -105,9 +104,9 @@ def telling(runs: Any, known: Any) -> Any:
 
 
 @jax.jit
-def errors(weights: Any, runs: Any, known: Any) -> Array:
+def errors(weights: Any, runs: Any, knowledge: Any) -> Array:
     """Errors of n runs over steps 2 to 34 of the scored breaths, cmH2O, ``(n,)``."""
-    with telling(runs, known):
+    with informed(runs, knowledge):
         pressure = train.roll(weights, runs)[0]
     return jnp.abs(pressure - runs.cells.pip)[1:].mean((0, 1))
 
@@ -151,7 +150,7 @@ def main(told: str = "nothing", updates: int = 1500, seed: int = 0) -> None:
         print("scores:", *(f"{values.mean():.2f}" for values in scores(weights, level)))
 
     def loss(weights: Any, runs: Any) -> Any:
-        with telling(runs, (level, *scale)):
+        with informed(runs, (level, *scale)):
             return _loss(weights, runs)
 
     weights = dict(np.load(ENTRY / "weights.npz"))
@@ -162,8 +161,8 @@ def main(told: str = "nothing", updates: int = 1500, seed: int = 0) -> None:
         f"train.py --start {out}/start.npz --checkpoint {out}/state.npz --out {out} "
         f"--seed {seed} --updates {updates} --rate 2e-3"
     ).split()
-    own: Any = {"rigs_to_train_on": lambda: sampled, "draw": draw, "loss": loss, "save": save}
-    with patch.multiple(train, **own), patch.object(sys, "argv", argv):
+    replaced: Any = {"rigs_to_train_on": lambda: sampled, "draw": draw, "loss": loss, "save": save}
+    with patch.multiple(train, **replaced), patch.object(sys, "argv", argv):
         train.main()
     ends = (scores(dict(np.load(f"{folder.format(TOLD[k])}/weights.npz")), k) for k in (0, level))
     for (draws, _), before, values in zip(sets, *ends, strict=True):

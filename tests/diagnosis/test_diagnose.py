@@ -285,15 +285,29 @@ def test_efforts_that_differ_are_neither_doubted_nor_unexplained():
     assert "patient_effort is worth" not in str(active)
 
 
-def test_efforts_are_not_judged_by_breaths_whose_efforts_nobody_knows():
-    """Held-out breaths told of them with each breath's effort integrated out."""
-    full = SimpleNamespace(hypothesis=Hypothesis(("patient_effort",)))
+@pytest.mark.parametrize(
+    ("names", "nats", "helps"),
+    [(("patient_effort",), {}, True)]
+    + [(("patient_effort", "leak"), {("patient_effort",): x}, x < 5.0) for x in (4.0, 6.0)],
+)
+def test_what_acts_beside_efforts_is_judged_beside_them(names, nats, helps):
+    """Nobody knows the efforts of the judging breaths: held-out breaths told of these."""
     worse = SimpleNamespace(rmse=2.0)
     open_loop: Any = SimpleNamespace(after=worse, refit=worse)
-    conclusion = SimpleNamespace(full=full, base=SimpleNamespace(hypothesis=Hypothesis()))
-    model: Any = SimpleNamespace(evaluator=None, conclusion=conclusion)
-    nobody: Any = None  # no judge is asked
+    full = SimpleNamespace(hypothesis=Hypothesis(names), noise=None)
+    evaluator = SimpleNamespace(fit=lambda other, noise: SimpleNamespace(hypothesis=other))
+    model: Any = SimpleNamespace(
+        evaluator=evaluator,
+        conclusion=SimpleNamespace(full=full),
+        pressures=lambda model, *_: model.hypothesis.names,
+    )
+    judge = SimpleNamespace(
+        log_likelihood=lambda names, _: {full.hypothesis.names: 5.0, **nats}[names]
+    )
+    experiment: Any = SimpleNamespace(
+        judge=judge, data=None, breaths=SimpleNamespace(pressure=np.zeros((1, 1)))
+    )
     for unchanged in (False, True):
         correction: Any = SimpleNamespace(unchanged=unchanged, helps=False)
-        told = _helps(nobody, correction, model, open_loop, by_breath=False)
-        assert told is not unchanged
+        told = _helps(experiment, correction, model, open_loop, by_breath=False)
+        assert told is (helps and not unchanged)

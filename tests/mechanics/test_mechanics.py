@@ -422,6 +422,9 @@ def test_labels_by_pressure_alone():
     assert bent.source == "pressure"
     # Noise knows R to 1 %; the equations, which leave out what every rig has a little of, do not.
     assert bent.ci95_R == pytest.approx((6.0 * 0.9691, 6.0 * 1.0319), rel=1e-3)
+    open_end = pretended(0.5, 20.0)
+    open_end.ci95 = lambda path: np.array([[0.0, 2.0] if path == "R" else [19.0, 21.0]])
+    assert label_match(open_end).ci95_R == pytest.approx((0.0, 2.0), abs=1e-3)  # none is negative
 
 
 @pytest.mark.parametrize(

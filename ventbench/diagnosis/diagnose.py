@@ -506,24 +506,24 @@ def _helps(
     Its error need not be lower in a recording where a mild effect drowns in slow noise, but then
     the likelihood of those breaths must rise. A periodic input, which differs from breath to breath
     (``by_breath``), corrects nothing, and nobody knows the efforts of breaths to come: neither is
-    judged here.
+    judged here, and what acts beside efforts is judged beside them.
     """
     if correction.unchanged:
         return False
     if correction.helps and open_loop.after.rmse < open_loop.refit.rmse:
         return True
-    evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
-    if conclusion.full.hypothesis.breath_terms:  # held-out breaths have said so, with their own
-        return True
-    if conclusion.base.hypothesis == conclusion.full.hypothesis:
-        return by_breath or correction.helps
-    base = evaluator.fit(conclusion.base.hypothesis, conclusion.full.noise)
+    full = recording_model.conclusion.full
+    hypothesis = full.hypothesis
+    judged = {*hypothesis.names} - {*hypothesis.breath_terms}
+    if not judged:
+        return by_breath or bool(hypothesis.breath_terms) or correction.helps
+    base = recording_model.evaluator.fit(hypothesis.minus(*judged), full.noise)
     first = experiment.breaths.pressure[:, 0]
     nats_full, nats_base = (
         experiment.judge.log_likelihood(
-            recording_model.pressures(model, experiment.data, first), conclusion.full.noise
+            recording_model.pressures(model, experiment.data, first), full.noise
         )
-        for model in (conclusion.full, base)
+        for model in (full, base)
     )
     return nats_full > nats_base
 

@@ -237,8 +237,10 @@ def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_EventFit]:
         paths = _paths(evaluator, fitted, training, share, 0)
         share = float(np.clip(paths.missed.sum() / max(paths.sent.sum(), 1.0), _RARE, _SHARES[-1]))
         # At a share that is too large each command that came costs: rare losses would be none.
-        if not k and _paths(evaluator, alone, training, share, 0).nats.sum() < least:
-            return candidates  # late ones seem lost, too
+        if not k:
+            paths = _paths(evaluator, alone, training, share, 0)
+            if paths.nats.sum() < least:
+                return candidates  # late ones seem lost, too
         now = replace(evaluator, training=_with_commands(evaluator, training, paths))
         before, fitted = fitted, fit_with_noise(now, alone.hypothesis, fitted)
         if not paths.missed.any() or before.noise == fitted.noise:

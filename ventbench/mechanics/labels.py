@@ -257,7 +257,7 @@ def match_labels(fit: Fit) -> tuple[LungMatch, ...]:
         R, compliance = (
             Estimate(
                 float(fit.value(path)[group]), unit, tuple(fit.ci95(path)[group].tolist())
-            ).with_error(FORM_ERROR)
+            ).with_error(FORM_ERROR, low=0.0)
             for path, unit in (("R", "cmH2O/(L/s)"), ("C", "mL/cmH2O"))
         )
         quadratic = float(quadratics[breath])

@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
 
 from ventbench.base.arrays import Floats
-from ventbench.base.linear import cholesky
+from ventbench.base.linear import cholesky, solve_lower
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
 from ventbench.diagnosis.in_time import SWINGS, in_time, of_some_breaths, swings, with_course
@@ -249,7 +248,7 @@ def _marginalise(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Float
     """Log evidence of a term, and the products with its coefficients integrated out."""
     at, sd = list(term.main), np.array(term.spread)
     L = cholesky(np.eye(len(at)) + sd[:, None] * G[np.ix_(at, at)] * sd)
-    R = linalg.solve_triangular(L, sd[:, None] * np.column_stack([G[at], b[at]]), lower=True)
+    R = solve_lower(L, sd[:, None] * np.column_stack([G[at], b[at]]))
     explained = R.T @ R
     return evidence(G, b, (term,)), G - explained[:-1, :-1], b - explained[:-1, -1]
 

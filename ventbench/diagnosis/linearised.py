@@ -12,7 +12,7 @@ import numpy as np
 from scipy import linalg, special
 
 from ventbench.base.arrays import Floats
-from ventbench.base.linear import cholesky
+from ventbench.base.linear import cholesky, solve_lower
 from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.physics.catalogue import library, mechanism, strength_path
 from ventbench.physics.mechanism import Parameter
@@ -78,7 +78,7 @@ def gaussian(G: Floats, b: Floats, sd: Floats) -> tuple[float, Floats, Floats]:
         sd: prior standard deviations, ``(k,)``.
     """
     L = cholesky(np.eye(len(sd)) + sd[:, None] * G * sd)
-    root = linalg.solve_triangular(L, np.diag(sd), lower=True, check_finite=False)
+    root = solve_lower(L, np.diag(sd))
     q = root @ b
     mean, sds = root.T @ q, np.sqrt(np.sum(root**2, axis=0))
     return 0.5 * float(q @ q) - float(np.log(np.diag(L)).sum()), mean, sds

@@ -306,6 +306,13 @@ def test_pieces_of_breaths_between_missing_readings_are_no_leak(seed):
         assert estimate.ci95[0] < truth < estimate.ci95[1]
 
 
+def test_bad_readings_where_few_breaths_begin_are_no_delay_and_no_inertance():
+    breaths = recording(32.0, 58.0, n=18, dt=0.02, sensors=("flow",), sigma=0.1)
+    pressure = breaths.pressure.copy()
+    pressure[[1, 10, 16], 2] += [44.0, -22.0, -23.0]
+    assert only(replace(breaths, pressure=pressure)).terms == ()
+
+
 @pytest.mark.slow
 def test_nothing_is_found_where_nothing_is():
     rng = np.random.default_rng(0)

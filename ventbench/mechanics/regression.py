@@ -272,17 +272,24 @@ def log_likelihood(table: CrossProducts, fitted: RegressionFit) -> Floats:
 _BOUND = 6.0
 
 
-def bounded(table: CrossProducts) -> CrossProducts:
-    """Bound the influence of breaths that no model of the others explains."""
+def influence(table: CrossProducts) -> Floats:
+    """Weight of each breath, ``(b,)``: less than one of what no model of the others explains."""
     if len(table) < 4:
-        return table
+        return np.ones(len(table))
     fitted = fit(table, np.ones(len(table), bool), PARABOLIC)
     square = _squares(table, fitted) / np.maximum(table.freedom, 1.0)
-    weight = np.minimum(1.0, _BOUND * np.median(square) / np.maximum(square, 1e-12))
-    if (weight == 1.0).all():
-        return table
+    return np.minimum(1.0, _BOUND * np.median(square) / np.maximum(square, 1e-12))
+
+
+def weighted(table: CrossProducts, weight: Floats) -> CrossProducts:
+    """Breaths that count with their weights, ``(b,)``."""
     products = table.products * weight[:, None, None, None]
     return CrossProducts(products, table.freedom * weight, table.constant * weight[:, None])
+
+
+def bounded(table: CrossProducts) -> CrossProducts:
+    """Bound the influence of breaths that no model of the others explains."""
+    return weighted(table, influence(table))
 
 
 def parabolic(segments: Sequence[Segment]) -> RegressionFit:

@@ -23,7 +23,9 @@ from ventbench.mechanics.regression import (
     cross_products,
     effect_size,
     fit,
+    influence,
     log_likelihood,
+    weighted,
 )
 from ventbench.mechanics.segments import Segment
 from ventbench.system_id.fit import t_quantile
@@ -228,14 +230,15 @@ def delay(segments: Sequence[Segment]) -> tuple[tuple[Segment, ...], Term | None
     if len({segment.breath for segment in segments}) < FEWEST_BREATHS:
         return tuple(segments), None
 
+    weight = influence(cross_products(segments, PARABOLIC))
+
     def models_of(family: _DelayFamily, change: _Change) -> list[_Model]:
-        return [
-            _Model(
-                cross_products([change(k, x) for k in range(len(segments))], _COLUMNS),
-                tuple(range(len(_COLUMNS))),
-            )
+        tables = (
+            cross_products([change(k, x) for k in range(len(segments))], _COLUMNS)
             for x in family.grid
-        ]
+        )
+        columns = tuple(range(len(_COLUMNS)))
+        return [_Model(weighted(table, weight), columns) for table in tables]
 
     sensor = models_of(_SENSOR, lambda k, lag: replace(segments[k], lag=lag))
     every = np.ones(len(sensor[0].table), bool)

@@ -105,6 +105,27 @@ def test_zeros_while_packets_are_lost_are_found_however_few_follow_one_another()
     np.testing.assert_array_equal(np.sort(np.concatenate([x.rows for x in bad])), rows)
 
 
+def test_zeros_that_mean_missing_are_found_on_edges_and_in_small_flows():
+    columns = signals()
+    rng = np.random.default_rng(2)
+    rows = np.sort(rng.choice(np.arange(3, 1797), 40, replace=False))
+    edges = np.array([300, 500, 750])  # where inspiration begins, or ends
+    rows = np.union1d(rows, edges)
+    small = np.abs(columns["flow"]) < 40.0  # what is not far from zero may be zero
+    rows = rows[~small[rows - 1] & ~small[rows + 1]]
+    columns["flow"][rows] = 0.0
+    (found,) = find_bad_samples(columns)
+    assert found.kind == "mark"
+    np.testing.assert_array_equal(found.rows, rows)
+    assert set(edges) <= set(rows.tolist())
+
+
+def test_zeros_at_which_a_flow_turns_are_readings():
+    columns = signals()
+    columns["flow"][np.arange(50, 1790, 150)] = 0.0  # between inspiration and expiration
+    assert find_bad_samples(columns) == ()
+
+
 def test_a_spike_that_others_hide_is_found():
     columns = signals()
     rows = np.array([320, 322, 324])

@@ -1,7 +1,7 @@
 """Samples that are no readings, as hypotheses against a signal that noise and physics move.
 
 - A *mark* of missing (-99, 99.99, 32767, 0): a value that comes again and again, exactly, with no
-  other value anywhere near it.
+  other value anywhere near it; or zeros beside which the signal is not near zero.
 - An *isolated* reading: it lies far outside of what its neighbours on both sides span.
 - A *held* reading: the last one comes again while the noise, which never rests, would have changed
   it. If all readings are held for the same time, the sensor is slower than the rows.
@@ -39,6 +39,9 @@ _AGAIN, _MOST, _APART = 3, 0.2, 0.1
 #: An isolated reading leaves what its neighbours span by so many times that span, so many standard
 #: deviations of the noise, and this share of the inner range.
 _SPANS, _DEVIATIONS, _RANGE = 4.0, 12.0, 0.03
+
+#: Standard deviations of the noise from which on a neighbour of a zero is not near zero.
+_AWAY = 4.0
 
 #: Times that isolated readings are looked for, as those that are found are no neighbours.
 _PASSES = 3
@@ -134,6 +137,8 @@ def find_bad_samples(
                 isolated = signal.isolated()
                 if "u_in" in columns:
                     isolated &= ~_pulses(columns["u_in"])
+                if name != "volume":  # which begins at zero
+                    add("mark", signal.zeros())
                 add("isolated", isolated)
         if schema and (out := COLUMNS[name].outside(schema[name]) & ~bad).mean() <= _NOTABLE:
             add("isolated", out)
@@ -277,6 +282,26 @@ class _Signal:
             remote = left & found[np.cumsum(first) - 1]
             if remote.sum() <= _MOST * left.sum():
                 out |= remote
+        return out
+
+    def zeros(self) -> Bools:
+        """Zeros that stand for missing values: one or two beside which nothing is near zero.
+
+        Several must have both neighbours on one side: an edge may pass zero.
+        """
+        where = np.flatnonzero(np.isfinite(self.values))
+        values = self.values[where]
+        out = np.zeros(len(self.values), bool)
+        spans = [span for span in runs(values == 0.0) if span[0] > 0 and span[1] < len(values)]
+        if not spans:
+            return out
+        first, last = np.array(spans).T
+        before, after = values[first - 1], values[last]
+        far = np.minimum(np.abs(before), np.abs(after)) > _AWAY * self.noise + 3.0 * self.resolution
+        far &= last - first <= 2
+        if np.sum(far & (before * after > 0.0)) >= _AGAIN:
+            for start, stop in zip(first[far], last[far], strict=True):
+                out[where[start:stop]] = True
         return out
 
     @property
